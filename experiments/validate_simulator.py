@@ -23,10 +23,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import polars as pl
+from measured_costs import measured_costs
 
 from chainshaper import load_application, open_recording, run_application, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.simulation.samples import measured_costs
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application

@@ -13,21 +13,6 @@ import pytest
 from chainshaper.sources.ctf import open_trace, read_events
 
 DUMP = Path(__file__).with_name("babeltrace_dump.py")
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
-REAL_TRACES = (
-    "galactic_caret_end_to_end",
-    "humble_sync",
-    "jazzy_avp_cyclonedds",
-    "jazzy_chain_cyclonedds",
-    "jazzy_chain_fastrtps_async",
-)
-
-
-def real_trace(name: Any) -> Any:
-    folder = SHARED / name / "trace"
-    if not folder.is_dir():
-        pytest.skip(f"no real traces: {folder} is absent")
-    return folder
 
 
 @functools.cache

@@ -18,21 +18,6 @@ def instances_by_callback(story: Story) -> dict[int, list[int]]:
     return dict(instances.group_by("callback_id", maintain_order=True).agg("start").iter_rows())
 
 
-def test_names_kinds_and_topics() -> None:
-    story = Story()
-    node = story.node("/front/filter", pid=7)
-    story.timer(node, period=250_000_000)
-    story.subscription(node, "/points", symbol="Filter::on_points(Cloud)")
-    graph = application_graph(story.tables())
-    timer, subscription = graph.callbacks
-    assert (timer.kind, timer.node, timer.pid) == ("timer", "/front/filter", 7)
-    assert timer.label == "/front/filter every 250ms"
-    assert (subscription.kind, subscription.topic) == ("subscription", "/points")
-    assert subscription.symbol == "Filter::on_points(Cloud)"
-    assert graph.subscribers == {"/points": ("/front/filter",)}
-    assert [node.name for node in graph.nodes] == ["/front/filter"]
-
-
 def _two_processes(story: Story) -> None:
     for start, (name, pid, topic) in ((20, ("/a", 1, "/x")), (50, ("/b", 2, "/y"))):
         callback = story.subscription(story.node(name, pid=pid), topic, handle=0xBEEF)
@@ -134,21 +119,6 @@ def test_publisher_created_before_its_node_as_rosout_is() -> None:
     story = Story()
     story.publisher(story.node("/a", pid=1, time=6, handle=8), "/rosout", time=5)
     assert application_graph(story.tables()).publishers == {"/rosout": ("/a",)}
-
-
-def test_python_nodes_have_assumed_instances() -> None:
-    # /py takes at 20 and 60 and publishes at 30 and 70; there are no callback events.
-    story = Story()
-    python = story.node("/py", pid=1)
-    taker = story.subscription(python, "/x", callbackless=True)
-    out = story.publisher(python, "/y")
-    for took in (20, 60):
-        story.take(taker, took, sent=took - 5)
-        story.publish(out, took + 10)
-    tables = story.tables()
-    (callback,) = application_graph(tables).callbacks
-    assert (callback.kind, callback.topic, callback.publishes) == ("subscription", "/x", ("/y",))
-    assert "without callback events" in resolve_objects(tables).notes[0]
 
 
 def test_empty_tables_are_an_empty_application() -> None:

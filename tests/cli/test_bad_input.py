@@ -109,12 +109,6 @@ def test_a_missing_core_is_the_platforms_fault(folder: Path, words: Words) -> No
         assert not (folder / "recording").exists()
 
 
-def test_a_period_shorter_than_the_longest_latency(words: Words) -> None:
-    message = refused(1, *words("plan --latencies LATENCIES --period 100ms"))
-    for part in ("the longest latency 120ms", "do not fit into the cycle of 100ms", "a longer"):
-        assert part in message
-
-
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="setpriv is not installed")
 @pytest.mark.parametrize("options", [["--realtime"], ["--cycles", "2"]])
 def test_without_the_privilege_it_runs_with_what_it_may(
@@ -176,14 +170,6 @@ def test_what_does_not_go_is_refused_and_nothing_written(
     before = {path: path.read_bytes() for path in folder.iterdir()}
     assert message in refused(2, *words(command))
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_a_recording_whose_tables_are_broken(tmp_path: Path, unshaped: Recording) -> None:
-    broken = Path(shutil.copytree(unshaped.path, tmp_path / "broken"))
-    table = broken / "callback_start.parquet"
-    table.write_bytes(table.read_bytes()[:100])
-    for verb in ("latency", "callbacks"):
-        assert f"{table}: not a readable event table" in refused(2, verb, broken)
 
 
 @pytest.mark.parametrize(

@@ -61,22 +61,6 @@ def test_instances_are_in_wall_clock_time(unshaped: Recording) -> None:
         assert modified - 600 * 10**9 < instance["start_ns"] < modified, "an epoch, not an uptime"
 
 
-def test_callbacks_as_json(unshaped: Recording) -> None:
-    rows = json_of("callbacks", unshaped.path)
-    by_node = {row["node"]: row for row in rows}
-    assert set(by_node) == {"/first", "/second", "/third", "/actuator"}
-    for row in rows:
-        assert set(row) == {
-            *("node", "kind", "topic", "period_ns", "pid", "tids", "count"),
-            *("response_ns", "execution_ns"),
-        }
-        assert row["tids"] == [row["pid"]]
-        assert set(row["execution_ns"]) == {"min", "mean", "max"}
-        assert 0 < row["execution_ns"]["min"] <= row["response_ns"]["max"]
-    assert (by_node["/first"]["kind"], by_node["/first"]["period_ns"]) == ("timer", 50_000_000)
-    assert (by_node["/third"]["kind"], by_node["/third"]["topic"]) == ("subscription", "/t2")
-
-
 def test_compare_as_json_and_with_figures(
     tmp_path: Path, unshaped: Recording, shaped: Recording
 ) -> None:

@@ -1,6 +1,7 @@
 """Slots that follow a timer: an hour of a timer that is some ppm off, as a drift watch sees it."""
 
 import random
+from collections.abc import Callable
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -18,17 +19,21 @@ MS, S = 1_000_000, 1_000_000_000
 LEAD_NS, LOOK_NS, NOISE_NS = 2 * MS, 10 * S, 30_000
 
 
-def waits_of(ppm: float, *, looks: bool = True) -> tuple[list[int], TimerTrack, int]:
+def waits_of(
+    ppm: float, *, looks: bool = True, busy: Callable[[int, random.Random], int] = lambda *_: 0
+) -> tuple[list[int], TimerTrack, int]:
     """How long before its slot the timer expires, look by look for an hour, and how often the
-    slots have moved. A thread that waits begins as its slot opens, else with its timer.
+    slots have moved. A thread that waits begins as its slot opens, else with its timer, and later
+    on a ``busy`` machine.
     """
-    noise, track = random.Random(1), TimerTrack(LEAD_NS, 0, looks=looks)
-    waits, moves = [], 0
-    for now_ns in range(LOOK_NS, 3600 * S, LOOK_NS):
+    noise, track = random.Random(1), TimerTrack(LEAD_NS, 0, 100 * MS, looks=looks)
+    waits, moves, now_ns = [], 0, 0
+    while now_ns < 3600 * S:
+        now_ns += LOOK_NS // 5 if track.is_unsure else LOOK_NS
         opens_ns = track.opens_ns
         waits.append(opens_ns + LEAD_NS - round(ppm * now_ns / 1e6))
-        seen_ns = max(0, -waits[-1]) + round(noise.gauss(0, NOISE_NS))
-        moves += track.saw(seen_ns, now_ns) != opens_ns
+        late_ns = round(noise.gauss(0, NOISE_NS)) + busy(now_ns, noise)
+        moves += track.saw(max(0, -waits[-1]) + late_ns, now_ns) != opens_ns
     return waits, track, moves
 
 
@@ -36,12 +41,23 @@ def waits_of(ppm: float, *, looks: bool = True) -> tuple[list[int], TimerTrack, 
 def test_slots_stay_by_their_timer_for_an_hour(ppm: float) -> None:
     """50 ppm off it moves by 180 ms in that time."""
     waits, track, moves = waits_of(ppm)
-    assert min(waits[6:]) > -1.2 * MS, "it begins hardly behind the margin of 1 ms"
-    assert min(waits[:6]) > -1.6 * MS, "before the rate is known"
+    assert min(waits[6:]) > -1.6 * MS, "of which 1 ms is in the margin"
+    assert min(waits[:6]) > -2 * MS, "before the rate is known"
     assert max(waits) < 3 * MS
     assert abs(track.rate * 1e6 - ppm) < 0.5
     if abs(ppm) < 1:
-        assert moves < 40, "where nothing drifts, slots hardly move"
+        assert moves < 50, "where nothing drifts, slots hardly move"
+
+
+@pytest.mark.parametrize("ppm", [0, 50, -50])
+def test_a_busy_machine_is_no_timer(ppm: float) -> None:
+    """Half of the time threads begin up to 2 ms late: an hour of it had moved slots by 4.4 s."""
+    waits, track, _ = waits_of(
+        ppm, busy=lambda now, noise: (now // (300 * S)) % 2 * noise.randrange(2 * MS)
+    )
+    assert min(waits) > -5 * MS
+    assert max(waits) < 12 * MS
+    assert abs(track.rate * 1e6 - ppm) < 15
 
 
 def test_without_looking_a_timer_that_falls_behind_is_followed() -> None:
@@ -59,8 +75,8 @@ def test_every_back_end_that_gates_follows_a_phase_that_was_measured(
     seen = {"latest_ns": MS, "looks": 1, "expect": lambda _: None}  # the timer, in the open slot
     here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None, arm=armed.append, **seen)
     run = _Run(plan, plan, Choice(back_end, ""), here, (), frozenset(), Event())
-    run.waits_ns, run.found = [LEAD_NS] * measured, here
+    run.waits_ns, run.found = [0] * measured, here
     run.begin_state((), "")
     moved = next(run.follow(here, [here]))
-    follows = measured and back_end != "fifo"
-    assert (moved, armed) == ((MS + LEAD_NS, [MS + LEAD_NS]) if follows else (0, []))
+    assert bool(moved) == (measured and back_end != "fifo")
+    assert armed == [moved % plan.cycle_ns] * bool(moved)

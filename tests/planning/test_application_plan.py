@@ -9,14 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper import load_application_plan, save_application_plan, save_plan
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    combined,
-    plan_in,
-    plan_of_chain,
-    plan_values,
-    whole,
-)
+from chainshaper.planning.application_plan import ApplicationPlan, combined, plan_of_chain, whole
 from chainshaper.planning.plan import (
     ChainOfPlan,
     Evidence,
@@ -26,8 +19,8 @@ from chainshaper.planning.plan import (
     Server,
     Slot,
     Thread,
-    plans_as_text,
 )
+from chainshaper.planning.plan_file import plan_in, plan_values, plans_as_text
 from chainshaper.values.errors import InputError
 
 MS = 1_000_000

@@ -125,14 +125,11 @@ def test_a_sink_that_forks_off_is_planned_right(
 def test_chains_are_planned_together(
     others: list[str], apart: bool, application: Application, recording: Recording, tmp_path: Path
 ) -> None:
-    """All at once in force, every output comes in its slot, the first chain's where it was."""
+    """All at once in force, every output comes in its slot, at the same place in every cycle."""
     chains = ["/t1../t3", *others]
     plan, remarks = plan_application(profile_chains(recording, chains), REQUEST)
     assert not remarks
     assert any(one.offset_ns for one in plan.chains) == apart
-    assert publish_slots(plan.chains[0]) == publish_slots(
-        plan_recording(recording, "/t1../t3", REQUEST)
-    )
     together = simulate(application, tmp_path / "together", plan, cycles=200)
     for one, chain in zip(plan.chains, chains, strict=True):
         ((opens, closes),) = publish_slots(one)

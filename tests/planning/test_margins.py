@@ -18,7 +18,7 @@ from chainshaper.planning.margins import (
     late_share,
     read_latencies,
 )
-from chainshaper.planning.plan import dump_plan
+from chainshaper.planning.plan_file import dump_plan
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

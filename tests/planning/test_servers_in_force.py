@@ -13,7 +13,7 @@ import pytest
 from small_chain import small_chain_plan
 
 from chainshaper.enforcement.litmus import litmus_commands
-from chainshaper.flow.threads import refuse_turns, server_table
+from chainshaper.flow.threads import refuse_unfit, server_table
 from chainshaper.planning import (
     PlanRequest,
     Profile,
@@ -112,6 +112,6 @@ def test_servers_of_one_priority_overlap_only_where_they_take_turns() -> None:
     assert open_in_ms(apart, "chain") == [(0, 21), (22, 50)]
     with pytest.raises(InputError, match="overlaps"):
         revised(apart, servers=with_slots(plan.servers, {"chain": [(0, 40 * MS)]}))
-    refuse_turns(whole(plan), "freezer")
+    refuse_unfit(whole(plan), "freezer")
     with pytest.raises(InputError, match=r"under the back end scx .* \(--backend freezer\)"):
-        refuse_turns(whole(plan), "scx")
+        refuse_unfit(whole(plan), "scx")

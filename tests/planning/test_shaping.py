@@ -15,12 +15,11 @@ from chainshaper.planning.plan import (
     Plan,
     Thread,
     band_predictions,
-    dump_plan,
-    plan_json,
     publish_slots,
     publishing_servers,
     server_of,
 )
+from chainshaper.planning.plan_file import dump_plan, plan_json
 from chainshaper.planning.shaping import (
     CallbackTimes,
     let_per_callback,

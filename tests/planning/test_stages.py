@@ -13,7 +13,8 @@ from chainshaper.enforcement.slot_dispatcher import boundaries_of
 from chainshaper.planning import CallbackTimes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.overruns import cycles_until_output, open_until_done, plan_warnings
 from chainshaper.planning.pipeline import in_cycle
-from chainshaper.planning.plan import dump_plan, load_plan, publish_slots, revised
+from chainshaper.planning.plan import publish_slots, revised
+from chainshaper.planning.plan_file import dump_plan, load_plan
 from chainshaper.planning.stages import Longest, Stage, opened_early, shortest_cut
 from chainshaper.values.errors import InputError, OperationError
 

@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 
-from chainshaper import compare_recordings, hop_breakdown, measure_latency, save_plan, write_report
+from chainshaper import (
+    compare_recordings,
+    draw_distribution,
+    draw_latency,
+    export_perfetto,
+    hop_breakdown,
+    measure_latency,
+    save_plan,
+    write_report,
+)
 from chainshaper.reporting.page import (
     distinct_names,
     latency_histogram,
@@ -281,11 +290,23 @@ def test_a_plan_can_be_named_for_a_recording_that_does_not_know_it(tmp_path: Pat
     assert _Reader(file.read_text()).data["recordings"][0]["slots"] == [[30 * MS, 31 * MS]]
 
 
-def test_a_report_on_a_full_disk_leaves_nothing(known: Recording, full_disk: Path) -> None:
-    path = full_disk / "report.html"
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        *(("report.html", write_report), ("latency.png", draw_latency)),
+        *(
+            ("cdf.png", draw_distribution),
+            ("t.pftrace", lambda one, at: export_perfetto(one[0], at)),
+        ),
+    ],
+)
+def test_a_file_on_a_full_disk_leaves_nothing(
+    name: str, write: Callable[[list[Measurement], Path], Path], known: Recording, full_disk: Path
+) -> None:
+    path = full_disk / name
     with pytest.raises(OperationError, match=f"{path}: the file cannot be written.*No space"):
-        write_report([measure_latency(known)], path)
-    assert not [file for file in full_disk.iterdir() if "report" in file.name]
+        write([measure_latency(known)], path)
+    assert [file.name for file in full_disk.iterdir()] == ["filling"]
 
 
 def _traversals(latencies: Sequence[int | None], disturbed: Sequence[bool]) -> pl.DataFrame:

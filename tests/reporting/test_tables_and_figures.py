@@ -11,17 +11,13 @@ from rich.console import Console
 
 from chainshaper import (
     compare_recordings,
-    draw_distribution,
-    draw_latency,
     measure_latency,
     open_recording,
 )
 from chainshaper.planning import Plan
-from chainshaper.reporting.figures import draw_comparison
 from chainshaper.reporting.latency import comparison_json, comparison_table
 from chainshaper.reporting.overviews import plan_table
 from chainshaper.reporting.tables import ResultTable
-from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import InForceInfo, Recording
 from chainshaper.verify.measure import Comparison
 
@@ -53,24 +49,6 @@ def test_brackets_are_shown_and_not_taken_for_markup(comparison: Comparison, pla
     values = comparison_json(comparison)
     names = [Path(entry["recording"]).name for entry in values["recordings"]]
     assert (values["chain"], names) == ("/t1../t3", ["before [bold]", "after"])
-
-
-def test_figures_are_drawn_and_never_over_others(comparison: Comparison, tmp_path: Path) -> None:
-    folder = tmp_path / "new" / "figures"
-    for path in draw_comparison(comparison.measurements, folder):
-        assert path.read_bytes().startswith(b"\x89PNG")
-    drawn = (folder / "latency.png").read_bytes()
-    with pytest.raises(InputError, match=r"latency.png exists already and is not overwritten"):
-        draw_comparison(comparison.measurements, folder)
-    assert (folder / "latency.png").read_bytes() == drawn
-
-
-def test_a_figure_on_a_full_disk_leaves_nothing(comparison: Comparison, full_disk: Path) -> None:
-    for draw in (draw_latency, draw_distribution):
-        path = full_disk / "figure.png"
-        with pytest.raises(OperationError, match=f"{path}: the file cannot be written.*No space"):
-            draw(comparison.measurements, path)
-        assert not path.exists()
 
 
 @pytest.mark.parametrize(

@@ -386,7 +386,7 @@ def test_what_the_machine_lacks_is_named_with_the_remedy(
         any_command.start()
     with pytest.raises(InputError, match=rf"process {os.getpid()} neither uses libtracetools.so"):
         EbpfTracer(tmp_path, (), (os.getpid(),)).start()
-    monkeypatch.setattr("chainshaper.sources.ebpf.session.mapped_libraries", lambda _: {})
+    monkeypatch.setattr("chainshaper.sources.ebpf.trace_points.mapped_libraries", lambda _: {})
     with pytest.raises(OperationError, match="no ROS 2 node to attach to"):
         EbpfTracer(tmp_path, (), ()).start()
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -156,19 +156,6 @@ def test_tracing_started_after_the_application(tmp_path: Path) -> None:
     assert "tracing has to start before" in refused(2, "latency", trace, "--chain", "/x../y")
 
 
-def test_before_jazzy_publications_carry_no_timestamp(tmp_path: Path) -> None:
-    tables = shifted(chain_story())
-    published = tables["rmw_publish"]
-    owners = tables["rcl_publisher_init"].select("rmw_publisher_handle", "publisher_handle")
-    tables["rmw_publish"] = published.drop("rmw_publisher_handle", "timestamp")
-    tables["rcl_publish"] = published.join(owners, on="rmw_publisher_handle").select(
-        pl.col("time") - 1, "pid", "tid", "publisher_handle", "message"
-    )
-    trace = write_lttng_trace(tmp_path / "trace", tables, clock_offset_ns=OFFSET)
-    found = json_of("latency", trace, "--chain", "/x../y")
-    assert (found["count"], found["min_ns"], found["max_ns"]) == (5, 300, 300)
-
-
 def test_components_share_a_process(tmp_path: Path) -> None:
     story = Story()
     first, second = story.node("/container/a", 10), story.node("/container/b", 10)
@@ -209,17 +196,6 @@ def test_traces_of_different_clocks_are_not_mixed(tmp_path: Path) -> None:
     write_trace(tmp_path / "traces" / "two", text, {})
     with pytest.raises(InputError, match=r"two was taken by another clock than .*one"):
         open_source(tmp_path / "traces")
-
-
-def test_what_is_no_trace_is_named(tmp_path: Path) -> None:
-    assert "no such folder" in refused(2, "info", tmp_path / "nothing")
-    (tmp_path / "empty").mkdir()
-    assert "folder without recording.json" in refused(2, "info", tmp_path / "empty")
-    (tmp_path / "bad").mkdir()
-    (tmp_path / "bad" / "metadata").write_text("/* CTF 1.8 */ trace { nonsense")
-    said = refused(2, "info", tmp_path / "bad")
-    assert str(tmp_path / "bad" / "metadata") in said
-    assert "is a recording" not in said
 
 
 def test_a_trace_without_ros_events_cannot_be_converted(tmp_path: Path) -> None:

@@ -9,12 +9,9 @@ from command_line import called, json_of, refused
 from chainshaper import compare_chains, load_application, measure_latency, simulate
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import PlanRequest, plan_application, publish_slots
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    combined,
-    save_application_plan,
-)
+from chainshaper.planning.application_plan import ApplicationPlan, combined
 from chainshaper.planning.plan import publishing_servers, revised, with_slots
+from chainshaper.planning.plan_file import save_application_plan
 from chainshaper.verify.predictions import due_of
 from chainshaper.workload.description import Application
 

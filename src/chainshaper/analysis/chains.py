@@ -61,8 +61,7 @@ def _likeness(first: str, second: str) -> float:
 def parse_chain(text: str) -> tuple[str, ...]:
     """The way points of a chain: ``/t1../t5`` → ``("/t1", "/t5")``.
 
-    Raises:
-        InputError: nothing between two dots, more than two dots in a row, a way point twice.
+    Raises InputError: nothing between two dots, more than two dots in a row, a way point twice.
     """
     waypoints = tuple(part.strip() for part in text.split(".."))
     if any(not part or part.startswith(".") or part.endswith(".") for part in waypoints):
@@ -99,8 +98,7 @@ class ChainEnumeration:
 def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     """The one chain of ``graph`` that ``spec`` means.
 
-    Raises:
-        InputError: a topic or node that does not exist, no path, only a cyclic one, or several.
+    Raises InputError: a topic or node that does not exist, no path, only a cyclic one, or several.
     """
     search = _Search(graph, spec, parse_chain(spec))
     paths, complete, _ = search.listed(HANDFUL + 1)
@@ -125,8 +123,7 @@ def enumerate_chains(
     triggers, without ``end`` they end with topics from which no callback goes on. ``response_ns``
     is the mean response time by callback id. Never hangs: the search has a budget.
 
-    Raises:
-        InputError: ``start`` or ``end`` does not exist, or nothing leads from one to the other.
+    Raises InputError: ``start`` or ``end`` does not exist, or nothing leads from one to the other.
     """
     waypoints = [name for name in (start, end) if name is not None]
     spec = f"{start or ''}..{end or ''}"
@@ -596,8 +593,7 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
     Each node of a path becomes a way point together with the topic it publishes. A last node that
     publishes nothing ends the chain with the topic it subscribes to.
 
-    Raises:
-        InputError: not readable, not YAML, no ``named_paths``, a path without nodes.
+    Raises InputError: not readable, not YAML, no ``named_paths``, a path without nodes.
     """
     path = Path(file)
     root = compose(read_text(path, "CARET's architecture file"), path)

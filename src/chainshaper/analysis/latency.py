@@ -170,19 +170,17 @@ def analyse_latency(
     chain: str | Chain,
     clock_offset_ns: int | None = None,
     *,
-    subscriber: str | None = None,
     due: Sequence[Due] = (),
     between: tuple[int, int | None] | None = None,
 ) -> LatencyAnalysis:
     """Every traversal of ``chain`` in a recording, with statistics.
 
     ``clock_offset_ns`` (event clock to CLOCK_REALTIME) is taken from a recording and needed for
-    tables from before Jazzy. ``subscriber`` names the node whose reception is reported. ``due`` is
-    when a plan has outputs leave; those of other chains are passed over. ``between`` leaves out
-    traversals that did not begin, and end, between two instants (ns).
+    tables from before Jazzy. ``due`` is when a plan has outputs leave; those of other chains are
+    passed over. ``between`` leaves out traversals that did not begin, and end, between two instants
+    (ns).
 
-    Raises:
-        InputError: the chain is not in the recording, see :func:`~.chains.find_chain`.
+    Raises InputError: the chain is not in the recording, see :func:`~.chains.find_chain`.
     """
     notes: tuple[str, ...] = ()
     if isinstance(source, Recording):
@@ -197,7 +195,7 @@ def analyse_latency(
     own = next((one for one in due if one.output in {None, chain.topics[-1]}), None)
     judged, releases = with_punctuality(flow, found, own)
     hit = pl.Series(disturbed(flow, judged, 0 if own is None else own.margin_ns))
-    received = reception(flow, found, graph, subscriber)
+    received = reception(flow, found, graph)
     sent, arrived = judged["end"].fill_null(0), received["received"].fill_null(-1)
     on_its_way = pl.Series(stalled_after(flow, sent.to_numpy(), arrived.to_numpy()))
     frame = judged.drop("origin", "computed_at").with_columns(

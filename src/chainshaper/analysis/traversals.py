@@ -292,21 +292,17 @@ def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:
     return pl.when(through_buffer).then(put).otherwise(time)
 
 
-def reception(
-    flow: DataFlow, traversals: Traversals, graph: ApplicationGraph, node: str | None = None
-) -> pl.DataFrame:
+def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -> pl.DataFrame:
     """When a callback of the output's subscriber started with each traversal's message.
 
     One row per traversal, in order: ``traversal``, ``received`` (null: never) and ``reception_ns``
-    (from the traversal's start). The subscriber is that of ``node``, by default the first
-    subscription callback of the last topic that received anything at all.
+    (from the traversal's start). The subscriber is the first subscription callback of the last
+    topic that received anything at all.
     """
     candidates = [
         callback.id
         for callback in graph.callbacks
-        if callback.kind == "subscription"
-        and callback.topic == traversals.chain.topics[-1]
-        and node in {None, callback.node}
+        if callback.kind == "subscription" and callback.topic == traversals.chain.topics[-1]
     ]
     taken = flow.takes.filter(pl.col("callback_id").is_in(candidates))
     taken = taken.drop_nulls(["publication", "instance"])

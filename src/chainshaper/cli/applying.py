@@ -8,19 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import chainshaper as cs
-from chainshaper.cli.options import JSON, USERS, argument, option
-from chainshaper.cli.output import (
-    Progress,
-    notes,
-    present,
-    print_json,
-    progress,
-    say,
-    show,
-    show_line,
-    stop_on_signals,
-    warn,
-)
+from chainshaper.cli import options as opt
+from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -36,18 +25,18 @@ def recording_of(plan: "cs.ApplicationPlan") -> Path | None:
 
 
 def threads(
-    where: str | None = argument(
+    where: str | None = opt.argument(
         "[PID|PLAN]",
         "A process, which stands for its descendants too, or a plan.yaml for the nodes "
         "of its servers. Default: all that looks like ROS 2 or DDS.",
     ),
-    recording: Path | None = option(
+    recording: Path | None = opt.option(
         "--recording REC",
         "A recording or trace of the processes while they ran: it tells nodes and "
         "executors for sure. Default: the plan's own, where it exists.",
     ),
-    user: list[str] | None = USERS,
-    json: bool = JSON,
+    user: list[str] | None = opt.USERS,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.reporting.overviews import threads_json, threads_table
@@ -60,39 +49,39 @@ def threads(
         recording = recording or recording_of(place)
     recorded = None if recording is None else cs.open_source(recording)
     found = cs.find_threads(place, recorded, users=user or ())
-    if present(json, threads_json(found), threads_table(found)):
-        notes(found.notes)
+    if out.present(json, threads_json(found), threads_table(found)):
+        out.notes(found.notes)
 
 
 def apply(
-    plan: Path = argument("plan.yaml", "The plan.", ...),
-    command: list[str] | None = argument(
+    plan: Path = opt.argument("plan.yaml", "The plan.", ...),
+    command: list[str] | None = opt.argument(
         "[-- COMMAND…]",
         "Start this, such as `ros2 launch …`, and end when it ends. Default: attach to what runs.",
     ),
-    backend: str = option(
+    backend: str = opt.option(
         "--backend NAME",
         "auto (the strongest that works here), scx, litmus, freezer or fifo.",
         "auto",
     ),
-    phase: int | None = option(
+    phase: int | None = opt.option(
         "--phase DURATION",
         "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC: slots then stay there."
         " Default: measured, and followed where it drifts.",
     ),
-    recording: Path | None = option(
+    recording: Path | None = opt.option(
         "--recording REC",
         "Of these very processes, or of an earlier run: it tells which threads execute what.",
     ),
-    wait: int | None = option(
+    wait: int | None = opt.option(
         "--wait DURATION",
         "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
     ),
-    user: list[str] | None = USERS,
-    dry_run: bool = option(
+    user: list[str] | None = opt.USERS,
+    dry_run: bool = opt.option(
         "--dry-run", "Show what would be done to which thread, and change nothing.", False
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Keep the threads of an application inside a plan's slots, until Ctrl-C.
 
@@ -109,8 +98,8 @@ def apply(
     if dry_run:
         _show_changes(planned, backend, json, how)
         return
-    warn(planned)
-    with stop_on_signals() as stop, _watching() as (watch, report):
+    out.warn(planned)
+    with out.stop_on_signals() as stop, _watching() as (watch, report):
         done = cs.apply_plan(
             planned,
             command or (),
@@ -123,8 +112,8 @@ def apply(
             progress=report,
             **how,
         )
-    present(json, asdict(done.state) | {"exit_code": done.exit_code}, servers_table(done.state))
-    notes(done.state.notes)
+    out.present(json, asdict(done.state) | {"exit_code": done.exit_code}, servers_table(done.state))
+    out.notes(done.state.notes)
     if done.exit_code and not stop.is_set():
         raise OperationError(f"the command ended with code {done.exit_code}")
 
@@ -138,17 +127,17 @@ def _show_changes(
 
     changes = cs.planned_changes(plan, backend, **how)
     if json:
-        print_json(asdict(changes))
+        out.print_json(asdict(changes))
         return
     for command in changes.commands:
-        show_line(shlex.join(command))
+        out.show_line(shlex.join(command))
     if not changes.commands:
-        show(changes_table(changes.threads))
-    notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
+        out.show(changes_table(changes.threads))
+    out.notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
 
 
 @contextmanager
-def _watching() -> "Iterator[tuple[Callable[[RunState], None], Progress]]":
+def _watching() -> "Iterator[tuple[Callable[[RunState], None], out.Progress]]":
     """What shows the state of a run, and progress before: a live table, or a line now and then."""
     from chainshaper.reporting.overviews import run_line, servers_table
 
@@ -169,21 +158,21 @@ def _watching() -> "Iterator[tuple[Callable[[RunState], None], Progress]]":
     def watch_in_lines(state: "RunState") -> None:
         nonlocal seen
         if seen == 0:
-            say(f"in force with {state.back_end}: {state.reason}; Ctrl-C ends it")
+            out.say(f"in force with {state.back_end}: {state.reason}; Ctrl-C ends it")
         elif seen % LINE_EVERY == 0:
-            say(run_line(state))
+            out.say(run_line(state))
         seen += 1
 
     with ExitStack() as stack:
-        report = stack.enter_context(progress("applying"))
+        report = stack.enter_context(out.progress("applying"))
         yield watch_live if sys.stderr.isatty() else watch_in_lines, report
 
 
 def status(
-    outputs: bool = option(
+    outputs: bool = opt.option(
         "--outputs", "Only the outputs that are shaped, bypassed or silent.", False
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the plans in force: back end, servers, counters, and what crashed runs have left.
 
@@ -196,22 +185,24 @@ def status(
 
     found = find_outputs()
     if json:
-        print_json([asdict(output) for output in found] if outputs else runs_as_json())
+        out.print_json([asdict(output) for output in found] if outputs else runs_as_json())
         return
     for output in found:
-        show_line(output_text(output))
+        out.show_line(output_text(output))
     if outputs:
         if not found:
-            show_line("no output has a shaping node")
+            out.show_line("no output has a shaping node")
         return
     runs = list(cs.find_runs())
     strays = stray_groups(journal for journal, _ in runs)
     if runs:
-        show(runs_table(runs), *(servers_table(state) for _, state in runs if state is not None))
+        out.show(
+            runs_table(runs), *(servers_table(state) for _, state in runs if state is not None)
+        )
     elif not strays:
-        show_line("no plan is in force")
-    notes(line for journal, _ in runs for line in strange_lines(journal))
-    notes(
+        out.show_line("no plan is in force")
+    out.notes(line for journal, _ in runs for line in strange_lines(journal))
+    out.notes(
         f"{folder} was left by a run whose journal is gone: `chainshaper release` lets its "
         "threads run"
         for folder in strays
@@ -219,7 +210,7 @@ def status(
 
 
 def release(
-    run: str | None = argument(
+    run: str | None = opt.argument(
         "[RUN]", "The run, as `chainshaper status` names it. Default: all of them."
     ),
 ) -> None:
@@ -244,28 +235,28 @@ def release(
             left = (str(error),)
         problems += left
         if not left:
-            show_line(f"{journal.path.parent.name}: everything is as it was before")
+            out.show_line(f"{journal.path.parent.name}: everything is as it was before")
     strays, left = release_strays(runs) if run is None else ((), ())
     for folder in strays:
-        show_line(f"{folder}, of a run whose journal is gone: its threads run again")
+        out.show_line(f"{folder}, of a run whose journal is gone: its threads run again")
     problems += left
-    notes(strangers)
+    out.notes(strangers)
     if problems:
         raise OperationError("; ".join(problems))
     if not chosen and not strays:
-        show_line("no plan is in force, and nothing was left behind")
+        out.show_line("no plan is in force, and nothing was left behind")
 
 
 def doctor(
-    watch: int = option(
+    watch: int = opt.option(
         "--watch DURATION", "How long to watch for stalls of the machine.", 5_000_000_000
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""
     from chainshaper.reporting.overviews import machine_json, machine_tables
 
-    with progress("examining this machine") as report:
+    with out.progress("examining this machine") as report:
         report(0.0, "watching for stalls")
         found = cs.examine_machine(watch)
-    present(json, machine_json(found), *machine_tables(found))
+    out.present(json, machine_json(found), *machine_tables(found))

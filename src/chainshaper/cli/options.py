@@ -214,8 +214,7 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     Without numbers bands have those of the modes' order. An output behind its mode's slot leaves at
     once unless ``late`` says otherwise.
 
-    Raises:
-        InputError: it is not of this form, or names what no mode or topic may be called.
+    Raises InputError: it is not of this form, or names what no mode or topic may be called.
     """
     if text is None:
         if late is not None:

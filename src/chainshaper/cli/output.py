@@ -89,7 +89,7 @@ def warn(plan: "cs.Plan | cs.ApplicationPlan") -> None:
     from chainshaper.planning import plan_warnings
     from chainshaper.planning.application_plan import whole
 
-    notes(dict.fromkeys(said for one in whole(plan).chains for said in plan_warnings(one)))
+    notes(plan_warnings(*whole(plan).chains))
 
 
 @contextmanager

@@ -6,59 +6,46 @@ from pathlib import Path
 from typing import Any
 
 import chainshaper as cs
+from chainshaper.cli import options as opt
+from chainshaper.cli import output as out
 from chainshaper.cli.applying import recording_of
-from chainshaper.cli.options import (
-    APPLICATION,
-    DESCRIPTIONS,
-    JSON,
-    NODE,
-    PLAN_WISHES,
-    SEED,
-    SINK,
-    NodeKind,
-    argument,
-    option,
-    takes_wishes,
-    wish,
-)
-from chainshaper.cli.output import notes, present, print_json, progress, show_line, warn
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback
 
 
-@takes_wishes(*PLAN_WISHES)
+@opt.takes_wishes(*opt.PLAN_WISHES)
 def plan(
-    recording: Path | None = argument("[REC]", "A recording's or a trace's folder."),
-    chain: list[str] | None = option(
+    recording: Path | None = opt.argument("[REC]", "A recording's or a trace's folder."),
+    chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
         " Give several to plan them together: what they share, and when each one's cycles start.",
     ),
-    output: Path | None = option(
+    output: Path | None = opt.option(
         "--output -o plan.yaml",
         "File to write; of several chains also a folder, for a plan each. Must not exist.",
     ),
-    latencies: Path | None = option(
+    latencies: Path | None = opt.option(
         "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
     ),
-    period: int | None = option(
+    period: int | None = opt.option(
         "--period DURATION", "Period, with --latencies or a chain that no timer starts."
     ),
     *,
     request: "cs.PlanRequest",
-    curve: Path | None = option(
+    curve: Path | None = opt.option(
         "--curve FILE.png",
         "With --bands auto: draw the average over the number of bands.",
         rich_help_panel="Latency bands",
     ),
-    mode_profile: list[str] | None = option(
+    mode_profile: list[str] | None = opt.option(
         "--mode-profile MODE=REC",
         "With --modes: what was measured in one mode alone, a recording or a file of latencies"
         " (may be repeated). Default: the cycles of the recording that began in it.",
         rich_help_panel="Latency bands",
     ),
-    sink: list[str] | None = SINK,
-    json: bool = JSON,
+    sink: list[str] | None = opt.SINK,
+    json: bool = opt.JSON,
 ) -> None:
     """Plan the reservation servers of a chain: by default one publish slot behind its longest
     latency, or several latency bands, or one of the schedules that shaping is compared with.
@@ -108,10 +95,10 @@ def plan(
         tables.append(choice_table(choice))
         if curve is not None:
             draw_curve(choice, curve)
-    if present(json, values, *tables):
-        notes(values["warnings"])
+    if out.present(json, values, *tables):
+        out.notes(values["warnings"])
         for path in filter(None, (curve, output)):
-            show_line(path)
+            out.show_line(path)
 
 
 def _profiles(
@@ -133,15 +120,15 @@ def _profiles(
 
 
 def offsets(
-    plans: list[Path] = argument("PLAN PLAN...", "Plans, one a chain.", ...),
-    output: Path | None = option(
+    plans: list[Path] = opt.argument("PLAN PLAN...", "Plans, one a chain.", ...),
+    output: Path | None = opt.option(
         "--output -o plan.yaml",
         "One plan of all chains; or a folder, for a plan each. Must not exist.",
     ),
-    time_limit: float = option(
+    time_limit: float = opt.option(
         "--time-limit SECONDS", "How long to search, per group.", 60.0, min=0.1
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Find when each chain's cycles start, so that no slots of one core collide.
 
@@ -165,46 +152,50 @@ def _print_several(
     from chainshaper.reporting.overviews import plan_table
 
     written = [output] if output is not None else []
-    if output is not None and output.suffix not in DESCRIPTIONS:
+    if output is not None and output.suffix not in opt.DESCRIPTIONS:
         written = save_plans(placed, output)
     else:
         joint = combined(with_own_names(placed))
         placed = joint.chains
         if output is not None:
             cs.save_application_plan(joint, output)
-    warnings = [*remarks, *(warning for one in placed for warning in plan_warnings(one))]
+    warnings = [*remarks, *plan_warnings(*placed)]
     files = [str(path) for path in written]
     values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}
-    if present(json, values, *map(plan_table, placed)):
-        notes(dict.fromkeys(warnings))
+    if out.present(json, values, *map(plan_table, placed)):
+        out.notes(warnings)
         for path in written:
-            show_line(path)
+            out.show_line(path)
 
 
 def sweep(
-    application: Path = APPLICATION,
-    vary: list[str] = option(
+    application: Path = opt.APPLICATION,
+    vary: list[str] = opt.option(
         "--vary NAME=VALUES",
         "An axis (repeat it for more): a wish for the plan, such as epsilon=0ms,1ms or"
         " bands=1..5; interference=0ms,20ms; or a value of the description by its path, such"
         " as nodes.node3.core=0,1.",
         ...,
     ),
-    output: Path = option("--output -o FILE.parquet", "File to write, a row for each point.", ...),
-    plan: Path | None = argument(
+    output: Path = opt.option(
+        "--output -o FILE.parquet", "File to write, a row for each point.", ...
+    ),
+    plan: Path | None = opt.argument(
         "plan.yaml", "A plan that is in force at all points. Default: each is planned."
     ),
-    cycles: int = option("--cycles", "Cycles to plan from, and to judge by.", 100_000, min=1),
-    seed: int | None = SEED,
-    workers: int | None = option(
+    cycles: int = opt.option("--cycles", "Cycles to plan from, and to judge by.", 100_000, min=1),
+    seed: int | None = opt.SEED,
+    workers: int | None = opt.option(
         "--workers", "Threads that compute. Default: one per core.", min=1
     ),
-    scheduler: str | None = option(
+    scheduler: str | None = opt.option(
         "--scheduler ADDRESS",
         "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
     ),
-    draw: Path | None = option("--draw FILE.png", "Draw average and jitter over the first axis."),
-    json: bool = JSON,
+    draw: Path | None = opt.option(
+        "--draw FILE.png", "Draw average and jitter over the first axis."
+    ),
+    json: bool = opt.JSON,
 ) -> None:
     """Simulate an application at every combination of some values: planned, shaped, judged.
 
@@ -226,7 +217,7 @@ def sweep(
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is given twice: give all of its values in one --vary")
     try:
-        with progress("sweep") as report:
+        with out.progress("sweep") as report:
             frame = cs.sweep(
                 described,
                 dict(axes),
@@ -240,50 +231,50 @@ def sweep(
             )
     except KeyboardInterrupt:
         if rows_beside(output).exists():
-            notes([f"finished points are in {rows_beside(output)}: the same command goes on"])
+            out.notes([f"finished points are in {rows_beside(output)}: the same command goes on"])
         raise
     if draw is not None:
         draw_sweep(frame, draw)
-    if present(json, frame.to_dicts(), sweep_table(frame)):
-        notes(frame["error"].drop_nulls().unique(maintain_order=True))
+    if out.present(json, frame.to_dicts(), sweep_table(frame)):
+        out.notes(frame["error"].drop_nulls().unique(maintain_order=True))
         for path in filter(None, (draw, output)):
-            show_line(path)
+            out.show_line(path)
 
 
 def splice(
-    plan: Path | None = argument("plan.yaml", "The plan; none with --throttle."),
-    launch: list[str] | None = argument(
+    plan: Path | None = opt.argument("plan.yaml", "The plan; none with --throttle."),
+    launch: list[str] | None = opt.argument(
         "LAUNCH... [NAME:=VALUE...]",
         "The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, behind --, "
         "a `ros2 run …`.",
     ),
     *,
-    output: Path = option("--output -o DIR", "Folder for the launch file.", ...),
-    throttle: list[str] | None = option(
+    output: Path = opt.option("--output -o DIR", "Folder for the launch file.", ...),
+    throttle: list[str] | None = opt.option(
         "--throttle [NODE:]TOPIC=PERIOD[,RULE]",
         "Instead of a plan: a throttler before an input that is not quite periodic, for "
         "NODE or whoever subscribes in the recording (may be repeated). RULE: newest, at fixed "
         "instants (default), or first, as it comes.",
     ),
-    node: NodeKind = NODE,
-    message_type: str | None = option(
+    node: opt.NodeKind = opt.NODE,
+    message_type: str | None = opt.option(
         "--type PKG/msg/TYPE", "Of the output, for --node typed. Default: what the recording says."
     ),
-    recording: Path | None = option(
+    recording: Path | None = opt.option(
         "--recording REC",
         "A recording of the application: it tells publishers, subscribers and types. "
         "Default: the plan's own, where it exists.",
     ),
-    fallback: Fallback | None = wish("fallback", default=None),
-    build: bool = option("--build", "Build the shaping node's package with colcon.", False),
-    dry_run: bool = option(
+    fallback: Fallback | None = opt.wish("fallback", default=None),
+    build: bool = opt.option("--build", "Build the shaping node's package with colcon.", False),
+    dry_run: bool = opt.option(
         "--dry-run",
         "Write nothing, and show what would be redirected: the launch files are carried out in "
         "this ROS 2 environment, but no process is started.",
         False,
     ),
-    undo: bool = option("--undo", "Remove DIR again, unless it was changed since.", False),
-    json: bool = JSON,
+    undo: bool = opt.option("--undo", "Remove DIR again, unless it was changed since.", False),
+    json: bool = opt.JSON,
 ) -> None:
     """Write a launch file that includes yours, starts a shaping node, and redirects the output.
 
@@ -297,9 +288,9 @@ def splice(
     if undo:
         cs.undo_splice(output)
         if json:
-            print_json({"removed": str(output)})
+            out.print_json({"removed": str(output)})
         else:
-            show_line(f"{output} is removed")
+            out.show_line(f"{output} is removed")
         return
     if build and node == "python":
         raise InputError("--node python needs no building: leave out --build, or choose another")
@@ -318,26 +309,25 @@ def splice(
             raise InputError(
                 "a throttler is for all types: choose --node python or cpp, and no --type"
             )
-        splicing = _throttled(throttle, recording, common)
+        if not files:
+            raise InputError(
+                "give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
+            )
+        known = _opened(recording)
+        splicing = cs.splice_throttlers(throttled_inputs(throttle), recording=known, **common)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
         planned = cs.load_application_plan(plan)
-        warn(planned)
+        out.warn(planned)
         common |= {"message_type": message_type, "fallback": fallback}
         known = _opened(recording or recording_of(planned))
         splicing = cs.splice_launch_files(planned, recording=known, **common)
     setup = build_package(splicing.folder / NODES) if build and not dry_run else None
     if json:
-        print_json(_splicing_json(splicing, setup))
+        out.print_json(_splicing_json(splicing, setup))
         return
     _show_splicing(splicing, arguments, setup)
-
-
-def _throttled(inputs: list[str], recording: Path | None, common: dict[str, Any]) -> "cs.Splicing":
-    if not common["launch_files"]:
-        raise InputError("give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`")
-    return cs.splice_throttlers(throttled_inputs(inputs), recording=_opened(recording), **common)
 
 
 def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":
@@ -367,18 +357,20 @@ def _show_splicing(splicing: "cs.Splicing", arguments: dict[str, str], setup: Pa
     for one in splicing.redirects:
         verb = "publishes" if one.kind == "publisher" else "subscribes to"
         for node in one.nodes:
-            show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
+            out.show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
     for found in splicing.redirected:
         for started in found["redirected"]:
-            show_line(f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}")
-    notes(splicing.notes)
+            out.show_line(
+                f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}"
+            )
+    out.notes(splicing.notes)
     if splicing.redirected:
         return
     if setup is not None:
-        show_line(f"source {setup}")
+        out.show_line(f"source {setup}")
     words = [f"{name}:={value}" for name, value in arguments.items()]
     for file in dict.fromkeys(splicing.launch.values()):
-        show_line(shlex.join(["ros2", "launch", str(file), *words]))
+        out.show_line(shlex.join(["ros2", "launch", str(file), *words]))
 
 
 def _splicing_json(splicing: "cs.Splicing", setup: Path | None) -> dict[str, Any]:

@@ -8,39 +8,8 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 import chainshaper as cs
-from chainshaper.cli.options import (
-    APPLICATION,
-    CYCLES,
-    DESCRIPTIONS,
-    JSON,
-    NODE,
-    PLAN_WISHES,
-    REALTIME,
-    RECORDING_OUTPUT,
-    SEED,
-    SINK,
-    SOURCE,
-    USERS,
-    NodeKind,
-    Source,
-    argument,
-    option,
-    plan_in_force,
-    takes_wishes,
-)
-from chainshaper.cli.output import (
-    late_progress,
-    lost_events,
-    notes,
-    present,
-    print_json,
-    progress,
-    show,
-    show_line,
-    stage_lines,
-    stop_on_signals,
-    warn,
-)
+from chainshaper.cli import options as opt
+from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables
 from chainshaper.values.errors import InputError, OperationError
@@ -54,32 +23,32 @@ STDERR = 2
 
 SHAPING_DURATION_NS = 60_000_000_000
 
-COMMAND: list[str] | None = argument(
+COMMAND: list[str] | None = opt.argument(
     "[-- COMMAND…]", "Starts the application, such as `ros2 launch …`; ended with the recording."
 )
-DURATION: int | None = option(
+DURATION: int | None = opt.option(
     "--duration DURATION", "How long to record. Default: until the application ends, or Ctrl-C."
 )
-BUFFER: int | None = option(
+BUFFER: int | None = opt.option(
     "--buffer MIB",
     "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
     min=1,
 )
 
 
-@takes_wishes("ideal_machine")
+@opt.takes_wishes("ideal_machine")
 def demo(
-    output: Path | None = option(
+    output: Path | None = opt.option(
         "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
     ),
-    application: Path | None = option(
+    application: Path | None = opt.option(
         "--application APP.yaml", "Another application than the paper's synthetic chain."
     ),
-    cycles: int = CYCLES,
-    realtime: bool | None = REALTIME,
+    cycles: int = opt.CYCLES,
+    realtime: bool | None = opt.REALTIME,
     *,
     request: "cs.PlanRequest",
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Measure a live chain, plan, splice the shaping node, measure again, show the gain.
 
@@ -91,7 +60,7 @@ def demo(
     from chainshaper.reporting.overviews import callback_table, plan_table
 
     folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
-    with progress("demo") as report:
+    with out.progress("demo") as report:
         result = run_demo(
             folder,
             application=application,
@@ -99,21 +68,21 @@ def demo(
             request=request,
             realtime=realtime,
             command=sys.argv,
-            planned=warn,
+            planned=out.warn,
             progress=report,
         )
     tables = [callback_table(result.callbacks), plan_table(result.plan)]
     tables.append(comparison_tables(result.comparison)[0])
-    if present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
-        notes(result.notes)
-        show_line(folder.absolute())
+    if out.present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
+        out.notes(result.notes)
+        out.show_line(folder.absolute())
 
 
 def run(
-    application: Path = APPLICATION,
-    output: Path = RECORDING_OUTPUT,
-    cycles: int = CYCLES,
-    realtime: bool | None = REALTIME,
+    application: Path = opt.APPLICATION,
+    output: Path = opt.RECORDING_OUTPUT,
+    cycles: int = opt.CYCLES,
+    realtime: bool | None = opt.REALTIME,
 ) -> None:
     """Run an application live over DDS and record its events.
 
@@ -121,25 +90,25 @@ def run(
     permitted). The recording is a folder of Parquet tables.
     """
     described = cs.load_application(application)
-    with progress(f"running {described.name}") as report:
+    with out.progress(f"running {described.name}") as report:
         recording = cs.run_application(
             described, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
         )
-    notes(recording.info.notes)
-    show_line(recording.path)
+    out.notes(recording.info.notes)
+    out.show_line(recording.path)
 
 
 def simulate(
-    application: Path = APPLICATION,
-    output: Path = RECORDING_OUTPUT,
-    plan: Path | None = argument("plan.yaml", "The plan in force."),
-    cycles: int = CYCLES,
-    seed: int | None = SEED,
-    switches: bool = option("--switches", "Record what ran on which core, too.", False),
-    execution_times: Path | None = option(
+    application: Path = opt.APPLICATION,
+    output: Path = opt.RECORDING_OUTPUT,
+    plan: Path | None = opt.argument("plan.yaml", "The plan in force."),
+    cycles: int = opt.CYCLES,
+    seed: int | None = opt.SEED,
+    switches: bool = opt.option("--switches", "Record what ran on which core, too.", False),
+    execution_times: Path | None = opt.option(
         "--execution-times REC", "Draw execution times from those recorded there."
     ),
-    block: int = option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
+    block: int = opt.option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
 
@@ -150,38 +119,38 @@ def simulate(
         from chainshaper.simulation.samples import with_recorded_times
 
         described = with_recorded_times(described, execution_times, block=block)
-    with late_progress(f"simulating {described.name}") as report:
+    with out.late_progress(f"simulating {described.name}") as report:
         recording = cs.simulate(
             described,
             output,
-            plan_in_force(plan),
+            opt.plan_in_force(plan),
             cycles=cycles,
             seed=seed,
             switches=switches,
             command=sys.argv,
             progress=report,
         )
-    show_line(recording.path)
+    out.show_line(recording.path)
 
 
 def record(
-    output: Path = RECORDING_OUTPUT,
+    output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
-    source: Source = SOURCE,
+    source: opt.Source = opt.SOURCE,
     duration: int | None = DURATION,
-    pid: list[int] | None = option(
+    pid: list[int] | None = opt.option(
         "--pid",
         "Attach to this process and what it has started (ebpf; may be repeated). "
         "Default, without a COMMAND: everything of the users that looks like ROS 2.",
     ),
-    user: list[str] | None = USERS,
+    user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
-    watch_stalls: bool = option(
+    watch_stalls: bool = opt.option(
         "--watch-stalls",
         "Have a sleeper on every core notice when the machine itself stands still.",
         False,
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Record a ROS 2 application: its events, nodes, threads and QoS.
 
@@ -211,20 +180,20 @@ def _record_and_show(
     """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
     from chainshaper.linux.own_processes import end_in_words
 
-    with stop_on_signals() as stop:
+    with out.stop_on_signals() as stop:
         recorded = cs.record_command(
             output,
             command,
             command_stdout=STDERR if json else None,  # standard output is ours
             buffer=buffer and buffer * MIB,
             stop=stop,
-            progress=stage_lines("record"),
+            progress=out.stage_lines("record"),
             **how,
         )
     recording = recorded.recording
     count = int(cs.event_counts(recording)["count"].sum())
     if json:
-        print_json(
+        out.print_json(
             {
                 "recording": str(recording.path),
                 "events": count,
@@ -234,8 +203,8 @@ def _record_and_show(
             }
         )
     else:
-        show_line(recording.path)
-    notes((*recording.info.notes, f"{count} events; {lost_events(recording)}"))
+        out.show_line(recording.path)
+    out.notes((*recording.info.notes, f"{count} events; {out.lost_events(recording)}"))
     if recorded.exit_code:
         raise OperationError(
             f"the command {end_in_words(recorded.exit_code)}; what was recorded until then is in "
@@ -243,36 +212,36 @@ def _record_and_show(
         )
 
 
-@takes_wishes("cores")
+@opt.takes_wishes("cores")
 def profile(
-    output: Path = RECORDING_OUTPUT,
+    output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
     *,
-    chain: list[str] | None = option(
+    chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
         "The chain whose nodes, and those that it waits for, get the priority (may be repeated);"
         " --like tells which those are.",
     ),
-    like: Path | None = option(
+    like: Path | None = opt.option(
         "--like REC",
         "An earlier recording of the application: it knows the chain's nodes, components "
         "of containers, and executors with several threads.",
     ),
-    node: list[str] | None = option(
+    node: list[str] | None = opt.option(
         "--node NAME",
         "A node that gets the priority (may be repeated). Default: the chain's, or all.",
     ),
-    core: int | None = option(
+    core: int | None = opt.option(
         "--core",
         "Where executors run. Default: the last core; with --chain and --like, others as well where"
         " branches run at the same time. DDS threads run on the others.",
         min=0,
     ),
     request: "cs.PlanRequest",
-    source: Source = SOURCE,
+    source: opt.Source = opt.SOURCE,
     duration: int | None = DURATION,
     buffer: int | None = BUFFER,
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Record with the chain's threads under SCHED_FIFO, DDS threads on another core.
 
@@ -310,7 +279,7 @@ def profile(
         seen, found = profiled_cores(earlier, chains, request)
         core_of |= found
         if len(undelayed(seen, found)) > 1:
-            notes(["chains that share a core delay each other here: profile them one by one"])
+            out.notes(["chains that share a core delay each other here: profile them one by one"])
     _record_and_show(
         *(output, command, json, buffer),
         source=source,
@@ -321,43 +290,43 @@ def profile(
     )
 
 
-@takes_wishes(*PLAN_WISHES)
+@opt.takes_wishes(*opt.PLAN_WISHES)
 def shape(
-    words: list[str] = argument(
+    words: list[str] = opt.argument(
         "APP.yaml plan.yaml | -- ros2 launch ...",
         "A described application and the plan in force; or what launches a real one, "
         "which is then measured and planned first.",
         ...,
     ),
-    output: Path = option(
+    output: Path = opt.option(
         "--output -o REC",
         "Folder for the recording; of a launched application, for everything.",
         ...,
     ),
-    cycles: int = CYCLES,
-    realtime: bool | None = REALTIME,
-    chain: list[str] | None = option(
+    cycles: int = opt.CYCLES,
+    realtime: bool | None = opt.REALTIME,
+    chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
         "The chain, by topics or nodes: /t1../t5. Several are shaped together. Default: you are"
         " asked.",
     ),
-    sink: list[str] | None = SINK,
-    throttle: list[str] | None = option(
+    sink: list[str] | None = opt.SINK,
+    throttle: list[str] | None = opt.option(
         "--throttle NODE:TOPIC=PERIOD",
         "A throttler before an input of NODE that is not quite periodic, from the first recording"
         " on (may be repeated).",
     ),
-    period: int | None = option("--period DURATION", "Period of a chain that no timer starts."),
-    duration: int | None = option(
+    period: int | None = opt.option("--period DURATION", "Period of a chain that no timer starts."),
+    duration: int | None = opt.option(
         "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
-    source: Source = SOURCE,
-    node: NodeKind = NODE,
-    backend: str = option("--backend NAME", "As for `chainshaper apply`.", "auto"),
+    source: opt.Source = opt.SOURCE,
+    node: opt.NodeKind = opt.NODE,
+    backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     *,
     request: "cs.PlanRequest",
-    user: list[str] | None = USERS,
-    json: bool = JSON,
+    user: list[str] | None = opt.USERS,
+    json: bool = opt.JSON,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
 
@@ -366,12 +335,12 @@ def shape(
     apply, record again, compare. Every file in between stays. All options but --cycles and
     --realtime are for this, and mean what they mean for `chainshaper plan` and `apply`.
     """
-    if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
+    if len(words) == 2 and words[0].endswith(opt.DESCRIPTIONS):
         if chain or sink or throttle or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
         return
-    if Path(words[0]).suffix in DESCRIPTIONS:
+    if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
             "a described application is shaped with its plan, and nothing else: `chainshaper shape "
             "APP.yaml plan.yaml -o REC`"
@@ -397,8 +366,8 @@ def _shape_described(
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
 
     described, planned = cs.load_application(application), cs.load_application_plan(plan)
-    warn(planned)
-    with progress(f"shaping {described.name}") as report:
+    out.warn(planned)
+    with out.progress(f"shaping {described.name}") as report:
         recording = cs.shape_application(
             described,
             planned,
@@ -411,25 +380,25 @@ def _shape_described(
     for chain in planned.chains:
         about = f"{chain.chain.output}: " if len(planned.chains) > 1 else ""
         if overruns := overruns_in(recording, chain):
-            notes([about + overruns_text(overruns)])
+            out.notes([about + overruns_text(overruns)])
     if dropped := dropped_in(recording):
-        notes([dropped_text(dropped)])
-    notes(recording.info.notes)
-    show_line(recording.path)
+        out.notes([dropped_text(dropped)])
+    out.notes(recording.info.notes)
+    out.show_line(recording.path)
 
 
 def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) -> None:
     """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
     from chainshaper.reporting.latency import comparison_json
 
-    with stop_on_signals() as stop:
+    with out.stop_on_signals() as stop:
         shaped = cs.shape_launch(
             command,
             folder,
             choose=_ask if sys.stdin.isatty() and not json else None,
             stop=stop,
-            planned=warn,
-            progress=stage_lines("shape"),
+            planned=out.warn,
+            progress=out.stage_lines("shape"),
             **how,
         )
     values = comparison_json(shaped.comparison) | {
@@ -438,16 +407,16 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
         "cores": dict(shaped.cores),
     }
     tables = [table for one in shaped.comparisons for table in comparison_tables(one)]
-    if present(json, values, *tables):
-        notes(shaped.notes)
-        show_line(shaped.folder)
+    if out.present(json, values, *tables):
+        out.notes(shaped.notes)
+        out.show_line(shaped.folder)
 
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
     from chainshaper.reporting.overviews import chain_table
     from chainshaper.values.safe_text import shown
 
-    show(chain_table(graph, found))
+    out.show(chain_table(graph, found))
     default = (found.heaviest or found.chains[0]).spec
     question = f"Which chain, FIRST..LAST? [{shown(default)}]"
     return str(typer.prompt(question, default=default, show_default=False, err=True))

@@ -4,55 +4,37 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import chainshaper as cs
-from chainshaper.cli.options import (
-    CHAIN,
-    JSON,
-    PLAN_IN_FORCE,
-    RECORDING_OUTPUT,
-    TRACE,
-    argument,
-    option,
-    plan_in_force,
-)
-from chainshaper.cli.output import (
-    late_progress,
-    lost_events,
-    notes,
-    opened,
-    present,
-    print_json,
-    show,
-    show_line,
-)
+from chainshaper.cli import options as opt
+from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError
 
 if TYPE_CHECKING:
     from chainshaper.reporting.tables import ResultTable
 
 
-def info(trace: list[Path] = TRACE, json: bool = JSON) -> None:
+def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
     from chainshaper.reporting.overviews import contents_json, contents_table
 
-    with opened("info", trace, overview=True) as (recording, _):
+    with out.opened("info", trace, overview=True) as (recording, _):
         contents = contents_json(recording)
-    if present(json, contents, *contents_table(recording)):
-        show_line(lost_events(recording))
-        notes(contents["notes"])
+    if out.present(json, contents, *contents_table(recording)):
+        out.show_line(out.lost_events(recording))
+        out.notes(contents["notes"])
 
 
 def graph(
-    trace: list[Path] = TRACE,
-    output: Path | None = option(
+    trace: list[Path] = opt.TRACE,
+    output: Path | None = opt.option(
         "--output -o FILE", "File to write: .svg, .dot or .json; must not exist."
     ),
-    everything: bool = option(
+    everything: bool = opt.option(
         "--all",
         "Also what every node has for itself: parameter services, /rosout, "
         "/parameter_events. In JSON they are always there, marked as internal.",
         False,
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
     from chainshaper.reporting import graph_drawing
@@ -60,47 +42,47 @@ def graph(
 
     if output is not None:
         new_file(output, graph_drawing.ENDINGS)
-    with opened("graph", trace) as (recording, report):
+    with out.opened("graph", trace) as (recording, report):
         application = cs.describe_application(recording)
         if output is not None:
             report(0.9, "drawing")
             cs.write_picture(application, output, everything=everything)
     if json:
-        print_json(graph_drawing.application_json(application))
+        out.print_json(graph_drawing.application_json(application))
     elif output is None:
         chosen = application if everything else graph_drawing.without_internals(application)
-        show(graph_drawing.application_table(chosen))
-        show_line(lost_events(recording))
-        notes(application.notes)
+        out.show(graph_drawing.application_table(chosen))
+        out.show_line(out.lost_events(recording))
+        out.notes(application.notes)
     else:
-        show_line(output.absolute())
-        notes((*application.notes, lost_events(recording)))
+        out.show_line(output.absolute())
+        out.notes((*application.notes, out.lost_events(recording)))
 
 
-def callbacks(trace: list[Path] = TRACE, json: bool = JSON) -> None:
+def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
     from chainshaper.reporting.overviews import callback_rows, callback_table
 
-    with opened("callbacks", trace) as (recording, _):
+    with out.opened("callbacks", trace) as (recording, _):
         flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
         statistics = cs.callback_statistics(flow)
-    if present(json, callback_rows(statistics), callback_table(statistics)):
-        show_line(lost_events(recording))
-        notes((*recording.info.notes, *flow.notes))
+    if out.present(json, callback_rows(statistics), callback_table(statistics)):
+        out.show_line(out.lost_events(recording))
+        out.notes((*recording.info.notes, *flow.notes))
     elif any(recording.info.lost.values()):  # the array has no place for it
-        notes([lost_events(recording)])
+        out.notes([out.lost_events(recording)])
 
 
 def chains(
-    trace: list[Path] = TRACE,
-    start: str | None = option(
+    trace: list[Path] = opt.TRACE,
+    start: str | None = opt.option(
         "--from X", "Topic or node where they begin. Default: callbacks that nothing triggers."
     ),
-    end: str | None = option(
+    end: str | None = opt.option(
         "--to Y", "Topic or node where they end. Default: topics from which nothing goes on."
     ),
-    limit: int = option("--limit", "How many to list.", 100, min=1),
-    json: bool = JSON,
+    limit: int = opt.option("--limit", "How many to list.", 100, min=1),
+    json: bool = opt.JSON,
 ) -> None:
     """List the computation chains, count them, and show the heaviest.
 
@@ -109,26 +91,26 @@ def chains(
     from chainshaper.analysis import graph_of
     from chainshaper.reporting.overviews import chain_table, chains_json, count_text
 
-    with opened("chains", trace) as (recording, report):
+    with out.opened("chains", trace) as (recording, report):
         flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
         report(0.9, "searching chains")
         application = graph_of(flow)
         found = cs.list_chains(flow, start, end, limit)
     remarks = [*recording.info.notes, *flow.notes]
     values = chains_json(application, found) | {"lost": recording.info.lost, "notes": remarks}
-    if present(json, values, chain_table(application, found)):
-        show_line(f"{count_text(found)}; {lost_events(recording)}")
-        notes(remarks)
+    if out.present(json, values, chain_table(application, found)):
+        out.show_line(f"{count_text(found)}; {out.lost_events(recording)}")
+        out.notes(remarks)
 
 
 def latency(
-    trace: list[Path] = TRACE,
-    chain: str | None = CHAIN,
-    chains: Path | None = option(
+    trace: list[Path] = opt.TRACE,
+    chain: str | None = opt.CHAIN,
+    chains: Path | None = opt.option(
         "--chains FILE", "A CARET architecture file: --chain then names one of its named_paths."
     ),
-    json: bool = JSON,
-    instances: bool = option("--instances", "With --json: every traversal, one by one.", False),
+    json: bool = opt.JSON,
+    instances: bool = opt.option("--instances", "With --json: every traversal, one by one.", False),
 ) -> None:
     """Show the end-to-end latency of a chain: average, maximum, jitter, percentiles.
 
@@ -142,26 +124,26 @@ def latency(
         raise InputError("--instances goes with --json: add it")
     if chains is not None:
         chain = named_chain(chains, chain)
-    with opened("latency", trace) as (recording, _):
+    with out.opened("latency", trace) as (recording, _):
         measurement = cs.measure_latency(recording, chain)
     analysis = measurement.analysis
     values = of_chain.latency_json(measurement, instances=instances)
     values |= of_chain.breakdown_json(analysis)
     tables = of_chain.latency_table(measurement), of_chain.breakdown_table(analysis)
-    if present(json, values, *tables):
-        show_line(f"{of_chain.doubts_text(measurement)}; {lost_events(recording)}")
-        notes(analysis.notes)
+    if out.present(json, values, *tables):
+        out.show_line(f"{of_chain.doubts_text(measurement)}; {out.lost_events(recording)}")
+        out.notes(analysis.notes)
 
 
-def convert(trace: list[Path] = TRACE, output: Path = RECORDING_OUTPUT) -> None:
+def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) -> None:
     """Write a trace as a recording: one Parquet file per event table."""
     from chainshaper.values.recording import refuse_existing
 
     refuse_existing(output)
-    with opened("convert", trace) as (recording, _):
+    with out.opened("convert", trace) as (recording, _):
         written = cs.convert_recording(recording, output)
-    show_line(written.path.absolute())
-    notes((*written.info.notes, lost_events(written)))
+    out.show_line(written.path.absolute())
+    out.notes((*written.info.notes, out.lost_events(written)))
 
 
 def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
@@ -179,13 +161,13 @@ def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
 
 
 def compare(
-    recordings: list[Path] = argument("REC REC...", "Recordings' folders.", ...),
-    chain: str | None = CHAIN,
-    figures: Path | None = option(
+    recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
+    chain: str | None = opt.CHAIN,
+    figures: Path | None = opt.option(
         "--figures DIR", "Draw latency.png and distribution.png into this folder."
     ),
-    plan: Path | None = PLAN_IN_FORCE,
-    json: bool = JSON,
+    plan: Path | None = opt.PLAN_IN_FORCE,
+    json: bool = opt.JSON,
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
@@ -194,28 +176,28 @@ def compare(
     """
     from chainshaper.reporting.latency import comparisons_json
 
-    comparisons = cs.compare_chains(recordings, chain, plan_in_force(plan))
+    comparisons = cs.compare_chains(recordings, chain, opt.plan_in_force(plan))
     if figures is not None:
         from chainshaper.reporting.figures import draw_comparison
 
         if len(comparisons) > 1:
             raise InputError("--figures draws one chain: name it with --chain")
         draw_comparison(comparisons[0].measurements, figures)
-    present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
+    out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
 
 
 def report(
-    recordings: list[Path] = argument("REC...", "Recordings' or LTTng traces' folders.", ...),
-    output: Path = option("--output -o FILE.html", "File to write; must not exist.", ...),
-    chain: str | None = CHAIN,
-    plan: Path | None = PLAN_IN_FORCE,
-    cycles: list[int] | None = option(
+    recordings: list[Path] = opt.argument("REC...", "Recordings' or LTTng traces' folders.", ...),
+    output: Path = opt.option("--output -o FILE.html", "File to write; must not exist.", ...),
+    chain: str | None = opt.CHAIN,
+    plan: Path | None = opt.PLAN_IN_FORCE,
+    cycles: list[int] | None = opt.option(
         "--cycle N",
         "A cycle that the timeline has to show, where there are too many to show all. "
         "May be given several times.",
         min=0,
     ),
-    json: bool = JSON,
+    json: bool = opt.JSON,
 ) -> None:
     """Write one self-contained HTML page about a chain, usually before and after shaping.
 
@@ -228,25 +210,25 @@ def report(
     from chainshaper.values.files import new_file
 
     new_file(output, ENDINGS)
-    in_force = plan_in_force(plan)
-    with late_progress("report") as progress:
+    in_force = opt.plan_in_force(plan)
+    with out.late_progress("report") as progress:
         comparisons = cs.compare_chains(recordings, chain, in_force, least=1, progress=progress)
         progress(0.9, "drawing")
         written = cs.write_report(comparisons, output, cycles or ())
     if json:
-        print_json({"report": str(written.absolute()), **comparisons_json(comparisons)})
+        out.print_json({"report": str(written.absolute()), **comparisons_json(comparisons)})
         return
-    show_line(written.absolute())
+    out.show_line(written.absolute())
 
 
 def export(
-    trace: list[Path] = TRACE,
-    output: Path = option(
+    trace: list[Path] = opt.TRACE,
+    output: Path = opt.option(
         "--output -o FILE", "File to write, such as trace.pftrace; must not exist.", ...
     ),
-    perfetto: bool = option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
-    chain: str | None = CHAIN,
-    plan: Path | None = PLAN_IN_FORCE,
+    perfetto: bool = opt.option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
+    chain: str | None = opt.CHAIN,
+    plan: Path | None = opt.PLAN_IN_FORCE,
 ) -> None:
     """Write a recording for another tool: threads, callbacks, messages, slots, stalls.
 
@@ -258,12 +240,12 @@ def export(
     from chainshaper.values.files import new_file
 
     new_file(output, ENDINGS)
-    in_force = plan_in_force(plan)
-    with opened("export", trace) as (recording, report):
+    in_force = opt.plan_in_force(plan)
+    with out.opened("export", trace) as (recording, report):
         report(0.5, "analysing")
         named = chain or recording.info.chain
         measured = None if named is None else cs.measure_latency(recording, named, in_force)
         report(0.7, "writing")
         written = cs.export_perfetto(measured or recording, output)
-    show_line(written.absolute())
-    notes((*recording.info.notes, lost_events(recording)))
+    out.show_line(written.absolute())
+    out.notes((*recording.info.notes, out.lost_events(recording)))

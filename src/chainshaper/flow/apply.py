@@ -41,15 +41,11 @@ from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.threads import list_threads
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    open_until_done,
-    plan_values,
-    whole,
-)
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
+from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -113,8 +109,7 @@ def apply_plan(
     threads.server_table(given)
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
-    threads.refuse_turns(given, choice.name)
-    threads.refuse_offsets(given, choice.name)
+    threads.refuse_unfit(given, choice.name)
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     recorded: tuple[RecordedProcess, ...] = ()
@@ -403,13 +398,16 @@ class _Run:
             yield from repeat(0)
         first = min(range(len(drifts)), key=lambda place: waits[place])
         stamped = all(chain.anchor == "stamp" for chain in self.plan.chains)
-        track = TimerTrack(waits[first], time.monotonic_ns(), looks=stamped)
+        track = TimerTrack(
+            waits[first], time.monotonic_ns(), self.plan.chains[first].cycle_ns, looks=stamped
+        )
         seen = 0
         while True:
             before_ns = track.opens_ns
             if drifts[first].looks > seen:
                 seen = drifts[first].looks
                 track.saw(drifts[first].latest_ns or 0, time.monotonic_ns())
+                drifts[first].look_soon = track.is_unsure
             if track.opens_ns != before_ns:
                 moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
                 servers.arm(moved_ns)

@@ -7,59 +7,113 @@ thread begins as the slot opens, however long before that the timer was. Only a 
 in the open slot shows where it is. So the slots open a little before the timer is expected, once in
 a while, just to see; in between they move at the rate that was found. Outputs are not moved by
 this: they count from the stamp of their own cycle.
+
+On a busy machine a thread begins late without its timer. So slots soon open still earlier once
+more: the timer stays where it is, while a thread that only begins late moves with the opening. What
+is late in spite of that is so in one direction only: the timer is the line beneath all sightings,
+the edge of their convex hull in the middle (Moon, Skelly and Towsley, INFOCOM 1999).
 """
 
 from dataclasses import dataclass, field
+from itertools import pairwise
+from statistics import mean
 
 SEEN_NS = 250_000  # so long behind the opening a thread begins that its timer woke, not the slot
 MOVE_NS = 250_000  # slots move by no less
-AHEAD_NS = 500_000  # so long before the timer they open, to see it
+AHEAD_NS = 400_000  # so long before the timer they open, to see it
+ONCE_MORE_NS = 400_000  # and so much earlier, to be sure
 SOONEST_NS, LATEST_NS = 10_000_000_000, 300_000_000_000  # from one time to the next
+SIGHTINGS = 16
+MOST_RATE = 500e-6  # of a quartz, and of timers that a program counts itself
 
 
 @dataclass
 class TimerTrack:
     """Where a timer expires, and where slots open for it; ns behind the first such opening.
 
-    ``lead_ns`` is how long before the opening the timer is to expire. It was seen to expire at
-    ``expires_ns`` at the time ``at_ns`` (CLOCK_MONOTONIC), and moves at ``rate`` (ns per ns).
-    Unless it ``looks``, the slots never open before the timer to see it.
+    ``lead_ns`` is how long before the opening the timer is to expire. It was seen to expire at the
+    times (CLOCK_MONOTONIC) and places of ``sightings``. Unless it ``looks``, the slots never open
+    before the timer to see it.
     """
 
     lead_ns: int
     at_ns: int
-    expires_ns: int = field(init=False)
-    rate: float = 0.0
-    opens_ns: int = 0
+    cycle_ns: int
     looks: bool = True
+    opens_ns: int = 0
+    sightings: list[tuple[int, int]] = field(init=False)
     _step_ns: int = 0  # while it is looked for: so much earlier the next time
     _every_ns: int = SOONEST_NS
+    _perhaps_ns: int | None = None  # where it seemed to expire, if it did not come late
+    _lost: int = 0  # how often it was not where it can be
 
     def __post_init__(self) -> None:
-        self.expires_ns = -self.lead_ns
+        self.sightings = [(self.at_ns, -self.lead_ns)]
+
+    @property
+    def rate(self) -> float:
+        """How fast the timer moves (ns per ns); 0 until it was seen again."""
+        (at, place), (later, there) = self._beneath()
+        return max(-MOST_RATE, min(MOST_RATE, (there - place) / max(1, later - at)))
+
+    @property
+    def is_unsure(self) -> bool:
+        """Whether to look again soon, before the timer has moved."""
+        return self._perhaps_ns is not None
+
+    def expected(self, now_ns: int) -> int:
+        """Where the timer expires now, as far as is known."""
+        _, (at, place) = self._beneath()
+        return place + round(self.rate * (now_ns - at))
 
     def saw(self, begins_ns: int, now_ns: int) -> int:
         """Where slots are to open from now on, the thread having begun so long behind their
         opening.
         """
-        elapsed = now_ns - self.at_ns
-        expected = self.expires_ns + round(self.rate * elapsed)
-        if abs(begins_ns) > SEEN_NS:  # before the opening: nothing stopped it
-            self._learn(self.opens_ns + begins_ns, expected, now_ns)
-            self.opens_ns = self.expires_ns + self.lead_ns
+        expires_ns, expected = self.opens_ns + begins_ns, self.expected(now_ns)
+        perhaps_ns, self._perhaps_ns = self._perhaps_ns, None
+        furthest = self._furthest(now_ns - self.sightings[-1][0])
+        stayed = perhaps_ns is not None and expires_ns - perhaps_ns > -3 * ONCE_MORE_NS // 4
+        if abs(begins_ns) > SEEN_NS and abs(expires_ns - expected) > furthest:
+            self._go_on(expected, lost=True)
+        elif begins_ns < -SEEN_NS or (begins_ns > SEEN_NS and stayed):  # nothing stopped it
+            self.sightings = [*self.sightings, (now_ns, expires_ns)][-SIGHTINGS:]
+            surprised = abs(expires_ns - expected) > MOVE_NS
+            self._every_ns = SOONEST_NS if surprised else min(LATEST_NS, 2 * self._every_ns)
+            self._go_on(self.expected(now_ns), lost=False)
+        elif begins_ns > SEEN_NS:
+            self._perhaps_ns = expires_ns
+            self.opens_ns -= ONCE_MORE_NS if self.looks else 0
         elif self._step_ns:  # the timer is earlier still
             self.opens_ns -= self._step_ns
             self._step_ns *= 2
-        elif self.looks and elapsed >= self._every_ns:
+            if expected - self.opens_ns > furthest:
+                self._go_on(expected, lost=True)
+        elif self.looks and now_ns - self.sightings[-1][0] >= self._every_ns:
             self.opens_ns, self._step_ns = expected - AHEAD_NS, AHEAD_NS
         elif abs(expected + self.lead_ns - self.opens_ns) > MOVE_NS:
             self.opens_ns = expected + self.lead_ns
         return self.opens_ns
 
-    def _learn(self, expires_ns: int, expected_ns: int, now_ns: int) -> None:
-        """The timer was seen: it has moved at this rate since the time before."""
-        elapsed, surprised = now_ns - self.at_ns, abs(expires_ns - expected_ns) > MOVE_NS
-        if elapsed >= SOONEST_NS // 2:
-            self.rate = (expires_ns - self.expires_ns) / elapsed
-        self.expires_ns, self.at_ns, self._step_ns = expires_ns, now_ns, 0
-        self._every_ns = SOONEST_NS if surprised else min(LATEST_NS, 2 * self._every_ns)
+    def _beneath(self) -> tuple[tuple[int, int], tuple[int, int]]:
+        """The edge of the lower convex hull of all sightings that has their middle in it."""
+        hull: list[tuple[int, int]] = []
+        for at, place in self.sightings:
+            while len(hull) > 1:
+                (first, low), (second, high) = hull[-2:]
+                if (high - low) * (at - first) < (place - low) * (second - first):
+                    break
+                hull.pop()
+            hull.append((at, place))
+        middle = mean(at for at, _ in self.sightings)
+        edges = (edge for edge in pairwise(hull) if edge[1][0] >= middle)
+        return next(edges, (hull[0], hull[0]))
+
+    def _furthest(self, elapsed_ns: int) -> int:
+        """How far from where it is expected the timer can be; further, the longer it is lost."""
+        return min(self.cycle_ns // 4, (4 * AHEAD_NS + round(MOST_RATE * elapsed_ns)) << self._lost)
+
+    def _go_on(self, expected_ns: int, *, lost: bool) -> None:
+        """Slots behind the timer again, until it is time to look for it the next time."""
+        self.opens_ns, self._step_ns = expected_ns + self.lead_ns, 0
+        self._lost = self._lost + 1 if lost else 0

@@ -23,8 +23,9 @@ from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.application_plan import ApplicationPlan, plan_values, whole
+from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.margins import read_latencies
+from chainshaper.planning.plan_file import plan_values
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
@@ -68,7 +69,13 @@ def profile_chains(
         recording = open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
-    profiles = [_profile_of(recording, flow, analysis, period_ns) for analysis in analyses]
+    planned = {
+        number
+        for analysis in analyses
+        for stage in graph_stages(analysis.graph, analysis.chain)
+        for number in stage.members
+    }
+    profiles = [_profile_of(recording, flow, one, period_ns, planned) for one in analyses]
     if modes is None:
         return tuple(profiles)
     if others := ", ".join(mode_recordings.keys() - modes.bands.keys()):
@@ -85,7 +92,7 @@ def profile_chains(
         for mode in modes.bands.keys() - apart if apart or in_force.count() else ():
             own = replace(analysis, traversals=analysis.traversals.filter(in_force == mode))
             try:
-                apart[mode] = _profile_of(recording, flow, own, period_ns)
+                apart[mode] = _profile_of(recording, flow, own, period_ns, planned)
             except OperationError as error:
                 remedy = f"or give the mode's own profile (--mode-profile {mode}=REC)"
                 raise OperationError(f"mode {mode}: {error}; {remedy}") from error
@@ -94,7 +101,11 @@ def profile_chains(
 
 
 def _profile_of(
-    recording: Recording, flow: DataFlow, analysis: LatencyAnalysis, period_ns: int | None
+    recording: Recording,
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    period_ns: int | None,
+    planned: Collection[int],
 ) -> Profile:
     graph, chain = analysis.graph, analysis.chain
     every = analysis.traversals.filter("complete")
@@ -115,7 +126,8 @@ def _profile_of(
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
     instances = _instances_apart_from(flow, disturbed)
     measured = every if all_disturbed else calm
-    steps = _steps(flow, analysis, cores)
+    branches = {n for stage in stages for n in stage.members} - {*chain.callbacks}
+    steps = _steps(flow, analysis, cores, {*planned, *chain.callbacks} - branches)
     return Profile(
         latencies_ns=measured["latency_ns"].to_numpy().astype(np.int64),
         every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
@@ -333,14 +345,20 @@ def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) ->
         mean_response_ns=round(float(response.mean())),  # type: ignore[arg-type]
         max_response_ns=int(response.max()) + waiting,  # type: ignore[arg-type]
         after=stage.after,
+        publishes=stage.topic,
     )
 
 
 def _steps(
-    flow: DataFlow, analysis: LatencyAnalysis, core_of: dict[str, int]
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    core_of: dict[str, int],
+    planned: Collection[int],
 ) -> npt.NDArray[np.int64]:
     """What each callback of the chain took, a row per traversal's number: from the message before
-    it to its own, without the time for which other instances of the chain had its core.
+    it to its own, without the time for which other instances of the chain, and ``planned``
+    callbacks of others, had its core while it waited. It waits as long as the recording's quickest
+    message at least.
 
     With those that overlapped out of it, a row's sum is the latency of an instance that is alone.
     """
@@ -352,18 +370,21 @@ def _steps(
     rows = 1 + max(int(one.max() or 0) for one in numbers)  # type: ignore[arg-type]
     steps = np.zeros((rows, len(chain.callbacks)), dtype=np.int64)
     free = np.zeros(rows, dtype=np.int64)  # when the instance before is over
+    sent = flow.takes.join(flow.publications.select("publication", sent="time"), on="publication")
+    quickest = int((sent["time"] - sent["sent"]).min() or 0)
     for hop, number in enumerate(chain.callbacks):
         own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
         own = own.with_columns(pl.coalesce("end", "publish"))
         row, start, end = (own[name].to_numpy() for name in ("traversal", "start", "end"))
         steps[row, hop] = (own["communication_ns"].fill_null(0) + own["computation_ns"]).to_numpy()
         if hop:
-            same = [one for one in chain.callbacks if core[one] == core[number]]
+            same = [one for one in planned if core[one] == core[number]]
             others = ran.filter(pl.col("callback_id").is_in(same))
             ended = np.maximum.accumulate(others["end"].to_numpy())  # some may only have waited
             began = np.maximum(others["start"].to_numpy(), np.append(0, ended)[:-1])
             since = np.minimum(free[row], start)
-            steps[row, hop] -= stalled_within(since, start, began, ended, np.zeros_like(began))
+            taken = stalled_within(since, start, began, ended, np.zeros_like(began))
+            steps[row, hop] -= np.minimum(taken, np.maximum(0, start - since - quickest))
         free[row] = end
     return steps
 

@@ -26,7 +26,8 @@ from chainshaper.flow.plan import graph_stages, profile_chains
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
-from chainshaper.planning.request import PlanRequest, Profile, cores_for
+from chainshaper.planning.profile import Profile
+from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError

@@ -37,7 +37,8 @@ from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
 from chainshaper.planning import ApplicationPlan, Plan
-from chainshaper.planning.application_plan import plan_values, whole
+from chainshaper.planning.application_plan import whole
+from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources import Tracer
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
 from chainshaper.sources.ros import Environment, ask_graph, environment_of

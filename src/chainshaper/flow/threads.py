@@ -236,8 +236,7 @@ def planned_changes(
     found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
         choice = choose_back_end(back_end)
-        refuse_offsets(plan, choice.name)
-        refuse_turns(plan, choice.name)
+        refuse_unfit(plan, choice.name)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
@@ -257,20 +256,16 @@ def planned_changes(
     return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor), notes)
 
 
-def refuse_offsets(plan: ApplicationPlan, back_end: str) -> None:
-    """Refuse offsets where nothing stops a chain until its cycle starts. Raises InputError."""
+def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
+    """Refuse a plan of which this back end cannot carry out all. Raises InputError: offsets, where
+    nothing stops a chain until its cycle starts; servers of one priority that take turns, where
+    only threads of one server do.
+    """
     if not gates(back_end) and any(chain.offset_ns for chain in plan.chains):
         raise InputError(
             f"the back end {back_end} sets priorities only, and chains whose cycles start at"
             " offsets have to be stopped until then: choose freezer or scx"
         )
-
-
-def refuse_turns(plan: ApplicationPlan, back_end: str) -> None:
-    """Refuse servers of one priority that take turns where the back end has no turns for servers.
-
-    Raises InputError: so it is.
-    """
     if plan.takes_turns and back_end == "scx":
         raise InputError(
             "equal_priorities: round-robin, but under the back end scx turns are those of one"

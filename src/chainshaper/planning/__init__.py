@@ -5,8 +5,6 @@ Everything starts with :func:`plan_shaping`; each further step takes a plan and 
 """
 
 from chainshaper.planning.application_plan import ApplicationPlan as ApplicationPlan
-from chainshaper.planning.application_plan import load_application_plan as load_application_plan
-from chainshaper.planning.application_plan import save_application_plan as save_application_plan
 from chainshaper.planning.bands import BandChoice as BandChoice
 from chainshaper.planning.bands import choose_bands as choose_bands
 from chainshaper.planning.bands import with_bands as with_bands
@@ -23,15 +21,17 @@ from chainshaper.planning.plan import ShapingNode as ShapingNode
 from chainshaper.planning.plan import Slot as Slot
 from chainshaper.planning.plan import Thread as Thread
 from chainshaper.planning.plan import band_predictions as band_predictions
-from chainshaper.planning.plan import dump_plan as dump_plan
-from chainshaper.planning.plan import load_plan as load_plan
-from chainshaper.planning.plan import plan_json as plan_json
 from chainshaper.planning.plan import publish_slots as publish_slots
-from chainshaper.planning.plan import save_plan as save_plan
-from chainshaper.planning.plan import save_plans as save_plans
 from chainshaper.planning.plan import server_of as server_of
+from chainshaper.planning.plan_file import dump_plan as dump_plan
+from chainshaper.planning.plan_file import load_application_plan as load_application_plan
+from chainshaper.planning.plan_file import load_plan as load_plan
+from chainshaper.planning.plan_file import plan_json as plan_json
+from chainshaper.planning.plan_file import save_application_plan as save_application_plan
+from chainshaper.planning.plan_file import save_plan as save_plan
+from chainshaper.planning.plan_file import save_plans as save_plans
+from chainshaper.planning.profile import Profile as Profile
 from chainshaper.planning.request import PlanRequest as PlanRequest
-from chainshaper.planning.request import Profile as Profile
 from chainshaper.planning.request import band_choice as band_choice
 from chainshaper.planning.request import plan_chain as plan_chain
 from chainshaper.planning.several_chains import plan_application as plan_application

@@ -10,15 +10,13 @@ each reserve slots for its thread, which then runs in all of them.
 its slots played out over the hyper-period. A plan for one chain is the same with one chain.
 """
 
-import contextlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import combinations, product
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, model_validator
 
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
@@ -30,13 +28,15 @@ from chainshaper.planning.plan import (
     Thread,
     shaping_nodes,
     slot_text,
-    write_plans,
 )
 from chainshaper.values.durations import format_duration
-from chainshaper.values.yaml_file import Part, read_model, wrong_value, wrong_values_refused
+from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
 
 MOST_SLOTS = 10_000
 """So many slots of all servers fit into a hyper-period at the most."""
+MOST_OPENED = 64
+"""So many slots in a hyper-period has a server at the most that is opened for overruns (sched_ext's
+tables have no room for more)."""
 WAITING_NS = 1_000_000
 """So long before a timer expires its thread's server is closed already."""
 BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
@@ -165,32 +165,57 @@ def plan_of_chain(plan: "Plan | ApplicationPlan", output: str | None) -> Plan | 
 def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> ApplicationPlan:
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
-    See :func:`chainshaper.planning.overruns.open_until_done`; a server whose longer slots would
-    meet those of another chain stays as planned. Of several chains, ``waits_ns`` is how long before
-    its cycle each one's timer expires: its thread waits, so that cycles start at their offsets.
+    See :func:`chainshaper.planning.overruns.open_until_done`; slots that are planned for other
+    chains are left out, so that an overrun delays none of these. In between, chains that overran
+    share their core; where that makes a server's slots too many, it stays as planned. Of several
+    chains, ``waits_ns`` is how long before its cycle each one's timer expires: its thread waits, so
+    that cycles start at their offsets.
     """
     waits = waits_ns if waits_ns and plan.moves_timers else [-WAITING_NS] * len(plan.chains)
-    longer = [
-        server
-        for chain, wait in zip(plan.chains, waits, strict=True)
-        for server in chain_open_until_done(chain, wait + WAITING_NS).servers
-    ]
-    # Of a server of several chains, the longest.
-    opened = {one.name: one for one in sorted(longer, key=lambda one: one.slots[-1][1])}
-    with contextlib.suppress(ValidationError):
-        return _with_servers(plan, opened)
-    for name, server in opened.items():
-        with contextlib.suppress(ValidationError):
-            plan = _with_servers(plan, {name: server})
-    return plan
+    opened: dict[str, Server] = {}
+    for chain, wait in zip(plan.chains, waits, strict=True):
+        for server in chain_open_until_done(chain, wait + WAITING_NS).servers:
+            apart = _without(server, [*_of_others(plan, chain, server)])
+            if len(apart.slots) * plan.cycle_ns > MOST_OPENED * chain.cycle_ns:
+                apart = next(one for one in chain.servers if one.name == server.name)
+            known = opened.get(server.name, apart)  # of a server of several chains, the longest
+            opened[server.name] = max(apart, known, key=lambda one: one.slots[-1][1])
+    chains = (
+        chain.model_copy(update={"servers": tuple(opened[one.name] for one in chain.servers)})
+        for chain in plan.chains
+    )
+    # Not checked: behind what is planned, slots of several chains may meet.
+    return ApplicationPlan.model_construct(chains=tuple(chains))
 
 
-def _with_servers(plan: ApplicationPlan, servers: Mapping[str, Server]) -> ApplicationPlan:
-    chains = []
-    for chain in plan.chains:
-        own = tuple(servers.get(one.name, one) for one in chain.servers)
-        chains.append(chain.model_copy(update={"servers": own}))
-    return ApplicationPlan(chains=tuple(chains))
+def _of_others(plan: ApplicationPlan, chain: Plan, server: Server) -> Iterator[Slot]:
+    """What is planned for other chains at a server's core and priority, in any of its cycles."""
+    for other in plan.chains:
+        if other is chain or chain.equal_priorities == other.equal_priorities == "round-robin":
+            continue
+        common = math.gcd(chain.cycle_ns, other.cycle_ns)
+        for one in other.servers:
+            if one in chain.servers or one.best_effort or one.name == server.name:
+                continue
+            if (one.core, one.priority) != (server.core, server.priority):
+                continue
+            for start, end in one.slots:
+                first = (start + other.offset_ns - chain.offset_ns) % common - common
+                yield from (
+                    (again, again + end - start) for again in range(first, chain.cycle_ns, common)
+                )
+
+
+def _without(server: Server, taken: Sequence[Slot]) -> Server:
+    """The server with its slots but for what is taken."""
+    left = []
+    for start, end in server.slots:
+        free_from = start
+        for begins, ends in sorted([*taken, (end, end)]):
+            if free_from < min(begins, end):
+                left.append((free_from, min(begins, end)))
+            free_from = max(free_from, ends)
+    return server.model_copy(update={"slots": tuple(left)}) if taken else server
 
 
 def combined(plans: Sequence[Plan]) -> ApplicationPlan:
@@ -350,38 +375,3 @@ def _collisions(one: Plan, two: Plan) -> Iterator[str]:
                     f" {slot_text((start, end))} of server {server.name!r} of {chain_name(one)} in"
                     f" some cycles, on core {server.core} at the same priority {server.priority}"
                 )
-
-
-# The file ---------------------------------------------------------------------------------------
-
-
-def load_application_plan(path: str | Path) -> ApplicationPlan:
-    """Read a plan for an application, or for one chain (format 1), however it is laid out.
-
-    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
-    reason and remedy.
-    """
-    made_by = "written by `chainshaper plan`"
-    return whole(read_model(path, Plan, made_by=made_by, otherwise=("chains", ApplicationPlan)))
-
-
-def plan_in(values: Mapping[str, Any]) -> ApplicationPlan:
-    """A plan from what a recording or a run has of it, of either format."""
-    if "chains" in values:
-        return ApplicationPlan.model_validate(values, strict=False)
-    return whole(Plan.model_validate(values, strict=False))
-
-
-def plan_values(plan: ApplicationPlan) -> dict[str, Any]:
-    """What a recording or a run has of a plan: plain data, as :func:`plan_in` reads it."""
-    return (plan.chains[0] if len(plan.chains) == 1 else plan).model_dump(mode="json")
-
-
-def save_application_plan(
-    plan: ApplicationPlan, path: str | Path, *, overwrite: bool = False
-) -> None:
-    """Write a plan, whole or not at all; one chain is written as its own plan.
-
-    Raises: as :func:`~chainshaper.planning.plan.save_plan`.
-    """
-    write_plans(plan.chains, path, overwrite=overwrite)

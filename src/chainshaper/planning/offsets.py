@@ -21,7 +21,7 @@ well but may run out of time.
 import math
 import random
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from itertools import chain, combinations
 from typing import NamedTuple, TypeAlias
@@ -78,6 +78,7 @@ def place_chains(
     *,
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
+    at_once: Callable[[], Sequence[Plan]] | None = None,
 ) -> tuple[tuple[Plan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
@@ -85,19 +86,20 @@ def place_chains(
     same time, the chain with the shorter period at the better priority, and only their publish
     slots stay apart. None begins while a better one runs, where there are such offsets, and has its
     core for as long as there can be: slots count from when a chain really begins, so one that began
-    late would have its publish slot where another has its own. Raises as :func:`with_offsets`.
+    late would have its publish slot where another has its own. ``at_once`` plans the chains again,
+    with latencies that they have then. Raises as :func:`with_offsets`.
     """
     together = together or [[k] for k in range(len(plans))]
     try:
         return with_offsets(plans, together=together, time_limit_s=time_limit_s), []
     except OperationError as error:
-        ranked = _ranked(plans, together)
-        if ranked == list(plans):
+        if _ranked(plans, together) == list(plans):
             raise
+        ranked = _ranked(plans if at_once is None else at_once(), together)
+        condition = ": their latencies must have been measured while all of them ran like this"
         remark = (
             f"{error}. Instead, the chains run at the same time at priorities of their own, and"
-            " only their publish slots are kept apart: their latencies must have been measured"
-            " while all of them ran like this."
+            f" only their publish slots are kept apart{'' if at_once else condition}."
         )
         for share in SHARES:
             with suppress(OperationError):

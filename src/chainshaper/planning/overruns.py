@@ -230,10 +230,18 @@ def publication_warnings(plan: Plan) -> list[str]:
     return warnings
 
 
-def plan_warnings(plan: Plan) -> list[str]:
-    """What a person must know before relying on a plan; one sentence each, none if all is well."""
+def plan_warnings(*plans: Plan) -> list[str]:
+    """What a person must know before relying on a plan; one sentence each, none if all is well. Of
+    several chains, each with its chain.
+    """
     about = (_about_stages, _about_late_outputs, _about_evidence, publication_warnings)
-    return [warning for one in about for warning in one(plan)]
+    names = [f"{plan.chain.spec or plan.chain.output}: " if plans[1:] else "" for plan in plans]
+    return [
+        f"{name}{warning}"
+        for name, plan in zip(names, plans, strict=True)
+        for one in about
+        for warning in one(plan)
+    ]
 
 
 def _about_stages(plan: Plan) -> Iterator[str]:
@@ -324,6 +332,11 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         yield (
             f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
             " longest latency may be among them. Record again, see the recording's notes."
+        )
+    if evidence.interference_ns:
+        yield (
+            f"{milliseconds(evidence.interference_ns)} ms of the slot are for other chains of the"
+            " plan, which may have the core first."
         )
     if evidence.incomplete:
         yield (

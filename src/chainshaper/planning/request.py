@@ -9,14 +9,13 @@ that were measured while nothing was shaped: shaping a topic that another chain'
 makes that one later than was measured, and its slot too early. Such chains are refused.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, permutations
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
 from chainshaper.planning.cores import Work, assign_cores
@@ -43,8 +42,8 @@ from chainshaper.planning.plan import (
     Plan,
     revised,
 )
+from chainshaper.planning.profile import Profile, with_interference
 from chainshaper.planning.shaping import (
-    CallbackTimes,
     evidence_of,
     let_per_callback,
     let_per_chain,
@@ -67,77 +66,6 @@ OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
 UNSHAPED = ("server-per-chain", "server-per-callback")
 _LIMITS = ("grid_ns", "max_gap_ns", "max_share")
-
-
-@dataclass(frozen=True)
-class Profile:
-    """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
-
-    ``latencies_ns`` are those of undisturbed cycles (where ``all_disturbed``, of all),
-    ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
-    ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
-    publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
-    also on branches that the chain waits for, ``cores`` that of any node that has one core; where a
-    node has several executors that run different callbacks, ``executors`` are those that take part,
-    each by its callbacks. ``begins`` is the first callback's number in the graph, and its name,
-    ``upstream`` the topics that the output waits for: on the chain, on those branches, and before
-    the chain begins. ``receivers`` are the nodes that subscribe to the chain's output and are none
-    of these. ``callbacks`` are those of the chain and its branches, see
-    :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
-    are what each callback of the chain took, a row per latency, see
-    :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
-    ``asynchronous`` whether its process has a thread that publishes (None: not known), ``together``
-    are nodes that share a process,
-    ``of_modes`` has what was measured in each mode of the system. The rest is
-    :class:`~chainshaper.planning.plan.Evidence`.
-    """
-
-    latencies_ns: NDArray[np.int64]
-    period_ns: int
-    every_latency_ns: NDArray[np.int64] | None = None
-    spec: str | None = None
-    nodes: tuple[str, ...] = ()
-    topics: tuple[str, ...] = ()
-    begins: tuple[int, str] | None = None
-    upstream: frozenset[str] = frozenset()
-    core_of: Mapping[str, int] = field(default_factory=dict)
-    executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
-    cores: Mapping[str, int] = field(default_factory=dict)
-    together: tuple[tuple[str, ...], ...] = ()
-    receivers: tuple[str, ...] = ()
-    callbacks: tuple[CallbackTimes, ...] = ()
-    steps_ns: NDArray[np.int64] | None = None
-    every_step_ns: NDArray[np.int64] | None = None
-    fifo_priority: int = 84
-    output_depth: int | None = None
-    recording: str | None = None
-    incomplete: int = 0
-    disturbed: int = 0
-    realtime: bool | None = None
-    longest_stall_ns: int | None = None
-    utilisation: float | None = None
-    longest_send_ns: int | None = None
-    longest_publication_ns: int | None = None
-    asynchronous: bool | None = None
-    lost_events: int | None = None
-    all_disturbed: bool | None = None
-    of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
-
-    @property
-    def name(self) -> str:
-        """What the chain is called in messages."""
-        return self.spec or "..".join(self.topics)
-
-    @property
-    def every(self) -> NDArray[np.int64]:
-        """The latencies of all cycles."""
-        every = self.every_latency_ns
-        return check_latencies(self.latencies_ns if every is None else every)
-
-    @property
-    def longest_ns(self) -> int:
-        """The longest of the latencies that are planned from."""
-        return int(check_latencies(self.latencies_ns).max())
 
 
 @dataclass(frozen=True)
@@ -171,6 +99,8 @@ def plan_chain(
     else:
         (profile, *sinks), _ = on_cores((profile, *sinks), request)
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
+    every, together = (profile, *sinks), [range(1 + len(sinks))]
+    profile, *sinks = with_interference(every, together, request, at_once=False)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
         profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
     if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":

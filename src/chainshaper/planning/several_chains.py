@@ -15,6 +15,7 @@ and is refused.
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 from chainshaper.planning.application_plan import ApplicationPlan, combined
@@ -28,9 +29,9 @@ from chainshaper.planning.plan import (
     revised,
     with_slots,
 )
+from chainshaper.planning.profile import Profile, with_interference
 from chainshaper.planning.request import (
     PlanRequest,
-    Profile,
     best_effort_cores,
     on_cores,
     plan_chain,
@@ -52,7 +53,7 @@ def plan_application(
 ) -> tuple[ApplicationPlan, list[str]]:
     """One plan for several chains of an application, and what is to be known about it.
 
-    A chain that is added behind others does not move their outputs within their cycles.
+    A chain that is added to others moves their outputs by what it can delay them, once.
 
     Raises: as :func:`.plan_chain` and :func:`.place_chains`. OperationError names the core, the
         chains and by how much they do not fit, and what would.
@@ -70,7 +71,9 @@ def plan_application(
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
             raise
-        raise OperationError(f"{error}. It fits with {', or with '.join(fits)}") from error
+        raise OperationError(
+            f"{str(error).rstrip('.')}. It fits with {', or with '.join(fits)}"
+        ) from error
 
 
 def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
@@ -94,15 +97,38 @@ def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
 def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[ApplicationPlan, list[str]]:
-    alone = replace(request, best_effort=())
-    plans = [plan_chain(profile, alone) for profile in profiles]
-    groups = beginning_together(profiles)
-    for group in groups:
-        for k, plan in zip(group, _sharing_servers([plans[k] for k in group]), strict=True):
-            plans[k] = plan
-    named = with_own_names(plans)
-    placed, remarks = place_chains(named, together=groups, time_limit_s=time_limit_s)
+    own, groups = replace(request, best_effort=()), beginning_together(profiles)
+
+    def plans(at_once: bool) -> list[Plan]:
+        delayed = with_interference(profiles, groups, request, at_once=at_once)
+        found = [_beside_others(profile, delayed, own) for profile in delayed]
+        for group in groups:
+            for k, plan in zip(group, _sharing_servers([found[k] for k in group]), strict=True):
+                found[k] = plan
+        return with_own_names(found)
+
+    placed, remarks = place_chains(
+        plans(at_once=False),
+        together=groups,
+        time_limit_s=time_limit_s,
+        at_once=partial(plans, at_once=True),
+    )
     return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
+
+
+def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequest) -> Plan:
+    """The plan of one of several chains; who takes the room that it lacks is named."""
+    try:
+        return plan_chain(profile, request)
+    except OperationError as error:
+        core = profile.core_of.get(profile.nodes[-1]) if profile.nodes else None
+        others = [one.name for one in every if one is not profile and core in one.core_of.values()]
+        if core is None or not profile.interference_ns:
+            raise
+        raise OperationError(
+            f"{profile.name} on core {core}, {format_duration(profile.interference_ns)} behind"
+            f" {' and '.join(others)}: {str(error).rstrip('.')}"
+        ) from error
 
 
 def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:

@@ -374,7 +374,7 @@ def with_sink(
 @dataclass(frozen=True)
 class CallbackTimes:
     """Measured response times of one callback; ``after`` are the places, in the sequence that this
-    stands in, of the callbacks whose data it needs.
+    stands in, of the callbacks whose data it needs. It ``publishes`` this topic of the graph's.
     """
 
     node: str
@@ -383,6 +383,7 @@ class CallbackTimes:
     mean_response_ns: int
     max_response_ns: int
     after: tuple[int, ...] = ()
+    publishes: str | None = None
 
 
 def server_per_chain(plan: Plan) -> Plan:

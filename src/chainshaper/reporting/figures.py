@@ -30,8 +30,7 @@ MOST_LINES = 12
 def write_comparison(comparison: Comparison, folder: Path) -> None:
     """Write `comparison.json`, `latency.png` and `distribution.png` into a folder.
 
-    Raises:
-        OperationError: they cannot be written.
+    Raises OperationError: they cannot be written.
     """
     draw_comparison(comparison.measurements, folder)
     text = json.dumps(comparison_json(comparison), indent=2) + "\n"
@@ -41,9 +40,7 @@ def write_comparison(comparison: Comparison, folder: Path) -> None:
 def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> tuple[Path, Path]:
     """Both figures, as `latency.png` and `distribution.png` in a folder that is made if needed.
 
-    Raises:
-        InputError: one of them exists already.
-        OperationError: they cannot be written.
+    Raises InputError: one of them exists already. OperationError: they cannot be written.
     """
     latency, distribution = Path(folder) / "latency.png", Path(folder) / "distribution.png"
     for path in (latency, distribution):
@@ -113,9 +110,7 @@ def _save_chain(
 def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     """The average latency over the number of bands (paper, figure 7), the chosen number marked.
 
-    Raises:
-        InputError: the file exists already.
-        OperationError: it cannot be written.
+    Raises InputError: the file exists already. OperationError: it cannot be written.
     """
     path = new_file(path)
     figure, axes = _new_figure()
@@ -134,8 +129,7 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
 def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
     """Average and jitter over the first axis, a line for each combination of the others.
 
-    Raises:
-        OperationError: the picture cannot be written.
+    Raises OperationError: the picture cannot be written.
     """
     first, *others = sweep_axes(frame)
     places = {value: place for place, value in enumerate(frame[first].unique(maintain_order=True))}
@@ -178,8 +172,7 @@ def _new_figure(panels: int = 1) -> tuple[Any, Any]:
 def _save_figure(figure: Any, path: str | Path) -> Path:
     """Write a figure, as its file's ending says, whole or not at all.
 
-    Raises:
-        OperationError: it cannot be written.
+    Raises OperationError: it cannot be written.
     """
     from matplotlib import pyplot as plt
     from matplotlib.text import Text

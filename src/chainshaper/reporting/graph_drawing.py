@@ -333,9 +333,8 @@ def write_picture(
 ) -> Path:
     """Write the graph as .svg, .dot or .json, by the ending of ``path``, whole or not at all.
 
-    Raises:
-        InputError: it exists, its folder does not, or its ending says no known format.
-        OperationError: it cannot be written.
+    Raises InputError: it exists, its folder does not, or its ending says no known format.
+    OperationError: it cannot be written.
     """
     path = new_file(path, ENDINGS)
     drawn = application if everything else without_internals(application)

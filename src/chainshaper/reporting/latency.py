@@ -28,23 +28,6 @@ from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_break
 from chainshaper.verify.overruns import dropped_text, next_cycles, overruns_text
 from chainshaper.verify.predictions import FigureHeld, PredictionHeld
 
-__all__ = [
-    "breakdown_json",
-    "breakdown_table",
-    "comparison_json",
-    "comparison_table",
-    "comparisons_json",
-    "doubts_text",
-    "headline_table",
-    "incomplete_table",
-    "late_text",
-    "latency_json",
-    "latency_table",
-    "overview_table",
-    "prediction_json",
-    "prediction_table",
-]
-
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows that say what happened to cycles that are called disturbed."""
 

@@ -28,21 +28,8 @@ import polars as pl
 from chainshaper.analysis import DataFlow, callback_statistics, data_flow
 from chainshaper.planning import Plan, dump_plan, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.reporting.latency import (
-    breakdown_table,
-    comparison_table,
-    headline_table,
-    incomplete_table,
-    overview_table,
-    prediction_table,
-)
-from chainshaper.reporting.overviews import (
-    callback_table,
-    condition_table,
-    plan_table,
-    recorded_thread_table,
-    stall_table,
-)
+from chainshaper.reporting import latency as of_chain
+from chainshaper.reporting import overviews
 from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
 from chainshaper.reporting.timeline import Timeline, timeline_data, timeline_of
 from chainshaper.values.durations import format_duration
@@ -88,9 +75,8 @@ def write_report(
     are numbers of cycles that the timeline has to show, should there be so many that it cannot show
     all.
 
-    Raises:
-        InputError: the path exists already or is no HTML file, or there is no such cycle.
-        OperationError: it cannot be written; nothing is left behind.
+    Raises InputError: the path exists already or is no HTML file, or there is no such cycle.
+    OperationError: it cannot be written; nothing is left behind.
     """
     path = new_file(path, ENDINGS)
     return write_whole(path, [report_page(measurements, cycles).encode("utf-8")])
@@ -122,18 +108,20 @@ def report_page(
         parts.append([_part(name, one, flows[id(one.recording)]) for name, one in named])
     drawn = [_drawn(of_one, cycles, number) for number, of_one in enumerate(parts)]
     folder = resources.files("chainshaper.reporting")
-    page, of_chain, style, script = (
+    page, of_each, style, script = (
         (folder / name).read_text("utf-8")
         for name in ("page.html", "chain.html", "page.css", "page.js")
     )
     blocks = []
     for of_one, data in zip(parts, drawn, strict=True):
         places = _tables(of_one, data["n"], several) | _beside_charts(of_one, data["recordings"])
-        blocks.append(Template(of_chain).substitute(places, n=data["n"]))
+        blocks.append(Template(of_each).substitute(places, n=data["n"]))
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
     embedded = json.dumps(_safe(drawn), ensure_ascii=True, separators=(",", ":"))
     about = f"{len(chains)} chains" if several else chains[0].chain
-    headline = overview_table(chains, names) if several else headline_table(names, shared)
+    headline = of_chain.headline_table(names, shared)
+    if several:
+        headline = of_chain.overview_table(chains, names)
     left_out = [(name, one.left_out.text) for name, one in zip(names, shared, strict=True)]
     return Template(page).substitute(
         title=escape(f"End-to-end latency of {about}"),
@@ -205,19 +193,21 @@ def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str
     names = [one.name for one in parts]
     measurements = [one.measurement for one in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
-    incomplete = incomplete_table(names, measurements)
-    heading = f"<h1>{escape(compared.chain)}</h1>\n{headline_table(names, measurements).html()}"
+    incomplete = of_chain.incomplete_table(names, measurements)
+    heading = (
+        f"<h1>{escape(compared.chain)}</h1>\n{of_chain.headline_table(names, measurements).html()}"
+    )
     callbacks = f"<h2>Callbacks</h2>\n{_lines(map(_callbacks, parts))}"
     hops = (
         _paragraph(f"{one.name}, all complete cycles [ms]:")
-        + breakdown_table(one.measurement.analysis).html()
+        + of_chain.breakdown_table(one.measurement.analysis).html()
         for one in parts
     )
     return {
         "heading": heading if several else "",
         "callbacks": "" if suffix else f'<section id="callbacks">\n{callbacks}\n</section>',
         "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
-        "comparison": comparison_table(compared, names).html(),
+        "comparison": of_chain.comparison_table(compared, names).html(),
         "predictions": _lines(map(_prediction, parts)),
         "hops": _lines(hops),
         "overruns": _lines(map(_overruns, parts)),
@@ -241,7 +231,7 @@ def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:
     ]
     threads = (_recorded_threads(name, own[0]) for name, own in zip(names, recordings, strict=True))
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    table = condition_table(names, recordings).html()
+    table = overviews.condition_table(names, recordings).html()
     return _lines([table, *threads, f'<ul class="notes">{items}</ul>'])
 
 
@@ -287,7 +277,7 @@ def _prediction(part: _Part) -> str:
     held = part.measurement.held
     if held is None:
         return ""
-    table = prediction_table(held)
+    table = of_chain.prediction_table(held)
     about = f"The plan's prediction and {part.name} [ms]: {table.caption}."
     if held.counted_from == "cycle":
         about += " Times count from the start of the cycle."
@@ -295,7 +285,7 @@ def _prediction(part: _Part) -> str:
 
 
 def _callbacks(part: _Part) -> str:
-    table = callback_table(callback_statistics(part.flow))
+    table = overviews.callback_table(callback_statistics(part.flow))
     title = f"Callbacks of {part.name} ({len(table.rows)}) [ms]"
     return _details(title, table.html(), unfolded=len(table.rows) <= LISTED)
 
@@ -349,7 +339,7 @@ def _stalls(part: _Part) -> str:
         f"{meter.wakeups:,} wake-ups of a sleeper at the highest priority; they disturbed "
         f"{statistics.disturbed} of {statistics.count} cycles."
     )
-    return _paragraph(about) + stall_table(meter, stalls).html()
+    return _paragraph(about) + overviews.stall_table(meter, stalls).html()
 
 
 def _plan(number: str, users: str, plan: Plan) -> str:
@@ -360,7 +350,7 @@ def _plan(number: str, users: str, plan: Plan) -> str:
         f'<div class="chart" role="group" tabindex="0" aria-label="{title}">{WAITING}</div>'
         "<figcaption>Blue: the server in whose slots the output is published. Slots are half-open"
         " and drawn at least 1.5 pixels wide; drag to zoom.</figcaption></figure>\n"
-        + plan_table(plan).html()
+        + overviews.plan_table(plan).html()
         + _details("The plan as YAML", f"<pre>{escape(dump_plan(plan))}</pre>")
         + "</section>"
     )
@@ -368,7 +358,7 @@ def _plan(number: str, users: str, plan: Plan) -> str:
 
 def _recorded_threads(name: str, measurement: Measurement) -> str:
     threads = measurement.recording.info.threads
-    table = recorded_thread_table(threads).html()
+    table = overviews.recorded_thread_table(threads).html()
     return _details(f"Threads of {name} ({len(threads)})", table) if threads else ""
 
 

@@ -80,9 +80,8 @@ class Track:
 def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
     """Write a recording for Perfetto; a measurement adds its chain, and the plan in force.
 
-    Raises:
-        InputError: the path exists already, or ends in none of :data:`ENDINGS`.
-        OperationError: it cannot be written; nothing is left behind.
+    Raises InputError: the path exists already, or ends in none of :data:`ENDINGS`. OperationError:
+    it cannot be written; nothing is left behind.
     """
     path = new_file(path, ENDINGS)
     measured = source if isinstance(source, Measurement) else None

@@ -108,9 +108,8 @@ def build_system(
 ) -> System:
     """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
 
-    Raises:
-        InputError: the application's chain is not one path through it, or a server of the plan
-            has a thread that the application does not have.
+    Raises InputError: the application's chain is not one path through it, or a server of the plan
+    has a thread that the application does not have.
     """
     processes = tuple(
         Process(node_name(key), key, FIRST_PID + 10 * number)
@@ -176,10 +175,7 @@ def _threads(
     application: Application, processes: Sequence[Process], publishers: Sequence[Publisher]
 ) -> Iterator[ThreadInfo]:
     for number, process in enumerate(processes):
-        own, dds = (
-            application.scheduling_of(process.key),
-            application.dds_scheduling_of(process.key),
-        )
+        own = application.scheduling_of(process.key)
         named = process.node.strip("/").replace("/", ".")[:15]
         wanted = [("executor", named, own.core, own.priority)]
         if any(p.asynchronous for p in publishers if p.process == number):
@@ -223,6 +219,7 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
 def _graph(
     processes: Sequence[Process], entities: Sequence[Entity], publishers: Sequence[Publisher]
 ) -> ApplicationGraph:
+    """Where the chain is found: callbacks alone publish, so topics need not name their nodes."""
     callbacks = [
         Callback(
             id=number,
@@ -236,17 +233,8 @@ def _graph(
         )
         for number, entity in enumerate(entities)
     ]
-    writers: dict[str, tuple[str, ...]] = {}
-    readers: dict[str, tuple[str, ...]] = {}
-    for publisher in publishers:
-        node = processes[publisher.process].node
-        writers[publisher.topic] = (*writers.get(publisher.topic, ()), node)
-    for entity in entities:
-        if entity.topic is not None:
-            node = processes[entity.process].node
-            readers[entity.topic] = (*readers.get(entity.topic, ()), node)
     nodes = tuple(Node(process.node, process.pid) for process in processes)
-    return ApplicationGraph(nodes, tuple(callbacks), writers, readers)
+    return ApplicationGraph(nodes, tuple(callbacks))
 
 
 class Rows(list[int]):

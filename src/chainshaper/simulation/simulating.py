@@ -12,13 +12,9 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    open_until_done,
-    plan_values,
-    whole,
-)
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.plan import Plan, publisher_servers
+from chainshaper.planning.plan_file import plan_values
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, X
@@ -65,10 +61,9 @@ def simulate(
     description's. With ``switches`` the recording has `sched_switch` as well. Memory does not
     grow with ``cycles``. As in a live run, a few cycles before the recorded ones are left out.
 
-    Raises:
-        InputError: ``output`` exists, the plan does not fit the application, or a callback of it
-            computes, so that its execution times are not known.
-        OperationError: messages pile up without end, or the recording cannot be written.
+    Raises InputError: ``output`` exists, the plan does not fit the application, or a callback of it
+    computes, so that its execution times are not known. OperationError: messages pile up without
+    end, or the recording cannot be written.
     """
     output = refuse_existing(output)
     joint = None if plan is None else whole(plan)

@@ -18,11 +18,7 @@ from chainshaper.values.errors import InputError
 
 _LATER = ("dropped", "lost", "row")
 """Columns that logs have since messages may wait at a gate."""
-_TYPES = {
-    **events.COMMON_COLUMNS,
-    **events.FIELDS["gate_release"],
-    **events.OPTIONAL_FIELDS["gate_release"],
-}
+_TYPES = events.column_types("gate_release")
 
 
 def read_gate_log(path: str | Path) -> pl.DataFrame:

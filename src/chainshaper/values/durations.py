@@ -20,8 +20,7 @@ def parse_duration(text: str) -> int:
 
     Exact: ``0.1ms`` is 100000, never 99999. A bare ``0`` needs no unit.
 
-    Raises:
-        InputError: no unit, an unknown unit, not a number, or finer than a nanosecond.
+    Raises InputError: no unit, an unknown unit, not a number, or finer than a nanosecond.
     """
     if text.strip() == "0":
         return 0

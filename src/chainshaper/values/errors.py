@@ -37,8 +37,7 @@ class PlatformError(ChainshaperError):
 def extra_library(name: str, purpose: str) -> Any:
     """Import a library that only some uses need, or one module of it.
 
-    Raises:
-        PlatformError: it is not installed; says what it is needed for and how to get it.
+    Raises PlatformError: it is not installed; says what it is needed for and how to get it.
     """
     try:
         return importlib.import_module(name)

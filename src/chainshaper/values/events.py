@@ -208,12 +208,12 @@ def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.Dat
 
     So code asks for the columns it can use, whatever a distribution or tracer did not record.
     """
-    frame, known = tables.get(name, empty(name)), _types(name)
+    frame, known = tables.get(name, empty(name)), column_types(name)
     missing = [column for column in columns if column not in frame.columns]
     return frame.with_columns(pl.lit(None, dtype=known[column]).alias(column) for column in missing)
 
 
-def _types(name: str) -> dict[str, pl.DataType]:
+def column_types(name: str) -> dict[str, pl.DataType]:
     """Every column that a table of event ``name`` may have; of others only the common ones."""
     own = {**FIELDS.get(name, {}), **OPTIONAL_FIELDS.get(name, {})}
     return {**COMMON_COLUMNS, **own} if name in FIELDS else {"time": COMMON_COLUMNS["time"]}
@@ -221,7 +221,7 @@ def _types(name: str) -> dict[str, pl.DataType]:
 
 def column_problems(schema: Mapping[str, pl.DataType], name: str) -> list[str]:
     """What is wrong with the columns of a table of event ``name``, in words."""
-    types = _types(name)
+    types = column_types(name)
     optional = {"cpu", *OPTIONAL_FIELDS.get(name, ()), *VERSION_FIELDS.get(name, ())}
     problems = [
         f"an event table needs a column `{column}`, this one has none"
@@ -231,16 +231,16 @@ def column_problems(schema: Mapping[str, pl.DataType], name: str) -> list[str]:
     problems += [
         f"column `{column}` has values of type {schema[column]}, not {kind}"
         for column, kind in types.items()
-        if column in schema and not _alike(schema[column], kind)
+        if column in schema and not castable(schema[column], kind)
     ]
     return problems
 
 
-def _alike(found: pl.DataType, wanted: pl.DataType) -> bool:
+def castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
     """Whether values can become those of a column: integers of another width can."""
     if isinstance(wanted, pl.List):
         return isinstance(found, pl.List | pl.Array) and found.inner.is_integer()
-    if wanted.is_integer():
+    if wanted.is_integer() and found is not None:
         return found.is_integer() or isinstance(found, pl.Null)
     return isinstance(found, pl.String | pl.Categorical | pl.Null)
 
@@ -248,14 +248,13 @@ def _alike(found: pl.DataType, wanted: pl.DataType) -> bool:
 def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
     """A frame with the types of its event's table.
 
-    Raises:
-        polars.exceptions.PolarsError: a value does not fit, or a row has no time.
+    Raises polars.exceptions.PolarsError: a value does not fit, or a row has no time.
     """
     if "cpu" not in frame.columns:
         frame = frame.with_columns(cpu=pl.lit(None, COMMON_COLUMNS["cpu"]))
     frame = frame.with_columns(
         pl.col(column).cast(kind, strict=True)
-        for column, kind in _types(name).items()
+        for column, kind in column_types(name).items()
         if column in frame.columns
     )
     if frame["time"].null_count():

@@ -56,8 +56,7 @@ def _is_own_group(gid: int, uid: int) -> bool:
 def free_place(path: Path, taken: bool) -> Path:
     """The path, if it is not ``taken`` and its folder is there; asked before long work begins.
 
-    Raises:
-        InputError: it is taken, or its folder does not exist.
+    Raises InputError: it is taken, or its folder does not exist.
     """
     if taken:
         raise InputError(
@@ -71,8 +70,7 @@ def free_place(path: Path, taken: bool) -> Path:
 def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
     """The path, once it is sure that a file of this kind can be made there.
 
-    Raises:
-        InputError: as :func:`free_place`, or it ends in none of ``endings``, if there are any.
+    Raises InputError: as :func:`free_place`, or it ends in none of ``endings``, if there are any.
     """
     path = Path(path)
     if endings and path.suffix not in endings:
@@ -83,8 +81,7 @@ def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
 def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
     """Write beside the final place, then rename.
 
-    Raises:
-        OperationError: it cannot be written; nothing is left behind.
+    Raises OperationError: it cannot be written; nothing is left behind.
     """
     partial: Path | None = None
     try:
@@ -106,8 +103,7 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
 def open_to_all(folder: Path) -> None:
     """Let everybody read a folder that we have made; never what a link in its place leads to.
 
-    Raises:
-        OSError: it is no folder any more.
+    Raises OSError: it is no folder any more.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:

@@ -226,9 +226,8 @@ def lost_text(lost: Mapping[str, int]) -> str:
 def open_recording(path: str | Path) -> Recording:
     """Open a recording folder.
 
-    Raises:
-        InputError: no such folder, no or an unreadable `recording.json`, a newer format, a table
-            that is missing or has not the columns of its event.
+    Raises InputError: no such folder, no or an unreadable `recording.json`, a newer format, a table
+    that is missing or has not the columns of its event.
     """
     path = Path(path)
     file = path / INFO_FILE
@@ -275,9 +274,8 @@ def write_recording(
     ``tables`` may come in parts, one after the other in time, for a recording that is larger than
     memory. A table of several parts is a folder of Parquet files, which readers take for one.
 
-    Raises:
-        InputError: ``path`` exists already.
-        OperationError: it cannot be written (disk full, no permission); nothing is left behind.
+    Raises InputError: ``path`` exists already. OperationError: it cannot be written (disk full, no
+    permission); nothing is left behind.
     """
     path = refuse_existing(path)
     try:

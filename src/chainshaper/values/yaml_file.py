@@ -123,9 +123,8 @@ def read_model(
 
     ``otherwise`` is the model of a file that has a certain key.
 
-    Raises:
-        InputError: no such file, not YAML, or wrong values; each is named with its line, key,
-            reason and remedy.
+    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+    reason and remedy.
     """
     path = Path(path)
     root = compose(read_text(path, made_by), path)
@@ -146,8 +145,7 @@ def read_model(
 def read_text(path: Path, made_by: str) -> str:
     """The text of a file that a person writes.
 
-    Raises:
-        InputError: it cannot be read, is no text in UTF-8, or larger than any such file.
+    Raises InputError: it cannot be read, is no text in UTF-8, or larger than any such file.
     """
     such = f"such a file is {made_by}"
     try:
@@ -182,8 +180,7 @@ class _Loader(yaml.SafeLoader):
 def compose(text: str, name: str | Path) -> yaml.Node | None:
     """The YAML nodes of a text, which ``name`` stands for in messages; None of an empty one.
 
-    Raises:
-        InputError: it is not YAML, or nested too deeply; the line is named.
+    Raises InputError: it is not YAML, or nested too deeply; the line is named.
     """
     try:
         return yaml.compose(text, Loader=_Loader)
@@ -202,9 +199,8 @@ _SCALARS = yaml.SafeLoader("")
 def _scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
     """A scalar's value. Dates and other things that no file of ours has are texts.
 
-    Raises:
-        ValueError: its tag says that it is something that it is not (``!!int ""``), or a number
-            is too large for any use; in words.
+    Raises ValueError: its tag says that it is something that it is not (``!!int ""``), or a number
+    is too large for any use; in words.
     """
     try:
         value = _SCALARS.construct_object(node)
@@ -238,8 +234,7 @@ class PlainData:
     def of(self, node: yaml.Node, where: _Path = ()) -> object:
         """The value of a node that stands at a place.
 
-        Raises:
-            InputError: a value that cannot be, or a key that stands twice; the line is named.
+        Raises InputError: a value that cannot be, or a key that stands twice; the line is named.
         """
         self.lines[where] = node.start_mark.line + 1
         if isinstance(node, yaml.ScalarNode):

@@ -16,7 +16,8 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ApplicationPlan, Plan
-from chainshaper.planning.application_plan import plan_in, plan_of_chain, whole
+from chainshaper.planning.application_plan import plan_of_chain, whole
+from chainshaper.planning.plan_file import plan_in
 from chainshaper.sources import open_source
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
@@ -89,8 +90,7 @@ class Comparison:
 def chain_of(recording: Recording, chain: str | None) -> str:
     """The chain that was asked for, or the one that the recording itself names.
 
-    Raises:
-        InputError: neither names one.
+    Raises InputError: neither names one.
     """
     named = chain or recording.info.chain
     if named is None:
@@ -187,8 +187,7 @@ def compare_recordings(
 
     ``plan`` was in force in the last of them, should that not say so itself.
 
-    Raises:
-        InputError: fewer than two recordings, or a chain that one of them does not have.
+    Raises InputError: fewer than two recordings, or a chain that one of them does not have.
     """
     return compare_chains(recordings, chain, plan)[0]
 

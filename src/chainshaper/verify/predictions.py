@@ -191,8 +191,9 @@ def _figures(
     def figure(at_start: int, name: str, lowest: int, above: int = 0) -> FigureHeld:
         at_end, found = getattr(predicted, name), getattr(measured, name)
         low, high, holds = min(lowest, at_start), at_end + above, None
-        if plan.modes is None and found is not None:  # as they are printed
-            holds = _printed(low) <= _printed(found) <= _printed(high)
+        if plan.modes is None and found is not None:
+            printed = [float(milliseconds(one)) for one in (low, found, high)]
+            holds = printed == sorted(printed)
         return FigureHeld(at_start, at_end, low, high, found, holds)
 
     return (
@@ -204,10 +205,6 @@ def _figures(
 
 def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
     return sum(share * value for share, value in zip(shares, values, strict=True))
-
-
-def _printed(nanoseconds: int) -> float:
-    return float(milliseconds(nanoseconds))
 
 
 def _represented(plan: Plan) -> bool:

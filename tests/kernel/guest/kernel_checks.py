@@ -315,7 +315,7 @@ def slots_follow_a_timer_that_drifts() -> str:
         expiries = range(governed + period - governed % period, end - CYCLE, period)
         late.append(sum(length(cut(ran, at, at + due)) < 0.97 * work for at in expiries))
     text = f"late of {len(expiries)}: {late[0]} ({said[0]}), not followed {late[1]} ({said[1]})"
-    assert late[0] == 0 < late[1] - len(expiries) // 3, text
+    assert late[0] < len(expiries) / 200 < len(expiries) / 3 < late[1], text
     return text
 
 

@@ -3,30 +3,32 @@
 import json
 
 import pytest
-from reference import REAL_TRACES, SHARED, assert_equal_to_babeltrace, real_trace
+from reference import assert_equal_to_babeltrace
+from reference_traces import TRACES, reference_folder
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
 
 
-@pytest.mark.parametrize("name", REAL_TRACES)
+@pytest.mark.parametrize("name", TRACES)
 def test_every_event_and_field_equals_babeltrace_and_counts_the_truth(name: str) -> None:
-    trace, frames = assert_equal_to_babeltrace(real_trace(name))
+    trace, frames = assert_equal_to_babeltrace(reference_folder(name) / "trace")
     assert trace.warnings == ()
     counts = count_events(trace)
     assert {n: len(f) for n, f in frames.items()} == counts
-    truth = json.loads((SHARED / name / "truth.json").read_text())
+    truth = json.loads((reference_folder(name) / "truth.json").read_text())
     assert {n: c for n, c in counts.items() if c} == truth["events"]
 
 
 def test_only_what_is_asked_for_is_read() -> None:
-    trace = open_trace(real_trace("humble_sync"))
+    trace = open_trace(reference_folder("humble_sync") / "trace")
     frames = read_events(trace, {"ros2:callback_start", "no:such_event"})
     assert list(frames) == ["ros2:callback_start"]
     assert frames["ros2:callback_start"].equals(read_events(trace)["ros2:callback_start"])
 
 
 def test_several_folders_are_merged_by_time() -> None:
-    folders = [real_trace("jazzy_chain_cyclonedds"), real_trace("jazzy_avp_cyclonedds")]
+    names = ("jazzy_chain_cyclonedds", "jazzy_avp_cyclonedds")
+    folders = [reference_folder(name) / "trace" for name in names]
     merged = read_events(open_trace(*folders))["ros2:rmw_take"]
     parts = [read_events(open_trace(folder))["ros2:rmw_take"] for folder in folders]
     assert len(merged) == sum(map(len, parts))

@@ -10,16 +10,7 @@ makes columns of what they write.
 """
 
 from chainshaper.sources.ctf.read import Events, count_events, read_events
-from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, open_trace
-from chainshaper.sources.ctf.tsdl import CtfError, CtfFolder
+from chainshaper.sources.ctf.trace import CtfTrace, open_trace
+from chainshaper.sources.ctf.tsdl import CtfError
 
-__all__ = [
-    "CtfError",
-    "CtfFolder",
-    "CtfStream",
-    "CtfTrace",
-    "Events",
-    "count_events",
-    "open_trace",
-    "read_events",
-]
+__all__ = ["CtfError", "CtfTrace", "Events", "count_events", "open_trace", "read_events"]

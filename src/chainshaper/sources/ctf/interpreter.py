@@ -121,9 +121,6 @@ def rehash(machine, count):
     return count
 
 
-# Numba mixes int64 and uint64 into float64: every value below keeps to one of the two.
-
-
 @compiled()
 def bits_at(base, position, size, big, mapped):
     """An unsigned integer of ``size`` bits at any bit, as uint64 (section 4.1.5)."""

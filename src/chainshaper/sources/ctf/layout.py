@@ -24,25 +24,7 @@ from uuid import UUID
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf.tsdl import (
-    ArrayType,
-    CtfError,
-    CtfFolder,
-    EnumMapping,
-    EventClass,
-    Field,
-    FloatType,
-    IntegerType,
-    StreamClass,
-    StringType,
-    StructType,
-    TraceClass,
-    Type,
-    VariantType,
-    alignment,
-    field_name,
-    is_text,
-)
+from chainshaper.sources.ctf import tsdl
 
 # fmt: off
 # A table's columns stand together, with what they hold behind them.
@@ -211,7 +193,7 @@ class Table:
     """
 
     name: str
-    columns: tuple[tuple[str, Type], ...]
+    columns: tuple[tuple[str, tsdl.Type], ...]
     slots: tuple[Slot, ...]
     levels: int
     has_cpu: bool
@@ -230,7 +212,7 @@ class Wanted(NamedTuple):
     context: bool = False
 
 
-_Scope = tuple[str, StructType | None, Container[str]]
+_Scope = tuple[str, tsdl.StructType | None, Container[str]]
 """A dynamic scope, its structure, and the TSDL names of the fields in it that get columns."""
 
 
@@ -307,7 +289,7 @@ class Layout:
         return len(rows) + sum(row[O_LEAST] for row in rows if row[O_CODE] == SWITCH)
 
 
-def lay_out(folders: Sequence[CtfFolder], wanted: Wanted) -> Layout:
+def lay_out(folders: Sequence[tsdl.CtfFolder], wanted: Wanted) -> Layout:
     """Lay out every stream and event class of all ``folders``.
 
     Raises `CtfError` for types that cannot be read.
@@ -319,7 +301,7 @@ def lay_out(folders: Sequence[CtfFolder], wanted: Wanted) -> Layout:
             _add_folder(layout, folder.declared, wanted)
         except LayoutError as error:
             file = folder.path / "metadata"
-            raise CtfError(file, None, str(error), "the trace cannot be read") from None
+            raise tsdl.CtfError(file, None, str(error), "the trace cannot be read") from None
         layout.folders.append((first, len(layout.streams)))
     return layout
 
@@ -332,7 +314,7 @@ class _Number(NamedTuple):
 
     register: int
     signed: bool
-    mappings: tuple[EnumMapping, ...]
+    mappings: tuple[tsdl.EnumMapping, ...]
 
 
 _Frame = dict[str, "_Number | _Frame | None"]
@@ -386,9 +368,11 @@ class _Writer:
                 self._skip(kind.align, 0)
             for member in kind.fields if kind is not None else ():
                 match member:
-                    case Field("uuid", ArrayType(IntegerType(8, 8), 16)) if self.fixed:
+                    case tsdl.Field("uuid", tsdl.ArrayType(tsdl.IntegerType(8, 8), 16)) if (
+                        self.fixed
+                    ):
                         for name in ("uuid_low", "uuid_high"):
-                            half = IntegerType(64, 8, byte_order="le")
+                            half = tsdl.IntegerType(64, 8, byte_order="le")
                             self._number(name, half, _Place((frame,), 0, False))
                     case _:
                         place = _Place((frame,), 0, member.name in wanted)
@@ -402,30 +386,30 @@ class _Writer:
             row[O_COUNTER] += counter
             row[O_INNER] += counter if row[O_INNER] >= 0 else 0
 
-    def _type(self, name: str, kind: Type, at: _Place) -> int:
+    def _type(self, name: str, kind: tsdl.Type, at: _Place) -> int:
         """Lay out a type; returns the least number of bits that it takes, alignment aside."""
         self.layout.steps += 1
         if len(at.frames) > _DEEPEST or self.layout.steps > _MOST_STEPS:
             raise LayoutError(f"{name}: types nested too deeply")
         match kind:
-            case StringType():
+            case tsdl.StringType():
                 self._row(TEXT, {O_ALIGN: 8, **self._slot(TEXT_CODES, at)})
                 return 8
-            case StructType():
+            case tsdl.StructType():
                 frame = at.frames[-1][name] = _Frame()
                 self._skip(kind.align, 0)
                 return sum(self._type(f.name, f.type, at.inside(frame)) for f in kind.fields)
-            case ArrayType():
+            case tsdl.ArrayType():
                 return min(self._array(name, kind, at), _ENDLESS_BITS)
-            case VariantType():
+            case tsdl.VariantType():
                 return self._variant(name, kind, at)
         return self._number(name, kind, at)
 
-    def _number(self, name: str, kind: IntegerType | FloatType, at: _Place) -> int:
+    def _number(self, name: str, kind: tsdl.IntegerType | tsdl.FloatType, at: _Place) -> int:
         big = self.big if kind.byte_order == "native" else kind.byte_order == "be"
         code, register, clock = "f", -1, False
         at.frames[-1][name] = None
-        if isinstance(kind, IntegerType):
+        if isinstance(kind, tsdl.IntegerType):
             code, clock = "i" if kind.signed else "u", kind.clock is not None
             if self.fixed and name in REGISTERS and (len(at.frames) == 1 or name == "id"):
                 register = REGISTERS[name]
@@ -446,14 +430,14 @@ class _Writer:
             row[O_CODE] = MOVE
         return kind.size
 
-    def _array(self, name: str, kind: ArrayType, at: _Place) -> int:
+    def _array(self, name: str, kind: tsdl.ArrayType, at: _Place) -> int:
         rows, count, register = self.layout.operations, 0, -1
         if isinstance(kind.length, int):
             count = kind.length
         else:
             register = self._referred(kind.length, at).register
-        columns = {O_ALIGN: alignment(kind), O_REGISTER: register, O_COUNT: count}
-        if is_text(kind):
+        columns = {O_ALIGN: tsdl.alignment(kind), O_REGISTER: register, O_COUNT: count}
+        if tsdl.is_text(kind):
             place = self._slot(TEXT_CODES, at)
             if place or register >= 0:
                 self._row(CHARACTERS if place else SKIP_MANY, {**columns, O_SIZE: 8, **place})
@@ -475,10 +459,10 @@ class _Writer:
         even = only[O_CODE] == SKIP and only[O_SIZE] % only[O_ALIGN] == 0
         if not found and even and only[O_SIZE] == 0:  # an array of empty structures
             del rows[first - 1 :]
-            self._skip(alignment(kind), 0)
+            self._skip(tsdl.alignment(kind), 0)
         elif even and register < 0 and not at.keep:
             del rows[first - 1 :]
-            self._skip(max(alignment(kind), only[O_ALIGN]), only[O_SIZE] * count)
+            self._skip(max(tsdl.alignment(kind), only[O_ALIGN]), only[O_SIZE] * count)
         elif even and only[O_SIZE] > 0:
             loop[O_CODE], loop[O_SIZE] = SKIP_MANY, only[O_SIZE]
             del rows[first:]
@@ -491,7 +475,7 @@ class _Writer:
             loop[O_COST] += self.layout.cost(first, len(rows))
         return count * least
 
-    def _variant(self, name: str, kind: VariantType, at: _Place) -> int:
+    def _variant(self, name: str, kind: tsdl.VariantType, at: _Place) -> int:
         if kind.tag is None:
             raise LayoutError(f"variant {name!r} has no tag")
         rows, tag = self.layout.operations, self._referred(kind.tag, at)
@@ -586,7 +570,7 @@ def _is_moved(row: list[int]) -> bool:
 # Stream and event classes
 
 
-def _add_folder(layout: Layout, trace: TraceClass, wanted: Wanted) -> None:
+def _add_folder(layout: Layout, trace: tsdl.TraceClass, wanted: Wanted) -> None:
     header = _Writer(layout, trace.byte_order == "be", trace.referenced)
     in_header = header.run([("trace.packet.header", trace.packet_header, ())])
     for stream in trace.streams.values():
@@ -622,7 +606,7 @@ def _add_event(
     header: _Writer,
     name: str,
     scopes: list[_Scope],
-    columns: list[tuple[str, Type]],
+    columns: list[tuple[str, tsdl.Type]],
     stream: list[int],
     wanted: Wanted,
 ) -> list[int]:
@@ -651,8 +635,8 @@ def _add_event(
 
 
 def _columns(
-    stream: StreamClass, event: EventClass, kernel: bool, asked: Wanted
-) -> tuple[list[_Scope], list[tuple[str, Type]]]:
+    stream: tsdl.StreamClass, event: tsdl.EventClass, kernel: bool, asked: Wanted
+) -> tuple[list[_Scope], list[tuple[str, tsdl.Type]]]:
     """The scopes of an event behind its header, and its columns by their final names.
 
     A kernel trace's own pid and tid are those of the initial namespace; user space traces have
@@ -664,7 +648,7 @@ def _columns(
     present: dict[str, tuple[str, str]] = {}
     for scope, kind in contexts.items():
         for member in kind.fields if kind is not None else ():
-            present.setdefault(field_name(member.name), (scope, member.name))
+            present.setdefault(tsdl.field_name(member.name), (scope, member.name))
     standard: dict[tuple[str, str], str] = {}
     for column in ("pid", "tid", *(["procname"] if event.name not in asked.nameless else [])):
         for name in (column, f"v{column}") if kernel else (f"v{column}", column):
@@ -672,19 +656,19 @@ def _columns(
                 standard[present[name]] = column
                 break
     scopes: list[_Scope] = []
-    columns: list[tuple[str, Type]] = []
+    columns: list[tuple[str, tsdl.Type]] = []
     for scope, kind in contexts.items():
         members = kind.fields if kind is not None else ()
         chosen = [m for m in members if asked.context or (scope, m.name) in standard]
         scopes.append((scope, kind, {member.name for member in chosen}))
         for member in chosen:
-            name = standard.get((scope, member.name), f"context.{field_name(member.name)}")
+            name = standard.get((scope, member.name), f"context.{tsdl.field_name(member.name)}")
             columns.append((name, member.type))
     members = event.fields.fields if event.fields is not None else ()
     scopes.append(("event.fields", event.fields, {member.name for member in members}))
     taken = {"time", "cpu", "pid", "tid", "procname", *(name for name, _ in columns)}
     for member in members:
-        name = field_name(member.name)
+        name = tsdl.field_name(member.name)
         while name in taken:
             name = f"payload.{name}"
         taken.add(name)
@@ -702,25 +686,25 @@ def _id_table(layout: Layout, rows: dict[int, int]) -> list[int]:
     return [first, dense, len(pairs), next(iter(rows)) if len(rows) == 1 else 0]
 
 
-def _quick_header(header: StructType | None, big: bool) -> list[int]:
+def _quick_header(header: tsdl.StructType | None, big: bool) -> list[int]:
     """Alignment, id bits, clock shift and clock bits of LTTng's compact and large headers.
 
     Both put an id of few bits and the clock's low bits into one load, and announce anything
     larger by an id of all ones. Zeros for every other header, which is then interpreted.
     """
     match header:
-        case StructType(
+        case tsdl.StructType(
             fields=(
-                Field("id", IntegerType(signed=False) as number),
-                Field(_, VariantType("id", options)),
+                tsdl.Field("id", tsdl.IntegerType(signed=False) as number),
+                tsdl.Field(_, tsdl.VariantType("id", options)),
             )
         ) if not big:
             last = (1 << number.size) - 1
             wanted = {"compact": (0, last - 1), "extended": (last, last)}
             compact = next((o.type for o in options if o.name == "compact"), None)
             match compact:
-                case StructType(
-                    fields=(Field(_, IntegerType(signed=False, clock=str()) as clock),)
+                case tsdl.StructType(
+                    fields=(tsdl.Field(_, tsdl.IntegerType(signed=False, clock=str()) as clock),)
                 ):
                     align, inner = header.align, compact.align
                     shift = -(-number.size // inner) * inner
@@ -732,16 +716,16 @@ def _quick_header(header: StructType | None, big: bool) -> list[int]:
     return [0, 0, 0, 0]
 
 
-def _clock_names(kind: Type | None) -> list[str]:
+def _clock_names(kind: tsdl.Type | None) -> list[str]:
     match kind:
-        case IntegerType(clock=str(name)):
+        case tsdl.IntegerType(clock=str(name)):
             return [name]
-        case StructType(fields=fields) | VariantType(options=fields):
+        case tsdl.StructType(fields=fields) | tsdl.VariantType(options=fields):
             return [name for f in fields for name in _clock_names(f.type)]
     return []
 
 
-def _frequency(stream: StreamClass, trace: TraceClass) -> int:
+def _frequency(stream: tsdl.StreamClass, trace: tsdl.TraceClass) -> int:
     """The rate of the clock that a stream's time stamps are mapped to, in Hz."""
     names = _clock_names(stream.event_header) + _clock_names(stream.packet_context)
     for name in names:

@@ -18,18 +18,9 @@ import polars as pl
 from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import layout as tb
+from chainshaper.sources.ctf import tsdl
 from chainshaper.sources.ctf.layout import Layout, Table, Wanted, lay_out
 from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scratch
-from chainshaper.sources.ctf.tsdl import (
-    ArrayType,
-    CtfError,
-    StringType,
-    StructType,
-    Type,
-    VariantType,
-    field_name,
-    is_text,
-)
 from chainshaper.values.compiled import kernel
 
 __all__ = ["Events", "count_events", "read_events"]
@@ -178,13 +169,11 @@ class _File:
     def warnings(self) -> Iterator[str]:
         """What cannot be read, packet by packet, the first ones of very many."""
         damaged = self.packets[self.packets[:, tb.P_ERROR] < 0]
+        unread = "the rest of this packet is not read"
         for packet in damaged[:_MOST_WARNINGS]:
             place = int(packet[tb.P_BYTE] + (packet[tb.P_ERROR_AT] >> 3))
-            reason, remedy = (
-                _FAILURES[int(packet[tb.P_ERROR])],
-                "the rest of this packet is not read",
-            )
-            yield str(CtfError(self.path, place, reason, remedy))
+            reason = _FAILURES[int(packet[tb.P_ERROR])]
+            yield str(tsdl.CtfError(self.path, place, reason, unread))
         if len(damaged) > _MOST_WARNINGS:
             yield f"{self.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
 
@@ -287,7 +276,7 @@ def _fill(span: int, files: list[_File], packets: NDArray[np.int64], layout: Lay
             scratch.grow()
     if status < 0:
         reason = f"{_FAILURES[status]}: the files changed while they were read"
-        raise CtfError(files[0].path.parent, None, reason, "stop the recording first")
+        raise tsdl.CtfError(files[0].path.parent, None, reason, "stop the recording first")
     strings = scratch.strings()
     for file, (first, last) in zip(files, table[:, [tb.F_PACKET, tb.F_LAST_PACKET]], strict=True):
         if first < last:  # this span was the last to read these
@@ -373,16 +362,16 @@ class _Columns:
         leading = [n for n in ("time", "cpu", "pid", "tid", "procname") if n in found]
         return pl.DataFrame([found[n] for n in dict.fromkeys([*leading, *found])])
 
-    def _column(self, name: str, kind: Type, rows: int, texts: pl.Series) -> pl.Series | None:
+    def _column(self, name: str, kind: tsdl.Type, rows: int, texts: pl.Series) -> pl.Series | None:
         """One column, from the next slots and levels; None for a structure without fields.
 
         Numbers keep their type; arrays become Polars arrays, sequences lists, structures and
         variants structs, an absent option null.
         """
         match kind:
-            case StringType() | ArrayType() if is_text(kind):
+            case tsdl.StringType() | tsdl.ArrayType() if tsdl.is_text(kind):
                 return texts.gather(pl.Series(next(self._slots))).alias(name)
-            case ArrayType(element, count):
+            case tsdl.ArrayType(element, count):
                 whole = isinstance(count, int)
                 lengths = np.zeros(rows, np.uint32) if whole else next(self._slots)
                 values = self._column(name, element, next(self._levels), texts)
@@ -390,14 +379,14 @@ class _Columns:
                     return None if values is None else _ragged(values, lengths)
                 deeper = values.dtype.shape if isinstance(values.dtype, pl.Array) else ()
                 return values.reshape((rows, count, *deeper))
-            case StructType(fields):
-                found = [self._column(field_name(f.name), f.type, rows, texts) for f in fields]
+            case tsdl.StructType(fields):
+                found = [self._column(tsdl.field_name(f.name), f.type, rows, texts) for f in fields]
                 columns = [column for column in found if column is not None]
                 return _struct(name, columns) if columns else None
-            case VariantType(_, options):
+            case tsdl.VariantType(_, options):
                 chosen, parts = pl.Series(next(self._slots)), []
                 for number, option in enumerate(options, start=1):
-                    values = self._column(field_name(option.name), option.type, rows, texts)
+                    values = self._column(tsdl.field_name(option.name), option.type, rows, texts)
                     if values is not None:
                         present = pl.when(pl.Series(chosen == number)).then(pl.lit(values))
                         alone = present.otherwise(None).alias(values.name)

@@ -25,16 +25,6 @@ from typing import NamedTuple
 
 from chainshaper.linux.threads import read_proc
 
-__all__ = [
-    "callback_functions",
-    "demangled",
-    "exported_functions",
-    "function_offsets",
-    "mapped_regions",
-    "read_regular",
-    "type_argument",
-]
-
 _LONGEST_FILE = 512 << 20
 _SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
 _NO_ELF = (OSError, LookupError, struct.error, ValueError)

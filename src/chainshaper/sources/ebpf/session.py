@@ -26,21 +26,9 @@ from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.processes import descendants, run_users, user_name, user_of
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents, read_proc, read_stat, status_field
+from chainshaper.sources.ebpf import trace_points as tp
 from chainshaper.sources.ebpf.functions import callback_functions, open_regular
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
-from chainshaper.sources.ebpf.trace_points import (
-    HEADER,
-    LIBRARY,
-    TEXT_BYTES,
-    Printed,
-    TracePoint,
-    TracingLibrary,
-    bpftrace_script,
-    installed_libraries,
-    mapped_libraries,
-    read_printed,
-    trace_points,
-)
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -86,14 +74,14 @@ class EbpfTracer:
         self._pids = tuple(pids)
         self._users = run_users() if users is None else users
         self._open: dict[Path, int] = {}
-        self._points: tuple[TracePoint, ...] = ()
+        self._points: tuple[tp.TracePoint, ...] = ()
         self._bpftrace: subprocess.Popen[bytes] | None = None
         self._began_ns = 0
         self._ended_ns: int | None = None
         self._ahead_ns = 0
         self._clock_offset_ns = 0
         self._notes: list[str] = []
-        self._printed: Printed | None = None
+        self._printed: tp.Printed | None = None
         self._functions: dict[tuple[int, int], str] = {}
 
     def start(self) -> Mapping[str, str]:
@@ -104,7 +92,7 @@ class EbpfTracer:
                 "bpftrace is not installed: install it (Debian and Ubuntu: `apt-get install "
                 "bpftrace`; 0.17 or later), or record with `--source lttng`"
             )
-        self._points = trace_points(self._libraries())
+        self._points = tp.trace_points(self._libraries())
         traced = self._traced()
         for file in dict.fromkeys(point.file for point in self._points):
             try:
@@ -114,11 +102,11 @@ class EbpfTracer:
         # A path is text that whoever owns a folder chooses, and what it leads to may change.
         ours = Path(f"/proc/{os.getpid()}/fd")
         points = [replace(one, file=ours / str(self._open[one.file])) for one in self._points]
-        script = bpftrace_script(points, traced, users=self._users, attached=self._attached)
+        script = tp.bpftrace_script(points, traced, users=self._users, attached=self._attached)
         self._script.write_text(script)
         self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
         with self._events.open("wb") as printed, self._said.open("wb") as said:
-            printed.write(HEADER.encode())
+            printed.write(tp.HEADER.encode())
             printed.flush()
             self._bpftrace = subprocess.Popen(
                 ["bpftrace", "-B", "full", str(self._script)],
@@ -164,7 +152,7 @@ class EbpfTracer:
                 "is killed: the last events are missing"
             ) from None
         with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
-            self._printed = read_printed(self._events, self._points, self._ahead_ns)
+            self._printed = tp.read_printed(self._events, self._points, self._ahead_ns)
             # As long as the application runs: its memory tells.
             callbacks = _callbacks(self._printed.tables)
             self._functions = callback_functions(
@@ -182,7 +170,7 @@ class EbpfTracer:
     def recording(self) -> tuple[EventTables, RecordingInfo]:
         """The events that bpftrace printed, and what is known of a system that ran already."""
         try:
-            printed = self._printed or read_printed(self._events, self._points, self._ahead_ns)
+            printed = self._printed or tp.read_printed(self._events, self._points, self._ahead_ns)
             lost = lost_events(self._events, self._said)
         except (OSError, pl.exceptions.PolarsError) as error:
             raise OperationError(
@@ -215,16 +203,16 @@ class EbpfTracer:
         )
         return tables, info
 
-    def _libraries(self) -> tuple[TracingLibrary, ...]:
+    def _libraries(self) -> tuple[tp.TracingLibrary, ...]:
         """The libraries to set probes on; at least one that exports trace points."""
-        libraries = self._mapped() if self._attached else installed_libraries(os.environ)
+        libraries = self._mapped() if self._attached else tp.installed_libraries(os.environ)
         if not libraries:
             raise PlatformError(
-                f"no {LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: set ROS 2 up "
+                f"no {tp.LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: set ROS 2 up "
                 "first (`source /opt/ros/DISTRIBUTION/setup.bash`); an application in a "
                 "container is started first, then attached to (no COMMAND)"
             )
-        if not trace_points(libraries):
+        if not tp.trace_points(libraries):
             paths = ", ".join(str(library.path) for library in libraries)
             raise PlatformError(
                 f"{paths}: exports no trace point, because this ROS 2 was built without tracing "
@@ -232,17 +220,17 @@ class EbpfTracer:
             )
         return libraries
 
-    def _mapped(self) -> tuple[TracingLibrary, ...]:
+    def _mapped(self) -> tuple[tp.TracingLibrary, ...]:
         """The libraries that the processes to attach to have mapped; at least one."""
         parent_of = parents()
         family = descendants(parent_of, *self._pids)
-        mapped = mapped_libraries(
+        mapped = tp.mapped_libraries(
             pid for pid in parent_of if pid in family or user_of(pid) in self._users
         )
         unsuited = [pid for pid in self._pids if not descendants(parent_of, pid) & mapped.keys()]
         if unsuited:
             raise InputError(
-                f"process {', '.join(map(str, unsuited))} neither uses {LIBRARY}, as every "
+                f"process {', '.join(map(str, unsuited))} neither uses {tp.LIBRARY}, as every "
                 "ROS 2 node does, nor has started one that does: give processes of nodes "
                 "(`chainshaper threads` lists them)"
             )
@@ -251,7 +239,7 @@ class EbpfTracer:
         if not libraries:
             raise OperationError(
                 f"no process of {', '.join(map(user_name, sorted(self._users)))} uses "
-                f"{LIBRARY}, so there is no ROS 2 node to attach to: start the application "
+                f"{tp.LIBRARY}, so there is no ROS 2 node to attach to: start the application "
                 "first, give the COMMAND that does behind `--`, or name who runs it (--user)"
             )
         return tuple(libraries)
@@ -293,7 +281,7 @@ class EbpfTracer:
         wrong = [line for line in lines if "ERROR" in line and "RLIMIT_MEMLOCK" not in line]
         return "; ".join(wrong or lines[-1:]).replace("ERROR: ", "") or "it does not say why"
 
-    def _about(self, tables: EventTables, printed: Printed, lost: int) -> Iterator[str]:
+    def _about(self, tables: EventTables, printed: tp.Printed, lost: int) -> Iterator[str]:
         """What a reader of the tables must know."""
         if not tables:
             libraries = dict.fromkeys(str(point.file) for point in self._points)
@@ -312,7 +300,7 @@ class EbpfTracer:
                 "it a core that is less busy."
             )
         if printed.cut_names:
-            yield f"{printed.cut_names} names are longer than {TEXT_BYTES} bytes and cut."
+            yield f"{printed.cut_names} names are longer than {tp.TEXT_BYTES} bytes and cut."
 
 
 def lost_events(*paths: Path) -> int:

@@ -402,5 +402,4 @@ def _table(rows: pl.DataFrame, point: TracePoint, texts: pl.DataFrame) -> pl.Dat
 def _typed(rows: pl.DataFrame, event: str) -> pl.DataFrame:
     """The event's columns that there are, with their types."""
     types = {**events.COMMON_COLUMNS, **events.FIELDS[event]}
-    known = {column: kind for column, kind in types.items() if column in rows.columns}
-    return rows.select(pl.col(column).cast(kind) for column, kind in known.items())
+    return rows.select(pl.col(name).cast(kind) for name, kind in types.items() if name in rows)

@@ -191,7 +191,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 field
                 for field, kind in events.FIELDS[name].items()
                 if field not in events.VERSION_FIELDS.get(name, ())
-                and not _castable(_decoded_type(self._fields[name].get(field)), kind)
+                and not events.castable(_decoded_type(self._fields[name].get(field)), kind)
             ]
             if missing:
                 yield (
@@ -340,14 +340,6 @@ def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
     return None
 
 
-def _castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
-    if isinstance(found, pl.List | pl.Array):
-        return isinstance(wanted, pl.List) and found.inner.is_integer()
-    if isinstance(wanted, pl.String):
-        return isinstance(found, pl.String)
-    return found is not None and found.is_integer() and wanted.is_integer()
-
-
 def _event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.DataFrame:
     """A decoded event's frame as an event table, without events of no known thread."""
     if "init_timestamp" in frame.columns and frame.schema["init_timestamp"].is_integer():
@@ -359,7 +351,7 @@ def _event_table(frame: pl.DataFrame, name: str, clock_offset_ns: int) -> pl.Dat
         return frame
     columns = []
     for column, kind in {**events.COMMON_COLUMNS, **events.FIELDS[name]}.items():
-        if _castable(frame.schema.get(column), kind):
+        if events.castable(frame.schema.get(column), kind):
             columns.append(pl.col(column).cast(kind, strict=False))
         elif column not in events.VERSION_FIELDS.get(name, ()):
             columns.append(pl.lit(None, dtype=kind).alias(column))

@@ -1,0 +1,220 @@
+"""The file of a plan: YAML that a person reads, edits, and gets back as it was written.
+
+Format 1 has one chain's plan. Format 2 has a list of chains, each of which is written as it stands
+alone, with two differences: a server is written out where it comes first, and further chains have
+its name in its place.
+"""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from textwrap import indent
+from typing import Any
+
+import yaml
+from pydantic import model_validator
+
+from chainshaper.planning.application_plan import ApplicationPlan, whole
+from chainshaper.planning.plan import Plan, band_predictions, publish_slots
+from chainshaper.values.errors import OperationError
+from chainshaper.values.files import new_file, write_whole
+from chainshaper.values.yaml_file import AS_YAML, read_model, wrong_value
+
+_HEADER = """\
+# A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
+# Edit it as you like; it is checked when it is used. Durations carry units (59ms, 250us);
+# slots are half-open, [start, end), and count from the start of a cycle.
+"""
+
+_SECTION_COMMENTS = {
+    "evidence": "the measurements behind the plan",
+    "margin": "epsilon: how far the chain's slot reaches beyond the longest latency measured",
+    "offset": "this chain's cycles start so much after the instant that all chains count from",
+    "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
+    "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
+    "into_open_slot": "an output that comes when its slot is open: at once, or in the next slot",
+    "messages": "several outputs in one cycle: all leave in order, or the newest, or the first",
+    "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
+    "shaping_thread": "shaping nodes' threads run in their servers' slots only; free: their gates"
+    " alone time them",
+    "equal_priorities": "servers of one core and priority take turns; apart: they never overlap",
+    "servers": "a thread runs only in its server's slots; a smaller priority is better",
+    "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
+    "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
+    "predicted": "for the slots as planned; not updated when they are edited",
+}
+
+
+def load_plan(path: str | Path) -> Plan:
+    """Read a plan, however a person has laid it out.
+
+    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+    reason and remedy.
+    """
+    several = ("chains", _OfSeveralChains)
+    return read_model(path, Plan, made_by="written by `chainshaper plan`", otherwise=several)
+
+
+class _OfSeveralChains(Plan):
+    """What a file is that has a plan where one chain's is wanted: refused."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _refused(cls, _: object) -> object:
+        raise wrong_value("the plan is of several chains, and that of one is wanted here", "chains")
+
+
+def dump_plan(plan: Plan) -> str:
+    """The YAML text of a plan; reading it gives an equal plan."""
+    return plans_as_text([plan])
+
+
+def plans_as_text(plans: Sequence[Plan]) -> str:
+    """The YAML text of a chain's plan, or of several in one file, each server written once."""
+    if len(plans) == 1:
+        return _HEADER + _sections(_yaml_values(plans[0]))
+    text, known = f"{_HEADER}format: 2\nchains:\n", set[str]()
+    for plan in plans:
+        values = _yaml_values(plan)
+        del values["format"]
+        names = [server["name"] for server in values["servers"]]
+        values["servers"] = [
+            name if name in known else server
+            for name, server in zip(names, values["servers"], strict=True)
+        ]
+        known.update(names)
+        text += "- " + indent(_sections(values), "  ")[2:]
+    return text
+
+
+def _yaml_values(plan: Plan) -> dict[str, Any]:
+    values = plan.model_dump(mode="json", by_alias=True, exclude_none=True, context=AS_YAML)
+    for server in values["servers"]:
+        server["threads"] = [
+            _OnOneLine({key: value for key, value in thread.items() if value})
+            for thread in server["threads"]
+        ]
+        if not server["best_effort"]:
+            del server["best_effort"]
+    if "modes" in values:
+        values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
+    if plan.offset_ns == 0:
+        del values["offset"]
+    for name in ("into_open_slot", "shaping_thread", "equal_priorities"):
+        if values[name] == Plan.model_fields[name].default:
+            del values[name]
+    if plan.shaping_node is None and plan.fallback == "bypass":
+        del values["fallback"]
+    if not values["further_shaping_nodes"]:
+        del values["further_shaping_nodes"]
+    return values
+
+
+def _sections(values: dict[str, Any]) -> str:
+    text = ""
+    for key, value in values.items():
+        if key in _SECTION_COMMENTS:
+            text += f"# {_SECTION_COMMENTS[key]}\n"
+        text += yaml.dump({key: value}, Dumper=_Dumper, sort_keys=False, width=100)
+    return text
+
+
+class _OnOneLine(dict[str, Any]):
+    """A mapping that is written on one line."""
+
+
+class _Dumper(yaml.SafeDumper):
+    """Sequences stand on one line, unless there are mappings in them."""
+
+    def represent_sequence(self, tag: str, sequence: Any, flow_style: bool | None = None) -> Any:
+        flow = flow_style or not any(isinstance(one, dict) for one in sequence)
+        return super().represent_sequence(tag, sequence, flow)
+
+
+_Dumper.add_representer(
+    _OnOneLine, lambda dumper, data: dumper.represent_mapping("tag:yaml.org,2002:map", data, True)
+)
+
+
+def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a plan, whole or not at all.
+
+    Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
+    OperationError: it cannot be written; nothing is left behind, an existing file stays.
+    """
+    write_plans([plan], path, overwrite=overwrite)
+
+
+def write_plans(plans: Sequence[Plan], path: str | Path, *, overwrite: bool) -> None:
+    """Write plans into one file. Raises: as :func:`save_plan`."""
+    path = Path(path)
+    if not (overwrite and path.is_file()):
+        new_file(path)
+    write_whole(path, [plans_as_text(plans).encode()])
+
+
+def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
+    """Write the plans of several chains into a new folder, each named after its output.
+
+    Raises InputError: ``folder`` exists, or what it stands in does not. OperationError: they cannot
+    be written; nothing is left behind.
+    """
+    folder = new_file(folder)
+    try:
+        folder.mkdir()
+    except OSError as error:
+        raise OperationError(f"{folder}: the folder cannot be made: {error}") from error
+    written: list[Path] = []
+    try:
+        for number, plan in enumerate(plans, start=1):
+            name = (plan.chain.output or "plan").strip("/").replace("/", "_")
+            written.append(folder / f"{number}_{name}.yaml")
+            save_plan(plan, written[-1])
+    except OperationError:
+        for path in written:
+            path.unlink(missing_ok=True)
+        folder.rmdir()
+        raise
+    return written
+
+
+def plan_json(plan: Plan) -> dict[str, Any]:
+    """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``, with the
+    ends of the publish slots (``bands_ns``) and :func:`band_predictions`.
+    """
+    return {
+        **plan.model_dump(mode="json"),
+        "bands_ns": [end for _, end in publish_slots(plan)],
+        "predicted_bands": [band._asdict() for band in band_predictions(plan)],
+    }
+
+
+def load_application_plan(path: str | Path) -> ApplicationPlan:
+    """Read a plan for an application, or for one chain (format 1), however it is laid out.
+
+    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
+    reason and remedy.
+    """
+    made_by = "written by `chainshaper plan`"
+    return whole(read_model(path, Plan, made_by=made_by, otherwise=("chains", ApplicationPlan)))
+
+
+def plan_in(values: Mapping[str, Any]) -> ApplicationPlan:
+    """A plan from what a recording or a run has of it, of either format."""
+    if "chains" in values:
+        return ApplicationPlan.model_validate(values, strict=False)
+    return whole(Plan.model_validate(values, strict=False))
+
+
+def plan_values(plan: ApplicationPlan) -> dict[str, Any]:
+    """What a recording or a run has of a plan: plain data, as :func:`plan_in` reads it."""
+    return (plan.chains[0] if len(plan.chains) == 1 else plan).model_dump(mode="json")
+
+
+def save_application_plan(
+    plan: ApplicationPlan, path: str | Path, *, overwrite: bool = False
+) -> None:
+    """Write a plan, whole or not at all; one chain is written as its own plan.
+
+    Raises: as :func:`save_plan`.
+    """
+    write_plans(plan.chains, path, overwrite=overwrite)

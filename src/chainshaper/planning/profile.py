@@ -1,0 +1,215 @@
+"""What was measured of a chain, and how long others can have its core while all of them run.
+
+While a recording is made every chain runs, at one priority, in whatever order messages come. What
+one instance took is therefore an accident: in another run the branches of a fork may be called in
+another order. Planned together, each chain's latencies are what it takes *alone* (its callbacks,
+without the time for which the others had its core), and to these is added the longest time for
+which the others can have it (Joseph and Pandya, The Computer Journal 29, 1986):
+
+    R = L + Σ ⌈(R + J) / T⌉ · C,
+
+over all that may run before the chain on its cores, each every T, for C at most, and up to J later
+in one cycle than in another:
+
+* the branches that begin with it, in any order: they share its server and its priority;
+* chains of a better priority, where they run at the same time (where they take turns, none);
+* the shaping nodes of all other chains, which spin before a slot and publish.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain as joined
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from chainshaper.planning.margins import check_latencies
+from chainshaper.planning.plan import SHORTEST_SLOT_NS
+from chainshaper.planning.shaping import CallbackTimes
+from chainshaper.values.plan_choices import Wishes
+
+_ADDED_UP = ("shaped", "one-long-slot", "server-per-chain")
+
+
+@dataclass(frozen=True)
+class Profile:
+    """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
+
+    ``latencies_ns`` are those of undisturbed cycles (where ``all_disturbed``, of all),
+    ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
+    ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
+    publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
+    also on branches that the chain waits for, ``cores`` that of any node that has one core; where a
+    node has several executors that run different callbacks, ``executors`` are those that take part,
+    each by its callbacks. ``begins`` is the first callback's number in the graph, and its name,
+    ``upstream`` the topics that the output waits for: on the chain, on those branches, and before
+    the chain begins. ``receivers`` are the nodes that subscribe to the chain's output and are none
+    of these. ``callbacks`` are those of the chain and its branches, see
+    :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
+    are what each callback of the chain took, a row per latency, see
+    :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
+    ``asynchronous`` whether its process has a thread that publishes (None: not known), ``together``
+    are nodes that share a process,
+    ``of_modes`` has what was measured in each mode of the system. The rest is
+    :class:`~chainshaper.planning.plan.Evidence`.
+    """
+
+    latencies_ns: NDArray[np.int64]
+    period_ns: int
+    every_latency_ns: NDArray[np.int64] | None = None
+    spec: str | None = None
+    nodes: tuple[str, ...] = ()
+    topics: tuple[str, ...] = ()
+    begins: tuple[int, str] | None = None
+    upstream: frozenset[str] = frozenset()
+    core_of: Mapping[str, int] = field(default_factory=dict)
+    executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
+    cores: Mapping[str, int] = field(default_factory=dict)
+    together: tuple[tuple[str, ...], ...] = ()
+    receivers: tuple[str, ...] = ()
+    callbacks: tuple[CallbackTimes, ...] = ()
+    steps_ns: NDArray[np.int64] | None = None
+    every_step_ns: NDArray[np.int64] | None = None
+    fifo_priority: int = 84
+    output_depth: int | None = None
+    recording: str | None = None
+    incomplete: int = 0
+    disturbed: int = 0
+    realtime: bool | None = None
+    longest_stall_ns: int | None = None
+    utilisation: float | None = None
+    interference_ns: int | None = None
+    longest_send_ns: int | None = None
+    longest_publication_ns: int | None = None
+    asynchronous: bool | None = None
+    lost_events: int | None = None
+    all_disturbed: bool | None = None
+    of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """What the chain is called in messages."""
+        return self.spec or "..".join(self.topics)
+
+    @property
+    def every(self) -> NDArray[np.int64]:
+        """The latencies of all cycles."""
+        every = self.every_latency_ns
+        return check_latencies(self.latencies_ns if every is None else every)
+
+    @property
+    def longest_ns(self) -> int:
+        """The longest of the latencies that are planned from."""
+        return int(check_latencies(self.latencies_ns).max())
+
+
+class Rival(NamedTuple):
+    """What runs before a chain: every ``period_ns`` for ``cost_ns``, up to ``jitter_ns`` later."""
+
+    period_ns: int
+    cost_ns: int
+    jitter_ns: int = 0
+
+
+def interference(own_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
+    """How long rivals can delay what takes ``own_ns`` alone (ns); what reaches ``limit_ns`` ends
+    the search.
+
+        >>> interference(5, [Rival(10, 2), Rival(7, 1)], 100)  # both once more in 5 + 2 + 1 > 7
+        4
+    """
+    delay = 0
+    while own_ns + delay < limit_ns:
+        busy = own_ns + delay
+        longer = sum(-(-(busy + one.jitter_ns) // one.period_ns) * one.cost_ns for one in rivals)
+        if longer == delay:
+            break
+        delay = longer
+    return delay
+
+
+def with_interference(
+    profiles: Sequence[Profile],
+    groups: Sequence[Sequence[int]],
+    wishes: Wishes,
+    *,
+    at_once: bool,
+) -> list[Profile]:
+    """The profiles with the latencies that the chains can have while all of them run.
+
+    ``groups`` are the places of chains that begin together. With ``at_once`` groups do not take
+    turns: those of a shorter period run at a better priority.
+    """
+    if len(profiles) == 1 or wishes.policy not in _ADDED_UP:
+        return list(profiles)
+    alone = [_alone(profile) for profile in profiles]
+    delayed = list(alone)
+    better: list[tuple[Sequence[int], list[Profile]]] = []  # groups, and their chains, so far
+    for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):
+        for k in group:
+            rivals = [_branches(alone[k], [alone[j] for j in group if j != k])]
+            rivals += [_group(alone[k], chains) for _, chains in better if at_once]
+            if wishes.policy != "server-per-chain" and wishes.publication == "synchronous":
+                others = [one for j, one in enumerate(alone) if j != k]
+                rivals += _gates(alone[k], others, wishes.spin_ns)
+            longest = int(alone[k].every.max())
+            delay = interference(longest, rivals, alone[k].period_ns)
+            delayed[k] = _later(alone[k], delay)
+        better.append((group, [delayed[k] for k in group]))
+    return delayed
+
+
+def _alone(profile: Profile) -> Profile:
+    """The profile with what its callbacks took, in sum; bare latencies as they are."""
+    if profile.steps_ns is None or profile.every_step_ns is None:
+        return profile
+    return replace(
+        profile,
+        latencies_ns=profile.steps_ns.sum(axis=1),
+        every_latency_ns=profile.every_step_ns.sum(axis=1),
+        of_modes={mode: _alone(one) for mode, one in profile.of_modes.items()},
+    )
+
+
+def _later(profile: Profile, delay_ns: int) -> Profile:
+    return replace(
+        profile,
+        latencies_ns=profile.latencies_ns + delay_ns,
+        every_latency_ns=profile.every + delay_ns,
+        interference_ns=delay_ns or None,
+        of_modes={mode: _later(one, delay_ns) for mode, one in profile.of_modes.items()},
+    )
+
+
+def _cores(profile: Profile) -> set[int]:
+    return {callback.core for callback in profile.callbacks}
+
+
+def _demand(profile: Profile, others: Sequence[Profile]) -> int:
+    """For how long callbacks of others, and not its own, have a chain's cores in one cycle."""
+    own = {(one.node, one.publishes) for one in profile.callbacks}
+    stages: dict[tuple[str, str | None], CallbackTimes] = {
+        (one.node, one.publishes): one
+        for one in joined.from_iterable(other.callbacks for other in others)
+        if (one.node, one.publishes) not in own and one.core in _cores(profile)
+    }
+    return sum(one.max_response_ns for one in stages.values())
+
+
+def _branches(profile: Profile, siblings: Sequence[Profile]) -> Rival:
+    return Rival(profile.period_ns, _demand(profile, siblings))
+
+
+def _group(profile: Profile, chains: Sequence[Profile]) -> Rival:
+    """Chains of one beginning that run before a chain: what waits elsewhere comes late."""
+    cost, longest = _demand(profile, chains), max(int(one.every.max()) for one in chains)
+    return Rival(chains[0].period_ns, cost, max(0, longest - cost))
+
+
+def _gates(profile: Profile, others: Sequence[Profile], spin_ns: int) -> Iterator[Rival]:
+    """The shaping nodes of other chains: each spins before its slot, and publishes."""
+    for other in others:
+        if other.nodes and other.core_of.get(other.nodes[-1]) in _cores(profile):
+            publication = other.longest_publication_ns or SHORTEST_SLOT_NS
+            yield Rival(other.period_ns, spin_ns + publication)

@@ -1,0 +1,167 @@
+"""How long other chains can have a chain's core: by hand, and played out."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chainshaper import load_application, measure_latency, simulate
+from chainshaper.flow.plan import profile_chains
+from chainshaper.planning import CallbackTimes, PlanRequest, plan_application
+from chainshaper.planning.application_plan import combined
+from chainshaper.planning.profile import Profile, Rival, interference
+from chainshaper.values.errors import OperationError
+
+MS = 1_000_000
+
+
+def _response(own: int, rivals: list[Rival], phases: list[int]) -> int:
+    """What a job of the worst priority takes that arrives at 0, in whole steps of time."""
+    left = [0] * len(rivals)
+    now = done = 0
+    while done < own:
+        for place, (one, phase) in enumerate(zip(rivals, phases, strict=True)):
+            left[place] += one.cost_ns * (now >= phase and (now - phase) % one.period_ns == 0)
+        first = next((place for place, rest in enumerate(left) if rest), None)
+        if first is None:
+            done += 1
+        else:
+            left[first] -= 1
+        now += 1
+    return now
+
+
+_RIVAL = st.builds(Rival, st.integers(8, 30), st.integers(1, 3), st.just(0))
+
+
+@given(st.integers(1, 20), st.lists(st.tuples(_RIVAL, st.integers(0, 30)), max_size=2))
+def test_no_phase_delays_more_and_one_delays_as_much(
+    own: int, drawn: list[tuple[Rival, int]]
+) -> None:
+    rivals, phases = [one for one, _ in drawn], [phase for _, phase in drawn]
+    longest = own + interference(own, rivals, 10_000)
+    assert _response(own, rivals, phases) <= longest
+    assert _response(own, rivals, [0] * len(rivals)) == longest  # all arrive at once
+
+
+def test_what_waits_elsewhere_may_come_twice() -> None:
+    # 6 + 2 of 20 while no instance is late; one that comes 15 later meets the next one's window.
+    assert interference(6, [Rival(20, 2)], 100) == 2
+    assert interference(6, [Rival(20, 2, 15)], 100) == 4
+    assert interference(50, [Rival(10, 10)], 100) >= 50  # never ends: the limit does
+
+
+GRAPH = """
+name: a fork
+chain: /in../left
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  source: {callbacks: [{timer: 100ms, execution: {constant: 2ms}, publishes: [/in]}]}
+  left: {callbacks: [{subscription: /in, execution: {constant: 5ms}, publishes: [/left]}]}
+  right: {callbacks: [{subscription: /in, execution: {constant: 7ms}, publishes: [/right]}]}
+  first: {callbacks: [{timer: PERIOD, execution: {constant: 1ms}, publishes: [/first]}]}
+  other: {callbacks: [{subscription: /first, execution: {constant: 2ms}, publishes: [/other]}]}
+  sink:
+    core: 0
+    callbacks: [{subscription: /left}, {subscription: /right}, {subscription: /other}]
+"""
+
+
+@pytest.mark.parametrize(("period", "before"), [("50ms", 0), ("40ms", 3)])
+def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    (tmp_path / "graph.yaml").write_text(GRAPH.replace("PERIOD", period))
+    application = load_application(tmp_path / "graph.yaml")
+    recording = simulate(application, tmp_path / "rec", cycles=40)
+    chains = ("/in../left", "/in../right", "/first../other")
+    profiles = profile_chains(recording, chains)
+    alone = [int(one.every_step_ns.sum(axis=1).max()) / MS for one in profiles]  # type: ignore[union-attr]
+    # Dispatching and messages take some of a millisecond; the branch that came second, 5 ms later,
+    # has not waited here.
+    assert all(own <= found < own + 0.8 for own, found in zip([7, 9, 3], alone, strict=True))
+    plan, remarks = plan_application(profiles, PlanRequest(epsilon_ns=0))
+    sent = [(one.longest_publication_ns or MS) / MS for one in profiles]
+    added = [(one.evidence.interference_ns or 0) / MS for one in plan.chains]
+    # A branch waits for the other one, and for two gates, each 1 ms and a publication; `other` for
+    # two gates. With 40 ms there is no room for turns: `other` runs first, its callbacks 3 ms long.
+    assert len(remarks) == (before > 0)
+    behind = [7 + 2 + sent[1] + sent[2] + before, 5 + 2 + sent[0] + sent[2] + before]
+    assert added == pytest.approx([*behind, 2 + sent[0] + sent[1]], abs=0.5)  # dispatching
+
+
+def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = None) -> Profile:
+    """A chain of two callbacks on core 1; the machine stalled in nine of 300 cycles."""
+    half = np.full(300, latency_ms * MS // 2)
+    second = half.copy()
+    second[:9] += stalls_ms * MS
+    topics = (f"/{name}1", f"/{name}2")
+    nodes = (topics[0], last or topics[1])
+    return Profile(
+        2 * half,
+        100 * MS,
+        every_latency_ns=half + second,
+        spec="..".join(topics),
+        nodes=nodes,
+        topics=topics,
+        begins=(ord(name), name),
+        core_of=dict.fromkeys(nodes, 1),
+        callbacks=tuple(CallbackTimes(n, 1, MS, MS, int(half[0])) for n in nodes),
+        steps_ns=np.stack([half, half], axis=1),
+        every_step_ns=np.stack([half, second], axis=1),
+    )
+
+
+def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:
+    # At once, /a takes 60 ms and, behind /b, 62 more; 24 ms too much with margin and slot.
+    with pytest.raises(OperationError, match=r"24ms too long") as refused:
+        plan_application([_profile("a", 60), _profile("b", 60)])
+    assert "core 1, 62ms behind /a1../a2" in str(refused.value)
+    assert "It fits with /a1../a2 on a core of its own (its nodes' `core`)" in str(refused.value)
+    # What passes one node has to take turns, for which stalls of 20 ms leave no room.
+    both = [_profile(name, 40, 20, last="/filter") for name in "ab"]
+    with pytest.raises(OperationError, match=r"does not stall \(--ideal-machine\)"):
+        plan_application(both)
+
+
+OVERRUNNING = """
+name: two chains in turns
+chain: /a1../a2
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a1: {callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/a1]}]}
+  a2:
+    callbacks: [{subscription: /a1, execution: {uniform: [5ms, 20ms]}, publishes: [/a2]}]
+  b1: {callbacks: [{timer: 50ms, execution: {constant: 2ms}, publishes: [/b1]}]}
+  b2: {callbacks: [{subscription: /b1, execution: {constant: 6ms}, publishes: [/b2]}]}
+  sink: {core: 0, callbacks: [{subscription: /a2}, {subscription: /b2}]}
+"""
+
+
+def test_an_overrun_goes_on_behind_the_next_chain_and_does_not_hit_it(tmp_path: Path) -> None:
+    """The first chain's slot ends after 20 of up to 26 ms, and the second's follows at once."""
+    pytest.importorskip("numba")
+    (tmp_path / "app.yaml").write_text(OVERRUNNING)
+    application = load_application(tmp_path / "app.yaml")
+    recording = simulate(application, tmp_path / "rec", cycles=100)
+    plan, _ = plan_application(profile_chains(recording, ("/a1../a2", "/b1../b2")))
+    first, second = plan.chains
+    chain, output = first.servers
+    earlier = [
+        chain.model_copy(update={"slots": ((0, 20 * MS),)}),
+        output.model_copy(update={"slots": ((20 * MS, 21 * MS),)}),
+    ]
+    tight = combined(
+        [
+            first.model_copy(update={"servers": tuple(earlier)}),
+            second.model_copy(update={"offset_ns": 20 * MS}),
+        ]
+    )
+    shaped = simulate(application, tmp_path / "shaped", tight, cycles=300)
+    late = measure_latency(shaped, "/a1../a2").analysis.statistics
+    other = measure_latency(shaped, "/b1../b2").analysis.statistics
+    assert (other.late, other.jitter_ns) == (0, 0)
+    # It had 6 ms to go at most, behind a slot of the second chain that lasts for 10 to 13.
+    assert 60 < (late.late or 0) < 180
+    assert 30 * MS < (late.max_ns or 0) < 41 * MS
