@@ -72,7 +72,7 @@ def test_every_back_end_that_gates_follows_a_phase_that_was_measured(
     tmp_path: Path, back_end: str, measured: bool
 ) -> None:
     plan, armed = whole(one_server_plan()), list[int]()
-    seen = {"latest_ns": MS, "looks": 1, "expect": lambda _: None}  # the timer, in the open slot
+    seen = {"latest_ns": MS, "looks": 1, "expect": lambda _: None}
     here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None, arm=armed.append, **seen)
     run = _Run(plan, plan, Choice(back_end, ""), here, (), frozenset(), Event())
     run.waits_ns, run.found = [0] * measured, here

@@ -301,11 +301,11 @@ def slots_follow_a_timer_that_drifts() -> str:
     Its output is due where the slot ends that opens 2 ms after the timer.
     """
     period, work, due = CYCLE + 15_000, 4 * MS, 12 * MS
+    job = (0, period, 0, work, "--ros-args", "-r", "__node:=sensor")
     late, said = [], list[str]()
     for follows in (1, 0):
         with scene() as s:
-            named = ("--ros-args", "-r", "__node:=sensor")
-            sensor = s.spinner("sensor", job=(0, period, 0, work, *named))
+            sensor = s.spinner("sensor", job=job)
             applied, governed = s.applied(CYCLE, 10 * MS, follows), time.monotonic_ns()
             wait(60_000)
             end = time.monotonic_ns()
