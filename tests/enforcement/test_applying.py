@@ -350,8 +350,9 @@ def test_a_node_that_is_started_again_is_taken_in(tmp_path: Path) -> None:
             assert run.wait(timeout=20) == 0
             governed.check_as_before()
             assert scheduling(again.pid) == before
-    servers = json.loads(said)[0]["state"]["servers"]
-    assert [one["threads"] for one in servers] == [[governed.pid], [again.pid]]
+    state = json.loads(said)[0]["state"]
+    assert [one["threads"] for one in state["servers"]] == [[governed.pid], [again.pid]]
+    assert any("slots stay where --phase puts them" in note for note in state["notes"])
 
 
 def test_what_a_governed_node_has_forked_is_as_the_node_was_before(tmp_path: Path) -> None:

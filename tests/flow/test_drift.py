@@ -2,10 +2,18 @@
 
 import random
 from collections.abc import Callable
+from pathlib import Path
+from threading import Event
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
+from applied_plans import one_server_plan
 
+from chainshaper.enforcement.back_ends import Choice
+from chainshaper.flow.apply import _Run
 from chainshaper.flow.drift import TimerTrack
+from chainshaper.planning.application_plan import whole
 
 MS, S = 1_000_000, 1_000_000_000
 LEAD_NS, LOOK_NS, NOISE_NS = 2 * MS, 10 * S, 30_000
@@ -56,3 +64,19 @@ def test_without_looking_a_timer_that_falls_behind_is_followed() -> None:
     waits, _, _ = waits_of(50, looks=False)
     assert min(waits) > -1.2 * MS
     assert waits_of(0, looks=False)[2] == 0
+
+
+@pytest.mark.parametrize("measured", [True, False])
+@pytest.mark.parametrize("back_end", ["scx", "litmus", "freezer", "fifo"])
+def test_every_back_end_that_gates_follows_a_phase_that_was_measured(
+    tmp_path: Path, back_end: str, measured: bool
+) -> None:
+    plan, armed = whole(one_server_plan()), list[int]()
+    seen = {"latest_ns": MS, "looks": 1, "expect": lambda _: None}
+    here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None, arm=armed.append, **seen)
+    run = _Run(plan, plan, Choice(back_end, ""), here, (), frozenset(), Event())
+    run.waits_ns, run.found = [0] * measured, here
+    run.begin_state((), "")
+    moved = next(run.follow(here, [here]))
+    assert bool(moved) == (measured and back_end != "fifo")
+    assert armed == [moved % plan.cycle_ns] * bool(moved)

@@ -18,7 +18,7 @@ KEYS = Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 MIRROR = "http://deb.debian.org/debian"
 SUITES = ("trixie", "trixie-backports", "sid")
 TRACING_SUITE = "bookworm"  # LTTng 2.13 builds for its kernel
-USERLAND = ("python3.13-minimal", "libpython3.13-stdlib", "libbpf1")
+USERLAND = ("python3.13", "libbpf1", "python3-numpy", "python3-pydantic", "python3-yaml")
 FLAVOURS = ("cloud-amd64", "rt-amd64")
 """A normal kernel (for virtual machines: small) and a PREEMPT_RT one."""
 
@@ -29,7 +29,7 @@ class PackageError(Exception):
 
 def fetch_userland() -> list[Path]:
     """Packages of the guests' programs. Raises PackageError: they cannot be had."""
-    return _cached("userland", SUITES, lambda apt: apt.download_all(USERLAND))
+    return _cached(" ".join(USERLAND), SUITES, lambda apt: apt.download_all(USERLAND))
 
 
 def fetch_kernels(name: str = "newest") -> list[Path]:
@@ -118,10 +118,11 @@ class _Apt:
         return done.stdout
 
     def download_all(self, names: tuple[str, ...]) -> list[Path]:
-        for old in self._archives.glob("*.deb"):
+        kernels = {*self._archives.glob("linux-*.deb")}  # other keys of the manifest
+        for old in {*self._archives.glob("*.deb")} - kernels:
             old.unlink()
         self.run("apt-get", "install", "--yes", "--download-only", *names)
-        return sorted(self._archives.glob("*.deb"))
+        return sorted({*self._archives.glob("*.deb")} - kernels)
 
     def download(self, name: str) -> Path:
         uri = self.run("apt-get", "download", "--print-uris", name).split()

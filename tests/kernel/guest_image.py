@@ -9,11 +9,13 @@ HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
 
 _NOT_NEEDED = (
+    "usr/include",
     "usr/share",
     "usr/lib/python3*/test",
     "usr/lib/python3*/idlelib",
     "usr/lib/python3*/pydoc_data",
     "usr/lib/python3*/ensurepip",
+    "usr/lib/python3/dist-packages/numpy/**/tests",
     "usr/lib/python3*/lib-dynload/_codecs_*",
     "usr/lib/*/gconv",
     "usr/lib/*/perl*",
@@ -51,6 +53,9 @@ def make_image(
                 shutil.rmtree(path)
             else:
                 path.unlink()
+    for name in ("blas", "lapack"):  # as Debian's alternatives have them
+        link = f"lib{name}.so.3"
+        (root / "usr/lib/x86_64-linux-gnu" / link).symlink_to(f"{name}/{link}")
     for name in ("bin", "lib", "lib64", "sbin"):
         if not (root / name).exists():
             (root / name).symlink_to(f"usr/{name}")

@@ -69,7 +69,9 @@ def test_a_schedule_is_the_one_worked_out_by_hand(tmp_path: Path, case: dict[str
     governed = None
     if "servers" in case:
         servers = [server(*each) for each in case["servers"]]
-        governed = plan(*servers, offset_ms=case.get("offset_ms", 0))
+        turns = case.get("equal_priorities", "apart")
+        offset_ms = case.get("offset_ms", 0)
+        governed = plan(*servers, offset_ms=offset_ms, equal_priorities=turns)
     recording = simulated(tmp_path, described(case), governed, case.get("cycles", 1))
     if "callbacks" in case:
         assert callbacks(recording) == [tuple(each) for each in case["callbacks"]]
@@ -97,7 +99,7 @@ def test_a_plan_for_another_application_is_refused(
         )
 
 
-TURNS = next(case for case in CASES if case["name"] == "threads of one server take turns")
+TURNS = next(case for case in CASES if "equal_priorities" in case)
 
 
 def test_servers_of_one_priority_take_turns_where_the_plan_says_so(tmp_path: Path) -> None:

@@ -66,7 +66,8 @@ def apply(
     ),
     phase: int | None = opt.option(
         "--phase DURATION",
-        "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC. Default: measured.",
+        "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC: slots then stay there."
+        " Default: measured, and followed where it drifts.",
     ),
     recording: Path | None = opt.option(
         "--recording REC",

@@ -3,8 +3,9 @@
 By the time a plan is carried out, its nodes have become threads. What is left is a **table**:
 servers with slots that repeat every cycle (paper, section 2.2.1), and thread ids assigned to them.
 Between slots a server's threads do not run at all (``fifo`` excepted, which isolates only); where
-servers overlap on a core, the better priority runs, a smaller number; threads of one server take
-turns; threads of no server run when no server's wants to.
+servers overlap on a core, the better priority runs, a smaller number; threads of one server come
+first come, first served (``scx``, ``litmus``: they take turns); threads of no server run when no
+server's wants to.
 """
 
 from dataclasses import dataclass

@@ -252,6 +252,8 @@ class _Run:
         else:
             anchor_ns = phase_ns + LEAD_NS - self.given.chains[0].offset_ns
             self.anchor_ns = anchor_ns % self.given.cycle_ns
+            if gates(self.choice.name):
+                self.note("slots stay where --phase puts them, also when the chain's timer drifts")
         self.plan = open_until_done(self.given, self.waits_ns)
         table, keeper = threads.server_table(self.plan), self.choice.name
         if not gates(keeper):
@@ -339,7 +341,7 @@ class _Run:
 
     def watch_over(self, servers: BackEnd, watch: Callable[[RunState], None]) -> None:
         """Watch over the run until it is to end; the state is then as it was last."""
-        drifts, sent, notes = self.drift_watches(), dict[int, int](), self.state.notes
+        drifts, sent, said = self.drift_watches(), dict[int, int](), tuple[str, ...]()
         following = self.follow(servers, drifts)
         latest: tuple[NodeThread, ...] = ()
         unsaved = untaken = ""
@@ -369,13 +371,14 @@ class _Run:
             if new and not self.telling:
                 sent.update(new)
                 self.tell(self.state.anchor_ns or 0, {k: ns - followed_ns for k, ns in new.items()})
-                said = (
+                others = [note for note in self.state.notes if note not in said]
+                said = tuple(
                     f"the beginning of {chain_name(self.plan.chains[place])} has moved by"
                     f" {format_duration(ns)} since the plan was put in force; shaping nodes get it,"
                     " and outputs without a stamp follow from the next cycle"
                     for place, ns in sent.items()
                 )
-                self.state = replace(self.state, notes=(*notes, *said))
+                self.state = replace(self.state, notes=(*others, *said))
             if self.stop.wait(_LOOK_S):
                 continue
             if self.guardians is not None:
@@ -385,7 +388,8 @@ class _Run:
     def follow(self, servers: BackEnd, drifts: Sequence[DriftWatch]) -> Iterator[int]:
         """Move the slots with the chain's timer; yields how far they have moved (ns).
 
-        Of several chains the one with the shortest wait for its slot is followed: the timers of one
+        Not where nothing gates, nor from a phase that was given, which need not be a timer's. Of
+        several chains the one with the shortest wait for its slot is followed: the timers of one
         machine have one clock. Where outputs count from the cycle and not from their stamp, slots
         stay where they are until the timer is seen behind their opening.
         """

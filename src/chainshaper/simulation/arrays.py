@@ -378,7 +378,7 @@ def build_machine(
         X.SWITCHES: switches,
         X.SWITCH_COST: described.context_switch_ns,
         X.PREEMPTION_COST: described.preemption_ns,
-        X.QUANTUM: described.quantum_ns,
+        X.QUANTUM: described.quantum_ns if plan is not None and plan.takes_turns else at.FOREVER,
         X.AWAY: round(1e6 * described.interrupts / (1 - described.interrupts)),
         X.CYCLE: plan.cycle_ns if plan is not None else 0,
         X.WARM_UP: WARM_UP_CYCLES,

@@ -3,8 +3,9 @@
 On every core the eligible runnable thread of the smallest rank runs; among equals the one that
 waits for longest, and a pre-empted thread stays in its place (SCHED_FIFO). Where a plan is in
 force, threads in servers are eligible while a slot of their server is open, ranked by the priority
-of the server; they take turns when their quantum is used up (round-robin). All others come behind
-them, by their own priority (best effort). Slots overlap freely: the better priority runs.
+of the server; where the plan says so, equals take turns when their quantum is used up
+(round-robin). All others come behind them, by their own priority (best effort). Slots overlap
+freely: the better priority runs.
 
 At one instant, first what was to come happens (expiries, deliveries, ends of sleeps), so that an
 executor's snapshot has all that happened up to that instant; then running threads that have used

@@ -91,8 +91,8 @@ class SimulationDescription(Part):
     begins, ``publish`` of a message, by its executor or its publisher thread, ``receive`` of a
     message by a DDS thread (None: these compete with no thread), ``context_switch`` for the thread
     switched to, ``preemption`` for one that is resumed. ``delivery`` is how long a message is under
-    way, ``quantum`` how long threads of one server take turns for, ``interrupts`` the share of a
-    core's time that interrupts and the stall meter take from callbacks (it counts as their CPU
+    way, ``quantum`` how long turns last where the plan has round robin, ``interrupts`` the share of
+    a core's time that interrupts and the stall meter take from callbacks (it counts as their CPU
     time), ``drift`` how much faster the clocks of nodes are (ppm of a period).
 
     The defaults are medians of several live runs on a virtual machine of two cores.

@@ -27,6 +27,7 @@ def prepare() -> None:
         Path(place).mkdir(exist_ok=True)
         machine_files.mount(kind, Path(place))
     _seed_random_numbers()
+    Path("/run").mkdir(exist_ok=True)
     Path("/tmp").mkdir(exist_ok=True)
     Path("/tmp").chmod(0o1777)
     os.environ["PYTHONPATH"] = "/src"

@@ -153,9 +153,10 @@ def moving_the_cycles_lets_nobody_slip_between() -> str:
     for anchor, start, until in zip(anchors, since, [*since[1:], end], strict=True):
         allowed += slots_between(A.slots, CYCLE, anchor * MS, start, until)
     used, outside = overlap(ran, allowed), length(ran) - overlap(ran, allowed)
-    assert used > 0.995 * length(allowed), f"used {used} of {length(allowed)} ns"
+    # While it writes a table the loader goes before a slot that opens.
+    assert used > 0.99 * length(allowed), f"used {used} of {length(allowed)} ns"
     assert outside < 10_000, f"{outside} ns outside over {len(anchors) - 1} changes"
-    assert kept["late_entries"] == 0, kept
+    assert kept["longest_lateness_ns"] < SLOT / 50, kept
     return f"{len(anchors) - 1} changes, {outside / 1e3:.1f} us outside in {len(allowed)} slots"
 
 
@@ -294,6 +295,30 @@ def a_stopped_loader_changes_nothing() -> str:
     return _exact(ran, slots_between(A.slots, CYCLE, 0, start, end))
 
 
+def slots_follow_a_timer_that_drifts() -> str:
+    """By `apply`, 300 ppm slow: 18 ms in a minute, where the job would fit 6 ms later in its slot.
+
+    Its output is due where the slot ends that opens 2 ms after the timer.
+    """
+    period, work, due = CYCLE + 15_000, 4 * MS, 12 * MS
+    job = (0, period, 0, work, "--ros-args", "-r", "__node:=sensor")
+    late, said = [], list[str]()
+    for follows in (1, 0):
+        with scene() as s:
+            sensor = s.spinner("sensor", job=job)
+            applied, governed = s.applied(CYCLE, 10 * MS, follows), time.monotonic_ns()
+            wait(60_000)
+            end = time.monotonic_ns()
+            applied.terminate()
+            said.append(applied.communicate()[0].decode().strip())
+            ran = cut(sensor.windows(), governed, end)
+        expiries = range(governed + period - governed % period, end - CYCLE, period)
+        late.append(sum(length(cut(ran, at, at + due)) < 0.97 * work for at in expiries))
+    text = f"late of {len(expiries)}: {late[0]} ({said[0]}), not followed {late[1]} ({said[1]})"
+    assert late[0] < len(expiries) / 200 < len(expiries) / 3 < late[1], text
+    return text
+
+
 def two_cores_are_governed_independently() -> str:
     """What can be said without virtual time: each thread runs in its slots, mostly."""
     b = server("B", 25, 45, core=1)
@@ -361,6 +386,7 @@ VIRTUAL_TIME = (
     without_privileges_the_missing_capabilities_are_named,
     threads_that_cannot_be_governed_are_refused,
     a_thread_without_a_slot_for_half_a_minute_ends_the_policy,
+    slots_follow_a_timer_that_drifts,
 )
 REAL_TIME_KERNEL = (
     a_killed_kicker_fails_open,

@@ -54,6 +54,10 @@ def run_tests(report: Callable[[str], object]) -> None:
     for kind, place in OWN:
         (MACHINE / place).mkdir(exist_ok=True)
         mount(kind, MACHINE / place)
+    project = MACHINE / told["folder"][1:]
+    if not project.exists():  # it is in one of those
+        project.mkdir(parents=True)
+        mount("", project, f"/lower{told['folder']}", flags=BIND)
     with subprocess.Popen(
         told["command"],
         env={"PATH": "/usr/sbin:/usr/bin:/sbin:/bin", "HOME": "/root"},

@@ -140,6 +140,15 @@ class Scene:
                 made.ask("assign", thread.tid, name)
         return made
 
+    def applied(self, *arguments: int) -> subprocess.Popen[bytes]:
+        """`apply_process.py`, in force."""
+        command = [sys.executable, str(HERE / "apply_process.py"), *map(str, arguments)]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        self._processes.append(process)
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"in force\n"
+        return process
+
     def close(self) -> None:
         """End everything, and see the machine as it was."""
         for process in self._processes:
