@@ -179,31 +179,17 @@ def check_publishers(
     gating = [chain for chain in plan.chains if any(publisher_servers(chain))]
     if not gating or recording is None:
         return []
+    from chainshaper.sources.ros.publication import publication_modes  # only who gates pays
+
     process = {node: one.thread.pid for one in found.threads for node in one.nodes}
-    modes = {pid: _asynchronous(pid) for pid in set(process.values())}
+    modes = {pid: publication_modes(pid) for pid in set(process.values())}
     writers = [
-        Writer(one.node, one.topic, one.depth, modes[pid], pid)
+        Writer(one.node, one.topic, one.depth, modes[pid](one.topic), pid)
         for one in recording.info.endpoints
         if one.kind == "publisher" and (pid := process.get(one.node)) is not None
     ]
     known = [c for c in gating if any(one.node == c.chain.publisher for one in writers)]
     return [said for chain in known for said in check_publication(chain, writers)]
-
-
-def _asynchronous(pid: int) -> bool | None:
-    """Whether rmw_fastrtps lets all writers of a process publish asynchronously; None: each as a
-    file of profiles says, or as it is by default.
-    """
-    from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
-
-    try:
-        asked = environment_of(pid).variables
-    except OperationError:
-        return None
-    if asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") == "1":
-        return None
-    modes = {"ASYNCHRONOUS": True, "SYNCHRONOUS": False}
-    return modes.get(asked.get("RMW_FASTRTPS_PUBLICATION_MODE", ""))
 
 
 @dataclass(frozen=True)
