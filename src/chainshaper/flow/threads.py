@@ -10,9 +10,12 @@ import platform
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
+from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end, gates
@@ -179,17 +182,47 @@ def check_publishers(
     gating = [chain for chain in plan.chains if any(publisher_servers(chain))]
     if not gating or recording is None:
         return []
-    from chainshaper.sources.ros.publication import publication_modes  # only who gates pays
-
     process = {node: one.thread.pid for one in found.threads for node in one.nodes}
-    modes = {pid: publication_modes(pid) for pid in set(process.values())}
+    modes = {pid: _asynchronous(pid) for pid in set(process.values())}
     writers = [
-        Writer(one.node, one.topic, one.depth, modes[pid](one.topic), pid)
+        Writer(one.node, one.topic, one.depth, modes[pid].get(one.topic, modes[pid].get("")), pid)
         for one in recording.info.endpoints
         if one.kind == "publisher" and (pid := process.get(one.node)) is not None
     ]
     known = [c for c in gating if any(one.node == c.chain.publisher for one in writers)]
     return [said for chain in known for said in check_publication(chain, writers)]
+
+
+def _asynchronous(pid: int) -> dict[str, bool]:
+    """Whether rmw_fastrtps lets a process publish topics asynchronously; "" stands for all others,
+    and is missing where that is not known.
+
+    Where it is left to Fast DDS's files of profiles, a topic's own profile counts, then the default
+    one; else it is synchronous. Where no file is to be read, a program may bring profiles itself.
+    """
+    from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
+
+    try:
+        asked = environment_of(pid).variables
+    except OperationError:
+        return {}
+    mode = asked.get("RMW_FASTRTPS_PUBLICATION_MODE")
+    if mode != "AUTO" and asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") != "1":
+        return {"": mode == "ASYNCHRONOUS"} if mode in ("ASYNCHRONOUS", "SYNCHRONOUS") else {}
+    files = [asked.get(f"{one}_DEFAULT_PROFILES_FILE") for one in ("FASTRTPS", "FASTDDS")]
+    modes: dict[str, bool] = {}
+    for name in (*files, "DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml"):
+        with suppress(OSError, ElementTree.ParseError):
+            if not (file := Path(f"/proc/{pid}/cwd", name or "")).is_file():
+                continue
+            for one in ElementTree.parse(file).iter():  # noqa: S314 - entities: expat bounds them
+                if one.tag.rpartition("}")[2] in ("data_writer", "publisher"):
+                    kind = one.findtext(".//{*}publishMode/{*}kind", "").strip()
+                    modes.setdefault(one.get("profile_name", ""), kind == "ASYNCHRONOUS")
+                    if one.get("is_default_profile") == "true":
+                        modes[""] = kind == "ASYNCHRONOUS"
+            modes.setdefault("", False)
+    return modes
 
 
 @dataclass(frozen=True)
