@@ -38,6 +38,7 @@ def generate_launch_description():
     words = [line.split() for line in {nodes!r}.split('\\n') if line]
     return LaunchDescription([
         Node(executable={program!r}, name=name, arguments=rest,
+             prefix='chrt -f 60' if name == 'reader' else '',  # whatever else runs here
              additional_env={profiles!r} if name == 'control' else {{}})
         for name, *rest in words
     ])
@@ -57,7 +58,7 @@ DRIVING = """
 tick     /ticked    0.2  1     every 100
 work     /worked    2    15    on /ticked
 control  /commands  1    10    on /worked
-motor    -          0    0.01  on /commands
+reader   -          0    0.01  on /commands
 """
 PROFILES = """
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>

@@ -100,9 +100,8 @@ def left_when_taken(flow: DataFlow, topics: Collection[str | None]) -> DataFlow:
         return flow
     sent = pl.when(pl.col("topic").is_in(own.implode())).then(left).otherwise("sent")
     note = "when it left no event says: it counts as published when its first reader took it"
-    notes = (f"a thread of its own publishes {', '.join(own.unique())}: {note}",)
-    published = flow.publications.with_columns(sent=sent)
-    return replace(flow, publications=published, notes=flow.notes + notes)
+    notes = (*flow.notes, f"a thread of its own publishes {', '.join(own.unique())}: {note}")
+    return replace(flow, publications=flow.publications.with_columns(sent=sent), notes=notes)
 
 
 def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:

@@ -197,8 +197,8 @@ def _asynchronous(pid: int) -> dict[str, bool]:
     """Whether rmw_fastrtps lets a process publish topics asynchronously; "" stands for all others,
     and is missing where that is not known.
 
-    Where it is left to Fast DDS's files of profiles, a topic's own profile counts, then the default
-    one; else it is synchronous. Where no file is to be read, a program may bring profiles itself.
+    Of Fast DDS's files of profiles, a topic's own profile counts, then the default one; else it is
+    synchronous. Where no file is to be read, a program may bring profiles itself.
     """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
 
