@@ -194,8 +194,7 @@ def check_publishers(
 
 
 def _asynchronous(pid: int) -> dict[str, bool]:
-    """Whether rmw_fastrtps lets a process publish topics asynchronously; "" stands for all others,
-    and is missing where that is not known.
+    """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others, if known.
 
     Of Fast DDS's files of profiles, a topic's own profile counts, then the default one; else it is
     synchronous. Where no file is to be read, a program may bring profiles itself.
