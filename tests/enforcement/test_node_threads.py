@@ -429,6 +429,14 @@ def test_what_cannot_be_planned_is_named_with_the_remedy(
         plan_scheduling(_plan(_server("server", planned)), _allocation(threads), (0, 1))
 
 
+def test_what_an_executor_that_we_had_raised_starts_leaves_the_publishers_core() -> None:
+    *others, late = _node("/b", 200, "executor", "publisher", "unknown")
+    late = replace(late, thread=replace(late.thread, cores=(1,), priority=85))
+    plan = _plan(_server("server", PUBLISHER_B))
+    wanted = _by_tid(plan_scheduling(plan, _allocation([*others, late]), (0, 1)))
+    assert wanted[202] == Scheduling(0, (0,)), "it inherited both"
+
+
 def test_nodes_that_share_an_executor_are_one_thread_of_one_server() -> None:
     shared = [replace(one, nodes=("/a", "/b")) for one in _node("/a", 100, "executor")]
     together = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))

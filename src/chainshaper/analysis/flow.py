@@ -90,8 +90,7 @@ def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
 def left_when_taken(flow: DataFlow, topics: Collection[str | None]) -> DataFlow:
     """The flow in which messages on ``topics`` left when their first reader took them.
 
-    For what a publisher's thread sends in ROS 2: events show only when it was handed over. Topics
-    without a reader stay as they are, and all topics where sends were recorded.
+    For what a publisher's thread sends in ROS 2, of which events show only when it was handed over.
     """
     taken = flow.takes.drop_nulls("publication").sort("time", descending=True)
     left = by_number(taken, "publication", "time", flow.publications.height)  # the last laid out

@@ -196,8 +196,7 @@ def check_publishers(
 def _asynchronous(pid: int) -> dict[str, bool]:
     """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others, if known.
 
-    Of Fast DDS's files of profiles, a topic's own profile counts, then the default one; else it is
-    synchronous. Where no file is to be read, a program may bring profiles itself.
+    In Fast DDS's files of profiles a topic's own counts, or the default one; else synchronous.
     """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
 
