@@ -250,8 +250,7 @@ def test_a_thread_that_never_ran_sent_nothing_and_without_one_publishing_is_send
     assert found.incomplete == ({"not sent": 2} if asynchronous else {})
 
 
-def test_where_no_event_says_when_the_thread_sent_a_message_its_first_reader_does() -> None:
-    """So it is in ROS 2."""
+def test_where_no_event_says_when_it_was_sent_as_in_ros_the_first_reader_does() -> None:
     story = _sent_by_thread(("sent", "sent", None))
     recorded = data_flow(story.tables(), OFFSET)
     assert left_when_taken(recorded, ["/t1"]) is recorded
