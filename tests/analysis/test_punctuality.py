@@ -9,6 +9,7 @@ from story import OFFSET, Story
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.analysis.disturbance import Due
+from chainshaper.analysis.flow import left_when_taken
 from chainshaper.analysis.messages import gate_decisions
 from chainshaper.values.recording import Recording
 
@@ -247,6 +248,17 @@ def test_a_thread_that_never_ran_sent_nothing_and_without_one_publishing_is_send
     found = analyse_latency(story.tables(), "/n../t1", OFFSET)
     assert found.traversals["latency_ns"].to_list() == latencies
     assert found.incomplete == ({"not sent": 2} if asynchronous else {})
+
+
+def test_where_no_event_says_when_it_was_sent_as_in_ros_the_first_reader_does() -> None:
+    story = _sent_by_thread(("sent", "sent", None))
+    recorded = data_flow(story.tables(), OFFSET)
+    assert left_when_taken(recorded, ["/t1"]) is recorded
+    del story.rows["asynchronous_send"], story.rows["rcl_publisher_init"][0]["asynchronous"]
+    found = analyse_latency(left_when_taken(data_flow(story.tables(), OFFSET), ["/t1"]), "/n../t1")
+    assert found.traversals["latency_ns"].to_list() == [79, 79, None], "handed over after 10"
+    assert found.incomplete == {"not sent": 1}
+    assert "publishes /t1: when it left no event says" in found.notes[-1]
 
 
 def test_inside_a_chain_waiting_for_the_thread_belongs_to_the_hop_that_publishes() -> None:

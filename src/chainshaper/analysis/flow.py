@@ -17,6 +17,7 @@ are assumed (``assumed``, no ``end``, no response time):
   publication, so that chains can begin there.
 """
 
+from collections.abc import Collection
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -84,6 +85,22 @@ def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
             "them."
         )
     return DataFlow(objects, instances, published, taken, tables, tuple(notes))
+
+
+def left_when_taken(flow: DataFlow, topics: Collection[str | None]) -> DataFlow:
+    """The flow in which messages on ``topics`` left when their first reader took them.
+
+    For what a publisher's thread sends in ROS 2, of which events show only when it was handed over.
+    """
+    taken = flow.takes.drop_nulls("publication").sort("time", descending=True)
+    left = by_number(taken, "publication", "time", flow.publications.height)  # the last laid out
+    own = flow.publications.filter(left.is_not_null() & pl.col("topic").is_in([*topics]))["topic"]
+    if events.table(flow.events, "asynchronous_send").height or not own.len():
+        return flow
+    sent = pl.when(pl.col("topic").is_in(own.implode())).then(left).otherwise("sent")
+    note = "when it left no event says: it counts as published when its first reader took it"
+    notes = (*flow.notes, f"a thread of its own publishes {', '.join(own.unique())}: {note}")
+    return replace(flow, publications=flow.publications.with_columns(sent=sent), notes=notes)
 
 
 def callback_instances(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:

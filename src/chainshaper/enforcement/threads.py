@@ -512,6 +512,8 @@ def _beside(
     if not shared:
         return None
     elsewhere = tuple(sorted(set(thread.cores) - shared))
+    inherits = not elsewhere and thread.priority > 0  # from the executor that we had raised
+    elsewhere = cores if inherits else elsewhere
     if not elsewhere:
         raise OperationError(
             f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may run on core "
@@ -519,7 +521,7 @@ def _beside(
             "never let it release the writer's lock: let it run on another core too (`taskset`)"
         )
     reason = "not on the core of its process's asynchronous publisher"
-    return WantedScheduling(one, Scheduling(None, elsewhere), None, reason)
+    return WantedScheduling(one, Scheduling(0 if inherits else None, elsewhere), None, reason)
 
 
 def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> WantedScheduling:

@@ -10,9 +10,12 @@ import platform
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
+from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end, gates
@@ -182,7 +185,7 @@ def check_publishers(
     process = {node: one.thread.pid for one in found.threads for node in one.nodes}
     modes = {pid: _asynchronous(pid) for pid in set(process.values())}
     writers = [
-        Writer(one.node, one.topic, one.depth, modes[pid], pid)
+        Writer(one.node, one.topic, one.depth, modes[pid].get(one.topic, modes[pid].get("")), pid)
         for one in recording.info.endpoints
         if one.kind == "publisher" and (pid := process.get(one.node)) is not None
     ]
@@ -190,20 +193,34 @@ def check_publishers(
     return [said for chain in known for said in check_publication(chain, writers)]
 
 
-def _asynchronous(pid: int) -> bool | None:
-    """Whether rmw_fastrtps lets all writers of a process publish asynchronously; None: each as a
-    file of profiles says, or as it is by default.
+def _asynchronous(pid: int) -> dict[str, bool]:
+    """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others, if known.
+
+    In Fast DDS's files of profiles a topic's own counts, or the default one; else synchronous.
     """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
 
     try:
         asked = environment_of(pid).variables
     except OperationError:
-        return None
-    if asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") == "1":
-        return None
-    modes = {"ASYNCHRONOUS": True, "SYNCHRONOUS": False}
-    return modes.get(asked.get("RMW_FASTRTPS_PUBLICATION_MODE", ""))
+        return {}
+    mode = asked.get("RMW_FASTRTPS_PUBLICATION_MODE")
+    if mode != "AUTO" and asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") != "1":
+        return {"": mode == "ASYNCHRONOUS"} if mode in ("ASYNCHRONOUS", "SYNCHRONOUS") else {}
+    files = [asked.get(f"{one}_DEFAULT_PROFILES_FILE") for one in ("FASTRTPS", "FASTDDS")]
+    modes: dict[str, bool] = {}
+    for name in (*files, "DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml"):
+        with suppress(OSError, ElementTree.ParseError):
+            if not (file := Path(f"/proc/{pid}/cwd", name or "")).is_file():
+                continue
+            for one in ElementTree.parse(file).iter():  # noqa: S314 - entities: expat bounds them
+                if one.tag.rpartition("}")[2] in ("data_writer", "publisher"):
+                    kind = one.findtext(".//{*}publishMode/{*}kind", "").strip()
+                    modes.setdefault(one.get("profile_name", ""), kind == "ASYNCHRONOUS")
+                    if one.get("is_default_profile") == "true":
+                        modes[""] = kind == "ASYNCHRONOUS"
+            modes.setdefault("", False)
+    return modes
 
 
 @dataclass(frozen=True)

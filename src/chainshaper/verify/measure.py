@@ -14,9 +14,11 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
+from chainshaper.analysis.flow import left_when_taken
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.application_plan import plan_of_chain, whole
+from chainshaper.planning.plan import publisher_servers
 from chainshaper.planning.plan_file import plan_in
 from chainshaper.sources import open_source
 from chainshaper.values import events
@@ -132,6 +134,8 @@ def _measured(
     due = [] if joint is None else [due for one in joint.chains for due in due_of(one)]
     spell, left_out = _in_force(recording)
     flow = data_flow(recording.events, info.clock_offset_ns)
+    if gated := [one for one in joint.chains if any(publisher_servers(one))] if joint else []:
+        flow = left_when_taken(flow, [one.chain.output for one in gated])
     if spell is not None:
         recording = replace(recording, events=events.happened(recording.events, *spell))
     measurements = []
