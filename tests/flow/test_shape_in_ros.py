@@ -1,21 +1,22 @@
-"""Two chains of a real `ros2 launch` shaped by one command, one of them over two cores.
+"""A real `ros2 launch` of C++ nodes that compute, shaped by one command.
 
-The first is valley parking in small (paper, section 5.1): the front filter runs beside the rear one
-on a core of its own. The second shares a core with it.
+``CHAINSHAPER_SHAPED=FOLDER`` has the recordings written there.
 """
 
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 from ros2 import ros2_environment
 
-from chainshaper import load_application_plan, open_recording
+from chainshaper import load_application, load_application_plan, load_plan, open_recording
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
+from chainshaper.planning.overruns import cycles_until_output
 
 pytestmark = [
     pytest.mark.ros2,
@@ -25,34 +26,65 @@ pytestmark = [
 ]
 
 HERE = Path(__file__).parent
+ROOT = HERE.parents[1]
+MS = 1_000_000
 LAUNCH = """
+import os
+
 from launch import LaunchDescription
 from launch_ros.actions import Node
 
-NODES = '''
-throttler    /raw      0.2  0.5  every 100
-rear_filter  /rear     1    4    on /raw
-front_filter /front    1    5    on /raw
-fusion       /fused    0.2  1    on /rear /front
-ndt          /pose     1    5    on /fused
-planner      -         0    0.01 on /pose
-tick         /ticked   0.2  1    every 50
-control      /commands 0.5  3    on /ticked
-motor        -         0    0.01 on /commands
-'''
+NODES = {nodes!r}
 
 
 def generate_launch_description():
-    words = [line.split() for line in NODES.split('\\n') if line]
-    return LaunchDescription(
-        [Node(executable={program!r}, name=name, arguments=rest) for name, *rest in words]
-    )
+    nodes = []
+    for name, *words in (line.replace('MODES', os.environ['MODES']).split() for line in NODES):
+        slow = {'twice_in': 'highway' if name == 'slow' else ''}
+        nodes.append(Node(executable={program!r}, name=name, arguments=words, parameters=[slow]))
+    return LaunchDescription(nodes)
 """
+PARKING = [
+    "throttler    /raw      0.2  0.5  every 100",
+    "rear_filter  /rear     1    4    on /raw",
+    "front_filter /front    1    5    on /raw",
+    "fusion       /fused    0.2  1    on /rear /front",
+    "ndt          /pose     1    5    on /fused",
+    "planner      -         0    0.01 on /pose",
+    "tick         /ticked   0.2  1    every 50",
+    "control      /commands 0.5  3    on /ticked",
+    "motor        -         0    0.01 on /commands",
+]
+"""Valley parking in small (section 5.1): the front filter runs beside the rear one on a core of its
+own. A second chain shares a core with it."""
+
+MODES = [
+    "camera  /image   1 2 every 100",
+    "slow    /objects 5 9 on /image",
+    "planner /command 1 3 on /objects",
+    "motor   -        0 0.01 on /command",
+    "driver  /driving_mode modes 4 MODES",
+]
+
+
+def described(path: str) -> tuple[str, list[str]]:
+    """The chain of a description, and its nodes as the words of a node that computes each."""
+    application = load_application(ROOT / path)
+    lines = []
+    for name, node in application.nodes.items():
+        (callback,) = node.callbacks
+        execution = callback.execution
+        times = execution.uniform_ns or [execution.constant_ns or 0] * 2
+        inputs = callback.synchronises or [callback.subscription]
+        how = ["every", str(callback.timer_ns // MS)] if callback.timer_ns else ["on", *inputs]
+        words = [name, *(callback.publishes or "-"), *(str(one / MS) for one in times), *how]
+        lines.append(" ".join(words))
+    return application.chain, lines
 
 
 @pytest.fixture(scope="module")
-def launch_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A launch file of nodes of C++, which are built first."""
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A node of C++, which is built first."""
     folder = tmp_path_factory.mktemp("nodes")
     for step in (["-S", str(HERE), "-B", str(folder)], ["--build", str(folder)]):
         command = ["env", "cmake", *step]
@@ -60,24 +92,52 @@ def launch_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
             command, env=ros2_environment(), capture_output=True, text=True, check=False
         )
         assert run.returncode == 0, run.stdout + run.stderr
-    file = folder / "parking.launch.py"
-    file.write_text(LAUNCH.replace("{program!r}", repr(str(folder / "vertex"))))
-    return file
+    return folder / "vertex"
 
 
-def test_two_chains_are_shaped_by_one_command(launch_file: Path, tmp_path: Path) -> None:
-    domain = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
-    environment = {**ros2_environment(), **domain, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    folder, (first, *_, last) = tmp_path / "shaped", available_cores()
+class Robot(NamedTuple):
+    """A launch file, and where all that is made of it goes."""
+
+    file: Path
+    folder: Path
+
+    def run(self, verb: str, *words: str, modes: str = "city highway") -> dict[str, Any]:
+        """What a verb says, of this robot behind `--`."""
+        domain = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100), "MODES": modes}
+        environment = {**ros2_environment(), **domain, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        command = [sys.executable, "-m", "chainshaper", verb, *words, "--json", "--"]
+        command += ["ros2", "launch", str(self.file)]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert run.returncode == 0, run.stderr[-3000:]
+        values: dict[str, Any] = json.loads(run.stdout)
+        return values
+
+    def shaped(self, *options: str, name: str = "shaped") -> dict[str, Any]:
+        return self.run("shape", "-o", str(self.folder / name), *options)
+
+
+@pytest.fixture
+def robot(program: Path, tmp_path: Path) -> Callable[[list[str]], Robot]:
+    def launched(nodes: list[str]) -> Robot:
+        folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path))
+        file = tmp_path / "robot.launch.py"
+        text = LAUNCH.replace("{program!r}", repr(str(program)))
+        file.write_text(text.replace("{nodes!r}", repr(nodes)))
+        return Robot(file, folder)
+
+    return launched
+
+
+Launched = Callable[[list[str]], Robot]
+
+
+def test_two_chains_are_shaped_by_one_command(robot: Launched) -> None:
+    launched, (first, *_, last) = robot(PARKING), available_cores()
     chains = ["/raw../rear../pose", "/ticked../commands"]
-    options = ["--cores", f"{last},{first}", "--epsilon", "2ms", "--duration", "30s", "--json"]
-    options += [word for chain in chains for word in ("--chain", chain)]
-    command = [sys.executable, "-m", "chainshaper", "shape", "-o", str(folder), *options]
-    command += ["--", "ros2", "launch", str(launch_file)]
-    run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr[-3000:]
-    values: dict[str, Any] = json.loads(run.stdout)
+    options = ["--cores", f"{last},{first}", "--epsilon", "2ms", "--duration", "30s"]
+    values = launched.shaped(*options, *(word for chain in chains for word in ("--chain", chain)))
 
+    folder = launched.folder / "shaped"
     cores = values["cores"]
     beside, *others = (cores[f"/{one}"] for one in ("front_filter", "throttler", "fusion", "ndt"))
     assert (beside, {*others}) == (first, {last}), "a branch that the chain waits for"
@@ -98,3 +158,68 @@ def test_two_chains_are_shaped_by_one_command(launch_file: Path, tmp_path: Path)
         assert after["prediction"]
         assert after["spread_ns"] < before["spread_ns"]
     assert (folder / "chain_2" / "latency.png").is_file()
+
+
+def test_a_graph_of_18_callbacks_runs_on_two_cores(robot: Launched) -> None:
+    """Section 5.4 of the paper, at its own pace: 764 ms, of which each path takes up to 560."""
+    chain, nodes = described("experiments/dag.yaml")
+    launched, (first, *_, last) = robot(nodes), available_cores()
+    options = ("--chain", chain, "--cores", f"{last},{first}", "--duration", "80s")
+    values = launched.shaped(*options, name="graph")
+    assert {*values["cores"].values()} == {first, last}
+    assert len(values["cores"]) == 18, "branches that the chain waits for, too"
+    before, after = values["recordings"]
+    assert after["count"] > 80
+    assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 20
+    plan = load_plan(launched.folder / "graph/plan.yaml")
+    assert [one.name for one in plan.servers] == ["chain_core0", "chain_core1", "output"]
+
+
+def test_a_chain_longer_than_its_period_becomes_a_pipeline(robot: Launched) -> None:
+    chain, nodes = described("examples/pipeline.yaml")
+    launched = robot(nodes)
+    options = ("--chain", chain, "--policy", "pipelined", "--duration", "30s")
+    values = launched.shaped(*options, name="pipelined")
+    plan = load_plan(launched.folder / "pipelined/plan.yaml")
+    assert {one.core for one in plan.servers} == set(available_cores()[-2:])
+    assert cycles_until_output(plan) == 1
+    before, after = values["recordings"]
+    assert after["count"] > 200
+    assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 10
+
+
+@pytest.mark.parametrize(
+    "policy", ["server-per-chain", "server-per-callback", "let-per-chain", "let-per-callback"]
+)
+def test_policies_that_shaping_is_compared_with(robot: Launched, policy: str) -> None:
+    launched = robot(PARKING[:6])
+    options = ("--chain", "/raw../rear../pose", "--policy", policy, "--duration", "15s")
+    values = launched.shaped(*options, "--overrun", "wait", "--cores", "1,0", name=policy)
+    plan = load_plan(launched.folder / policy / "plan.yaml")
+    before, after = values["recordings"]
+    assert plan.policy == policy
+    assert after["count"] > 80
+    cycles = cycles_until_output(plan)
+    assert after["percentiles_ns"]["50"] // (100 * MS) == cycles
+    if cycles:
+        assert after["undisturbed"]["spread_ns"] < before["spread_ns"]
+
+
+def test_each_mode_has_the_slot_of_its_own_profile(robot: Launched) -> None:
+    """Recorded apart without LTTng, then in turns every 4 s."""
+    launched, chain = robot(MODES), ("--chain", "/image../command")
+    options = ["--modes", "/driving_mode:city,highway", "--duration", "30s", *chain]
+    for mode in ("city", "highway"):
+        place = str(launched.folder / mode)
+        words = ["-o", place, "--source", "ebpf", "--duration", "20s"]
+        words += [word for node in ("camera", "slow", "planner") for word in ("--node", node)]
+        launched.run("profile", *words, modes=mode)
+        options += ["--mode-profile", f"{mode}={place}"]
+    values = launched.shaped(*options, "--epsilon", "2ms", name="modes")
+    plan = load_plan(launched.folder / "modes/plan.yaml")
+    assert plan.modes is not None
+    assert plan.modes.bands == {"city": 1, "highway": 2}
+    assert plan.evidence.modes is not None
+    longest = {mode: one.max_latency_ns for mode, one in plan.evidence.modes.items()}
+    assert 9 * MS < longest["city"] < 15 * MS < longest["highway"] < 26 * MS
+    assert values["recordings"][1]["count"] > 200

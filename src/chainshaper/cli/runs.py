@@ -13,6 +13,7 @@ from chainshaper.cli.options import (
     CYCLES,
     DESCRIPTIONS,
     JSON,
+    MODE_PROFILE,
     NODE,
     PLAN_WISHES,
     REALTIME,
@@ -24,6 +25,7 @@ from chainshaper.cli.options import (
     NodeKind,
     Source,
     argument,
+    mode_profiles,
     option,
     plan_in_force,
     takes_wishes,
@@ -356,6 +358,7 @@ def shape(
     backend: str = option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     *,
     request: "cs.PlanRequest",
+    mode_profile: list[str] | None = MODE_PROFILE,
     user: list[str] | None = USERS,
     json: bool = JSON,
 ) -> None:
@@ -367,7 +370,7 @@ def shape(
     --realtime are for this, and mean what they mean for `chainshaper plan` and `apply`.
     """
     if len(words) == 2 and words[0].endswith(DESCRIPTIONS):
-        if chain or sink or throttle or request != cs.PlanRequest():
+        if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
         return
@@ -382,6 +385,7 @@ def shape(
         sinks=sink or (),
         throttled=throttled_inputs(throttle or []),
         period_ns=period,
+        mode_recordings=mode_profiles(mode_profile, request),
         duration_ns=duration or SHAPING_DURATION_NS,
         source=source,
         node=node,

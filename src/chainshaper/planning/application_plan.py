@@ -167,14 +167,14 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
 
     See :func:`chainshaper.planning.overruns.open_until_done`; a server whose longer slots would
     meet those of another chain stays as planned. Of several chains, ``waits_ns`` is how long before
-    its cycle each one's timer expires: its thread waits, so that cycles start at their offsets.
+    its cycle each one's timer expires: its thread waits, so that cycles start at their offsets. The
+    first stage of a pipeline waits too, for slots of further stages to count from the same instant.
     """
-    waits = waits_ns if waits_ns and plan.moves_timers else [-WAITING_NS] * len(plan.chains)
-    longer = [
-        server
-        for chain, wait in zip(plan.chains, waits, strict=True)
-        for server in chain_open_until_done(chain, wait + WAITING_NS).servers
-    ]
+    longer: list[Server] = []
+    known_ns = waits_ns or [-WAITING_NS] * len(plan.chains)
+    for chain, wait in zip(plan.chains, known_ns, strict=True):
+        waits = plan.moves_timers or chain.policy == "pipelined"
+        longer += chain_open_until_done(chain, wait + WAITING_NS if waits else 0).servers
     # Of a server of several chains, the longest.
     opened = {one.name: one for one in sorted(longer, key=lambda one: one.slots[-1][1])}
     with contextlib.suppress(ValidationError):

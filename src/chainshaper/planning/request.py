@@ -32,7 +32,7 @@ from chainshaper.planning.margins import (
 )
 from chainshaper.planning.modes import place_modes, with_modes
 from chainshaper.planning.offsets import refuse_common
-from chainshaper.planning.pipeline import pipelined
+from chainshaper.planning.pipeline import pipelined, stage_cores
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     SENDS_PER_SLOT,
@@ -106,8 +106,8 @@ class Profile:
     together: tuple[tuple[str, ...], ...] = ()
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
-    steps_ns: NDArray[np.int64] | None = None
-    every_step_ns: NDArray[np.int64] | None = None
+    steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    every_step_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     fifo_priority: int = 84
     output_depth: int | None = None
     recording: str | None = None
@@ -165,7 +165,7 @@ def plan_chain(
     has. OperationError: no such plan exists; the message names what prevents it. PlatformError: a
     library that only this request needs is not installed.
     """
-    _refuse_contradictions(request, bool(sinks))
+    refuse_contradictions(request, sinks=bool(sinks))
     if request.policy == "pipelined":
         profile = _apart(profile)
     else:
@@ -178,12 +178,7 @@ def plan_chain(
     else:
         finish = partial(_with_policy, profile=profile, request=request)
         margin = _margin(profile, request)
-        if request.bands_of_modes == "found":
-            raise InputError(
-                "nothing says which mode was in force while latencies were measured, so none has a"
-                " slot that can be found: give the modes' own profiles (--mode-profile MODE=REC),"
-                " or record an application whose description `announces` them"
-            )
+        refuse_unknown_bands(request)
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
         raise OperationError(
@@ -222,11 +217,14 @@ def plan_chain(
 
 def _apart(profile: Profile) -> Profile:
     """The profile of a chain whose instances do not overlap: what its callbacks took, in sum."""
-    steps, every = profile.steps_ns, profile.every_step_ns
-    if steps is None or every is None or len(profile.callbacks) > len(profile.nodes):
+    steps, every, name = profile.steps_ns, profile.every_step_ns, profile.name or "a chain"
+    if not steps.size:
+        raise InputError(f"{name}: stages are cut by what callbacks took: plan from a recording")
+    if beside := sorted({one.node for one in profile.callbacks} - {*profile.nodes}):
         raise InputError(
-            f"{profile.name or 'a chain'}: stages are cut from a single path, by what each of its"
-            " callbacks took: plan from a recording, a chain without branches that it waits for"
+            f"{name} waits for {', '.join(beside)} beside it, whose work would begin in a stage"
+            " while the instance before is there, and delay it: stages are cut from a single path."
+            " Begin the chain behind the callback that waits, or give it a longer period"
         )
     return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
 
@@ -247,7 +245,8 @@ def cores_for(
     request: PlanRequest = _STANDARD,
     worth: float = 0.0,
 ) -> dict[str, int]:
-    """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`.
+    """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`
+    and, for stages, :func:`.stage_cores`.
 
     Raises InputError: a profile has no callbacks, being bare latencies.
     """
@@ -256,6 +255,9 @@ def cores_for(
             f"--cores distributes callbacks, and latencies do not tell those of {bare[0]}: plan"
             " from a recording"
         )
+    if request.policy == "pipelined":
+        staged = (stage_cores(p.nodes, _apart(p).steps_ns, p.period_ns, cores) for p in profiles)
+        return {node: core for own in staged for node, core in own.items()}
     margin = EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
     work = [Work((p.begins, p.period_ns), p.period_ns, p.callbacks, margin) for p in profiles]
     together = [group for profile in profiles for group in profile.together]
@@ -459,8 +461,8 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
             f"the policy {request.policy} needs the chain's callbacks, which latencies do not tell:"
             " plan from a recording"
         )
-    steps, every = profile.steps_ns, profile.every_step_ns
-    if request.policy == "pipelined" and steps is not None and every is not None:
+    if request.policy == "pipelined":
+        steps, every = profile.steps_ns, profile.every_step_ns
         if profile.all_disturbed:
             steps = every[every.sum(axis=1) <= profile.longest_ns]
         return pipelined(plan, profile.nodes, steps, profile.core_of, request.cores)
@@ -469,7 +471,18 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     return let_per_callback(plan, profile.topics, profile.nodes)
 
 
-def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
+def refuse_unknown_bands(request: PlanRequest) -> None:
+    """Where no mode's latencies are known, each mode must have the number of its band."""
+    if request.bands_of_modes == "found":
+        raise InputError(
+            "nothing says which mode was in force while latencies were measured, so none has a"
+            " slot that can be found: give the modes' own profiles (--mode-profile MODE=REC),"
+            " or record an application whose description `announces` them"
+        )
+
+
+def refuse_contradictions(request: PlanRequest, *, sinks: bool = False) -> None:
+    """Refuse wishes that exclude each other, whatever was measured."""
     if request.epsilon_ns is not None and request.overrun_probability is not None:
         raise InputError(
             "the margin is either given or covers a share of the cycles: leave out --epsilon or the"
