@@ -245,7 +245,7 @@ def _record_and_show(
         )
 
 
-@takes_wishes("cores")
+@takes_wishes("cores", "policy")
 def profile(
     output: Path = RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,

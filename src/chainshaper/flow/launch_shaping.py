@@ -47,11 +47,7 @@ from chainshaper.planning import (
     save_application_plan,
 )
 from chainshaper.planning.application_plan import whole
-from chainshaper.planning.request import (
-    refuse_contradictions,
-    refuse_entangled,
-    refuse_unknown_bands,
-)
+from chainshaper.planning.request import refuse_contradictions, refuse_entangled
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
@@ -122,7 +118,7 @@ def shape_launch(
     launch = parse_launch_command(command)
     request = request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
-    _refuse_early(request, chains, sinks, throttled, mode_recordings)
+    _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
     if node != "python":
         check_build_tools()
     folder, stop = refuse_existing(folder), stop or threading.Event()
@@ -159,7 +155,7 @@ def shape_launch(
     chains = chains or [_chosen(first, choose)]
     wanted = (*chains, *sinks)
     seen, core_of = profiled_cores(first, wanted, request, period_ns)
-    _refuse_at_first_look(request, chains, sinks, seen)
+    _refuse_at_first_look(seen, len(chains), request)
     permitted = may_use_fifo()  # else it is measured under ordinary scheduling
     found = [] if permitted else [NOT_PERMITTED]
     measured: dict[int, tuple[Recording, Profile]] = {}
@@ -174,10 +170,7 @@ def shape_launch(
         )
         found += before.info.notes
         profiles = profile_chains(
-            *(before, own),
-            period_ns=period_ns,
-            modes=request.modes,
-            mode_recordings=mode_recordings,
+            before, own, period_ns=period_ns, modes=request.modes, mode_recordings=mode_recordings
         )
         measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
     progress(0.0, "planning")
@@ -225,12 +218,10 @@ def _refuse_early(
     chains: Sequence[str],
     sinks: Sequence[str],
     throttled: Sequence[ThrottledInput],
-    mode_recordings: Collection[str],
+    modes: bool,
 ) -> None:
     """What need not be tried: it would be refused minutes later."""
-    refuse_contradictions(request, sinks=bool(sinks))
-    if not mode_recordings:
-        refuse_unknown_bands(request)
+    refuse_contradictions(request, sinks=bool(sinks), modes=modes)
     check_cores(dict.fromkeys(request.cores or (), "--cores"))
     if sinks and len(chains) > 1:
         raise InputError("--sink goes with one chain: name each output with a --chain of its own")
@@ -241,23 +232,19 @@ def _refuse_early(
         )
 
 
-def _refuse_at_first_look(
-    request: PlanRequest, chains: Sequence[str], sinks: Sequence[str], seen: Sequence[Profile]
-) -> None:
+def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanRequest) -> None:
     """What is not to be had of these chains, however long they take."""
-    refuse_entangled(seen, request.policy, sinks=bool(sinks))
+    refuse_entangled(seen, request.policy, sinks=len(seen) > chains)
     if seen and request.policy != "shaped":
         with suppress(OperationError):
-            _planned(seen, len(chains), request)
+            _planned(seen, chains, request)
 
 
 def _planned(
     profiles: Sequence[Profile], chains: int, request: PlanRequest
 ) -> tuple[ApplicationPlan, list[str]]:
-    """The plan for the first of the profiles and its sinks, or for all; cores as measured, but
-    that stages may have one twice.
-    """
-    if request.policy != "pipelined":
+    """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
+    if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
     if chains > 1:
         return plan_application(profiles, request)

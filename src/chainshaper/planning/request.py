@@ -9,6 +9,7 @@ that were measured while nothing was shaped: shaping a topic that another chain'
 makes that one later than was measured, and its slot too early. Such chains are refused.
 """
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -165,7 +166,7 @@ def plan_chain(
     has. OperationError: no such plan exists; the message names what prevents it. PlatformError: a
     library that only this request needs is not installed.
     """
-    refuse_contradictions(request, sinks=bool(sinks))
+    refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
     if request.policy == "pipelined":
         profile = _apart(profile)
     else:
@@ -178,7 +179,6 @@ def plan_chain(
     else:
         finish = partial(_with_policy, profile=profile, request=request)
         margin = _margin(profile, request)
-        refuse_unknown_bands(request)
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
         raise OperationError(
@@ -220,11 +220,10 @@ def _apart(profile: Profile) -> Profile:
     steps, every, name = profile.steps_ns, profile.every_step_ns, profile.name or "a chain"
     if not steps.size:
         raise InputError(f"{name}: stages are cut by what callbacks took: plan from a recording")
-    if beside := sorted({one.node for one in profile.callbacks} - {*profile.nodes}):
+    if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
         raise InputError(
-            f"{name} waits for {', '.join(beside)} beside it, whose work would begin in a stage"
-            " while the instance before is there, and delay it: stages are cut from a single path."
-            " Begin the chain behind the callback that waits, or give it a longer period"
+            f"{name} waits for {', '.join(beside)} beside it, which would begin while the instance"
+            " before is in that stage, and delay it: begin the chain behind what waits for them"
         )
     return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
 
@@ -471,18 +470,14 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     return let_per_callback(plan, profile.topics, profile.nodes)
 
 
-def refuse_unknown_bands(request: PlanRequest) -> None:
-    """Where no mode's latencies are known, each mode must have the number of its band."""
-    if request.bands_of_modes == "found":
+def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> None:
+    """Refuse wishes that nothing fulfils, with further ``sinks``, and ``modes`` measured or not."""
+    if request.bands_of_modes == "found" and not (modes and request.policy == "shaped"):
         raise InputError(
             "nothing says which mode was in force while latencies were measured, so none has a"
             " slot that can be found: give the modes' own profiles (--mode-profile MODE=REC),"
             " or record an application whose description `announces` them"
         )
-
-
-def refuse_contradictions(request: PlanRequest, *, sinks: bool = False) -> None:
-    """Refuse wishes that exclude each other, whatever was measured."""
     if request.epsilon_ns is not None and request.overrun_probability is not None:
         raise InputError(
             "the margin is either given or covers a share of the cycles: leave out --epsilon or the"
