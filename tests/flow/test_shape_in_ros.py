@@ -9,7 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, TypeAlias
 
 import pytest
 from ros2 import ros2_environment
@@ -73,8 +73,7 @@ def described(path: str) -> tuple[str, list[str]]:
     lines = []
     for name, node in application.nodes.items():
         (callback,) = node.callbacks
-        execution = callback.execution
-        times = execution.uniform_ns or [execution.constant_ns or 0] * 2
+        times = callback.execution.uniform_ns or [callback.execution.constant_ns or 0] * 2
         inputs = callback.synchronises or [callback.subscription]
         how = ["every", str(callback.timer_ns // MS)] if callback.timer_ns else ["on", *inputs]
         words = [name, *(callback.publishes or "-"), *(str(one / MS) for one in times), *how]
@@ -95,49 +94,35 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "vertex"
 
 
-class Robot(NamedTuple):
-    """A launch file, and where all that is made of it goes."""
-
-    file: Path
-    folder: Path
-
-    def run(self, verb: str, *words: str, modes: str = "city highway") -> dict[str, Any]:
-        """What a verb says, of this robot behind `--`."""
-        domain = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100), "MODES": modes}
-        environment = {**ros2_environment(), **domain, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-        command = [sys.executable, "-m", "chainshaper", verb, *words, "--json", "--"]
-        command += ["ros2", "launch", str(self.file)]
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
-        assert run.returncode == 0, run.stderr[-3000:]
-        values: dict[str, Any] = json.loads(run.stdout)
-        return values
-
-    def shaped(self, *options: str, name: str = "shaped") -> dict[str, Any]:
-        return self.run("shape", "-o", str(self.folder / name), *options)
+Result: TypeAlias = tuple[dict[str, Any], Path]
+"""What a verb says, and the folder that it made."""
 
 
 @pytest.fixture
-def robot(program: Path, tmp_path: Path) -> Callable[[list[str]], Robot]:
-    def launched(nodes: list[str]) -> Robot:
-        folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path))
-        file = tmp_path / "robot.launch.py"
-        text = LAUNCH.replace("{program!r}", repr(str(program)))
-        file.write_text(text.replace("{nodes!r}", repr(nodes)))
-        return Robot(file, folder)
+def run(program: Path, tmp_path: Path) -> Callable[..., Result]:
+    """Run a verb on what launches such nodes."""
 
-    return launched
+    def run(nodes: list[str], verb: str, name: str, *words: str, modes: str = "") -> Result:
+        domain = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100), "MODES": modes}
+        environment = {**ros2_environment(), **domain, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+        folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / name
+        file, text = tmp_path / "robot.launch.py", LAUNCH.replace("{nodes!r}", repr(nodes))
+        file.write_text(text.replace("{program!r}", repr(str(program))))
+        command = [sys.executable, "-m", "chainshaper", verb, "-o", str(folder), *words, "--json"]
+        command += ["--", "ros2", "launch", str(file)]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        assert run.returncode == 0, run.stderr[-3000:]
+        return json.loads(run.stdout), folder
+
+    return run
 
 
-Launched = Callable[[list[str]], Robot]
-
-
-def test_two_chains_are_shaped_by_one_command(robot: Launched) -> None:
-    launched, (first, *_, last) = robot(PARKING), available_cores()
-    chains = ["/raw../rear../pose", "/ticked../commands"]
+def test_two_chains_are_shaped_by_one_command(run: Callable[..., Result]) -> None:
+    (first, *_, last), chains = available_cores(), ["/raw../rear../pose", "/ticked../commands"]
     options = ["--cores", f"{last},{first}", "--epsilon", "2ms", "--duration", "30s"]
-    values = launched.shaped(*options, *(word for chain in chains for word in ("--chain", chain)))
+    options += [word for chain in chains for word in ("--chain", chain)]
+    values, folder = run(PARKING, "shape", "shaped", *options)
 
-    folder = launched.folder / "shaped"
     cores = values["cores"]
     beside, *others = (cores[f"/{one}"] for one in ("front_filter", "throttler", "fusion", "ndt"))
     assert (beside, {*others}) == (first, {last}), "a branch that the chain waits for"
@@ -160,27 +145,25 @@ def test_two_chains_are_shaped_by_one_command(robot: Launched) -> None:
     assert (folder / "chain_2" / "latency.png").is_file()
 
 
-def test_a_graph_of_18_callbacks_runs_on_two_cores(robot: Launched) -> None:
+def test_a_graph_of_18_callbacks_runs_on_two_cores(run: Callable[..., Result]) -> None:
     """Section 5.4 of the paper, at its own pace: 764 ms, of which each path takes up to 560."""
-    chain, nodes = described("experiments/dag.yaml")
-    launched, (first, *_, last) = robot(nodes), available_cores()
+    (chain, nodes), (first, *_, last) = described("experiments/dag.yaml"), available_cores()
     options = ("--chain", chain, "--cores", f"{last},{first}", "--duration", "80s")
-    values = launched.shaped(*options, name="graph")
-    assert {*values["cores"].values()} == {first, last}
+    values, folder = run(nodes, "shape", "graph", *options)
     assert len(values["cores"]) == 18, "branches that the chain waits for, too"
+    assert {*values["cores"].values()} == {first, last}
     before, after = values["recordings"]
     assert after["count"] > 80
     assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 20
-    plan = load_plan(launched.folder / "graph/plan.yaml")
-    assert [one.name for one in plan.servers] == ["chain_core0", "chain_core1", "output"]
+    servers = load_plan(folder / "plan.yaml").servers
+    assert [one.name for one in servers] == ["chain_core0", "chain_core1", "output"]
 
 
-def test_a_chain_longer_than_its_period_becomes_a_pipeline(robot: Launched) -> None:
+def test_a_chain_longer_than_its_period_becomes_a_pipeline(run: Callable[..., Result]) -> None:
     chain, nodes = described("examples/pipeline.yaml")
-    launched = robot(nodes)
     options = ("--chain", chain, "--policy", "pipelined", "--duration", "30s")
-    values = launched.shaped(*options, name="pipelined")
-    plan = load_plan(launched.folder / "pipelined/plan.yaml")
+    values, folder = run(nodes, "shape", "pipelined", *options)
+    plan = load_plan(folder / "plan.yaml")
     assert {one.core for one in plan.servers} == set(available_cores()[-2:])
     assert cycles_until_output(plan) == 1
     before, after = values["recordings"]
@@ -191,32 +174,29 @@ def test_a_chain_longer_than_its_period_becomes_a_pipeline(robot: Launched) -> N
 @pytest.mark.parametrize(
     "policy", ["server-per-chain", "server-per-callback", "let-per-chain", "let-per-callback"]
 )
-def test_policies_that_shaping_is_compared_with(robot: Launched, policy: str) -> None:
-    launched = robot(PARKING[:6])
+def test_policies_that_shaping_is_compared_with(run: Callable[..., Result], policy: str) -> None:
     options = ("--chain", "/raw../rear../pose", "--policy", policy, "--duration", "15s")
-    values = launched.shaped(*options, "--overrun", "wait", "--cores", "1,0", name=policy)
-    plan = load_plan(launched.folder / policy / "plan.yaml")
+    values, folder = run(PARKING[:6], "shape", policy, *options, "--overrun", "wait")
+    plan = load_plan(folder / "plan.yaml")
     before, after = values["recordings"]
     assert plan.policy == policy
     assert after["count"] > 80
-    cycles = cycles_until_output(plan)
-    assert after["percentiles_ns"]["50"] // (100 * MS) == cycles
-    if cycles:
+    assert after["percentiles_ns"]["50"] // (100 * MS) == cycles_until_output(plan)
+    if plan.shaping_node is not None:
         assert after["undisturbed"]["spread_ns"] < before["spread_ns"]
 
 
-def test_each_mode_has_the_slot_of_its_own_profile(robot: Launched) -> None:
-    """Recorded apart without LTTng, then in turns every 4 s."""
-    launched, chain = robot(MODES), ("--chain", "/image../command")
-    options = ["--modes", "/driving_mode:city,highway", "--duration", "30s", *chain]
+def test_each_mode_has_the_slot_of_its_own_profile(run: Callable[..., Result]) -> None:
+    """Recorded apart, without LTTng, and then in turns every 4 s."""
+    options = ["--modes", "/driving_mode:city,highway", "--chain", "/image../command"]
     for mode in ("city", "highway"):
-        place = str(launched.folder / mode)
-        words = ["-o", place, "--source", "ebpf", "--duration", "20s"]
+        words = ["--source", "ebpf", "--duration", "20s"]
         words += [word for node in ("camera", "slow", "planner") for word in ("--node", node)]
-        launched.run("profile", *words, modes=mode)
+        _, place = run(MODES, "profile", mode, *words, modes=mode)
         options += ["--mode-profile", f"{mode}={place}"]
-    values = launched.shaped(*options, "--epsilon", "2ms", name="modes")
-    plan = load_plan(launched.folder / "modes/plan.yaml")
+    options += ["--epsilon", "2ms", "--duration", "30s"]
+    values, folder = run(MODES, "shape", "modes", *options, modes="city highway")
+    plan = load_plan(folder / "plan.yaml")
     assert plan.modes is not None
     assert plan.modes.bands == {"city": 1, "highway": 2}
     assert plan.evidence.modes is not None
