@@ -78,9 +78,8 @@ def plan(
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     wanted: list[str | None] = [*chain] if chain else [None]
-    known: dict[str, Any] = {"modes": request.modes}
-    known["mode_recordings"] = mode_profiles(mode_profile, request)
-    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], **known)
+    modes = {"modes": request.modes, "mode_recordings": mode_profiles(mode_profile, request)}
+    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], **modes)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     if len(planned) > 1:
         if sinks or curve is not None:

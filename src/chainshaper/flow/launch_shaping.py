@@ -19,7 +19,6 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
@@ -88,7 +87,7 @@ def shape_launch(
     choose: Choose | None = None,
     request: PlanRequest | None = None,
     period_ns: int | None = None,
-    mode_recordings: Mapping[str, str | Path] = MappingProxyType({}),
+    mode_recordings: Mapping[str, str | Path] | None = None,
     duration_ns: int = 60_000_000_000,
     source: Literal["lttng", "ebpf"] = "lttng",
     node: NodeKind = "python",
@@ -115,9 +114,9 @@ def shape_launch(
         PlatformError: there is no such core. PlatformError, OperationError: a step failed; what the
             steps before it left is kept.
     """
-    launch = parse_launch_command(command)
-    request = request or PlanRequest()
+    launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
+    known: Any = {"modes": request.modes, "mode_recordings": mode_recordings or {}}
     _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
     if node != "python":
         check_build_tools()
@@ -169,9 +168,7 @@ def shape_launch(
             watch_stalls=True,
         )
         found += before.info.notes
-        profiles = profile_chains(
-            before, own, period_ns=period_ns, modes=request.modes, mode_recordings=mode_recordings
-        )
+        profiles = profile_chains(before, own, period_ns=period_ns, **known)
         measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
     progress(0.0, "planning")
     plan, remarks = _planned([measured[k][1] for k in range(len(wanted))], len(chains), request)

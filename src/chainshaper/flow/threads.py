@@ -300,8 +300,7 @@ def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
 
 
 def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
-    """The thread that begins each chain: the first executor of its server whose slot comes first,
-    but for shaping nodes, which may publish the cycle before then.
+    """The thread that begins each chain: the first executor, of no shaping node, by servers' slots.
 
     Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
     """

@@ -94,10 +94,8 @@ def pipelined(
 def stage_cores(
     nodes: Sequence[str], steps_ns: NDArray[np.int64], cycle_ns: int, cores: Sequence[int]
 ) -> dict[str, int]:
-    """Where to measure these nodes: on the core of their stage, by what is usual, without a margin.
-
-    On one core the instances of such a chain would pile up. Where no cut fits, for whatever ran
-    beside it, the cores have as much to do as each other, more or less.
+    """Where to measure nodes, so that instances do not pile up: on the core of their stage, by the
+    medians, without a margin. Where no cut fits, the fullest stage has as little to do as can be.
     """
     usual, cuts = _longest(np.median(steps_ns, axis=0, keepdims=True)), _cuts(nodes)
     cycles = (cycle_ns * tenths // 10 for tenths in count(10))

@@ -198,8 +198,8 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
     ``core_of`` names the core of every node that takes part, also on branches that the chain waits
-    for and that the plan does not know yet. Servers come in the order of the nodes, so that the one
-    with the first node is first: with its timer the cycle begins.
+    for and that the plan does not know yet. The server of the first node, whose timer begins the
+    cycle, comes first.
 
     Raises InputError: a node of the plan is missing.
     """
