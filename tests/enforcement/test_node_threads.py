@@ -301,8 +301,8 @@ def test_the_cycle_begins_with_the_first_node() -> None:
     named = {"output": "/out", "publisher": "/b", "nodes": ("/a", "/b")}
     plan = plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS, **named)  # type: ignore[arg-type]
     plan = over_cores(plan, {"/a": 1, "/b": 0})
-    nodes = ("/b", "/chainshaper_out", "/a")
-    found = _allocation(*(_node(name, pid, "executor") for pid, name in enumerate(nodes)))
+    nodes = enumerate(("/b", "/chainshaper_out", "/a"))
+    found = _allocation(*(_node(name, pid, "executor") for pid, name in nodes))
     for one in (plan, let_per_chain(plan)):
         assert [thread.pid for thread in first_threads(whole(one), found)] == [2]
 

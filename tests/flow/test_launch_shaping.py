@@ -47,7 +47,6 @@ def test_what_cannot_be_shaped_is_refused_before_anything_is_launched(
         "--throttle /in=100ms": "as in --throttle NODE:/in=PERIOD",
         "--throttle /node:/in": "write a topic and a period",
         "--policy pipelined --sink /a../e": "further sinks are shaped",
-        "--policy let-per-chain --bands 2": "--bands places latency bands",
         "--modes /mode:city,highway": "nothing says which mode was in force",
         "--mode-profile city=before": "goes with --modes",
     }.items():
