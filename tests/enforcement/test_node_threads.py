@@ -28,7 +28,7 @@ from chainshaper.enforcement.threads import (
     server_members,
     server_priorities,
 )
-from chainshaper.flow.threads import check_publishers
+from chainshaper.flow.threads import check_publishers, first_threads
 from chainshaper.linux.processes import Process, read_process
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, role_of
@@ -36,6 +36,7 @@ from chainshaper.planning import plan_shaping
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.plan import Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread
+from chainshaper.planning.shaping import let_per_chain, over_cores
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import EndpointInfo, Recording, RecordingInfo
 
@@ -292,6 +293,17 @@ def test_servers_stand_below_dds_in_the_order_of_their_priority() -> None:
         201: Scheduling(90, (0,)),
         # Best effort, unknown threads and other processes are left alone.
     }
+
+
+def test_the_cycle_begins_with_the_first_node() -> None:
+    """Not with one on a core of a lower number, nor with a shaping node, though it is due first."""
+    named = {"output": "/out", "publisher": "/b", "nodes": ("/a", "/b")}
+    plan = plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS, **named)  # type: ignore[arg-type]
+    plan = over_cores(plan, {"/a": 1, "/b": 0})
+    nodes = enumerate(("/b", "/chainshaper_out", "/a"))
+    found = _allocation(*(_node(name, pid, "executor") for pid, name in nodes))
+    for one in (plan, let_per_chain(plan)):
+        assert [thread.pid for thread in first_threads(whole(one), found)] == [2]
 
 
 def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:

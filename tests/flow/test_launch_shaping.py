@@ -46,6 +46,9 @@ def test_what_cannot_be_shaped_is_refused_before_anything_is_launched(
         "--chain /a../b --chain /c../d --sink /a../e": "--sink goes with one chain",
         "--throttle /in=100ms": "as in --throttle NODE:/in=PERIOD",
         "--throttle /node:/in": "write a topic and a period",
+        "--policy pipelined --sink /a../e": "further sinks are shaped",
+        "--modes /mode:city,highway": "nothing says which mode was in force",
+        "--mode-profile city=before": "goes with --modes",
     }.items():
         assert reason in refused(2, "shape", *words.split(), *launch)
     assert not (tmp_path / "out").exists()

@@ -183,11 +183,11 @@ def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
 def test_shaping_opens_a_server_on_each_core_of_the_graph() -> None:
     plan = plan_recording(_recorded(), CHAIN, PlanRequest(epsilon_ns=2 * MS))
     assert [(server.name, server.core) for server in plan.servers] == [
-        ("chain_core0", 0),
         ("chain_core1", 1),
+        ("chain_core0", 0),
         ("output", 1),
     ]
-    assert [thread.node for thread in plan.servers[0].threads] == ["/front_filter"]
+    assert [thread.node for thread in plan.servers[1].threads] == ["/front_filter"]
     apart = plan_recording(_recorded(), CHAIN, PlanRequest(epsilon_ns=2 * MS, first_slot_ns=2 * MS))
     assert _slots_ms(apart)["first"] == [(0, 2)]
 

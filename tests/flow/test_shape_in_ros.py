@@ -1,22 +1,22 @@
-"""Chains of a real `ros2 launch` shaped by one command.
+"""A real `ros2 launch` of C++ nodes that compute, shaped by one command.
 
-Two chains, one of them over two cores: valley parking in small (paper, section 5.1), whose front
-filter runs beside the rear one on a core of its own; the second shares a core with it. And one
-whose output a thread of Fast DDS publishes, which is held until its slot (design 1).
+``CHAINSHAPER_SHAPED=FOLDER`` has the recordings written there.
 """
 
 import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import pytest
 from ros2 import ros2_environment
 
-from chainshaper import load_application_plan, open_recording
+from chainshaper import load_application, load_application_plan, load_plan, open_recording
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
+from chainshaper.planning.overruns import cycles_until_output
 
 pytestmark = [
     pytest.mark.ros2,
@@ -26,38 +26,57 @@ pytestmark = [
 ]
 
 HERE = Path(__file__).parent
-Run: TypeAlias = subprocess.CompletedProcess[str]
+MS = 1_000_000
 LAUNCH = """
+import json
+import os
 from launch import LaunchDescription
 from launch_ros.actions import Node
-
+NODES = {nodes!r}
+ASYNCHRONOUS = json.loads(os.environ['ASYNCHRONOUS'])
 
 def generate_launch_description():
-    words = [line.split() for line in {nodes!r}.split('\\n') if line]
-    return LaunchDescription([
-        Node(executable={program!r}, name=name, arguments=rest,
-             prefix='chrt -f 60' if name == 'reader' else '',  # whatever else runs here
-             additional_env={profiles!r} if name == 'control' else {{}})
-        for name, *rest in words
-    ])
+    nodes = []
+    for name, *words in (line.replace('MODES', os.environ['MODES']).split() for line in NODES):
+        slow = {'twice_in': 'highway' if name == 'slow' else ''}
+        nodes.append(Node(
+            executable={program!r}, name=name, arguments=words, parameters=[slow],
+            prefix='chrt -f 60' if name == 'reader' else '',  # whatever else runs here
+            additional_env=ASYNCHRONOUS if name == 'control' else {},
+        ))
+    return LaunchDescription(nodes)
 """
-PARKING = """
-throttler    /raw      0.2  0.5  every 100
-rear_filter  /rear     1    4    on /raw
-front_filter /front    1    5    on /raw
-fusion       /fused    0.2  1    on /rear /front
-ndt          /pose     1    5    on /fused
-planner      -         0    0.01 on /pose
-tick         /ticked   0.2  1    every 50
-control      /commands 0.5  3    on /ticked
-motor        -         0    0.01 on /commands
-"""
-DRIVING = """
-tick     /ticked    0.2  1     every 100
-work     /worked    2    15    on /ticked
-control  /commands  1    10    on /worked
-reader   -          0    0.01  on /commands
-"""
+PARKING = [
+    "throttler    /raw      0.2  0.5  every 100",
+    "rear_filter  /rear     1    4    on /raw",
+    "front_filter /front    1    5    on /raw",
+    "fusion       /fused    0.2  1    on /rear /front",
+    "ndt          /pose     1    5    on /fused",
+    "planner      -         0    0.01 on /pose",
+    "tick         /ticked   0.2  1    every 50",
+    "control      /commands 0.5  3    on /ticked",
+    "motor        -         0    0.01 on /commands",
+]
+"""Valley parking in small (section 5.1): the front filter runs beside the rear one on a core of its
+own. A second chain shares a core with it."""
+
+MODES = [
+    "camera  /image   1 2 every 100",
+    "slow    /objects 5 9 on /image",
+    "planner /command 1 3 on /objects",
+    "motor   -        0 0.01 on /command",
+    "driver  /driving_mode modes 4 MODES",
+]
+
+
+DRIVING = [
+    "tick     /ticked    0.2  1     every 100",
+    "work     /worked    2    15    on /ticked",
+    "control  /commands  1    10    on /worked",
+    "reader   -          0    0.01  on /commands",
+]
+"""What `control` publishes leaves by a thread of Fast DDS, if it is told so (design 1)."""
+
 PROFILES = """
 <dds xmlns="http://www.eprosima.com/XMLSchemas/fastRTPS_Profiles"><profiles>
   <data_writer profile_name="{topic}">
@@ -68,8 +87,20 @@ PROFILES = """
 """
 
 
+def described(path: str) -> tuple[str, list[str]]:
+    """The chain of a description, and a line for each of its nodes."""
+    application, lines = load_application(HERE.parents[1] / path), []
+    for name, node in application.nodes.items():
+        (callback,) = node.callbacks
+        least, most = callback.execution.uniform_ns or [callback.execution.constant_ns or 0] * 2
+        inputs = " ".join(callback.synchronises or [callback.subscription or ""])
+        how = f"every {callback.timer_ns // MS}" if callback.timer_ns else f"on {inputs}"
+        lines.append(f"{name} {(*callback.publishes, '-')[0]} {least / MS} {most / MS} {how}")
+    return application.chain, lines
+
+
 @pytest.fixture(scope="module")
-def program(tmp_path_factory: pytest.TempPathFactory) -> str:
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A node of C++, which is built first."""
     folder = tmp_path_factory.mktemp("nodes")
     for step in (["-S", str(HERE), "-B", str(folder)], ["--build", str(folder)]):
@@ -78,28 +109,46 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> str:
             command, env=ros2_environment(), capture_output=True, text=True, check=False
         )
         assert run.returncode == 0, run.stdout + run.stderr
-    return str(folder / "vertex")
+    return folder / "vertex"
 
 
-def _shaped(file: Path, text: str, *options: str, **variables: str) -> Run:
-    """What shaping a launch file says, into the folder `shaped` beside it."""
-    file.write_text(text)
-    domain = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100), **variables}
-    environment = {**ros2_environment(), **domain, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    command = [sys.executable, "-m", "chainshaper", "shape", "-o", str(file.parent / "shaped")]
-    command += [*options, "--epsilon", "2ms", "--json", "--", "ros2", "launch", str(file)]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+Result: TypeAlias = tuple[dict[str, Any], Path]
+"""What a verb says of what launches such nodes, and the folder that it made."""
+Attempt: TypeAlias = tuple[subprocess.CompletedProcess[str], Path]
 
 
-def test_two_chains_are_shaped_by_one_command(program: str, tmp_path: Path) -> None:
-    folder, (first, *_, last) = tmp_path / "shaped", available_cores()
-    chains = ["/raw../rear../pose", "/ticked../commands"]
-    options = ["--cores", f"{last},{first}", "--duration", "30s"]
+@pytest.fixture
+def attempt(program: Path, tmp_path: Path) -> Callable[..., Attempt]:
+    def attempt(nodes: list[str], verb: str, name: str, *words: str, **variables: str) -> Attempt:
+        known = {"MODES": "", "ASYNCHRONOUS": "{}", "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
+        environment = {**ros2_environment(), **known, **variables}
+        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / name
+        file, text = tmp_path / "robot.launch.py", LAUNCH.replace("{nodes!r}", repr(nodes))
+        file.write_text(text.replace("{program!r}", repr(str(program))))
+        command = [sys.executable, "-m", "chainshaper", verb, "-o", str(folder), *words, "--json"]
+        command += ["--", "ros2", "launch", str(file)]
+        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        return run, folder
+
+    return attempt
+
+
+@pytest.fixture
+def run(attempt: Callable[..., Attempt]) -> Callable[..., Result]:
+    def run(*arguments: Any, **variables: str) -> Result:
+        done, folder = attempt(*arguments, **variables)
+        assert done.returncode == 0, done.stderr[-3000:]
+        return json.loads(done.stdout), folder
+
+    return run
+
+
+def test_two_chains_are_shaped_by_one_command(run: Callable[..., Result]) -> None:
+    (first, *_, last), chains = available_cores(), ["/raw../rear../pose", "/ticked../commands"]
+    options = ["--cores", f"{last},{first}", "--epsilon", "2ms", "--duration", "30s"]
     options += [word for chain in chains for word in ("--chain", chain)]
-    text = LAUNCH.format(nodes=PARKING, program=program, profiles={})
-    run = _shaped(tmp_path / "parking.launch.py", text, *options)
-    assert run.returncode == 0, run.stderr[-3000:]
-    values: dict[str, Any] = json.loads(run.stdout)
+    values, folder = run(PARKING, "shape", "shaped", *options)
 
     cores = values["cores"]
     beside, *others = (cores[f"/{one}"] for one in ("front_filter", "throttler", "fusion", "ndt"))
@@ -123,27 +172,84 @@ def test_two_chains_are_shaped_by_one_command(program: str, tmp_path: Path) -> N
     assert (folder / "chain_2" / "latency.png").is_file()
 
 
-def _driving(program: str, folder: Path, topic: str, duration: str) -> Run:
+def test_a_graph_of_18_callbacks_runs_on_two_cores(run: Callable[..., Result]) -> None:
+    """Section 5.4 of the paper, at its own pace: 764 ms, of which each path takes up to 560."""
+    (chain, nodes), (first, *_, last) = described("experiments/dag.yaml"), available_cores()
+    options = ("--chain", chain, "--cores", f"{last},{first}", "--duration", "120s")
+    values, folder = run(nodes, "shape", "graph", *options)
+    cores = values["cores"].values()
+    assert (len(cores), {*cores}) == (18, {first, last}), "branches that the chain waits for, too"
+    before, after = values["recordings"]
+    assert after["count"] > 80
+    assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 10
+    servers = load_plan(folder / "plan.yaml").servers
+    assert [one.name for one in servers] == ["chain_core1", "chain_core0", "output"]
+
+
+def test_a_chain_longer_than_its_period_becomes_a_pipeline(run: Callable[..., Result]) -> None:
+    chain, nodes = described("examples/pipeline.yaml")
+    options = ("--chain", chain, "--policy", "pipelined", "--duration", "30s")
+    values, folder = run(nodes, "shape", "pipelined", *options)
+    plan = load_plan(folder / "plan.yaml")
+    assert {one.core for one in plan.servers} == set(available_cores()[-2:])
+    assert cycles_until_output(plan) == 1
+    before, after = values["recordings"]
+    assert after["count"] > 100
+    assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 10
+
+
+@pytest.mark.parametrize(
+    "policy", ["server-per-chain", "server-per-callback", "let-per-chain", "let-per-callback"]
+)
+def test_policies_that_shaping_is_compared_with(run: Callable[..., Result], policy: str) -> None:
+    options = ("--chain", "/raw../rear../pose", "--policy", policy, "--duration", "20s")
+    values, folder = run(PARKING[:6], "shape", policy, *options, "--overrun", "wait")
+    plan = load_plan(folder / "plan.yaml")
+    before, after = values["recordings"]
+    assert (plan.policy, after["count"] > 40) == (policy, True)
+    assert after["percentiles_ns"]["50"] // (100 * MS) == cycles_until_output(plan)
+    if plan.shaping_node is not None:
+        assert after["undisturbed"]["spread_ns"] < before["spread_ns"]
+
+
+def test_each_mode_has_the_slot_of_its_own_profile(run: Callable[..., Result]) -> None:
+    """Recorded apart, and then in turns, 4 s each."""
+    options = ["--modes", "/driving_mode:city,highway", "--chain", "/image../command"]
+    for mode in ("city", "highway"):
+        nodes = [word for node in ("camera", "slow", "planner") for word in ("--node", node)]
+        _, place = run(MODES, "profile", mode, *nodes, "--duration", "20s", MODES=mode)
+        options += ["--mode-profile", f"{mode}={place}"]
+    options += ["--epsilon", "2ms", "--duration", "30s"]
+    values, folder = run(MODES, "shape", "modes", *options, MODES="city highway")
+    plan = load_plan(folder / "plan.yaml")
+    assert plan.modes is not None
+    assert plan.modes.bands == {"city": 1, "highway": 2}
+    longest = {mode: one.max_latency_ns for mode, one in (plan.evidence.modes or {}).items()}
+    assert 9 * MS < longest["city"] < 15 * MS < longest["highway"] < 26 * MS
+    assert values["recordings"][1]["count"] > 100
+
+
+def _driving(attempt: Callable[..., Attempt], folder: Path, topic: str, duration: str) -> Attempt:
     """Shape a chain on Fast DDS, whose last node publishes one topic asynchronously."""
     prefixes, rmw = ros2_environment()["AMENT_PREFIX_PATH"].split(":"), "rmw_fastrtps_cpp"
     if not any(Path(prefix, "share", rmw).is_dir() for prefix in prefixes):
         pytest.skip(f"the package {rmw} is not installed in this ROS 2")
-    profiles, file = folder / "profiles.xml", folder / "driving.launch.py"
+    profiles = folder / "profiles.xml"
     profiles.write_text(PROFILES.format(topic=topic))
     asked = {"FASTRTPS_DEFAULT_PROFILES_FILE": str(profiles), "RMW_FASTRTPS_USE_QOS_FROM_XML": "1"}
-    text = LAUNCH.format(nodes=DRIVING, program=program, profiles=asked)
-    options = ["--chain", "/ticked../commands", "--publication", "asynchronous"]
+    options = ["--chain", "/ticked../commands", "--publication", "asynchronous", "--epsilon", "2ms"]
     options += ["--publish-slot", "10ms", "--duration", duration]
-    return _shaped(file, text, *options, RMW_IMPLEMENTATION=rmw)
+    variables = {"RMW_IMPLEMENTATION": rmw, "ASYNCHRONOUS": json.dumps(asked)}
+    return attempt(DRIVING, "shape", "shaped", *options, **variables)
 
 
 def test_the_thread_by_which_fast_dds_publishes_is_held_until_its_slot(
-    program: str, tmp_path: Path
+    attempt: Callable[..., Attempt], tmp_path: Path
 ) -> None:
-    run = _driving(program, tmp_path, "/commands", "30s")
+    run, folder = _driving(attempt, tmp_path, "/commands", "30s")
     assert run.returncode == 0, run.stderr[-3000:]
     before, after = json.loads(run.stdout)["recordings"]
-    held = open_recording(tmp_path / "shaped" / "after").info.threads
+    held = open_recording(folder / "after").info.threads
     (thread,) = (one for one in held if one.role == "publisher")
     assert (thread.node, thread.comm) == ("/control", "dds.asyn.0.1")
     assert after["count"] > 200
@@ -152,9 +258,9 @@ def test_the_thread_by_which_fast_dds_publishes_is_held_until_its_slot(
 
 
 def test_what_is_published_synchronously_is_not_held_by_anothers_thread(
-    program: str, tmp_path: Path
+    attempt: Callable[..., Attempt], tmp_path: Path
 ) -> None:
-    run = _driving(program, tmp_path, "/rosout", "15s")
+    run, folder = _driving(attempt, tmp_path, "/rosout", "15s")
     assert run.returncode == 2
     assert "/control publishes /commands synchronously" in run.stderr
-    assert not (tmp_path / "shaped" / "after").exists()
+    assert not (folder / "after").exists()

@@ -77,7 +77,7 @@ def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path:
     recording = simulate(application, tmp_path / "rec", cycles=40)
     chains = ("/in../left", "/in../right", "/first../other")
     profiles = profile_chains(recording, chains)
-    alone = [int(one.every_step_ns.sum(axis=1).max()) / MS for one in profiles]  # type: ignore[union-attr]
+    alone = [int(one.every_step_ns.sum(axis=1).max()) / MS for one in profiles]
     # Dispatching and messages take some of a millisecond; the branch that came second, 5 ms later,
     # has not waited here.
     assert all(own <= found < own + 0.8 for own, found in zip([7, 9, 3], alone, strict=True))

@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 
 from chainshaper.enforcement.slot_dispatcher import boundaries_of
 from chainshaper.planning import CallbackTimes, Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning.application_plan import open_until_done as joint_until_done
+from chainshaper.planning.application_plan import whole
 from chainshaper.planning.overruns import cycles_until_output, open_until_done, plan_warnings
 from chainshaper.planning.pipeline import in_cycle
 from chainshaper.planning.plan import publish_slots, revised
 from chainshaper.planning.plan_file import dump_plan, load_plan
+from chainshaper.planning.request import cores_for
 from chainshaper.planning.stages import Longest, Stage, opened_early, shortest_cut
 from chainshaper.values.errors import InputError, OperationError
 
@@ -184,6 +187,17 @@ def test_a_pipeline_by_hand(tmp_path: Path) -> None:
     assert "leave at 161.000 ms, once a cycle." in note
     assert slots_ms(open_until_done(plan))["stage1"] == [(0, 100)], "an overrun may finish"
     assert slots_ms(open_until_done(plan))["stage2"] == [(0, 61), (64, 100)]
+    in_force = joint_until_done(whole(plan), [2 * MS])
+    slots = {server.name: server.slots for server in in_force.servers}
+    assert slots["stage1"] == ((0, 97 * MS),), "its timer waits: all slots count from one instant"
+
+
+def test_a_pipeline_is_measured_on_the_cores_of_its_stages() -> None:
+    """By the medians, of which no half is longer than a cycle; and where no cut fits, evenly."""
+    request = PlanRequest(policy="pipelined")
+    noisy = profile([*ROWS, [30, 40, 300, 40]])
+    assert cores_for([noisy], (1, 0), request) == {"/n1": 1, "/n2": 1, "/n3": 0, "/n4": 0}
+    assert cores_for([profile([[90, 90, 90, 90]])], (1, 0), request)["/n3"] == 0
 
 
 def test_waiting_for_a_turn_costs_what_the_plan_says() -> None:
@@ -230,7 +244,7 @@ def test_only_a_single_path_that_was_recorded_is_cut() -> None:
     with pytest.raises(InputError, match="plan from a recording"):
         plan_chain(Profile(np.array([80, 90]) * MS, 100 * MS), request)
     beside = [CallbackTimes(node, 1, 1, 1, 1) for node in ("/n1", "/rear", "/n2")]
-    with pytest.raises(InputError, match="a chain without branches"):
+    with pytest.raises(InputError, match="waits for /rear beside it, which would begin"):
         plan_chain(profile([[80, 80]], callbacks=tuple(beside)), request)
 
 

@@ -152,6 +152,12 @@ def wish(name: str, **more: Any) -> Any:
     return option(f"{names} {metavar}", described.help, default, rich_help_panel=panel, **more)
 
 
+MODE_PROFILE: list[str] | None = option(
+    "--mode-profile MODE=REC",
+    "With --modes: what was measured in one mode alone, a recording or a file of latencies"
+    " (may be repeated). Default: the cycles of the recording that began in it.",
+    rich_help_panel=BANDS,
+)
 _MODES = option(
     "--modes TOPIC:MODE[=BAND],…",
     "Each mode's band, 1 is the first, found where none has a number; the first mode named is in"
@@ -206,6 +212,14 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
         return called
 
     return decorate
+
+
+def mode_profiles(given: list[str] | None, request: "cs.PlanRequest") -> dict[str, str]:
+    """What `--mode-profile` names for each mode. Raises InputError: it is not of that form."""
+    pairs = [one.partition("=") for one in given or ()]
+    if not all(request.modes is not None and place for _, _, place in pairs):
+        raise InputError("--mode-profile goes with --modes, as MODE=REC: correct one of the two")
+    return {mode: place for mode, _, place in pairs}
 
 
 def modes_of(text: str | None, late: Late | None) -> "Modes | None":

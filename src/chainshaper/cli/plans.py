@@ -38,12 +38,7 @@ def plan(
         "With --bands auto: draw the average over the number of bands.",
         rich_help_panel="Latency bands",
     ),
-    mode_profile: list[str] | None = opt.option(
-        "--mode-profile MODE=REC",
-        "With --modes: what was measured in one mode alone, a recording or a file of latencies"
-        " (may be repeated). Default: the cycles of the recording that began in it.",
-        rich_help_panel="Latency bands",
-    ),
+    mode_profile: list[str] | None = opt.MODE_PROFILE,
     sink: list[str] | None = opt.SINK,
     json: bool = opt.JSON,
 ) -> None:
@@ -68,12 +63,8 @@ def plan(
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     wanted: list[str | None] = [*chain] if chain else [None]
-    pairs = [one.partition("=") for one in mode_profile or ()]
-    if not all(request.modes is not None and place for _, _, place in pairs):
-        raise InputError("--mode-profile goes with --modes, as MODE=REC: correct one of the two")
-    known: dict[str, Any] = {"modes": request.modes}
-    known["mode_recordings"] = {mode: place for mode, _, place in pairs}
-    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], **known)
+    modes = {"modes": request.modes, "mode_recordings": opt.mode_profiles(mode_profile, request)}
+    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], **modes)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     if len(planned) > 1:
         if sinks or curve is not None:

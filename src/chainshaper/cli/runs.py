@@ -212,7 +212,7 @@ def _record_and_show(
         )
 
 
-@opt.takes_wishes("cores")
+@opt.takes_wishes("cores", "policy")
 def profile(
     output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
@@ -325,6 +325,7 @@ def shape(
     backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     *,
     request: "cs.PlanRequest",
+    mode_profile: list[str] | None = opt.MODE_PROFILE,
     user: list[str] | None = opt.USERS,
     json: bool = opt.JSON,
 ) -> None:
@@ -336,7 +337,7 @@ def shape(
     --realtime are for this, and mean what they mean for `chainshaper plan` and `apply`.
     """
     if len(words) == 2 and words[0].endswith(opt.DESCRIPTIONS):
-        if chain or sink or throttle or request != cs.PlanRequest():
+        if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
         return
@@ -351,6 +352,7 @@ def shape(
         sinks=sink or (),
         throttled=throttled_inputs(throttle or []),
         period_ns=period,
+        mode_recordings=opt.mode_profiles(mode_profile, request),
         duration_ns=duration or SHAPING_DURATION_NS,
         source=source,
         node=node,

@@ -16,7 +16,7 @@ import sys
 import threading
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -46,7 +46,7 @@ from chainshaper.planning import (
     save_application_plan,
 )
 from chainshaper.planning.application_plan import whole
-from chainshaper.planning.request import refuse_entangled
+from chainshaper.planning.request import refuse_contradictions, refuse_entangled
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
@@ -87,6 +87,7 @@ def shape_launch(
     choose: Choose | None = None,
     request: PlanRequest | None = None,
     period_ns: int | None = None,
+    mode_recordings: Mapping[str, str | Path] | None = None,
     duration_ns: int = 60_000_000_000,
     source: Literal["lttng", "ebpf"] = "lttng",
     node: NodeKind = "python",
@@ -100,12 +101,12 @@ def shape_launch(
 
     ``chain`` is the one to shape, or several; without it, ``choose`` is asked. ``sinks`` are chains
     to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that get them
-    by way of a throttler, ``period_ns`` is that of chains that no timer starts. ``request.cores``
-    are where executors run (default: the last core, and others that are worth it). The application
-    is launched three times, briefly, and for ``duration_ns`` before and after; more often, where
-    chains are measured one by one. ``planned`` gets the plan before it is used, to say what is
-    doubtful about it. ``stop`` ends the step that is under way, and with it everything. ``users``
-    are for :func:`.apply_plan`.
+    by way of a throttler, ``period_ns`` is that of chains that no timer starts, and
+    ``mode_recordings`` are for :func:`.profile_chains`. ``request.cores`` are where executors run
+    (default: the last core, and others that are worth it). The application is launched three times,
+    briefly, and for ``duration_ns`` before and after; more often, where chains are measured one by
+    one. ``planned`` gets the plan before it is used, to say what is doubtful about it. ``stop``
+    ends the step that is under way, and with it everything. ``users`` are for :func:`.apply_plan`.
 
     Raises:
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
@@ -113,10 +114,10 @@ def shape_launch(
         PlatformError: there is no such core. PlatformError, OperationError: a step failed; what the
             steps before it left is kept.
     """
-    launch = parse_launch_command(command)
-    request = request or PlanRequest()
+    launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
-    _refuse_early(request, chains, sinks, throttled)
+    known: Any = {"modes": request.modes, "mode_recordings": mode_recordings or {}}
+    _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
     if node != "python":
         check_build_tools()
     folder, stop = refuse_existing(folder), stop or threading.Event()
@@ -153,7 +154,7 @@ def shape_launch(
     chains = chains or [_chosen(first, choose)]
     wanted = (*chains, *sinks)
     seen, core_of = profiled_cores(first, wanted, request, period_ns)
-    refuse_entangled(seen, request.policy, sinks=bool(sinks))
+    _refuse_at_first_look(seen, len(chains), request)
     permitted = may_use_fifo()  # else it is measured under ordinary scheduling
     found = [] if permitted else [NOT_PERMITTED]
     measured: dict[int, tuple[Recording, Profile]] = {}
@@ -167,7 +168,7 @@ def shape_launch(
             watch_stalls=True,
         )
         found += before.info.notes
-        profiles = profile_chains(before, own, period_ns=period_ns)
+        profiles = profile_chains(before, own, period_ns=period_ns, **known)
         measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
     progress(0.0, "planning")
     plan, remarks = _planned([measured[k][1] for k in range(len(wanted))], len(chains), request)
@@ -214,8 +215,10 @@ def _refuse_early(
     chains: Sequence[str],
     sinks: Sequence[str],
     throttled: Sequence[ThrottledInput],
+    modes: bool,
 ) -> None:
     """What need not be tried: it would be refused minutes later."""
+    refuse_contradictions(request, sinks=bool(sinks), modes=modes)
     check_cores(dict.fromkeys(request.cores or (), "--cores"))
     if sinks and len(chains) > 1:
         raise InputError("--sink goes with one chain: name each output with a --chain of its own")
@@ -226,11 +229,20 @@ def _refuse_early(
         )
 
 
+def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanRequest) -> None:
+    """What is not to be had of these chains, however long they take."""
+    refuse_entangled(seen, request.policy, sinks=len(seen) > chains)
+    if seen and request.policy != "shaped":
+        with suppress(OperationError):
+            _planned(seen, chains, request)
+
+
 def _planned(
     profiles: Sequence[Profile], chains: int, request: PlanRequest
 ) -> tuple[ApplicationPlan, list[str]]:
     """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
-    request = replace(request, cores=None)
+    if request.policy != "pipelined":  # whose stages may have a core twice
+        request = replace(request, cores=None)
     if chains > 1:
         return plan_application(profiles, request)
     return whole(plan_chain(profiles[0], request, profiles[1:])), []

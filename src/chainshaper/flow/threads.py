@@ -35,7 +35,7 @@ from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import Writer, check_publication
-from chainshaper.planning.plan import Plan, Server, publisher_servers
+from chainshaper.planning.plan import Plan, Server, publisher_servers, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -312,7 +312,7 @@ def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
 
 
 def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
-    """The thread that begins each chain: the first executor of its server whose slot comes first.
+    """The thread that begins each chain: the first executor, of no shaping node, by servers' slots.
 
     Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
     """
@@ -326,9 +326,10 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
 
 
 def _first_thread(chain: Plan, of_thread: Mapping[PlannedThread, Sequence[Thread]]) -> Thread:
+    gates = {node.thread for node in shaping_nodes(chain)}
     for server in sorted(chain.servers, key=lambda one: (one.slots[0][0], one.priority)):
         for planned in server.threads:
-            for thread in of_thread.get(planned, ()):
+            for thread in of_thread.get(planned, ()) if planned not in gates else ():
                 if thread.role == "executor":
                     return thread
     raise OperationError(

@@ -169,12 +169,14 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
     chains are left out, so that an overrun delays none of these. In between, chains that overran
     share their core; where that makes a server's slots too many, it stays as planned. Of several
     chains, ``waits_ns`` is how long before its cycle each one's timer expires: its thread waits, so
-    that cycles start at their offsets.
+    that cycles start at their offsets. The first stage of a pipeline waits too, for slots of
+    further stages to count from the same instant.
     """
-    waits = waits_ns if waits_ns and plan.moves_timers else [-WAITING_NS] * len(plan.chains)
     opened: dict[str, Server] = {}
-    for chain, wait in zip(plan.chains, waits, strict=True):
-        for server in chain_open_until_done(chain, wait + WAITING_NS).servers:
+    known_ns = waits_ns or [-WAITING_NS] * len(plan.chains)
+    for chain, wait in zip(plan.chains, known_ns, strict=True):
+        waits = plan.moves_timers or chain.policy == "pipelined"
+        for server in chain_open_until_done(chain, wait + WAITING_NS if waits else 0).servers:
             apart = _without(server, [*_of_others(plan, chain, server)])
             if len(apart.slots) * plan.cycle_ns > MOST_OPENED * chain.cycle_ns:
                 apart = next(one for one in chain.servers if one.name == server.name)

@@ -80,7 +80,8 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     the next slot of its core begins.
     """
     if plan.overrun == "publish" and plan.policy == "pipelined":
-        return revised(plan, servers=with_slots(plan.servers, dict(_longer_stages(plan))))
+        longer_stages = dict(_longer_stages(plan, plan.cycle_ns - closed_ns))
+        return revised(plan, servers=with_slots(plan.servers, longer_stages))
     if plan.policy not in ("shaped", "one-long-slot") or output_server(plan) is None:
         return plan
     beside = [*publishing_servers(plan), *(one for one in plan.servers if one.best_effort)]
@@ -119,14 +120,14 @@ def _filled(server: Server, taken: list[Slot], end_ns: int) -> tuple[Slot, ...]:
     return tuple(filled)
 
 
-def _longer_stages(plan: Plan) -> Iterator[tuple[str, list[Slot]]]:
+def _longer_stages(plan: Plan, end_ns: int) -> Iterator[tuple[str, list[Slot]]]:
     """The slots of a pipeline's stages until the next slot of the core, or the cycle's end."""
     for stage in (server for server in plan.servers if server not in publishing_servers(plan)):
-        own = [
-            slot for server in plan.servers if server.core == stage.core for slot in server.slots
-        ]
-        starts = sorted([*(start for start, _ in own), plan.cycle_ns])
-        yield stage.name, [(a, next(one for one in starts if one >= b)) for a, b in stage.slots]
+        of_core = [server.slots for server in plan.servers if server.core == stage.core]
+        starts = sorted(start for slots in of_core for start, _ in slots)
+        ends = [next((one for one in starts if one >= b), end_ns) for _, b in stage.slots]
+        slots = zip(stage.slots, ends, strict=True)
+        yield stage.name, [(start, max(end, longer)) for (start, end), longer in slots]
 
 
 @dataclass(frozen=True)

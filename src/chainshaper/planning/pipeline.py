@@ -12,7 +12,7 @@ latency; and what took long together stays together, as L̄ has it.
 """
 
 from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from itertools import count, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,13 +50,7 @@ def pipelined(
             "a pipeline needs a shaping node, which sees how many cycles old an output is: plan"
             " from a recording, with --publication synchronous"
         )
-    totals = np.pad(steps_ns.cumsum(axis=1), ((0, 0), (1, 0))).T
-    longest = [[int((until - since).max()) for until in totals] for since in totals]
-    cuts = [
-        place
-        for place in range(len(nodes) + 1)  # a node's thread is in one stage
-        if set(nodes[:place]).isdisjoint(nodes[place:])
-    ]
+    longest, cuts = _longest(steps_ns), _cuts(nodes)
     _refuse_too_long(longest, cuts, nodes, margin, cycle)
     stages = shortest_cut(longest, cuts, margin, cycle, len(cores))
     if stages is None:
@@ -95,6 +89,30 @@ def pipelined(
             shaping_node=node.model_copy(update={"core": output.core}),
             predicted=Prediction(mean_ns=done, max_ns=done, jitter_ns=length, shares=(1.0,)),
         )
+
+
+def stage_cores(
+    nodes: Sequence[str], steps_ns: NDArray[np.int64], cycle_ns: int, cores: Sequence[int]
+) -> dict[str, int]:
+    """Where to measure nodes, so that instances do not pile up: on the core of their stage, by the
+    medians, without a margin. Where no cut fits, the fullest stage has as little to do as can be.
+    """
+    usual, cuts = _longest(np.median(steps_ns, axis=0, keepdims=True)), _cuts(nodes)
+    cycles = (cycle_ns * tenths // 10 for tenths in count(10))
+    tried = (shortest_cut(usual, cuts, 0, cycle, len(cores)) for cycle in cycles)
+    stages = next(found for found in tried if found)
+    return {node: cores[one.place] for one in stages for node in nodes[one.first : one.end]}
+
+
+def _longest(steps_ns: NDArray[np.floating | np.integer]) -> Longest:
+    totals = np.pad(steps_ns.cumsum(axis=1), ((0, 0), (1, 0))).T
+    return [[int((until - since).max()) for until in totals] for since in totals]
+
+
+def _cuts(nodes: Sequence[str]) -> list[int]:
+    """Where stages may begin and end: a node's thread is in one stage."""
+    places = range(len(nodes) + 1)
+    return [place for place in places if set(nodes[:place]).isdisjoint(nodes[place:])]
 
 
 def in_cycle(opens_ns: int, closes_ns: int, cycle_ns: int) -> tuple[Slot, ...]:

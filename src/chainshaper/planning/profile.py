@@ -72,8 +72,8 @@ class Profile:
     together: tuple[tuple[str, ...], ...] = ()
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()
-    steps_ns: NDArray[np.int64] | None = None
-    every_step_ns: NDArray[np.int64] | None = None
+    steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    every_step_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     fifo_priority: int = 84
     output_depth: int | None = None
     recording: str | None = None
@@ -168,7 +168,7 @@ def with_interference(
 
 def _alone(profile: Profile) -> Profile:
     """The profile with what its callbacks took, in sum; bare latencies as they are."""
-    if profile.steps_ns is None or profile.every_step_ns is None:
+    if not profile.steps_ns.size:
         return profile
     return replace(
         profile,

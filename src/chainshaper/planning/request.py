@@ -9,6 +9,7 @@ that were measured while nothing was shaped: shaping a topic that another chain'
 makes that one later than was measured, and its slot too early. Such chains are refused.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -31,7 +32,7 @@ from chainshaper.planning.margins import (
 )
 from chainshaper.planning.modes import place_modes, with_modes
 from chainshaper.planning.offsets import refuse_common
-from chainshaper.planning.pipeline import pipelined
+from chainshaper.planning.pipeline import pipelined, stage_cores
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     SENDS_PER_SLOT,
@@ -93,7 +94,7 @@ def plan_chain(
     has. OperationError: no such plan exists; the message names what prevents it. PlatformError: a
     library that only this request needs is not installed.
     """
-    _refuse_contradictions(request, bool(sinks))
+    refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
     if request.policy == "pipelined":
         profile = _apart(profile)
     else:
@@ -108,12 +109,6 @@ def plan_chain(
     else:
         finish = partial(_with_policy, profile=profile, request=request)
         margin = _margin(profile, request)
-        if request.bands_of_modes == "found":
-            raise InputError(
-                "nothing says which mode was in force while latencies were measured, so none has a"
-                " slot that can be found: give the modes' own profiles (--mode-profile MODE=REC),"
-                " or record an application whose description `announces` them"
-            )
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
         raise OperationError(
@@ -152,11 +147,13 @@ def plan_chain(
 
 def _apart(profile: Profile) -> Profile:
     """The profile of a chain whose instances do not overlap: what its callbacks took, in sum."""
-    steps, every = profile.steps_ns, profile.every_step_ns
-    if steps is None or every is None or len(profile.callbacks) > len(profile.nodes):
+    steps, every, name = profile.steps_ns, profile.every_step_ns, profile.name or "a chain"
+    if not steps.size:
+        raise InputError(f"{name}: stages are cut by what callbacks took: plan from a recording")
+    if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
         raise InputError(
-            f"{profile.name or 'a chain'}: stages are cut from a single path, by what each of its"
-            " callbacks took: plan from a recording, a chain without branches that it waits for"
+            f"{name} waits for {', '.join(beside)} beside it, which would begin while the instance"
+            " before is in that stage, and delay it: begin the chain behind what waits for them"
         )
     return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
 
@@ -177,7 +174,8 @@ def cores_for(
     request: PlanRequest = _STANDARD,
     worth: float = 0.0,
 ) -> dict[str, int]:
-    """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`.
+    """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`
+    and, for stages, :func:`.stage_cores`.
 
     Raises InputError: a profile has no callbacks, being bare latencies.
     """
@@ -186,6 +184,9 @@ def cores_for(
             f"--cores distributes callbacks, and latencies do not tell those of {bare[0]}: plan"
             " from a recording"
         )
+    if request.policy == "pipelined":
+        staged = (stage_cores(p.nodes, _apart(p).steps_ns, p.period_ns, cores) for p in profiles)
+        return {node: core for own in staged for node, core in own.items()}
     margin = EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
     work = [Work((p.begins, p.period_ns), p.period_ns, p.callbacks, margin) for p in profiles]
     together = [group for profile in profiles for group in profile.together]
@@ -389,8 +390,8 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
             f"the policy {request.policy} needs the chain's callbacks, which latencies do not tell:"
             " plan from a recording"
         )
-    steps, every = profile.steps_ns, profile.every_step_ns
-    if request.policy == "pipelined" and steps is not None and every is not None:
+    if request.policy == "pipelined":
+        steps, every = profile.steps_ns, profile.every_step_ns
         if profile.all_disturbed:
             steps = every[every.sum(axis=1) <= profile.longest_ns]
         return pipelined(plan, profile.nodes, steps, profile.core_of, request.cores)
@@ -399,7 +400,14 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     return let_per_callback(plan, profile.topics, profile.nodes)
 
 
-def _refuse_contradictions(request: PlanRequest, sinks: bool) -> None:
+def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> None:
+    """Refuse wishes that nothing fulfils, with further ``sinks``, and ``modes`` measured or not."""
+    if request.bands_of_modes == "found" and not (modes and request.policy == "shaped"):
+        raise InputError(
+            "nothing says which mode was in force while latencies were measured, so none has a"
+            " slot that can be found: give the modes' own profiles (--mode-profile MODE=REC),"
+            " or record an application whose description `announces` them"
+        )
     if request.epsilon_ns is not None and request.overrun_probability is not None:
         raise InputError(
             "the margin is either given or covers a share of the cycles: leave out --epsilon or the"

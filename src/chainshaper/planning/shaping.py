@@ -198,14 +198,15 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
     ``core_of`` names the core of every node that takes part, also on branches that the chain waits
-    for and that the plan does not know yet.
+    for and that the plan does not know yet. The server of the first node, whose timer begins the
+    cycle, comes first.
 
     Raises InputError: a node of the plan is missing.
     """
     chain, others = _chain_and_others(plan)
     if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:
         raise InputError(f"no core is named for {', '.join(missing)}: name one for each node")
-    cores = sorted(set(core_of.values()))
+    cores = list(dict.fromkeys(core_of.values()))
     with wrong_values_refused(Plan):
         split = [
             Server(

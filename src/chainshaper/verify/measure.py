@@ -140,7 +140,8 @@ def _measured(
         recording = replace(recording, events=events.happened(recording.events, *spell))
     measurements = []
     for chain in chains:
-        found = analyse_latency(flow, chain_of(recording, chain), due=due, between=spell)
+        begun = _in_front(chain_of(recording, chain), joint)
+        found = analyse_latency(flow, begun, due=due, between=spell)
         analysis = replace(found, notes=(*info.notes, *found.notes))
         output = analysis.chain.topics[-1]
         own = None if joint is None else plan_of_chain(joint, output)
@@ -160,6 +161,13 @@ def _measured(
             )
         )
     return measurements
+
+
+def _in_front(chain: str, plan: ApplicationPlan | None) -> str:
+    """A chain whose first topic is shaped, under LET, from in front of that shaping node."""
+    first, *others = chain.split("..")
+    inputs = {node.output: node.input for node in plan.shaping_nodes} if plan and others else {}
+    return "..".join([inputs.get(first, first), *others])
 
 
 def _in_force(recording: Recording) -> tuple[tuple[int, int | None] | None, LeftOut]:
