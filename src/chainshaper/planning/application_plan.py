@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
+from chainshaper.planning.overruns import slots_without
 from chainshaper.planning.plan import (
     Plan,
     Server,
@@ -177,8 +178,9 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
     for chain, wait in zip(plan.chains, known_ns, strict=True):
         waits = plan.moves_timers or chain.policy == "pipelined"
         for server in chain_open_until_done(chain, wait + WAITING_NS if waits else 0).servers:
-            apart = _without(server, [*_of_others(plan, chain, server)])
-            if len(apart.slots) * plan.cycle_ns > MOST_OPENED * chain.cycle_ns:
+            slots = slots_without(server.slots, [*_of_others(plan, chain, server)])
+            apart = server.model_copy(update={"slots": slots})
+            if len(slots) * plan.cycle_ns > MOST_OPENED * chain.cycle_ns:
                 apart = next(one for one in chain.servers if one.name == server.name)
             known = opened.get(server.name, apart)  # of a server of several chains, the longest
             opened[server.name] = max(apart, known, key=lambda one: one.slots[-1][1])
@@ -206,18 +208,6 @@ def _of_others(plan: ApplicationPlan, chain: Plan, server: Server) -> Iterator[S
                 yield from (
                     (again, again + end - start) for again in range(first, chain.cycle_ns, common)
                 )
-
-
-def _without(server: Server, taken: Sequence[Slot]) -> Server:
-    """The server with its slots but for what is taken."""
-    left = []
-    for start, end in server.slots:
-        free_from = start
-        for begins, ends in sorted([*taken, (end, end)]):
-            if free_from < min(begins, end):
-                left.append((free_from, min(begins, end)))
-            free_from = max(free_from, ends)
-    return server.model_copy(update={"slots": tuple(left)}) if taken else server
 
 
 def combined(plans: Sequence[Plan]) -> ApplicationPlan:

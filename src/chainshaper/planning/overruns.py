@@ -14,7 +14,6 @@ from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
-    Server,
     ShapingNode,
     Slot,
     Thread,
@@ -102,22 +101,25 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
             if (other.core, other.priority) == (server.core, server.priority)
             for slot in longer.get(other.name, other.slots)
         ]
-        end_ns = max(server.slots[-1][1], plan.cycle_ns - closed_ns)
-        longer[server.name] = _filled(server, taken, end_ns)
+        *before, (start, end) = server.slots
+        until_end = (start, max(end, plan.cycle_ns - closed_ns))
+        longer[server.name] = slots_without([*before, until_end], taken)
     try:
         return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))
     except InputError:  # below its executor, a publisher would meet another server's slot
         return plan
 
 
-def _filled(server: Server, taken: list[Slot], end_ns: int) -> tuple[Slot, ...]:
-    """A server's slots, the last one until ``end_ns`` but where others have theirs."""
-    filled, (free_from, _) = list(server.slots[:-1]), server.slots[-1]
-    for start, end in sorted([*taken, (end_ns, end_ns)]):
-        if free_from < start:
-            filled.append((free_from, start))
-        free_from = max(free_from, end)
-    return tuple(filled)
+def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, ...]:
+    """Slots but for what is taken of them."""
+    left = []
+    for start, end in slots:
+        free_from = start
+        for begins, ends in sorted([*taken, (end, end)]):
+            if free_from < min(begins, end):
+                left.append((free_from, min(begins, end)))
+            free_from = max(free_from, ends)
+    return tuple(left)
 
 
 def _longer_stages(plan: Plan, end_ns: int) -> Iterator[tuple[str, list[Slot]]]:
