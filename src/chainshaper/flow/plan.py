@@ -69,13 +69,10 @@ def profile_chains(
         recording = open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
-    planned = {
-        number
-        for analysis in analyses
-        for stage in graph_stages(analysis.graph, analysis.chain)
-        for number in stage.members
-    }
-    profiles = [_profile_of(recording, flow, one, period_ns, planned) for one in analyses]
+    stages = [graph_stages(one.graph, one.chain) for one in analyses]
+    planned = {number for own in stages for stage in own for number in stage.members}
+    profile_of = partial(_profile_of, recording, flow, period_ns=period_ns, planned=planned)
+    profiles = [profile_of(one, stages=own) for one, own in zip(analyses, stages, strict=True)]
     if modes is None:
         return tuple(profiles)
     if others := ", ".join(mode_recordings.keys() - modes.bands.keys()):
@@ -92,7 +89,7 @@ def profile_chains(
         for mode in modes.bands.keys() - apart if apart or in_force.count() else ():
             own = replace(analysis, traversals=analysis.traversals.filter(in_force == mode))
             try:
-                apart[mode] = _profile_of(recording, flow, own, period_ns, planned)
+                apart[mode] = profile_of(own, stages=stages[number])
             except OperationError as error:
                 remedy = f"or give the mode's own profile (--mode-profile {mode}=REC)"
                 raise OperationError(f"mode {mode}: {error}; {remedy}") from error
@@ -104,6 +101,8 @@ def _profile_of(
     recording: Recording,
     flow: DataFlow,
     analysis: LatencyAnalysis,
+    *,
+    stages: list["_Stage"],
     period_ns: int | None,
     planned: Collection[int],
 ) -> Profile:
@@ -119,7 +118,6 @@ def _profile_of(
     all_disturbed = calm.height < 2
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
     period = _period(analysis, period_ns)
-    stages = graph_stages(graph, chain)
     nodes = dict.fromkeys(stage.node for stage in stages)
     running, named = _running(flow, stages)
     cores, priority = _executors(recording, graph, running)
