@@ -24,8 +24,8 @@ from small_chain import small_chain
 from chainshaper import load_plan, open_source, plan_recording, save_plan, simulate
 from chainshaper.cli.app import VERBS
 from chainshaper.planning.plan import revised
+from chainshaper.values.errors import shown
 from chainshaper.values.recording import Recording, write_recording
-from chainshaper.values.safe_text import shown
 
 HOSTILE = (
     "\x1b]0;owned\x07\x1b[31m\x1b[2J\x9b5n\r\b\x7f\t\x00\u202e\u2067\u200b\u2028\ufffe"

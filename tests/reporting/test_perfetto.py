@@ -15,8 +15,8 @@ from reference_traces import reference_folder
 
 from chainshaper import data_flow, export_perfetto, measure_latency, open_source
 from chainshaper.reporting.perfetto import Slice, Track, Value, encode_trace
+from chainshaper.values.errors import shown
 from chainshaper.values.recording import Recording
-from chainshaper.values.safe_text import shown
 from chainshaper.verify.measure import Measurement
 
 BEGIN, END, INSTANT = 1, 2, 3

@@ -63,7 +63,7 @@ def _run(arguments: list[str] | None, name: str) -> Any:
     """The verb's exit code, None for 0."""
     from chainshaper.cli.app import USAGE_ERROR, Abort, app
     from chainshaper.cli.output import say
-    from chainshaper.values.safe_text import shown
+    from chainshaper.values.errors import shown
 
     try:
         return app(arguments, prog_name=name, standalone_mode=False)

@@ -12,8 +12,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import chainshaper as cs
-from chainshaper.values.errors import OperationError
-from chainshaper.values.safe_text import shown
+from chainshaper.values.errors import OperationError, shown
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -37,8 +37,7 @@ from chainshaper.linux.scheduling import (
     stop_garbage_collection,
 )
 from chainshaper.linux.threads import read_proc
-from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError
-from chainshaper.values.safe_text import shown
+from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError, shown
 
 PRIORITY = 97
 _LATE_NS = 100_000

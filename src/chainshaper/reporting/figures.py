@@ -17,9 +17,8 @@ import polars as pl
 from chainshaper.planning import BandChoice, publish_slots
 from chainshaper.reporting.latency import comparison_json
 from chainshaper.reporting.overviews import sweep_axes, sweep_value
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError, shown
 from chainshaper.values.files import new_file, why_distrusted, write_whole
-from chainshaper.values.safe_text import shown
 from chainshaper.verify.measure import Comparison, Measurement
 
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")

@@ -29,9 +29,9 @@ from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.reporting.tables import Column, ResultTable, words
 from chainshaper.values.application import INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import escape, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import lost_text
-from chainshaper.values.safe_text import escape, shown
 
 ENDINGS = (".svg", ".dot", ".json")
 

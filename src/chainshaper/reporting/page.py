@@ -33,9 +33,8 @@ from chainshaper.reporting import overviews
 from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
 from chainshaper.reporting.timeline import Timeline, timeline_data, timeline_of
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import InputError
+from chainshaper.values.errors import InputError, escape, shown
 from chainshaper.values.files import new_file, write_whole
-from chainshaper.values.safe_text import escape, shown
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown
 from chainshaper.verify.overruns import next_cycles, overruns_text
 

@@ -23,9 +23,9 @@ import polars as pl
 from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values import events
+from chainshaper.values.errors import shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
-from chainshaper.values.safe_text import shown
 from chainshaper.verify.measure import Measurement
 
 __all__ = ["ENDINGS", "Slice", "Track", "Value", "encode_trace", "export_perfetto"]

@@ -12,7 +12,7 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from chainshaper.values.durations import milliseconds
-from chainshaper.values.safe_text import escape, shown
+from chainshaper.values.errors import escape, shown
 
 __all__ = ["ABSENT", "Column", "ResultTable", "figures", "plain", "words"]
 

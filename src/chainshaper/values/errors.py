@@ -1,13 +1,21 @@
-"""What can go wrong, and the exit code it ends the command line with.
+"""What people are shown: what went wrong, with the exit code it ends in, and text of others.
 
 Every message names the thing (file, line, topic, thread), the reason and the remedy. A caller has
 three ways to react: correct the input, look at what failed, or change the machine.
+
+Characters in text of others (traces, names of hosts, topics, files) rewrite a terminal, answer in
+the user's place, turn the direction of reading around, are not seen, or end an XML file. They are
+shown as Python writes them (``\\x1b``). Whatever shows text passes it through here, all of it and
+last; JSON escapes by itself.
 """
 
+import html
 import importlib
+import re
 from typing import Any
 
-__all__ = ["ChainshaperError", "InputError", "OperationError", "PlatformError", "extra_library"]
+__all__ = ["ChainshaperError", "InputError", "OperationError", "PlatformError"]
+__all__ += ["escape", "extra_library", "shown"]
 
 
 class ChainshaperError(Exception):
@@ -47,3 +55,22 @@ def extra_library(name: str, purpose: str) -> Any:
             f"{purpose} needs the Python package {package} ({error}): install it with"
             f" `pip install {package}`"
         ) from error
+
+
+_UNSAFE = re.compile(
+    "[\x00-\x1f\x7f-\x9f"  # control characters: with ESC and CSI begin all sequences of terminals
+    "\u061c\u200e\u200f\u202a-\u202e\u2066-\u2069"  # bidirectional marks, overrides, isolates
+    "\u2028\u2029"  # separators of lines and paragraphs
+    "\u200b\u2060-\u2064\ufeff\ufff9-\ufffb\U000e0000-\U000e007f"  # not seen
+    "\ud800-\udfff\ufffe\uffff]"  # no characters: lone surrogates are bytes that are no UTF-8
+)
+
+
+def shown(text: str, but: str = "") -> str:
+    """The text with every character escaped that does more than be seen, ``but`` these."""
+    return _UNSAFE.sub(lambda found: found[0] if found[0] in but else ascii(found[0])[1:-1], text)
+
+
+def escape(text: str) -> str:
+    """The same for HTML and SVG, in elements and attributes; lines stay lines."""
+    return html.escape(shown(text, but="\n"))
