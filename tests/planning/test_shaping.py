@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.planning.bands import predict_bands, with_bands
-from chainshaper.planning.overruns import plan_warnings
+from chainshaper.planning.overruns import open_until_done, plan_warnings
 from chainshaper.planning.plan import (
     Plan,
     Thread,
@@ -217,6 +217,11 @@ def test_section_2_5_gives_each_callback_a_millisecond_more() -> None:
     callbacks += [_callback(f"/n{number}", 15_000, after=(number - 1,)) for number in range(1, 5)]
     plan = server_per_callback(_avp(), callbacks, margin_ns=MS)
     assert list(_slots_ms(plan).values()) == [[(16 * n, 16 * n + 16)] for n in range(5)]
+    # What overran finishes behind its slot; what begins the chain waits for its own.
+    enforced = open_until_done(plan, 2 * MS)
+    longer = [[(0, 16)], *([(16 * n, 98)] for n in range(1, 5))]
+    assert list(_slots_ms(enforced).values()) == longer
+    assert open_until_done(enforced, 2 * MS) == enforced
 
 
 def test_callbacks_of_one_node_share_a_server() -> None:

@@ -24,7 +24,7 @@ def plan(*servers: Server, cycle_ms: int = 20, offset_ms: int = 0, **more: Any) 
         chain=ChainOfPlan(spec="a", period_ns=cycle_ms * MS),
         evidence=Evidence(samples=1, min_latency_ns=1, mean_latency_ns=1, max_latency_ns=1 * MS),
         margin=Margin(epsilon_ns=0),
-        policy="server-per-callback",
+        policy="server-per-chain",
         cycle_ns=cycle_ms * MS,
         offset_ns=offset_ms * MS,
         servers=servers,

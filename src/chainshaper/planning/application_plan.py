@@ -176,7 +176,7 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
     opened: dict[str, Server] = {}
     known_ns = waits_ns or [-WAITING_NS] * len(plan.chains)
     for chain, wait in zip(plan.chains, known_ns, strict=True):
-        waits = plan.moves_timers or chain.policy == "pipelined"
+        waits = plan.moves_timers or chain.policy in ("pipelined", "server-per-callback")
         for server in chain_open_until_done(chain, wait + WAITING_NS if waits else 0).servers:
             slots = slots_without(server.slots, [*_of_others(plan, chain, server)])
             apart = server.model_copy(update={"slots": slots})

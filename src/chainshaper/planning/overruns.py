@@ -14,6 +14,7 @@ from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
+    Server,
     ShapingNode,
     Slot,
     Thread,
@@ -77,10 +78,19 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     other servers of the same core and priority are left out, and the last ``closed_ns`` of a cycle:
     a thread whose timer expires in these waits for its slot. A stage of a pipeline stays open until
     the next slot of its core begins.
+
+    Servers of callbacks stay open as well, but for one of its own in which chains begin: what comes
+    too late for its slot waits. A callback that was stopped would take its next slot, which is as
+    long as one execution, and leave that cycle's no room: every output would be late until two
+    short executions met. Those that wait for it have no other use for their slots. A server of a
+    whole chain that shapes nothing is closed as it says: it is there for what runs beside it.
     """
     if plan.overrun == "publish" and plan.policy == "pipelined":
         longer_stages = dict(_longer_stages(plan, plan.cycle_ns - closed_ns))
         return revised(plan, servers=with_slots(plan.servers, longer_stages))
+    if plan.policy == "server-per-callback":
+        # Not checked: behind what is planned, slots of servers meet.
+        return plan.model_copy(update={"servers": tuple(_until(plan, plan.cycle_ns - closed_ns))})
     if plan.policy not in ("shaped", "one-long-slot") or output_server(plan) is None:
         return plan
     beside = [*publishing_servers(plan), *(one for one in plan.servers if one.best_effort)]
@@ -108,6 +118,18 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
         return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))
     except InputError:  # below its executor, a publisher would meet another server's slot
         return plan
+
+
+def _until(plan: Plan, end_ns: int) -> Iterator[Server]:
+    """The servers, with last slots that end there, but for one that begins chains for others."""
+    for server in plan.servers:
+        *before, (start, end) = server.slots
+        begins = server.slots[0][0] == 0 and len(plan.servers) > 1
+        if begins or server.best_effort:
+            yield server
+        else:
+            slots = (*before, (start, max(end, end_ns)))
+            yield server.model_copy(update={"slots": slots})
 
 
 def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, ...]:

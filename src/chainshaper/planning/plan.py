@@ -35,6 +35,7 @@ SHORTEST_SLOT_NS = 1_000_000  # of an asynchronous publisher; of any, unless one
 SENDS_PER_SLOT = 4
 PER_CALLBACK = ("server-per-callback", "let-per-callback", "pipelined")
 """Policies whose slots follow from the callbacks, so that an execution may span cycles."""
+UNSHAPED = ("server-per-chain", "server-per-callback")
 
 
 def _plain_name(what: str) -> AfterValidator:

@@ -37,6 +37,7 @@ from chainshaper.planning.plan import (
     PER_CALLBACK,
     SENDS_PER_SLOT,
     SHORTEST_SLOT_NS,
+    UNSHAPED,
     Evidence,
     Margin,
     Modes,
@@ -65,7 +66,6 @@ from chainshaper.values.plan_choices import Policy, Wishes
 DEFAULT_CORE = 1
 OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
-UNSHAPED = ("server-per-chain", "server-per-callback")
 _LIMITS = ("grid_ns", "max_gap_ns", "max_share")
 
 

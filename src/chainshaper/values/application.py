@@ -53,6 +53,7 @@ class Callback:
     symbol: str | None = None  # the registered function, demangled where possible
     publishes: tuple[str, ...] = ()  # topics written by its instances (and, synchronised, for it)
     passes_on: tuple[str, ...] = ()  # those of `publishes` that another callback writes for it
+    in_turns: tuple[str, ...] = ()  # those that it or another writes, whichever has the last input
 
     @property
     def label(self) -> str:
