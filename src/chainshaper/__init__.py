@@ -90,6 +90,7 @@ if TYPE_CHECKING:
     from chainshaper.workload.description import Application as Application
     from chainshaper.workload.description import load_application as load_application
     from chainshaper.workload.live import run_application as run_application
+    from chainshaper.workload.ros_package import generate_package as generate_package
 
 
 @cache

@@ -392,6 +392,9 @@ OWN = "Fusion::on_points(Cloud)"
             *(OWN, "left 10-20>25, right 30-40>45, left 110-120, right 130-140>145", LEFT),
             [(9, 25), (109, None)],
         ),
+        # A synchroniser of the application's own: each ran between any two publications.
+        (OWN, EITHER_LAST, LEFT, [(9, 45), (129, 145)]),
+        (OWN, EITHER_LAST, RIGHT, [(29, 45), (109, 145)]),
         # Left waits at 120 for a right message. The node is destroyed, created again at 200 in the
         # same process, and publishes a set of its own.
         (

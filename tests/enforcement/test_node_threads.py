@@ -133,6 +133,17 @@ def test_the_nodes_of_a_process_and_of_its_threads() -> None:
     assert nodes_of(_process(100, "c", "c", "c"), seen) == [BOX, ("/a",), ("/a", "/b")]
 
 
+def test_a_program_that_names_its_nodes_in_its_code_is_known_by_an_earlier_run() -> None:
+    """By its main thread, whose name the kernel cuts off; not where two programs have that name."""
+    main = RecordedThread(100, "unknown", (), "all_nodes_in_on")
+    ran = RecordedThread(101, "executor", ("/a", "/b"), "main")
+    earlier = RecordedProcess(100, ("/a", "/b"), (main, ran), seen_ns=0)
+    process = _process(700, "/opt/lib/all_nodes_in_one --ros-args -r a:out:=/other", "main")
+    assert {t.nodes for t in allocate([process], [earlier]).threads} == {("/a", "/b")}
+    twice = [earlier, replace(earlier, pid=200, threads=(replace(main, tid=200), ran))]
+    assert {t.nodes for t in allocate([process], twice).threads} == {("/all_nodes_in_one",)}
+
+
 TICKS, CHAIN = (("/x", "every 10ms"),), (("/x", "/t1"), ("/x", "every 100ms"))
 GROUPS = (
     *(RecordedThread(100 + n, "unknown", ("/x",), "main") for n in (0, 2)),  # 101 has ended

@@ -11,9 +11,12 @@ import pytest
 from applied_plans import one_server_plan
 
 from chainshaper.enforcement.back_ends import Choice
+from chainshaper.flow import apply as applying
+from chainshaper.flow import threads
 from chainshaper.flow.apply import _Run
 from chainshaper.flow.drift import TimerTrack
 from chainshaper.planning.application_plan import whole
+from chainshaper.values.errors import OperationError
 
 MS, S = 1_000_000, 1_000_000_000
 LEAD_NS, LOOK_NS, NOISE_NS = 2 * MS, 10 * S, 30_000
@@ -80,3 +83,64 @@ def test_every_back_end_that_gates_follows_a_phase_that_was_measured(
     moved = next(run.follow(here, [here]))
     assert bool(moved) == (measured and back_end != "fifo")
     assert armed == [moved % plan.cycle_ns] * bool(moved)
+
+
+def test_a_run_that_is_to_end_while_its_slots_move_has_not_failed(tmp_path: Path) -> None:
+    """Re-arming waits for answers; asked to end meanwhile, it gives up with an error of its own."""
+    plan, stop = whole(one_server_plan()), Event()
+
+    def arm(_: int) -> None:
+        raise OperationError("the run was asked to end")
+
+    seen = {"latest_ns": MS, "looks": 1, "expect": lambda _: None}
+    here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None, arm=arm, **seen)
+    run = _Run(plan, plan, Choice("freezer", ""), here, (), frozenset(), stop)
+    run.waits_ns, run.found = [0], here
+    run.begin_state((), "")
+    with pytest.raises(OperationError):
+        next(run.follow(here, [here]))
+    stop.set()
+    following = run.follow(here, [here])
+    assert next(following) == 0, "they stay where they were"
+    next(following)
+    assert run.state.anchor_ns is None
+
+
+@pytest.mark.parametrize(
+    ("slots", "early_ns"),
+    [([(0, 30)], 0), ([(0, 100)], 3 * MS), ([(0, 20), (40, 100)], 3 * MS), ([(10, 100)], 0)],
+)
+def test_a_chain_begins_with_its_timer_unless_its_server_is_closed_then(
+    tmp_path: Path, slots: list[tuple[int, int]], early_ns: int
+) -> None:
+    """Nodes that publish in slots get that instant: outputs without a stamp came 2 ms late."""
+    (chain,) = whole(one_server_plan()).chains
+    longer = tuple((start * MS, end * MS) for start, end in slots)
+    server = chain.servers[0].model_copy(update={"slots": longer})
+    plan = whole(chain.model_copy(update={"servers": (server,), "cycle_ns": 100 * MS}))
+    here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None)
+    run = _Run(plan, plan, Choice("freezer", ""), here, (), frozenset(), Event())
+    run.waits_ns = [3 * MS]
+    assert run.early(0) == early_ns
+    assert run.begins(0, 50 * MS) == 50 * MS - early_ns
+
+
+@pytest.mark.parametrize(("end", "slots"), [(30, ((0, 30 * MS),)), (100, ())])
+def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: int, slots: tuple[tuple[int, int], ...]
+) -> None:
+    """What a server has stopped wakes up for short; so does a sensor that only publishes."""
+    (chain,) = whole(one_server_plan()).chains
+    server = chain.servers[0].model_copy(update={"slots": ((0, end * MS),)})
+    plan = whole(chain.model_copy(update={"servers": (server,), "cycle_ns": 100 * MS}))
+    here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None)
+    run = _Run(plan, plan, Choice("freezer", ""), here, (), frozenset(), Event())
+    run.waits_ns, run.found = [3 * MS], here
+    governed = SimpleNamespace(name=server.name, threads=(7,))
+    run.state = SimpleNamespace(servers=[governed], anchor_ns=0)  # type: ignore[assignment]
+    first = SimpleNamespace(pid=7, tid=7)
+    watched: list[Any] = []
+    monkeypatch.setattr(threads, "first_threads", lambda *_: [first])
+    monkeypatch.setattr(applying, "DriftWatch", lambda *given, **_: watched.append(given[-1]))
+    run.drift_watches()
+    assert watched == [slots]

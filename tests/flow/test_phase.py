@@ -260,6 +260,24 @@ def test_a_beginning_that_moves_is_told_again_once(
     assert abs((states[-1].drift_ns or 0) - CYCLE // 3) < 10 * MS
 
 
+def test_one_look_at_a_busy_machine_moves_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A thread that was late throughout one look has not moved; one that is twice so has."""
+    looks, surely = iter([10_000, 330_000, -20_000, 400_000, 420_000]), list[int | None]()
+
+    def look(watch: DriftWatch, _near: int | None, _expected: int) -> int:
+        surely.append(watch.surely_ns)
+        if (seen := next(looks, None)) is None:
+            raise OperationError("the thread has ended")
+        return seen
+
+    monkeypatch.setattr(DriftWatch, "_look", look)
+    monkeypatch.setattr(DriftWatch, "EVERY_S", 0.0)
+    watch = DriftWatch(1, 1, CYCLE, 0)
+    wait_for(lambda: len(surely) == 6, "the looks")
+    assert surely == [None, 0, 10_000, -20_000, -20_000, 400_000]
+    assert watch.looks == 5
+
+
 @needs_fifo
 def test_it_can_be_stopped_before_the_nodes_were_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

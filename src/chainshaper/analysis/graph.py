@@ -7,13 +7,19 @@ callback and published in another of the same node:
   input which completes the set; no event says so. A subscription callback is taken to be such an
   input of topic X when another subscription callback of its node publishes X, subscribes to another
   topic, and it either is registered by message_filters (its symbol says so) or publishes nothing.
+* **A synchroniser of the application's own** keeps its latest inputs, and publishes in the callback
+  of whichever comes last. Several subscription callbacks of a node that publish topic X are taken
+  to be its inputs when each of them ran between any two publications of X. Such topics stand in
+  ``Callback.in_turns``.
 * **Stored messages**: a subscription callback in a node whose subscription callbacks publish
   nothing at all, but whose timers do, is taken to store the message for the timers.
 
-Both are inferences: such topics stand in ``Callback.publishes`` and also in ``passes_on``.
+All are inferences. What a callback never publishes itself stands in ``Callback.publishes`` and also
+in ``passes_on``.
 """
 
 from collections import defaultdict
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import polars as pl
@@ -53,10 +59,17 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     for callback in callbacks:
         if callback.kind != "unknown":
             of_node[callback.pid, callback.node].append(callback)
+    turns = _in_turns(flow, of_node.values())
     nodes = flow.objects.nodes.select("node", "pid").unique(maintain_order=True)
     return ApplicationGraph(
         nodes=tuple(Node(name, pid) for name, pid in nodes.iter_rows()),
-        callbacks=tuple(_with_passed_on(one, of_node[one.pid, one.node]) for one in callbacks),
+        callbacks=tuple(
+            replace(
+                _with_passed_on(one, of_node[one.pid, one.node]),
+                in_turns=tuple(sorted(turns[one.id])),
+            )
+            for one in callbacks
+        ),
         publishers=_by_topic(flow.objects.publishers),
         subscribers=_by_topic(flow.objects.subscriptions),
     )
@@ -78,6 +91,36 @@ def _with_passed_on(callback: Callback, siblings: list[Callback]) -> Callback:
     return replace(callback, publishes=publishes, passes_on=tuple(sorted(passed)))
 
 
+def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[str]]:
+    """Which topics each callback writes in turns with others of its node, as their synchroniser.
+
+    Between two publications each of them has run, the publishing instances included: callbacks that
+    publish independently of each other do not keep to that.
+    """
+    found = defaultdict[int, set[str]](set)
+    for callbacks in nodes:
+        for topic in _outputs(callbacks, "subscription"):
+            writers = [one for one in callbacks if topic in one.publishes]
+            inputs = {one.topic for one in writers if one.kind == "subscription"}
+            if len(writers) < 2 or len(inputs) < len(writers):
+                continue  # one alone; or a timer publishes it too, or two callbacks of one topic do
+            ids = [one.id for one in writers]
+            own = pl.col("callback_id").is_in(ids) & (pl.col("topic") == topic)
+            sent = flow.publications.filter(own)["time"].sort()
+            if len(sent) < 2:
+                continue  # nothing lies between
+            ran = flow.instances.filter(pl.col("callback_id").is_in(ids))
+            ran = ran.sort("start").select("callback_id", "start")
+            counts = (
+                ran.filter(callback_id=one)["start"].search_sorted(sent, side="right").diff()
+                for one in ids
+            )
+            if all((count.drop_nulls() > 0).all() for count in counts):
+                for one in ids:
+                    found[one].add(topic)
+    return found
+
+
 def _outputs(callbacks: list[Callback], kind: str) -> set[str]:
     topics = {topic for one in callbacks if one.kind == kind for topic in one.publishes}
     return topics - INTERNAL_TOPICS
@@ -93,10 +136,10 @@ def _by_topic(endpoints: pl.DataFrame) -> dict[str, tuple[str, ...]]:
 def goes_on_elsewhere(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
     """Whether what ``callback`` reads may leave on ``topic`` through another of its node.
 
-    So it is for callbacks that pass the topic on and, since the last input completes a set, for
-    the siblings that publish it. Where each of several callbacks publishes the topic, they are
-    inputs of one synchroniser if message_filters registered them, or if nothing is known about
-    who did; otherwise they publish independently.
+    So it is for callbacks that pass the topic on, or write it in turns, and, since the last input
+    completes a set, for the siblings that publish it. Where each of several callbacks publishes the
+    topic, they are inputs of one synchroniser if message_filters registered them, or if nothing is
+    known about who did; otherwise they publish independently.
     """
     if callback.kind != "subscription":
         return False
@@ -107,7 +150,9 @@ def goes_on_elsewhere(graph: ApplicationGraph, callback: Callback, topic: str) -
         and (other.pid, other.node) == (callback.pid, callback.node)
         and topic in other.publishes
     ]
-    if topic in callback.passes_on or any(topic in other.passes_on for other in siblings):
+    if topic in {*callback.passes_on, *callback.in_turns} or any(
+        topic in other.passes_on for other in siblings
+    ):
         return True
     filtered = callback.symbol is None or MESSAGE_FILTER in callback.symbol
     return filtered and any(other.kind == "subscription" for other in siblings)

@@ -18,7 +18,7 @@ USAGE_ERROR: Any = typer.BadParameter.__base__
 """What Typer raises where a command line is wrong; the name of its module changes."""
 
 _MODULES = (
-    ("runs", "demo run simulate"),
+    ("runs", "demo run simulate generate"),
     ("plans", "sweep"),
     ("runs", "record profile"),
     ("traces", "info graph callbacks chains latency convert"),

@@ -133,6 +133,24 @@ def simulate(
     out.show_line(recording.path)
 
 
+def generate(
+    application: Path = opt.APPLICATION,
+    output: Path = opt.option(
+        "--output -o DIR", "Folder of the package, named like it; must not exist.", ...
+    ),
+    json: bool = opt.option("--json", "Print what was written as JSON.", False),
+) -> None:
+    """Write a colcon package with the application as ROS 2 nodes in C++.
+
+    Build it with `colcon build`, then `ros2 launch NAME NAME.launch.py`; `chainshaper shape` shapes
+    that as any other application.
+    """
+    files = cs.generate_package(cs.load_application(application), output)
+    value = {"package": output.name, "folder": str(output), "files": list(map(str, files))}
+    if out.present(json, value):
+        out.show_line(output)
+
+
 def record(
     output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
@@ -246,7 +264,8 @@ def profile(
     """Record with the chain's threads under SCHED_FIFO, DDS threads on another core.
 
     This is how the latencies are measured that a plan is computed from. Whatever ends it, all
-    threads are as before. What happened before the priorities were in force is left out.
+    threads are as before. What happened before the priorities were in force is left out, and is no
+    part of --duration.
     """
     from chainshaper.flow.profiling import check_profiling, profiled_cores, undelayed
     from chainshaper.linux.own_processes import check_command
@@ -416,7 +435,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:
     from chainshaper.reporting.overviews import chain_table
-    from chainshaper.values.safe_text import shown
+    from chainshaper.values.errors import shown
 
     out.show(chain_table(graph, found))
     default = (found.heaviest or found.chains[0]).spec

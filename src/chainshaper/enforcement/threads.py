@@ -52,6 +52,7 @@ _BEST_SERVER_PRIORITY = 87
 _STEP = 2  # room for a publisher below the better server's threads
 _RECEIVES = "receives the output"
 _MOST_NAMED = 5
+_COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
 
 
 @dataclass(frozen=True)
@@ -201,6 +202,8 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
         main = all(thread.role != "executor" for thread in match.threads)
         return _Identified(process, nodes, known_by, known, main_executes=main)
     earlier = next((seen for seen in recorded if nodes and set(nodes) <= set(seen.nodes)), None)
+    if earlier is None and (earlier := _same_program(nodes, named, recorded)) is not None:
+        nodes, known_by = earlier.nodes, "recording"
     if earlier is None:
         return _Identified(process, nodes, known_by)
     # A container's command line names the container only; an earlier run tells its components.
@@ -210,6 +213,24 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
     executing = [thread.tid for thread in earlier.threads if thread.role == "executor"]
     main = not executing or earlier.pid in executing
     return _Identified(process, nodes, known_by, like, bool(like), main)
+
+
+def _same_program(
+    guess: Sequence[str], named: Sequence[str], recorded: Sequence[RecordedProcess]
+) -> RecordedProcess | None:
+    """The earlier run of a program that names its nodes in its code, known by its main thread.
+
+    None where its command line names nodes, or where several programs had that name.
+    """
+    if named or not guess:
+        return None
+    comm = guess[0][1:][:_COMM_LENGTH]
+    runs = [
+        seen
+        for seen in recorded
+        if seen.nodes and any((one.tid, one.comm) == (seen.pid, comm) for one in seen.threads)
+    ]
+    return runs[0] if len(runs) == 1 else None
 
 
 def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedThread]:

@@ -304,18 +304,29 @@ class _Run:
                 )
         return phases
 
-    def begins(self, chain: Plan, anchor_ns: int) -> int:
-        """Where a chain begins in its cycles: as its slot opens, where a server stops it until
-        then, otherwise with its timer.
+    def begins(self, place: int, anchor_ns: int) -> int:
+        """Where the chain at this place begins in its cycles."""
+        chain = self.plan.chains[place]
+        return (anchor_ns + chain.offset_ns - self.early(place)) % chain.cycle_ns
+
+    def early(self, place: int) -> int:
+        """How long before its slot a chain begins: with its timer, unless a server stops it until
+        then, which is one that is closed when the cycle ends.
         """
-        early = 0 if gates(self.choice.name) else LEAD_NS
-        return (anchor_ns + chain.offset_ns - early) % chain.cycle_ns
+        chain = self.plan.chains[place]
+        if not gates(self.choice.name):
+            return LEAD_NS
+        if not self.waits_ns:
+            return 0
+        first, _ = next(threads.in_order_of_slots(chain))
+        waits = first.slots[0][0] > 0 or first.slots[-1][1] < chain.cycle_ns
+        return 0 if waits else self.waits_ns[place]
 
     def tell(self, anchor_ns: int, moved_ns: Mapping[int, int] | None = None) -> None:
         """Begin to give shaping nodes where cycles begin: all, or of chains that have moved."""
         for place, chain in enumerate(self.plan.chains):
             if moved_ns is None or place in moved_ns:
-                begins = self.begins(chain, anchor_ns) + (moved_ns or {}).get(place, 0)
+                begins = self.begins(place, anchor_ns) + (moved_ns or {}).get(place, 0)
                 telling = tell_phase(shaping_nodes(chain), self.found, begins % chain.cycle_ns)
                 self.telling.append(telling)
 
@@ -348,7 +359,10 @@ class _Run:
         while True:
             is_over = self.command_ended or self.stop.is_set()
             followed_ns = next(following)
-            seen = {k: one.latest_ns for k, one in enumerate(drifts)}
+            seen = {k: one.surely_ns for k, one in enumerate(drifts)}
+            for k, ns in seen.items():
+                if ns is not None and (drifts[k].latest_ns or 0) - ns > PHASE_BOUND_NS:
+                    drifts[k].look_soon = True
             moved = {k: ns + followed_ns for k, ns in seen.items() if ns is not None}
             self.end_telling()
             self.look_at(servers, max(moved.values(), key=abs, default=None))
@@ -406,14 +420,22 @@ class _Run:
             before_ns = track.opens_ns
             if drifts[first].looks > seen:
                 seen = drifts[first].looks
-                track.saw(drifts[first].latest_ns or 0, time.monotonic_ns())
+                early = self.early(first)  # nothing stops it: one look alone may just be late
+                seen_ns = drifts[first].surely_ns if early else drifts[first].latest_ns
+                track.saw((seen_ns or 0) - early, time.monotonic_ns())
                 drifts[first].look_soon = track.is_unsure
             if track.opens_ns != before_ns:
                 moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
-                servers.arm(moved_ns)
+                try:
+                    servers.arm(moved_ns)
+                except OperationError:
+                    if not self.stop.is_set():
+                        raise
+                    yield before_ns  # asked to end meanwhile, which is no failure
+                    continue
                 self.state = replace(self.state, anchor_ns=moved_ns)
-                for chain, drift in zip(self.plan.chains, drifts, strict=True):
-                    drift.expect(self.begins(chain, moved_ns))
+                for place, drift in enumerate(drifts):
+                    drift.expect(self.begins(place, moved_ns))
             yield track.opens_ns
 
     def drift_watches(self) -> list[DriftWatch]:
@@ -421,19 +443,19 @@ class _Run:
         gated, cores = gates(self.choice.name), {server.core for server in self.plan.servers}
         watches: dict[int, DriftWatch] = {}
         found = []
-        for chain, origin in zip(
-            self.plan.chains, threads.first_threads(self.plan, self.found), strict=True
-        ):
+        origins = threads.first_threads(self.plan, self.found)
+        for place, (chain, origin) in enumerate(zip(self.plan.chains, origins, strict=True)):
             if origin.tid not in watches:
                 own = (
                     one.slots
                     for one in chain.servers
                     for state in self.state.servers
                     if gated and state.name == one.name and origin.tid in state.threads
+                    if not self.early(place)  # else nothing stops it, and short runs count too
                 )
                 watches[origin.tid] = DriftWatch(
                     *(origin.pid, origin.tid, chain.cycle_ns),
-                    self.begins(chain, self.state.anchor_ns or 0),
+                    self.begins(place, self.state.anchor_ns or 0),
                     next(own, ()),
                     cores=set(available_cores()) - cores,
                 )

@@ -186,7 +186,7 @@ def shape_launch(
         shaped = [*setup, *_sourced(splicing), *launch.with_file(file)]
     after = record(
         *("after", shaped, duration_ns),
-        scheduling=_in_force(plan, back_end, first, taken, applied := list[str]()),
+        scheduling=plan_in_force(plan, back_end, first, taken, applied := list[str]()),
         plan=plan,
         gate_logs=() if splicing is None else splicing.logs,
         chain=chains[0],
@@ -273,7 +273,7 @@ def _sourced(splicing: Splicing) -> list[str]:
 
 
 @contextmanager
-def _in_force(
+def plan_in_force(
     plan: ApplicationPlan,
     back_end: str,
     recording: Recording,

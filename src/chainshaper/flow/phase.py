@@ -180,9 +180,10 @@ class DriftWatch:
     """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
 
     ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
-    ``looks``; the next one comes earlier where it is to ``look_soon``. Looking takes a tenth of a
-    core: it is done on ``cores``, if there are any, and only ``NEAR`` where the thread began last.
-    A thread that is not seen there any more is looked for in the whole cycle.
+    ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
+    thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
+    takes a tenth of a core: it is done on ``cores``, if there are any, and only ``NEAR`` where the
+    thread began last. A thread that is not seen there any more is looked for in the whole cycle.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -201,6 +202,7 @@ class DriftWatch:
         cores: Collection[int] = (),
     ) -> None:
         self.latest_ns: int | None = None
+        self._before_ns = 0  # what the look before saw
         self.looks = 0
         self.look_soon = False
         self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
@@ -209,7 +211,11 @@ class DriftWatch:
 
     def expect(self, expected_ns: int) -> None:
         """The thread is to begin elsewhere from now on; what is seen of it till then is void."""
-        self._expected_ns = expected_ns
+        self._expected_ns, self._before_ns = expected_ns, 0
+
+    @property
+    def surely_ns(self) -> int | None:
+        return None if self.latest_ns is None else min(self.latest_ns, self._before_ns)
 
     def _look_again(self) -> None:
         if self._cores:
@@ -227,6 +233,7 @@ class DriftWatch:
                 if expected_ns != self._expected_ns:
                     near_ns = self._expected_ns
                 elif drift is not None:
+                    self._before_ns = self.latest_ns or 0
                     self.latest_ns = drift
                     self.looks += 1
 

@@ -67,6 +67,7 @@ TRACE_FOLDER = "trace"
 SPARE_DISK = 64 << 20  # a run ends when its disk has no more (bytes): there is more to be written
 _STEP_S = 0.1
 _FIRST_LOOK_NS = 500_000_000
+_LONGEST_UNTIL_IN_FORCE_NS = 180_000_000_000  # a dozen slow cycles are measured, up to five times
 _LONGEST_PAUSE_NS = 5_000_000_000  # looking takes some ms: the longer a run lasts, the rarer it is
 
 
@@ -233,14 +234,20 @@ def _trace(
 
 
 def _watch(run: _Run) -> None:
-    """Look at the application now and then, until it, its time or the tracer ends."""
+    """Look at the application now and then, until it, its time or the tracer ends.
+
+    Its time begins when the scheduling that was asked for is in force.
+    """
     next_look = run.begun_ns + _FIRST_LOOK_NS
     while True:
         lasted = time.monotonic_ns() - run.begun_ns
+        awaits_force = run.schedule is not None and run.in_force_ns is None
+        counted = 0 if awaits_force else lasted - ((run.in_force_ns or run.begun_ns) - run.begun_ns)
         if run.command is not None and run.command.poll() is not None:
             run.exit_code = run.command.returncode
             return
-        over = run.stop.is_set() or (run.duration_ns is not None and lasted >= run.duration_ns)
+        over = run.stop.is_set() or (run.duration_ns is not None and counted >= run.duration_ns)
+        over |= awaits_force and lasted >= _LONGEST_UNTIL_IN_FORCE_NS
         if over or lasted >= next_look - run.begun_ns:
             failure = run.tracer.failure()
             if failure is None and shutil.disk_usage(run.folder).free < SPARE_DISK:
@@ -252,8 +259,9 @@ def _watch(run: _Run) -> None:
                 return
             pause = _FIRST_LOOK_NS if run.schedule else max(_FIRST_LOOK_NS, lasted)
             next_look = run.begun_ns + lasted + min(_LONGEST_PAUSE_NS, pause)
-        share = 0.0 if run.duration_ns is None else lasted / run.duration_ns
-        run.progress(min(1.0, share), "recording; Ctrl-C ends it")
+        share = 0.0 if run.duration_ns is None else counted / run.duration_ns
+        doing = "waiting until the scheduling is in force" if awaits_force else "recording"
+        run.progress(min(1.0, share), f"{doing}; Ctrl-C ends it")
         run.stop.wait(_STEP_S)
 
 

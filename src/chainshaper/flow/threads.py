@@ -9,7 +9,7 @@ Which nodes a process has, its creation events say; which threads execute, the c
 import platform
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -325,13 +325,18 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
     return [_first_thread(chain, of_thread) for chain in plan.chains]
 
 
-def _first_thread(chain: Plan, of_thread: Mapping[PlannedThread, Sequence[Thread]]) -> Thread:
+def in_order_of_slots(chain: Plan) -> Iterator[tuple[Server, PlannedThread]]:
+    """The planned threads that run a chain, with their servers: those of shaping nodes left out."""
     gates = {node.thread for node in shaping_nodes(chain)}
     for server in sorted(chain.servers, key=lambda one: (one.slots[0][0], one.priority)):
-        for planned in server.threads:
-            for thread in of_thread.get(planned, ()) if planned not in gates else ():
-                if thread.role == "executor":
-                    return thread
+        yield from ((server, planned) for planned in server.threads if planned not in gates)
+
+
+def _first_thread(chain: Plan, of_thread: Mapping[PlannedThread, Sequence[Thread]]) -> Thread:
+    for _, planned in in_order_of_slots(chain):
+        for thread in of_thread.get(planned, ()):
+            if thread.role == "executor":
+                return thread
     raise OperationError(
         f"no server of {chain_name(chain)} holds an executor, so nothing says where in a cycle the"
         " chain begins: give its phase (--phase)"

@@ -1,0 +1,232 @@
+// One node of the described application:
+//
+//   described_node NAME SEED START_NS true|false
+//
+// Timers expire first at START_NS of CLOCK_MONOTONIC and their phase, late ones whole periods
+// later. With `true` threads get the described cores and SCHED_FIFO priorities.
+#include <sched.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <chrono>
+#include <cstdio>
+#include <cstring>
+#include <deque>
+#include <filesystem>
+#include <fstream>
+#include <functional>
+#include <memory>
+#include <stdexcept>
+#include <string>
+#include <type_traits>
+#include <utility>
+#include <vector>
+
+#include "application.hpp"
+#if __has_include("message_filters/subscriber.hpp")
+#include "message_filters/subscriber.hpp"
+#else
+#include "message_filters/subscriber.h"
+#endif
+#include "rclcpp/rclcpp.hpp"
+#include "sensor_msgs/msg/compressed_image.hpp"
+#include "std_msgs/msg/string.hpp"
+
+using Data = sensor_msgs::msg::CompressedImage;  // a header and bytes
+using Filter = message_filters::Subscriber<Data>;
+using Stamp = builtin_interfaces::msg::Time;
+using Text = std_msgs::msg::String;
+
+std::int64_t used_ns() { return clock_ns(CLOCK_THREAD_CPUTIME_ID); }
+
+rclcpp::QoS quality(const Topic &topic) {
+  rclcpp::QoS qos{topic.depth};
+  return topic.reliable ? qos.reliable() : qos.best_effort();
+}
+
+rclcpp::QoS lasting(const Topic &topic) {
+  const auto lifespan = rclcpp::Duration::from_nanoseconds(topic.lifespan_ns);
+  return topic.lifespan_ns > 0 ? quality(topic).lifespan(lifespan) : quality(topic);
+}
+
+// What a callback does: spend its time, and pass a stamp on to all its topics.
+class Work {
+ public:
+  Work(rclcpp::Node &node, const Callback &described, ExecutionTimes times)
+      : times_{std::move(times)}, announces_{described.announces} {
+    for (const auto &topic : described.outputs) {
+      if (announces_.empty()) {
+        outputs_.push_back(node.create_publisher<Data>(topic.name, lasting(topic)));
+        messages_.emplace_back().data.resize(topic.payload);
+      } else {  // the one topic of modes, also for who comes later
+        modes_ = node.create_publisher<Text>(topic.name, lasting(topic).transient_local());
+      }
+    }
+  }
+
+  void run(const Stamp &stamp, std::int64_t since_ns) {
+    for (auto &message : messages_) message.header.stamp = stamp;
+    spend(times_.next(), since_ns);
+    for (std::size_t i = 0; i < outputs_.size(); ++i) outputs_[i]->publish(messages_[i]);
+    if (modes_) {
+      Text mode;
+      mode.data = announces_[turn_++ % announces_.size()];
+      modes_->publish(mode);
+    }
+  }
+
+ private:
+  ExecutionTimes times_;
+  std::vector<std::string> announces_;
+  std::vector<rclcpp::Publisher<Data>::SharedPtr> outputs_;
+  std::vector<Data> messages_;
+  rclcpp::Publisher<Text>::SharedPtr modes_;
+  std::size_t turn_{0};
+};
+
+// `subscribe` takes another type of QoS from Kilted on; a template, for only one of them compiles.
+template <typename F>
+void subscribe(F &filter, rclcpp::Node *node, const Topic &input) {
+  if constexpr (std::is_constructible_v<F, rclcpp::Node *, std::string, rclcpp::QoS>) {
+    filter.subscribe(node, input.name, quality(input));
+  } else {
+    filter.subscribe(node, input.name, quality(input).get_rmw_qos_profile());
+  }
+}
+
+// Works for a set of the oldest message of every input, with the stamp of the first input's.
+class Synchroniser {
+ public:
+  Synchroniser(rclcpp::Node *node, const std::vector<Topic> &inputs, std::shared_ptr<Work> work)
+      : inputs_{inputs}, waiting_(inputs.size()), work_{std::move(work)} {
+    for (std::size_t i = 0; i < inputs.size(); ++i) {
+      filters_.push_back(std::make_unique<Filter>());
+      filters_[i]->registerCallback(std::function<void(const Data::ConstSharedPtr &)>(
+          [this, i](const Data::ConstSharedPtr &message) { add(i, message->header.stamp); }));
+      subscribe(*filters_[i], node, inputs[i]);
+    }
+  }
+
+ private:
+  void add(std::size_t i, const Stamp &stamp) {
+    const auto since_ns = used_ns();
+    waiting_[i].push_back(stamp);
+    if (waiting_[i].size() > inputs_[i].depth) waiting_[i].pop_front();
+    for (const auto &stamps : waiting_) {
+      if (stamps.empty()) return;
+    }
+    const Stamp first = waiting_[0].front();
+    for (auto &stamps : waiting_) stamps.pop_front();
+    work_->run(first, since_ns);
+  }
+
+  std::vector<Topic> inputs_;
+  std::vector<std::deque<Stamp>> waiting_;
+  std::shared_ptr<Work> work_;
+  std::vector<std::unique_ptr<Filter>> filters_;
+};
+
+using Timer = std::pair<std::int64_t, rclcpp::TimerBase::SharedPtr>;  // when it is armed
+
+class DescribedNode : public rclcpp::Node {
+ public:
+  DescribedNode(const Described &described, std::uint64_t seed, std::int64_t start_ns)
+      : Node{described.name.substr(described.name.rfind('/') + 1),
+             described.name.substr(0, described.name.rfind('/'))} {
+    const auto number = static_cast<std::uint32_t>(&described - application.data());
+    std::uint32_t index = 0;
+    for (const auto &callback : described.callbacks) {
+      ExecutionTimes times{callback.execution, seed, number, index++};
+      const auto work = std::make_shared<Work>(*this, callback, std::move(times));
+      if (callback.period_ns > 0) {
+        add_timer(callback, work, start_ns);
+      } else if (callback.inputs.size() > 1) {
+        synchronisers_.push_back(std::make_unique<Synchroniser>(this, callback.inputs, work));
+      } else {
+        const Topic &input = callback.inputs[0];
+        const auto run = [work](const Data &message) { work->run(message.header.stamp, used_ns()); };
+        subscriptions_.push_back(create_subscription<Data>(input.name, quality(input), run));
+      }
+    }
+  }
+
+  // Let every timer begin when it is due; what arrives before is worked on.
+  void start(rclcpp::Executor &executor) {
+    std::sort(timers_.begin(), timers_.end());
+    for (const auto &[armed_ns, timer] : timers_) {
+      while (rclcpp::ok() && clock_ns(CLOCK_MONOTONIC) < armed_ns) {
+        executor.spin_once(std::chrono::nanoseconds{armed_ns - clock_ns(CLOCK_MONOTONIC)});
+      }
+      timer->reset();
+    }
+  }
+
+ private:
+  void add_timer(const Callback &callback, std::shared_ptr<Work> work, std::int64_t start_ns) {
+    const auto period_ns = callback.period_ns, now = clock_ns(CLOCK_MONOTONIC);
+    const auto timer = create_wall_timer(std::chrono::nanoseconds{period_ns}, [work] {
+      const auto since_ns = used_ns(), wall_ns = clock_ns(CLOCK_REALTIME);
+      Stamp stamp;
+      stamp.sec = static_cast<std::int32_t>(wall_ns / 1'000'000'000);
+      stamp.nanosec = static_cast<std::uint32_t>(wall_ns % 1'000'000'000);
+      work->run(stamp, since_ns);
+    });
+    timer->cancel();  // it expires first a period after it was armed
+    const auto armed_ns = start_ns + callback.phase_ns - period_ns;
+    const auto missed = armed_ns < now ? (now - armed_ns) / period_ns + 1 : 0;
+    timers_.emplace_back(armed_ns + missed * period_ns, timer);
+  }
+
+  std::vector<Timer> timers_;
+  std::vector<rclcpp::SubscriptionBase::SharedPtr> subscriptions_;
+  std::vector<std::unique_ptr<Synchroniser>> synchronisers_;
+};
+
+void require(bool done, const std::string &what) {
+  if (!done) {
+    throw std::runtime_error{what + " is refused (" + std::strerror(errno) +
+                             "): permit it, or launch with scheduling:=false"};
+  }
+}
+
+// This thread is the executor, the others are those of DDS; LTTng's stay as they are.
+void schedule(const Described &described) {
+  for (const auto &task : std::filesystem::directory_iterator{"/proc/self/task"}) {
+    std::string name;
+    std::ifstream{task.path() / "comm"} >> name;
+    if (name.find("-ust") != std::string::npos) continue;
+    const pid_t thread = std::stoi(task.path().filename());
+    const Threads &wanted = thread == getpid() ? described.executor : described.dds;
+    sched_param parameters{};
+    parameters.sched_priority = wanted.priority;
+    require(sched_setscheduler(thread, SCHED_FIFO, &parameters) == 0, "SCHED_FIFO");
+    std::vector<cpu_set_t> cores(8);  // of 1024 each
+    CPU_SET_S(wanted.core, cores.size() * sizeof(cpu_set_t), cores.data());
+    require(sched_setaffinity(thread, cores.size() * sizeof(cpu_set_t), cores.data()) == 0,
+            "core " + std::to_string(wanted.core));
+  }
+}
+
+int main(int argc, char **argv) {
+  const auto words = rclcpp::init_and_remove_ros_arguments(argc, argv);
+  for (const auto &described : application) {
+    if (words.size() != 5 || words[1] != described.name) continue;
+    try {
+      const auto start_ns = std::stoll(words[3]);
+      const auto node = std::make_shared<DescribedNode>(described, std::stoull(words[2]), start_ns);
+      if (words[4] == "true") schedule(described);
+      rclcpp::executors::SingleThreadedExecutor executor;
+      executor.add_node(node);
+      node->start(executor);
+      executor.spin();
+    } catch (const std::exception &error) {
+      std::fprintf(stderr, "%s: %s\n", words[1].c_str(), error.what());
+      return 1;
+    }
+    rclcpp::shutdown();
+    return 0;
+  }
+  std::fprintf(stderr, "usage: described_node NAME SEED START_NS true|false\n");
+  return 2;
+}
