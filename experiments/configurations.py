@@ -6,28 +6,36 @@ asynchronous publisher, as `chainshaper shape` does it: the executors' prioritie
 A plan that has servers only, or one that is to have all its servers in force (``servers``), is
 carried out by freezing the application's threads, as `chainshaper apply` does it.
 
+Live, configurations that are compared take turns, in blocks: A B A B …, so that what the machine
+does to one it does to the other as well. Every block draws execution times of its own, which a plan
+that was made before has not seen.
+
     with ExitStack() as until:
         options = parse_options(__doc__, cycles=200, until=until)
         runs = [simulated("FIFO", application, cycles=options.simulated_cycles)]
         if options.live:
-            runs += [live("FIFO", application, cycles=options.cycles, folder=options.keep)]
-            plan = plan_recording(options.keep / "FIFO")
-            runs += [live("1 band", application, plan, cycles=options.cycles, folder=options.keep)]
+            live("profile", application, cycles=options.cycles, folder=options.keep)
+            plan = plan_recording(options.keep / "profile")
+            both = Configuration("FIFO", application), Configuration("1 band", application, plan)
+            runs += live_in_turns(both, cycles=options.cycles, folder=options.keep)
 """
 
 import argparse
+import os
+import shutil
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import polars as pl
 import yaml
-from results import MS, Run
+from results import MS, Column, Run
 
 from chainshaper import (
     apply_plan,
@@ -47,26 +55,42 @@ from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application, application_as_written
 
 __all__ = [
+    "Configuration",
     "Options",
     "Panel",
     "draw_latencies",
+    "first_cycles",
+    "joined",
     "latencies_of",
     "live",
+    "live_in_turns",
+    "missing_for_live",
+    "missing_for_ros",
+    "output_of",
     "parse_options",
     "simulated",
+    "taking_turns",
 ]
 
 BEFORE_IN_FORCE = 80
 """Cycles that a command runs longer: finding the nodes and measuring their phase takes a while."""
+
+BLOCKS = 5
+MOST_REPEATS = 3
+STOOD_STILL = 0.01
+"""A block is repeated where a core stood still for a larger share of it, whatever its latencies."""
+
+T = TypeVar("T")
 
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 
 
 @dataclass(frozen=True)
 class Options:
-    """How an experiment is run; ``keep`` is where recordings and plans of live runs are."""
+    """How an experiment is run; ``keep`` is where recordings and plans of measured runs are."""
 
     live: bool
+    ros: bool
     cycles: int
     simulated_cycles: int
     keep: Path
@@ -75,30 +99,44 @@ class Options:
 def parse_options(
     about: str, *, cycles: int, simulated_cycles: int = 10_000, until: ExitStack
 ) -> Options:
-    """The command line that every experiment has; the reason is printed where live runs cannot be.
+    """The command line that every experiment has; the reason is printed for runs that cannot be.
 
     Recordings are removed as ``until`` ends, unless `--keep FOLDER` says where they stay: those
     that are there already are used, and not measured again.
     """
     parser = argparse.ArgumentParser(description=about.partition("\n")[0])
-    parser.add_argument("--simulated", action="store_true", help="nothing is run live")
-    parser.add_argument("--cycles", type=int, default=cycles, help="of every live run")
+    parser.add_argument("--simulated", action="store_true", help="nothing is measured")
+    parser.add_argument("--without", choices=("live", "ros"), help="this is not measured")
+    parser.add_argument("--cycles", type=int, default=cycles, help="of every measured run")
     parser.add_argument("--simulated-cycles", type=int, default=simulated_cycles)
     parser.add_argument("--keep", type=Path, help="keep recordings here, and use those there")
     given = parser.parse_args()
-    missing = _missing_for_live()
-    if missing and not given.simulated:
-        print(f"simulated only: {missing}")
+    missing = missing_for_live()
+    measured = {
+        "live": not missing and given.without != "live",
+        "ros": not (missing or missing_for_ros()) and given.without != "ros",
+    }
+    if not given.simulated:
+        for reason in filter(None, (missing, missing_for_ros())):
+            print(f"not measured: {reason}")
     keep = given.keep or Path(until.enter_context(tempfile.TemporaryDirectory()))
     keep.mkdir(parents=True, exist_ok=True)
-    return Options(not (given.simulated or missing), given.cycles, given.simulated_cycles, keep)
+    live, ros = (one and not given.simulated for one in measured.values())
+    return Options(live, ros, given.cycles, given.simulated_cycles, keep)
 
 
-def _missing_for_live() -> str:
+def missing_for_live() -> str:
     if len(available_cores()) < 2:
         return "a live run needs two cores, one of them for the threads of DDS"
     if not may_use_fifo():
         return "a live run needs SCHED_FIFO: run as root, or with an rtprio limit of 98"
+    return ""
+
+
+def missing_for_ros() -> str:
+    needed = [one for one in ("ros2", "colcon", "lttng") if shutil.which(one) is None]
+    if needed or "AMENT_PREFIX_PATH" not in os.environ:
+        return f"runs on ROS 2 need it sourced, and {', '.join(needed) or 'AMENT_PREFIX_PATH'}"
     return ""
 
 
@@ -138,7 +176,7 @@ def live(
         PlatformError: SCHED_FIFO, freezing threads or a core is not to be had here.
         OperationError: a run failed, or the servers were not in force before it ended.
     """
-    output = folder / name.replace(" ", "_")
+    output = output_of(folder, name)
     in_force = output.with_name(f"{output.name}.in_force")
     if not output.exists():
         print(f"{application.name}, {name}: {cycles} cycles live", flush=True)
@@ -150,18 +188,113 @@ def live(
             shape_application(application, plan, output, cycles=cycles, realtime=True)
     since = int(in_force.read_text()) if in_force.exists() else 0
     found = latencies_of(name, open_recording(output), chain, since_ns=since)
-    return replace(found, latency_ns=found.latency_ns[:cycles], disturbed=found.disturbed[:cycles])
+    return first_cycles(found, cycles)
+
+
+def first_cycles(run: Run, cycles: int) -> Run:
+    return replace(run, latency_ns=run.latency_ns[:cycles], disturbed=run.disturbed[:cycles])
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """What :func:`live` runs, when it takes turns with others."""
+
+    name: str
+    application: Application
+    plan: Plan | None = None
+    chain: str | None = None
+    servers: bool = False
+
+
+def live_in_turns(
+    configurations: Sequence[Configuration], *, cycles: int, folder: Path, blocks: int = BLOCKS
+) -> list[Run]:
+    """Run configurations one after the other, and all again, until each has had ``blocks`` turns.
+
+    Recordings are `FOLDER/block_N/NAME`; configurations of one name, with other chains, share them.
+    Raises: as :func:`live`.
+    """
+
+    def measure(number: int, block: int) -> tuple[Run, Path]:
+        one, own = configurations[number], folder / f"block_{block}"
+        own.mkdir(exist_ok=True)
+        seed = one.application.seed + 1 + block
+        run = live(
+            one.name,
+            one.application.model_copy(update={"seed": seed}),
+            one.plan,
+            cycles=-(-cycles // blocks),
+            folder=own,
+            chain=one.chain,
+            servers=one.servers,
+        )
+        return run, output_of(own, one.name)
+
+    return [joined(*one) for one in taking_turns(len(configurations), blocks, measure)]
+
+
+def taking_turns(
+    count: int, blocks: int, measure: Callable[[int, int], tuple[T, Path]]
+) -> list[tuple[list[T], int]]:
+    """Measure one of ``count`` configurations after the other, and all again in the next block.
+
+    ``measure`` gets the number of a configuration and of a block; it gives what it measured and the
+    recording. Blocks in which the machine stood still are measured again, three of a configuration
+    at most. Of each configuration come what was measured in its blocks, and how many were repeated.
+    """
+    found: list[list[T]] = [[] for _ in range(count)]
+    repeats = [0] * count
+    for block in range(blocks):
+        for number, own in enumerate(found):
+            one, output = measure(number, block)
+            while repeats[number] < MOST_REPEATS and stood_still(open_recording(output)):
+                repeats[number] += 1
+                shutil.rmtree(output)
+                one, output = measure(number, block)
+            own.append(one)
+    return list(zip(found, repeats, strict=True))
+
+
+def stood_still(recording: Recording) -> bool:
+    """Whether a core stood still for more than 1 % of a recording, by its stall meters."""
+    stalls, starts = recording.events["machine_stall"], recording.events["callback_start"]["time"]
+    longest = stalls.group_by("cpu").agg(pl.col("duration").sum())["duration"].max() or 0
+    lasted = int(starts.max()) - int(starts.min())  # type: ignore[arg-type]
+    return int(longest) > STOOD_STILL * lasted  # type: ignore[arg-type]
+
+
+def joined(blocks: Sequence[Run], repeats: int) -> Run:
+    """The blocks of one configuration as one run."""
+    return replace(
+        blocks[0],
+        latency_ns=np.concatenate([one.latency_ns for one in blocks]),
+        disturbed=np.concatenate([one.disturbed for one in blocks]),
+        block=np.repeat(np.arange(len(blocks)), [one.latency_ns.size for one in blocks]),
+        repeats=repeats,
+    )
+
+
+def output_of(folder: Path, name: str) -> Path:
+    return folder / name.replace(" ", "_")
 
 
 def latencies_of(
-    name: str, recording: Recording, chain: str | None = None, *, since_ns: int = 0
+    name: str,
+    recording: Recording,
+    chain: str | None = None,
+    *,
+    column: Column | None = None,
+    since_ns: int = 0,
 ) -> Run:
-    """The latencies of a recorded chain, of the cycles that began at ``since_ns`` or later."""
+    """The latencies of a recorded chain, of the cycles that began at ``since_ns`` or later.
+
+    ``column`` is where it was recorded; by default, the recording tells.
+    """
     frame = measure_latency(recording, chain).analysis.traversals
     frame = frame.filter(pl.col("start") >= since_ns).sort("start")
     return Run(
         name,
-        live=recording.info.source == "live",
+        column or ("live" if recording.info.source == "live" else "simulated"),
         latency_ns=frame["latency_ns"].fill_null(-1).to_numpy(),
         disturbed=frame["disturbed"].to_numpy(),
     )

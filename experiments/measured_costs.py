@@ -1,5 +1,6 @@
 """What a machine takes besides computing, for a simulation: measured in a recording made on it."""
 
+from collections.abc import Collection
 from pathlib import Path
 
 import polars as pl
@@ -23,11 +24,14 @@ FAR = 10
 """What took so many times the median waited for something else."""
 
 
-def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
+def measured_costs(
+    recording: Recording | str | Path, but_for: Collection[str] = ()
+) -> SimulationDescription:
     """What a machine takes besides computing, from a recording of a live run on it.
 
-    Only executors that nothing of the application out-ranks on their core count: others wait for
-    more, such as the DDS threads that receive a large message there. Publishing lasts from a
+    Only executors that nothing of the application out-ranks on their core count, ``but_for`` these
+    nodes, such as shaping nodes, which rest while the chain runs: others wait for more, such as the
+    DDS threads that receive a large message there. Publishing lasts from a
     callback's last publication to its end; taking from the executor's choice to the callback's
     start. A message that came while the core was busy was there by the time that it was free, and
     from then to the choice the executor woke up; one that found it idle was on its way before that.
@@ -37,7 +41,7 @@ def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
     """
     recording = recording if isinstance(recording, Recording) else open_source(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    core = pl.col("tid").replace_strict(_first_executors(recording), default=None)
+    core = pl.col("tid").replace_strict(_first_executors(recording, but_for), default=None)
     instances = flow.instances.with_columns(core=core).drop_nulls(["core", "end"])
     read = _read(recording, flow, instances)
     waited = read.filter(pl.col("before").fill_null(0) <= pl.col("sent"))
@@ -63,9 +67,13 @@ def measured_costs(recording: Recording | str | Path) -> SimulationDescription:
     )
 
 
-def _first_executors(recording: Recording) -> dict[int, int]:
+def _first_executors(recording: Recording, but_for: Collection[str]) -> dict[int, int]:
     """The core of each executor that no thread of the application out-ranks there."""
-    threads = [thread for thread in recording.info.threads if thread.role != "stall-meter"]
+    threads = [
+        thread
+        for thread in recording.info.threads
+        if thread.role != "stall-meter" and thread.node not in but_for
+    ]
     return {
         one.tid: one.cores[0]
         for one in threads

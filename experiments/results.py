@@ -1,24 +1,25 @@
 """What every experiment hands in: numbers beside the paper's, and the latencies they come from.
 
-An experiment of the paper has up to three values for each number: the paper's, ours by simulation,
-ours live. :class:`Line` is one such number, :class:`Run` the latencies of one run, simulated or
-live. :func:`save` prints the lines of one table or figure and writes `results/NAME.json`, with the
-cycles of every run and how many of them the machine disturbed, beside `results/NAME.parquet`, which
-has the latencies that the numbers can be recomputed from.
+An experiment of the paper has a value for each number in up to five columns: the paper's, and ours
+by simulation, live, and on ROS 2 over two middlewares. :class:`Line` is one such number,
+:class:`Run` the latencies of one run. :func:`save` prints the lines of one table or figure and
+writes `results/NAME.json`, with the cycles of every run and how many of them the machine disturbed,
+beside `results/NAME.parquet`, which has the latencies that the numbers can be recomputed from.
 
-Live values cost minutes and cannot be had on every machine. An experiment that was only simulated
-therefore takes over the live values, runs and pictures (files named `…_live.png`) of the last time,
-each with the day and the machine of its measurement.
+Measured values cost minutes and cannot be had on every machine. An experiment that was only
+simulated therefore takes the measured runs of the last time from its files (:func:`earlier_runs`),
+and the pictures (files that end in the column, such as `_live.png`), with day and machine.
 """
 
 import json
 import os
 import platform
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, fields
 from datetime import date
+from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import polars as pl
@@ -27,13 +28,23 @@ from rich.console import Console
 from rich.table import Table
 
 __all__ = [
+    "COLUMNS",
     "HERE",
+    "MARK",
     "MS",
+    "OURS",
     "PICTURES",
     "RESULTS",
+    "ROS",
+    "Column",
     "Line",
     "Run",
     "Value",
+    "cell",
+    "drawn_again",
+    "earlier_lines",
+    "earlier_runs",
+    "figure",
     "lines_of",
     "save",
     "value_text",
@@ -45,6 +56,30 @@ RESULTS = HERE / "results"
 PICTURES = HERE / "pictures"
 
 Value: TypeAlias = float | str | None
+Column: TypeAlias = Literal["simulated", "live", "ros", "fast"]
+"""Where a run's latencies come from; the last two are ROS 2 on Cyclone DDS, and on Fast DDS."""
+
+ROS: tuple[Column, ...] = ("ros", "fast")
+OURS: tuple[Column, ...] = ("simulated", "live", *ROS)
+
+COLUMNS = {
+    "paper": "paper",
+    "simulated": "simulated",
+    "simulated_all": "all cycles",
+    "live": "live",
+    "live_all": "all cycles",
+    "ros": "ROS 2, Cyclone DDS",
+    "ros_all": "all cycles",
+    "fast": "ROS 2, Fast DDS",
+    "fast_all": "all cycles",
+}
+"""The columns of values: those of undisturbed cycles in time, and beside them those of all."""
+
+MARK = "○"
+"""Stands behind a value that says nothing about how near ours is to the paper's."""
+
+RESAMPLES, STRETCH = 2_000, 10
+"""Bootstrap: how often drawn again, and how many consecutive cycles are drawn together."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +87,11 @@ class Line:
     """One number of the paper, and ours. ``why`` says why they differ, where they do.
 
     ``what`` names the number and is unique within its table or figure. None stands for what there
-    is not: a number that the paper does not give, a run that was not made.
+    is not: a number that the paper does not give, a run that was not made. ``simulated``,
+    ``live``, ``ros`` and ``fast`` are over undisturbed cycles in time; the values with ``_all``
+    over all that came to an end, late ones too. ``intervals`` hold 95 % of the measured values of
+    a column that are drawn again. ``no_evidence`` says of a column why its value does not count as
+    one that is near. ``measured`` says when and where the live value was, if it is of no run here.
     """
 
     what: str
@@ -61,6 +100,15 @@ class Line:
     simulated: Value
     live: Value
     why: str = ""
+    simulated_all: Value = None
+    live_all: Value = None
+    ros: Value = None
+    ros_all: Value = None
+    fast: Value = None
+    fast_all: Value = None
+    measured: str | None = None
+    intervals: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    no_evidence: Mapping[Column, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -68,13 +116,18 @@ class Run:
     """The end-to-end latencies of one configuration, in the order of time.
 
     ``latency_ns`` is −1 where a cycle came to no end (lost, discarded, merged with another);
-    ``disturbed`` marks cycles that the machine disturbed, none of them in a simulation.
+    ``disturbed`` marks cycles that the machine disturbed, none of them in a simulation. ``block``
+    counts the stretches in which a configuration took turns with others; ``repeats`` of these were
+    measured again, because the machine stood still. ``measured`` is when and where, now by default.
     """
 
     name: str
-    live: bool
+    column: Column
     latency_ns: NDArray[np.int64]
     disturbed: NDArray[np.bool_]
+    block: NDArray[np.int64] | None = None
+    repeats: int = 0
+    measured: str = ""
 
     @property
     def undisturbed_ns(self) -> NDArray[np.int64]:
@@ -82,18 +135,55 @@ class Run:
         return self.latency_ns[(self.latency_ns >= 0) & ~self.disturbed]
 
     @property
-    def is_mostly_disturbed(self) -> bool:
-        """Whether fewer than half of the complete cycles are undisturbed."""
-        return bool(2 * self.undisturbed_ns.size < (self.latency_ns >= 0).sum())
+    def complete_ns(self) -> NDArray[np.int64]:
+        """The latencies of all cycles that came to an end."""
+        return self.latency_ns[self.latency_ns >= 0]
 
     @property
-    def counted_ns(self) -> NDArray[np.int64]:
-        """What figures are over: the undisturbed cycles, or all if those are too few to tell.
+    def blocks(self) -> NDArray[np.int64]:
+        """The block of each cycle; one where none took turns."""
+        return np.zeros(self.latency_ns.size, np.int64) if self.block is None else self.block
 
-        With all cycles a maximum or a jitter can only become larger.
-        """
-        complete = self.latency_ns[self.latency_ns >= 0]
-        return complete if self.is_mostly_disturbed else self.undisturbed_ns
+
+def figure(what: str, latency_ns: NDArray[np.int64], late_from_ns: float = np.inf) -> Value:
+    """One figure of latencies, in ms; of those in time, but for ``late``, which counts the others.
+
+    None where there is nothing that it could be of.
+    """
+    late = latency_ns >= late_from_ns
+    if what == "late":
+        return int(late.sum())
+    in_time = latency_ns[~late] / MS
+    if not in_time.size:
+        return None
+    if what == "jitter":
+        return float(np.ptp(in_time))
+    return float(in_time.max() if what == "maximum" else in_time.mean())
+
+
+def drawn_again(
+    run: Run, of: Callable[[NDArray[np.int64], NDArray[np.bool_]], Value]
+) -> tuple[float, float] | None:
+    """Between which values 95 % of a run's figure lie, when its cycles are drawn again.
+
+    Stretches of ten consecutive cycles are drawn with replacement, as many of every block as it
+    has: what belongs together in time stays together (moving-block bootstrap, Künsch 1989). ``of``
+    gets latencies and which of them are disturbed. Of a maximum it shows how much hangs on few
+    cycles, not how much larger another run's may be.
+    """
+    random, drawn = np.random.default_rng(1), list[NDArray[np.int64]]()
+    for block in np.unique(run.blocks):
+        own = np.flatnonzero(run.blocks == block)
+        length = min(STRETCH, own.size)
+        starts = random.integers(0, own.size - length + 1, (RESAMPLES, -(-own.size // length)))
+        places = (starts[:, :, None] + np.arange(length)).reshape(RESAMPLES, -1)[:, : own.size]
+        drawn.append(own[places])
+    again = (of(run.latency_ns[row], run.disturbed[row]) for row in np.concatenate(drawn, axis=1))
+    values = [value for value in again if isinstance(value, float | int)]
+    if not values:
+        return None
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(low), float(high)
 
 
 def lines_of(
@@ -103,44 +193,64 @@ def lines_of(
     *,
     late_from_ns: int | None = None,
     why: str = "",
+    no_evidence: Mapping[Column, str] | None = None,
 ) -> list[Line]:
     """The lines of one configuration, simulated and live, whose runs are both called ``name``.
 
     ``paper`` has the paper's value for each line that is wanted: ``average``, ``maximum`` and
     ``jitter`` (maximum − minimum) in ms, ``late`` in cycles: those that took ``late_from_ns`` or
-    longer, which missed the slot that they were due in. They are left out of the other figures.
-    Where most cycles of a run were disturbed, ``why`` is extended by that.
+    longer, which missed the slot that they were due in. Figures of undisturbed cycles leave the
+    late ones out, figures of all cycles leave out nothing.
     """
-    found = {run.live: run.counted_ns for run in runs if run.name == name}
-    for run in runs:
-        if run.name == name and run.is_mostly_disturbed:
-            why += (
-                f"{'; ' if why else ''}live over all cycles, as {run.disturbed.sum()} of"
-                f" {run.disturbed.size} are marked as disturbed"
+    found = {run.column: run for run in runs if run.name == name}
+    limit = np.inf if late_from_ns is None else late_from_ns
+
+    def calm(what: str, latency: NDArray[np.int64], disturbed: NDArray[np.bool_]) -> Value:
+        return figure(what, latency[(latency >= 0) & ~disturbed], limit)
+
+    def every(what: str, latency: NDArray[np.int64], _: NDArray[np.bool_]) -> Value:
+        return figure(what, latency[latency >= 0], limit if what == "late" else np.inf)
+
+    def line(what: str, value: Value) -> Line:
+        values: dict[str, Any] = dict.fromkeys(("simulated", "live"))
+        intervals: dict[str, tuple[float, float]] = {}
+        for column, run in found.items():
+            for name_of, of in ((column, calm), (f"{column}_all", every)):
+                values[name_of] = of(what, run.latency_ns, run.disturbed)
+                again = None if column == "simulated" else drawn_again(run, partial(of, what))
+                if again is not None:
+                    intervals[name_of] = again
+        unit = "cycles" if what == "late" else "ms"
+        values |= {"intervals": intervals, "no_evidence": no_evidence or {}}
+        return Line(f"{name}: {what}", unit, value, why=why, **values)
+
+    return [line(what, value) for what, value in paper.items()]
+
+
+def earlier_runs(name: str, *columns: Column, folder: Path = RESULTS) -> list[Run]:
+    """The runs of these columns that an experiment had the last time; none without its files."""
+    path = folder / f"{name}.json"
+    if not path.exists():
+        return []
+    rows, found = pl.read_parquet(path.with_suffix(".parquet")), []
+    for run in json.loads(path.read_text())["runs"]:
+        if run["column"] in columns:
+            own = rows.filter(pl.col("column") == run["column"], pl.col("run") == run["name"])
+            latency, disturbed, block = (
+                own[key].to_numpy() for key in ("latency_ns", "disturbed", "block")
             )
+            of_run = (run["repeats"], run["measured"])
+            found.append(Run(run["name"], run["column"], latency, disturbed, block, *of_run))
+    return found
 
-    def ours(what: str, live: bool) -> Value:
-        if live not in found:
-            return None
-        late = found[live] >= (np.inf if late_from_ns is None else late_from_ns)
-        in_time = found[live][~late] / MS
-        if what == "late":
-            return int(late.sum())
-        if what == "jitter":
-            return float(np.ptp(in_time))
-        return float(in_time.max() if what == "maximum" else in_time.mean())
 
-    return [
-        Line(
-            f"{name}: {what}",
-            "cycles" if what == "late" else "ms",
-            value,
-            ours(what, False),
-            ours(what, True),
-            why,
-        )
-        for what, value in paper.items()
-    ]
+def earlier_lines(name: str, prefix: str, folder: Path = RESULTS) -> list[Line]:
+    """The lines of the last time that begin with ``prefix``, for what only a live run can make."""
+    path = folder / f"{name}.json"
+    lines = json.loads(path.read_text())["lines"] if path.exists() else []
+    known = {one.name for one in fields(Line)}
+    own = (line for line in lines if line["what"].startswith(prefix))
+    return [Line(**{key: value for key, value in line.items() if key in known}) for line in own]
 
 
 def save(
@@ -155,23 +265,18 @@ def save(
 ) -> Path:
     """Print the lines, and write `NAME.json` and `NAME.parquet`; the path of the former.
 
-    ``pictures`` are files in :data:`PICTURES`; those that show live latencies are called
-    `…_live.png`. ``notes`` (Markdown) stand below the table; without any, the earlier ones do.
+    ``pictures`` are files in :data:`PICTURES`, called `…_COLUMN.png`. ``notes`` (Markdown) stand
+    below the table; without any, the earlier ones do.
     """
     folder.mkdir(exist_ok=True)
     path, rows_path = folder / f"{name}.json", folder / f"{name}.parquet"
     earlier = json.loads(path.read_text()) if path.exists() else {}
-    kept = [
-        run
-        for run in earlier.get("runs", [])
-        if run["live"] and not any(one.live and one.name == run["name"] for one in runs)
-    ]
-    _write_beside(rows_path, _rows(runs, kept, rows_path).write_parquet)
+    _write_beside(rows_path, _rows(runs).write_parquet)
     document = {
         "title": title,
         "notes": notes or earlier.get("notes", ""),
-        "lines": _lines(lines, earlier.get("lines", [])),
-        "runs": [_summary(run) for run in runs] + kept,
+        "lines": _lines(lines, runs, earlier.get("lines", [])),
+        "runs": [_summary(run) for run in runs],
         "pictures": _pictures(pictures, earlier.get("pictures", [])),
     }
     text = json.dumps(document, indent=1, ensure_ascii=False) + "\n"
@@ -189,53 +294,80 @@ def value_text(value: Value) -> str:
     return f"{value:.1f}" if abs(value) >= 10 else f"{value:.2f}"
 
 
-def _rows(runs: Sequence[Run], kept: Sequence[dict[str, Any]], path: Path) -> pl.DataFrame:
-    """One row per cycle: of these runs, and of the earlier ones that are kept."""
-    types = {"run": pl.String, "live": pl.Boolean, "latency_ns": pl.Int64, "disturbed": pl.Boolean}
+def cell(line: Mapping[str, Any], column: str) -> str:
+    """One value of a line as it is printed, with its interval, and its mark where it has one."""
+    text = value_text(line[column])
+    interval = line["intervals"].get(column)
+    if interval is not None and line[column] is not None:
+        whole = line["unit"] == "cycles"
+        low, high = (value_text(round(limit) if whole else limit) for limit in interval)
+        text += f" ({low}–{high})"
+    marked = column.removesuffix("_all") in line["no_evidence"] and line[column] is not None
+    return f"{text} {MARK}" if marked else text
+
+
+def _rows(runs: Sequence[Run]) -> pl.DataFrame:
+    """One row per cycle."""
+    types: dict[str, type[pl.DataType]] = {
+        **{"run": pl.String, "column": pl.String, "latency_ns": pl.Int64},
+        **{"disturbed": pl.Boolean, "block": pl.Int64},
+    }
     frames = [pl.DataFrame(schema=types)]
     for run in runs:
-        rows = pl.DataFrame({"latency_ns": run.latency_ns, "disturbed": run.disturbed})
-        named = rows.with_columns(run=pl.lit(run.name), live=pl.lit(run.live))
+        rows = pl.DataFrame(
+            {"latency_ns": run.latency_ns, "disturbed": run.disturbed, "block": run.blocks}
+        )
+        named = rows.with_columns(run=pl.lit(run.name), column=pl.lit(run.column))
         frames.append(named.select(*types))
-    if kept:
-        names = [run["name"] for run in kept]
-        frames.append(pl.read_parquet(path).filter("live", pl.col("run").is_in(names)))
     return pl.concat(frames)
 
 
 def _summary(run: Run) -> dict[str, Any]:
     return {
         "name": run.name,
-        "live": run.live,
-        "measured": _here_and_now(run.live),
+        "column": run.column,
+        "measured": run.measured or _here_and_now(run.column != "simulated"),
         "cycles": int(run.latency_ns.size),
+        "blocks": int(np.unique(run.blocks).size),
+        "repeats": run.repeats,
         "incomplete": int((run.latency_ns < 0).sum()),
         "disturbed": int(run.disturbed.sum()),
     }
 
 
-def _lines(lines: Sequence[Line], earlier: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The lines as they are written; a live value that is missing is the earlier one."""
+def _lines(
+    lines: Sequence[Line], runs: Sequence[Run], earlier: Sequence[dict[str, Any]]
+) -> list[dict[str, Any]]:
+    """The lines as they are written; a measured value that is of no run here is the earlier one."""
     before = {line["what"]: line for line in earlier}
+    days = {run.name: run.measured or _here_and_now(True) for run in runs if run.column == "live"}
     written = []
     for line in lines:
-        if line.live is None and line.what in before:
-            live, measured = before[line.what]["live"], before[line.what]["measured"]
-        else:
-            live, measured = line.live, _here_and_now(True) if line.live is not None else None
-        written.append({**asdict(line), "live": live, "measured": measured})
+        values, name = asdict(line), line.what.rpartition(": ")[0]
+        if line.live is not None:
+            values["measured"] = line.measured or days.get(name)
+        known = before.get(line.what, {"live": None, "measured": None})
+        if line.live in (None, known["live"]) and values["measured"] is None:
+            values |= {key: known[key] for key in ("live", "measured")}
+        elif values["measured"] is None:
+            values["measured"] = _here_and_now(True)
+        for column in ROS:
+            if values[column] is None and line.what in before:
+                values[column] = before[line.what][column]
+        written.append(values)
     return written
 
 
 def _pictures(pictures: Sequence[Path], earlier: Sequence[str]) -> list[str]:
     names = [path.name for path in pictures]
-    kept = [name for name in earlier if name.endswith("_live.png") and name not in names]
-    return sorted(names + kept)
+    ends = tuple(f"_{column}.png" for column in OURS if column != "simulated")
+    measured = [name for name in earlier if name.endswith(ends)]
+    return sorted({*names, *measured})
 
 
-def _here_and_now(live: bool) -> str:
-    """The day; for what is live, also the kernel and the processors."""
-    if not live:
+def _here_and_now(measured: bool) -> str:
+    """The day; for what is measured, also the kernel and the processors."""
+    if not measured:
         return f"{date.today()}"
     cpu = next(
         (
@@ -257,9 +389,10 @@ def _write_beside(path: Path, write: Callable[[Path], object]) -> None:
 def _print(document: Mapping[str, Any]) -> None:
     table = Table(title=document["title"], title_justify="left")
     table.add_column("")
-    for column in ("unit", "paper", "simulated", "live"):
+    lines = document["lines"]
+    there = [one for one in COLUMNS if any(line[one] is not None for line in lines)]
+    for column in ("unit", *(COLUMNS[one] for one in there)):
         table.add_column(column, justify="right")
-    for line in document["lines"]:
-        values = (value_text(line[column]) for column in ("paper", "simulated", "live"))
-        table.add_row(line["what"], line["unit"], *values)
-    Console(width=120).print(table)
+    for line in lines:
+        table.add_row(line["what"], line["unit"], *(cell(line, column) for column in there))
+    Console(width=160).print(table)
