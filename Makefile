@@ -42,8 +42,8 @@ benchmark: .venv/.ready-dev
 	.venv/bin/python benchmarks/trace_to_latency.py
 	.venv/bin/python benchmarks/enforcement/enter_exit.py
 
-# The paper's tables and figures, ours beside them, in experiments/RESULTS.md. Half an hour on a quiet
-# machine; LIVE=0 only simulates, which takes a minute or two.
+# The paper's tables and figures, ours beside them, in experiments/RESULTS.md. An hour on a quiet
+# machine, some more where ROS 2 is sourced; LIVE=0 only simulates, which takes a minute or two.
 experiments: .venv/.ready-dev
 	.venv/bin/python experiments/render.py $(if $(filter 0,$(LIVE)),--simulated)
 
