@@ -86,7 +86,8 @@ class Run:
         wait_for(lambda: not any(map(is_alive, ours)), "our processes to end")
         for journal in find_journals(self.runs):
             assert undo_run(journal) == ()
-        assert list(self.runs.iterdir()) == []
+        # We may have killed the one that was just removing the folder, which was empty then.
+        assert not [path for path in self.runs.rglob("*") if path.is_file()]
         assert groups_left(self.owner.pid) == []
 
 
@@ -170,9 +171,12 @@ def test_whichever_two_are_killed_or_stopped_all_is_as_before(
         (tmp_path / name).mkdir()
         with node_to_govern(tmp_path / name, name) as node, run_on(node, back_end) as run:
             assert state_of(node.pid).scheduling_class.priority > 0
-            for whose, number in faults:
-                for pid in run.pids(whose):
-                    kill(pid, number)
+            lost = [(pid, number) for whose, number in faults for pid in run.pids(whose)]
+            if len(lost) > 1:  # at one instant: none is to react to what befell the other
+                for pid, _ in lost:
+                    kill(pid, STOP)
+            for pid, number in lost:
+                kill(pid, number)
             run.wait_until_restored()
 
     without = {"dispatcher", "guardians"} if back_end == "fifo" else set()
