@@ -22,6 +22,7 @@ from chainshaper.enforcement.threads import (
     RecordedThread,
     WantedScheduling,
     allocate,
+    first_planned,
     left_by_back_end,
     new_and_ended,
     plan_scheduling,
@@ -299,7 +300,7 @@ def test_servers_stand_below_dds_in_the_order_of_their_priority() -> None:
     )
     assert _by_tid(plan_scheduling(plan, allocation, (0, 1))) == {
         200: Scheduling(87, (1,)),
-        100: Scheduling(85, (1,)),
+        100: Scheduling(84, (1,)),
         101: Scheduling(90, (0,)),
         201: Scheduling(90, (0,)),
         # Best effort, unknown threads and other processes are left alone.
@@ -360,8 +361,8 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     wanted = plan_scheduling(plan, allocation, (0, 1))
     assert _by_tid(wanted) == {
         100: Scheduling(87, (1,)),
-        200: Scheduling(85, (1,)),  # in the chain, and so not below it
-        300: Scheduling(83, (1,)),
+        200: Scheduling(84, (1,)),  # in the chain, and so not below it
+        300: Scheduling(81, (1,)),
         301: Scheduling(91, (0,)),  # waited for, so above other DDS threads
     }
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
@@ -401,19 +402,20 @@ def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> No
         _node("/c", 300, "executor"),
     )
     wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
-    assert wanted[200] == Scheduling(85, (1,), takes_turns=True)
-    assert wanted[201] == Scheduling(84, (1,)), "not 87, which its server would have"
-    assert wanted[300] == Scheduling(83, (1,)), "the next server stays below it"
+    assert wanted[100] == Scheduling(85, (1,), takes_turns=True), "it begins the chain"
+    assert wanted[200] == Scheduling(84, (1,), takes_turns=True)
+    assert wanted[201] == Scheduling(83, (1,)), "not 87, which its server would have"
+    assert wanted[300] == Scheduling(81, (1,)), "the next server stays below it"
     assert wanted[202] == Scheduling(90, (0,))
     assert wanted[203] == Scheduling(None, (0,)), "it would be outranked on core 1"
 
 
-def test_several_threads_of_a_server_take_turns() -> None:
+def test_several_threads_of_a_server_take_turns_but_the_chain_begins_at_once() -> None:
     plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
     allocation = _allocation(_node("/a", 100, "executor", "executor"), _node("/b", 200, "executor"))
-    assert set(_by_tid(plan_scheduling(plan, allocation, (0, 1))).values()) == {
-        Scheduling(87, (1,), takes_turns=True)
-    }
+    first, following = (Scheduling(priority, (1,), takes_turns=True) for priority in (88, 87))
+    wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
+    assert wanted == {100: first, 101: first, 200: following}
 
 
 def test_a_publisher_on_a_core_of_its_own_has_its_servers_priority() -> None:
@@ -472,9 +474,9 @@ def test_nodes_that_share_an_executor_are_one_thread_of_one_server() -> None:
 
 
 def test_more_priorities_than_there_are_are_refused() -> None:
-    assert min(server_priorities(range(1, 44)).values()) == 3
-    with pytest.raises(InputError, match="44 different server priorities do not fit below 90"):
-        server_priorities(range(1, 45))
+    assert min(server_priorities(range(1, 30)).values()) == 3
+    with pytest.raises(InputError, match="30 different server priorities do not fit below 90"):
+        server_priorities(range(1, 31))
 
 
 @st.composite
@@ -508,20 +510,26 @@ def test_whatever_the_plan_the_order_of_priorities_holds(
     plan, allocation = application
     wanted = plan_scheduling(plan, allocation, (0, 1, 2))
     ranks = {server.name: server.priority for server in plan.servers}
+    first = first_planned(plan.chains[0])
+
+    def begins(one: WantedScheduling) -> int:
+        return first is not None and first.node in one.thread.nodes
+
     assert len({one.thread.thread.tid for one in wanted}) == len(wanted), "one wish per thread"
     for one in wanted:
         priority, role = one.wanted.priority, one.thread.thread.role
         assert (role == "dds") == (priority == DDS_PRIORITY)
         if role == "dds" or priority is None or one.server is None:
             continue
-        assert 1 <= priority < 88
+        assert 1 <= priority < 89
         for other in wanted:
             if other.server is None or other.wanted.priority is None:
                 continue
             if ranks[one.server] < ranks[other.server] and role != "publisher":
                 assert priority > other.wanted.priority
             if role == other.thread.thread.role == "executor" and one.server == other.server:
-                assert one.wanted == other.wanted
+                above = begins(one) - begins(other)
+                assert priority - other.wanted.priority == above
     after = {one.thread.thread.tid: one.wanted for one in wanted}
     for one in wanted:
         if one.thread.thread.role != "publisher":

@@ -304,7 +304,9 @@ def profile(
         source=source,
         duration_ns=duration,
         chain=chains[0] if chains else None,
-        scheduling=cs.profiling_condition(core_of, core_of or cores[0], like=earlier),
+        scheduling=cs.profiling_condition(
+            core_of, core_of or cores[0], like=earlier, chains=chains
+        ),
         watch_stalls=True,
     )
 

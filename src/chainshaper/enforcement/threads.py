@@ -11,6 +11,8 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   is received, they have the first of these cores, which the shaping node leaves clear;
 * servers stand below 88 in the order of their own priority, smaller first; several threads of one
   server share a priority under SCHED_RR, so that they take turns;
+* the thread that begins a chain stands one above the others of its server, if there are any: the
+  chain begins as its timer expires, also where another of them runs a callback then;
 * who receives what a shaping node publishes stands below all servers, on the shaping node's core;
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
   the writer's lock, and above them would never let them release it;
@@ -20,7 +22,7 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 """
 
 import time
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain as joined
 from types import MappingProxyType
@@ -38,7 +40,7 @@ from chainshaper.linux.processes import (
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole
 from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Server
+from chainshaper.planning.plan import Plan, Server, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -49,7 +51,7 @@ IN_ORDER = (
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
-_STEP = 2  # room for a publisher below the better server's threads
+_STEP = 3  # room for a publisher below the better server's threads, and a thread that begins above
 _RECEIVES = "receives the output"
 _MOST_NAMED = 5
 _COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
@@ -406,9 +408,9 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
 
 
 def server_priorities(priorities: Iterable[int]) -> dict[int, int]:
-    """The real-time priority for each server priority: 87 for the best, 85, 83 …
+    """The real-time priority for each server priority: 87 for the best, 84, 81 …
 
-    Raises InputError: there are more than 43 of them.
+    Raises InputError: there are more than 29 of them.
     """
     ranks = sorted(set(priorities))
     if _BEST_SERVER_PRIORITY - _STEP * (len(ranks) - 1) <= 1:
@@ -447,7 +449,21 @@ def plan_scheduling(
         receiving=receiving,
         take_turns=plan.takes_turns,
         clear=clear,
+        first={begins.node for chain in plan.chains if (begins := first_planned(chain))},
     )
+
+
+def first_planned(chain: Plan) -> PlannedThread | None:
+    """The thread that begins a chain: the first executor, of no shaping node, by servers' slots."""
+    run_it = (planned for _, planned in in_order_of_slots(chain))
+    return next((one for one in run_it if one.role == "executor"), None)
+
+
+def in_order_of_slots(chain: Plan) -> Iterator[tuple[Server, PlannedThread]]:
+    """The planned threads that run a chain, with their servers: those of shaping nodes left out."""
+    gates = {node.thread for node in shaping_nodes(chain)}
+    for server in sorted(chain.servers, key=lambda one: (one.slots[0][0], one.priority)):
+        yield from ((server, planned) for planned in server.threads if planned not in gates)
 
 
 def _ranked(servers: Iterable[Server | ReservationServer]) -> list[int]:
@@ -464,29 +480,32 @@ def scheduling_around(
     receiving: Sequence[WantedScheduling] = (),
     take_turns: bool = False,
     clear: Collection[int] = (),
+    first: Collection[str] = (),
 ) -> tuple[WantedScheduling, ...]:
     """What the threads of servers, and the others of their processes, shall get.
 
     ``members`` are by server's name. ``receiving`` is what threads that receive an output shall
     get, whose processes are treated alike; with ``take_turns``, servers of one priority share it by
     turns. DDS threads leave the cores of all servers or, where these are all that there are, those
-    to be ``clear``.
+    to be ``clear``. The nodes that begin a chain are ``first``.
 
     Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
     InputError: see :func:`server_priorities`.
     """
     ranks = server_priorities(_ranked(servers))
 
-    def wanted_in(server: Server | ReservationServer) -> Scheduling:
+    def wanted_in(server: Server | ReservationServer, one: NodeThread) -> Scheduling:
         if getattr(server, "best_effort", False):
             return Scheduling(0, (server.core,))
-        turns = take_turns or len(members[server.name]) > 1
-        return Scheduling(ranks[server.priority], (server.core,), turns)
+        several = len(members[server.name]) > 1
+        begins = one.thread.role == "executor" and not set(first).isdisjoint(one.nodes)
+        above = several and begins and not take_turns
+        return Scheduling(ranks[server.priority] + above, (server.core,), take_turns or several)
 
     own = [
         WantedScheduling(
             member,
-            wanted_in(server),
+            wanted_in(server, member),
             server.name,
             f"server priority {server.priority}",
         )

@@ -318,7 +318,7 @@ class _Run:
             return LEAD_NS
         if not self.waits_ns:
             return 0
-        first, _ = next(threads.in_order_of_slots(chain))
+        first, _ = next(allocation.in_order_of_slots(chain))
         waits = first.slots[0][0] > 0 or first.slots[-1][1] < chain.cycle_ns
         return 0 if waits else self.waits_ns[place]
 

@@ -163,7 +163,9 @@ def shape_launch(
         cores = {node: core_of[node] for node in chain_nodes(first, *own)}
         before = record(
             *("before" if number == 1 else f"before_{number}", shaped, duration_ns),
-            scheduling=profiling_condition(cores, cores, like=first) if permitted else None,
+            scheduling=profiling_condition(cores, cores, like=first, chains=own)
+            if permitted
+            else None,
             chain=own[0],
             watch_stalls=True,
         )

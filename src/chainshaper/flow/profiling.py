@@ -44,6 +44,7 @@ def profiling_condition(
     core: int | Mapping[str, int] | None = None,
     folder: Path | None = None,
     like: Recording | None = None,
+    chains: Sequence[str] = (),
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
@@ -51,16 +52,18 @@ def profiling_condition(
     ``core`` is where the executors run (default: the last that we may use), or the core of each of
     ``nodes``, which those that share a process have in common. ``folder`` is where journals are
     (default: `/run/chainshaper`). An earlier recording of the application that this one is ``like``
-    says which components a container has, and which executors several threads.
+    says which components a container has, and which executors several threads; ``chains`` in it
+    begin as a plan has them begin (:mod:`chainshaper.enforcement.threads`).
 
-    Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
-    governs one of the nodes, or the core; not all could be put back. And where it is called: a node
-    does not appear, or the kernel refuses something.
+    Raises InputError: no such chain. PlatformError: no such core, or SCHED_FIFO is not permitted.
+    OperationError: `apply` governs one of the nodes, or the core; not all could be put back. And
+    where it is called: a node does not appear, or the kernel refuses something.
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
     cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     servers = [ReservationServer(f"the executors of core {one}", one, 1, ()) for one in cores]
     recorded = recorded_processes(like)[0] if like is not None else ()
+    first = {chain_nodes(like, one)[0] for one in chains} if like is not None else ()
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
 
     def see_to_it(processes: Sequence[Process]) -> bool:
@@ -81,7 +84,9 @@ def profiling_condition(
             for server in servers
         }
         clear = cores[:1] if len(cores) > 1 else ()  # the plan's, whose output it has mostly
-        around = scheduling_around(homes, servers, found, available_cores(), clear=clear)
+        around = scheduling_around(
+            homes, servers, found, available_cores(), clear=clear, first=first
+        )
         new = [one for one in around if one.thread.thread.identity not in done]
         # One after the other, as under SCHED_FIFO in the paper: no turns.
         changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]

@@ -9,7 +9,7 @@ Which nodes a process has, its creation events say; which threads execute, the c
 import platform
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -35,8 +35,7 @@ from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import Writer, check_publication
-from chainshaper.planning.plan import Plan, Server, publisher_servers, shaping_nodes
-from chainshaper.planning.plan import Thread as PlannedThread
+from chainshaper.planning.plan import Plan, Server, publisher_servers
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -312,7 +311,7 @@ def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
 
 
 def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
-    """The thread that begins each chain: the first executor, of no shaping node, by servers' slots.
+    """The running thread that begins each chain (:func:`.first_planned`).
 
     Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
     """
@@ -322,25 +321,16 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
         for server in plan.servers
         for planned in server.threads
     }
-    return [_first_thread(chain, of_thread) for chain in plan.chains]
-
-
-def in_order_of_slots(chain: Plan) -> Iterator[tuple[Server, PlannedThread]]:
-    """The planned threads that run a chain, with their servers: those of shaping nodes left out."""
-    gates = {node.thread for node in shaping_nodes(chain)}
-    for server in sorted(chain.servers, key=lambda one: (one.slots[0][0], one.priority)):
-        yield from ((server, planned) for planned in server.threads if planned not in gates)
-
-
-def _first_thread(chain: Plan, of_thread: Mapping[PlannedThread, Sequence[Thread]]) -> Thread:
-    for _, planned in in_order_of_slots(chain):
-        for thread in of_thread.get(planned, ()):
-            if thread.role == "executor":
-                return thread
-    raise OperationError(
-        f"no server of {chain_name(chain)} holds an executor, so nothing says where in a cycle the"
-        " chain begins: give its phase (--phase)"
-    )
+    begin: list[Thread] = []
+    for chain in plan.chains:
+        planned = allocation.first_planned(chain)
+        if planned is None:
+            raise OperationError(
+                f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
+                " cycle the chain begins: give its phase (--phase)"
+            )
+        begin.append(of_thread[planned][0])
+    return begin
 
 
 def chain_phases(
