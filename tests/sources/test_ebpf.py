@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,22 @@ import pytest
 from command_line import called, json_of
 from processes import children_of, wait_for
 from strangers import NOBODY, named, open_folder, strange
-from traced_program import Program, Traced, build, built, skip_without_bpftrace, traced
+from traced_program import (
+    Program,
+    Traced,
+    assert_same,
+    build,
+    built,
+    of_process,
+    skip_without_bpftrace,
+    traced,
+)
 
 from chainshaper.analysis.flow import DataFlow, data_flow
 from chainshaper.flow.record import record_command
+from chainshaper.sources.ebpf import EbpfTracer
 from chainshaper.sources.ebpf.late_attachment import with_found_nodes
-from chainshaper.sources.ebpf.session import EbpfTracer
-from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
-from chainshaper.values.events import EventTables
 from chainshaper.values.recording import EndpointInfo, open_recording
 
 __all__ = ["open_folder"]
@@ -60,37 +66,6 @@ def set_up(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> N
     monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
 
 
-def assert_same(tables: Mapping[str, pl.DataFrame], printed: list[list[str]], version: str) -> None:
-    """The tables have what the program says it passed."""
-    assert tables.keys() - {"sched_switch"} == {event for event, *_ in printed}
-    rows = {name: table.iter_rows(named=True) for name, table in tables.items()}
-    for event, tid, before, after, *passed in printed:
-        types = events.FIELDS[event]
-        columns, values = list(types), passed
-        if event == "rcl_init":
-            values = [*passed, version.encode().hex()]
-        elif event == "rclcpp_publish":
-            values = passed[1:]
-        elif event == "rmw_publish" and len(passed) == 1:
-            columns = ["message"]
-        row: dict[str, Any] = {"tid": int(tid)}
-        for column, value in zip(columns, values, strict=True):
-            if isinstance(types[column], pl.String):
-                row[column] = bytes.fromhex(value).decode()
-            elif isinstance(types[column], pl.List):
-                row[column] = list(bytes.fromhex(value))[:16]
-            else:
-                row[column] = int(value)
-        found = next(rows[event])
-        assert int(before) <= found["time"] <= int(after), event
-        assert row.items() <= found.items(), event
-    for event, table in tables.items():
-        kinds = {**events.COMMON_COLUMNS, **events.FIELDS[event]}
-        assert table.schema == {name: kinds[name] for name in kinds if name in table.columns}
-        assert table["time"].is_sorted()
-        assert event == "sched_switch" or next(rows[event], None) is None, event
-
-
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Traced, dict[str, Any]]:
     """`every` of two versions, as on a machine with two distributions, and a chain: one recording.
@@ -110,11 +85,6 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Traced, dict[s
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("AMENT_PREFIX_PATH", f"{program.prefix}:{humble.prefix}")
         return traced(tracer, run_all), printed
-
-
-def of_process(tables: EventTables, pid: int) -> dict[str, pl.DataFrame]:
-    own = {name: table.filter(pid=pid) for name, table in tables.items()}
-    return {name: table for name, table in own.items() if table.height}
 
 
 def test_every_argument_of_every_function_arrives_as_it_was_passed(
@@ -340,7 +310,7 @@ def bpftrace_of(parent: int) -> int:
 def test_bpftrace_ends_when_the_tracer_is_killed(few: Program, tmp_path: Path) -> None:
     code = (
         "import sys, time, pathlib\n"
-        "from chainshaper.sources.ebpf.session import EbpfTracer\n"
+        "from chainshaper.sources.ebpf import EbpfTracer\n"
         f"EbpfTracer(pathlib.Path({str(tmp_path)!r}), ('any',), ()).start()\n"
         "print('ready', flush=True)\n"
         "time.sleep(60)\n"
@@ -360,7 +330,7 @@ def test_without_privileges_the_error_names_them_and_what_to_do() -> None:
     code = (
         "import os, pathlib\n"
         "from chainshaper.values.errors import PlatformError\n"
-        "from chainshaper.sources.ebpf.session import EbpfTracer\n"
+        "from chainshaper.sources.ebpf import EbpfTracer\n"
         "os.setuid(65534)\n"
         "try:\n"
         "    EbpfTracer(pathlib.Path('.'), ('any',), ()).start()\n"

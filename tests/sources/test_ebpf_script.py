@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from traced_program import built, skip_without_bpftrace
 
-from chainshaper.sources.ebpf.session import lost_events
+from chainshaper.sources.ebpf import lost_events
 from chainshaper.sources.ebpf.trace_points import (
     FIRST_POINT,
     FUNCTION_PREFIX,

@@ -18,7 +18,7 @@ import pytest
 from lttng_node import required_node
 from processes import children_of, marked_processes, wait_for
 
-from chainshaper.sources.lttng.session import MIB, LttngSession, buffer_size
+from chainshaper.sources.lttng import MIB, LttngSession, buffer_size
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.timed  # other tests' recordings are sessions of the sa
 DEPTH = 7  # of every queue in chain_node.c
 ANOTHER = """
 import pathlib, sys
-from chainshaper.sources.lttng.session import LttngSession
+from chainshaper.sources.lttng import LttngSession
 session = LttngSession(pathlib.Path(sys.argv[1]), ["x"], ())
 try:
     session.start()

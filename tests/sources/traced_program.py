@@ -1,4 +1,4 @@
-"""A program with the trace points of ROS 2, without ROS 2, and runs of it under the eBPF tracer."""
+"""A program with the trace points of ROS 2, without ROS 2, and runs of it under a tracer."""
 
 import atexit
 import functools
@@ -6,17 +6,29 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import polars as pl
 import pytest
 
-from chainshaper.sources.ebpf.session import EbpfTracer
+from chainshaper.sources import Tracer
+from chainshaper.values import events
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = ["Program", "Traced", "build", "built", "skip_without_bpftrace", "traced"]
+__all__ = [
+    "Program",
+    "Traced",
+    "assert_same",
+    "build",
+    "built",
+    "of_process",
+    "skip_without_bpftrace",
+    "traced",
+]
 
 _SOURCES = Path(__file__).parent / "tracetools"
 _PACKAGE = "<package><name>tracetools</name><version>{}</version></package>"
@@ -118,13 +130,51 @@ def build(prefix: Path, *flags: str, version: str = "8.2.3") -> Program:
     return program
 
 
-def traced(tracer: EbpfTracer, run: Callable[[], list[list[str]]] = lambda: []) -> Traced:
-    """Trace while ``run`` runs."""
+def traced(tracer: Tracer, run: Callable[[], list[list[str]]] = list) -> Traced:
+    """Trace while ``run`` runs, in the environment that the tracer asks for."""
     try:
-        tracer.start()
-        printed = run()
+        with pytest.MonkeyPatch.context() as patch:
+            for name, value in tracer.start().items():
+                patch.setenv(name, value)
+            printed = run()
         assert tracer.failure() is None
         tracer.stop()
     finally:
         tracer.remove()
     return Traced(*tracer.recording(), printed)
+
+
+def assert_same(tables: Mapping[str, pl.DataFrame], printed: list[list[str]], version: str) -> None:
+    """The tables have what the program says it passed."""
+    assert tables.keys() - {"sched_switch"} == {event for event, *_ in printed}
+    rows = {name: table.iter_rows(named=True) for name, table in tables.items()}
+    for event, tid, before, after, *passed in printed:
+        types = events.FIELDS[event]
+        columns, values = list(types), passed
+        if event == "rcl_init":
+            values = [*passed, version.encode().hex()]
+        elif event == "rclcpp_publish":
+            values = passed[1:]
+        elif event == "rmw_publish" and len(passed) == 1:
+            columns = ["message"]
+        row: dict[str, Any] = {"tid": int(tid)}
+        for column, value in zip(columns, values, strict=True):
+            if isinstance(types[column], pl.String):
+                row[column] = bytes.fromhex(value).decode()
+            elif isinstance(types[column], pl.List):
+                row[column] = list(bytes.fromhex(value))[:16]
+            else:
+                row[column] = int(value)
+        found = next(rows[event])
+        assert int(before) <= found["time"] <= int(after), event
+        assert row.items() <= found.items(), event
+    for event, table in tables.items():
+        kinds = events.column_types(event)
+        assert table.schema == {name: kinds[name] for name in kinds if name in table.columns}
+        assert table["time"].is_sorted()
+        assert event == "sched_switch" or next(rows[event], None) is None, event
+
+
+def of_process(tables: EventTables, pid: int) -> dict[str, pl.DataFrame]:
+    own = {name: table.filter(pid=pid) for name, table in tables.items()}
+    return {name: table for name, table in own.items() if table.height}

@@ -22,7 +22,7 @@ from chainshaper.values.plan_choices import BANDS, Wishes
 if TYPE_CHECKING:
     from chainshaper.planning import Modes
 
-Source: TypeAlias = Literal["lttng", "ebpf"]
+Source: TypeAlias = Literal["lttng", "preload", "ebpf"]
 
 DESCRIPTIONS = (".yaml", ".yml")
 """What files that people write end with: applications and plans."""

@@ -182,14 +182,20 @@ def _tracer(
     users: frozenset[int],
 ) -> Tracer:
     if source == "lttng":
-        from chainshaper.sources.lttng.session import LttngSession
+        from chainshaper.sources.lttng import LttngSession
 
         return LttngSession(folder, command, pids, buffer, users)
-    if source != "ebpf":
-        raise InputError(f"{source!r} is no source of events: name lttng or ebpf")
+    if source not in ("ebpf", "preload"):
+        raise InputError(f"{source!r} is no source of events: name lttng, preload or ebpf")
     if buffer is not None:
-        raise InputError("--buffer is about LTTng's buffers: leave it out with `--source ebpf`")
-    from chainshaper.sources.ebpf.session import EbpfTracer
+        raise InputError(
+            f"--buffer is about LTTng's buffers: leave it out with `--source {source}`"
+        )
+    if source == "preload":
+        from chainshaper.sources.preload import PreloadTracer
+
+        return PreloadTracer(folder, command, pids, users)
+    from chainshaper.sources.ebpf import EbpfTracer
 
     return EbpfTracer(folder, command, pids, users)
 

@@ -98,7 +98,7 @@ class RecordingInfo(BaseModel, frozen=True):
     """
 
     format: Integer = FORMAT
-    source: str  # live, simulated, lttng, ebpf
+    source: str  # live, simulated, lttng, preload, ebpf
     host: str = Field(default_factory=platform.node)
     kernel: str = Field(default_factory=platform.release)
     distribution: str | None = None  # of ROS 2

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from lttng_node import required_node
 
-from chainshaper.sources.lttng.session import LttngSession
+from chainshaper.sources.lttng import LttngSession
 
 RESULTS = Path("/results")
 CALLBACKS = 10

@@ -1,1 +1,360 @@
-"""eBPF: the events of `libtracetools.so` by uprobes, without LTTng."""
+"""Tracing with eBPF: uprobes on the library that every ROS 2 node has, set by bpftrace.
+
+Uprobes belong to a file, so they are there before the first process maps it, and they reach
+processes that run already (`docs/record_ebpf.md`). Probes are set, and removed, one after the
+other: what comes before the last one was set or after the first one was removed is left out.
+
+Upstream: bpftrace(8); `src/bpftrace.cpp` of bpftrace 0.17 to 0.26.
+"""
+
+import mmap
+import os
+import re
+import signal
+import subprocess
+import time
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import polars as pl
+
+from chainshaper.gate.decision import clock_offset
+from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.processes import descendants, run_users, user_name, user_of
+from chainshaper.linux.scheduling import signalled_with_parent
+from chainshaper.linux.threads import parents, read_proc, read_stat, status_field
+from chainshaper.sources.ebpf import trace_points as tp
+from chainshaper.sources.ebpf.functions import callback_functions, open_regular
+from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
+from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+from chainshaper.values import events
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
+
+__all__ = ["EbpfTracer", "lost_events"]
+
+_ATTACHED = "__BPFTRACE_NOTIFY_PROBES_ATTACHED"
+_PAGES = "BPFTRACE_PERF_RB_PAGES"
+_SETTINGS = {
+    _ATTACHED: "1",
+    _PAGES: "1024",  # 4 MiB (a core, before 0.21): some 50,000 events
+    "BPFTRACE_MAP_KEYS_MAX": "65536",  # until 0.18; its name since then:
+    "BPFTRACE_MAX_MAP_KEYS": "65536",
+    "BPFTRACE_MAX_PROBES": "4096",
+    "BPFTRACE_MAX_BPF_PROGS": "4096",
+    "BPFTRACE_CACHE_USER_SYMBOLS": "0",
+}
+_LOST = re.compile(rb"^Lost (\d+) events", re.MULTILINE)
+_NICE = 10
+_SHORTEST_SUSPENSION_NS = 1_000_000
+_START_S, _READ_S, _STOP_S = 120.0, 10.0, 60.0
+_LOOK_S = 0.02
+_CAP_SYS_ADMIN, _CAP_PERFMON, _CAP_BPF = 21, 38, 39
+_FIRST_PID_NAMESPACE = "pid:[4026531836]"  # linux/proc_ns.h: PROC_PID_INIT_INO
+
+
+class EbpfTracer:
+    """Records with bpftrace: a :class:`~chainshaper.sources.Tracer`."""
+
+    def __init__(
+        self,
+        folder: Path,
+        command: Sequence[str],
+        pids: Sequence[int],
+        users: Collection[int] | None = None,
+    ) -> None:
+        self._script, self._events, self._said = (
+            folder.absolute() / name for name in ("events.bt", "events.txt", "bpftrace.log")
+        )
+        self._attached = not command
+        self._pids = tuple(pids)
+        self._users = run_users() if users is None else users
+        self._open: dict[Path, int] = {}
+        self._points: tuple[tp.TracePoint, ...] = ()
+        self._bpftrace: subprocess.Popen[bytes] | None = None
+        self._began_ns = 0
+        self._ended_ns: int | None = None
+        self._ahead_ns = 0
+        self._clock_offset_ns = 0
+        self._notes: list[str] = []
+        self._printed: tp.Printed | None = None
+        self._functions: dict[tuple[int, int], str] = {}
+
+    def start(self) -> Mapping[str, str]:
+        """Find the libraries, write the script, and wait until its probes are in place."""
+        _check_privileges()
+        if not is_installed("bpftrace"):
+            raise PlatformError(
+                "bpftrace is not installed: install it (Debian and Ubuntu: `apt-get install "
+                "bpftrace`; 0.17 or later), or record with `--source lttng`"
+            )
+        self._points = tp.trace_points(self._libraries())
+        traced = self._traced()
+        for file in dict.fromkeys(point.file for point in self._points):
+            try:
+                self._open[file] = open_regular(file)
+            except OSError as error:
+                raise OperationError(f"{file}: cannot be traced: {error}") from error
+        # A path is text that whoever owns a folder chooses, and what it leads to may change.
+        ours = Path(f"/proc/{os.getpid()}/fd")
+        points = [replace(one, file=ours / str(self._open[one.file])) for one in self._points]
+        script = tp.bpftrace_script(points, traced, users=self._users, attached=self._attached)
+        self._script.write_text(script)
+        self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
+        with self._events.open("wb") as printed, self._said.open("wb") as said:
+            printed.write(tp.HEADER.encode())
+            printed.flush()
+            self._bpftrace = subprocess.Popen(
+                ["bpftrace", "-B", "full", str(self._script)],
+                env={**_SETTINGS, **tool_environment()},
+                stdin=subprocess.DEVNULL,
+                stdout=printed,
+                stderr=said,
+                start_new_session=True,  # Ctrl-C is ours to react to
+                preexec_fn=partial(_in_the_background, os.getpid()),  # noqa: PLW1509
+            )
+        self._wait_until_attached(self._bpftrace)
+        self._began_ns = time.monotonic_ns()
+        return {}
+
+    def failure(self) -> str | None:
+        """Look whether bpftrace is there."""
+        if self._bpftrace is None or self._bpftrace.poll() is None:
+            return None
+        return f"bpftrace ended with code {self._bpftrace.returncode}: {self._complaint()}"
+
+    def stop(self) -> None:
+        """Have bpftrace remove its probes and write down what it has."""
+        if self._bpftrace is None or self._ended_ns is not None:
+            return
+        self._ended_ns = time.monotonic_ns()
+        if _boot_time_ahead() - self._ahead_ns > _SHORTEST_SUSPENSION_NS:
+            self._notes.append(
+                "the machine was suspended during the recording: times after that are too late by "
+                "as long as it slept."
+            )
+        bpftrace, until = f"/proc/{self._bpftrace.pid}", time.monotonic() + _READ_S
+        with suppress(OSError):  # it has ended
+            time.sleep(_LOOK_S)
+            # It sleeps when it has read all: the rest it would throw away.
+            while read_stat(bpftrace)[1][0] == b"R" and time.monotonic() < until:
+                time.sleep(_LOOK_S)
+        self._bpftrace.send_signal(signal.SIGINT)
+        try:
+            self._bpftrace.wait(_STOP_S)
+        except subprocess.TimeoutExpired:
+            raise OperationError(
+                f"bpftrace (process {self._bpftrace.pid}) did not end within {_STOP_S:.0f} s and "
+                "is killed: the last events are missing"
+            ) from None
+        with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
+            self._printed = tp.read_printed(self._events, self._points, self._ahead_ns)
+            # As long as the application runs: its memory tells.
+            callbacks = _callbacks(self._printed.tables)
+            self._functions = callback_functions(
+                one for one in callbacks if self._pids or user_of(one[0]) in self._users
+            )
+
+    def remove(self) -> None:
+        """End bpftrace if it still runs; the kernel removes its probes with it."""
+        if self._bpftrace is not None and self._bpftrace.poll() is None:
+            self._bpftrace.kill()
+            self._bpftrace.wait()
+        while self._open:
+            os.close(self._open.popitem()[1])
+
+    def recording(self) -> tuple[EventTables, RecordingInfo]:
+        """The events that bpftrace printed, and what is known of a system that ran already."""
+        try:
+            printed = self._printed or tp.read_printed(self._events, self._points, self._ahead_ns)
+            lost = lost_events(self._events, self._said)
+        except (OSError, pl.exceptions.PolarsError) as error:
+            raise OperationError(
+                f"{self._events}: what bpftrace wrote cannot be read: {error}"
+            ) from error
+        ended = self._ended_ns or time.monotonic_ns()
+        in_place = pl.col("time").is_between(self._began_ns, ended)  # all probes, that is
+        whole = {name: table.filter(in_place) for name, table in printed.tables.items()}
+        tables: EventTables = {name: table for name, table in whole.items() if table.height}
+        notes = [*self._notes, *self._about(tables, printed, lost)]
+        if self._attached:
+            tables, found = with_found_objects(tables, printed.handles, self._began_ns)
+            notes += found
+        tables = with_functions(tables, self._functions, self._began_ns)
+        # Process → the name of its main thread as `sched_switch` has it.
+        switches = events.table(tables, "sched_switch").select("next_tid", "next_comm")
+        names = dict(switches.unique("next_tid", keep="last").iter_rows())
+        emitting = (table["pid"] for name, table in tables.items() if name != "sched_switch")
+        commands = {pid: names.get(pid) or "" for pids in emitting for pid in pids.unique()}
+        # What `rcl_init` would say of the library's version, whether or not it was traced.
+        versions = [point.tracing_library.version for point in self._points[:1]]
+        info = RecordingInfo(
+            source="ebpf",
+            distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions})}, {}),
+            rmw=printed.rmw or rmw_of_gids(tables),
+            clock_offset_ns=self._clock_offset_ns,
+            processes=processes_of(tables, commands),
+            lost={"lost_events": lost},
+            notes=tuple(notes),
+        )
+        return tables, info
+
+    def _libraries(self) -> tuple[tp.TracingLibrary, ...]:
+        """The libraries to set probes on; at least one that exports trace points."""
+        libraries = self._mapped() if self._attached else tp.installed_libraries(os.environ)
+        if not libraries:
+            raise PlatformError(
+                f"no {tp.LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: set ROS 2 up "
+                "first (`source /opt/ros/DISTRIBUTION/setup.bash`); an application in a "
+                "container is started first, then attached to (no COMMAND)"
+            )
+        if not tp.trace_points(libraries):
+            paths = ", ".join(str(library.path) for library in libraries)
+            raise PlatformError(
+                f"{paths}: exports no trace point, because this ROS 2 was built without tracing "
+                "(TRACETOOLS_DISABLED): build tracetools with it, or install ROS 2's packages"
+            )
+        return libraries
+
+    def _mapped(self) -> tuple[tp.TracingLibrary, ...]:
+        """The libraries that the processes to attach to have mapped; at least one."""
+        parent_of = parents()
+        family = descendants(parent_of, *self._pids)
+        mapped = tp.mapped_libraries(
+            pid for pid in parent_of if pid in family or user_of(pid) in self._users
+        )
+        unsuited = [pid for pid in self._pids if not descendants(parent_of, pid) & mapped.keys()]
+        if unsuited:
+            raise InputError(
+                f"process {', '.join(map(str, unsuited))} neither uses {tp.LIBRARY}, as every "
+                "ROS 2 node does, nor has started one that does: give processes of nodes "
+                "(`chainshaper threads` lists them)"
+            )
+        wanted = family if self._pids else mapped.keys()
+        libraries = dict.fromkeys(one for pid in mapped if pid in wanted for one in mapped[pid])
+        if not libraries:
+            raise OperationError(
+                f"no process of {', '.join(map(user_name, sorted(self._users)))} uses "
+                f"{tp.LIBRARY}, so there is no ROS 2 node to attach to: start the application "
+                "first, give the COMMAND that does behind `--`, or name who runs it (--user)"
+            )
+        return tuple(libraries)
+
+    def _traced(self) -> tuple[int, ...]:
+        """The processes that events are limited to, with all that they start; empty: to none."""
+        if self._attached and not self._pids:
+            return ()
+        if Path("/proc/self/ns/pid").readlink() != Path(_FIRST_PID_NAMESPACE):
+            self._notes.append(
+                "inside a container bpftrace cannot tell which process is which: everything of "
+                "the same users on this machine that uses the same libraries was recorded, under "
+                "the machine's process numbers."
+            )
+            return ()
+        # What we start is ours: the application, which does not run yet.
+        return tuple(sorted(descendants(parents(), *(self._pids or (os.getpid(),)))))
+
+    def _wait_until_attached(self, bpftrace: "subprocess.Popen[bytes]") -> None:
+        until = time.monotonic() + _START_S
+        files = (self._said, self._events)  # it says so on its standard output since 0.23
+        while not any(_ATTACHED.encode() in file.read_bytes() for file in files):
+            if bpftrace.poll() is not None:
+                raise PlatformError(
+                    f"bpftrace cannot trace here: {self._complaint()}; it needs a kernel with BPF, "
+                    "uprobes and tracefs, and CAP_BPF, CAP_PERFMON and CAP_SYS_ADMIN (in a "
+                    "container: `docker run --privileged --pid host`)"
+                )
+            if time.monotonic() > until:
+                raise OperationError(
+                    f"bpftrace did not set its probes within {_START_S:.0f} s: {self._complaint()}"
+                )
+            time.sleep(_LOOK_S)
+
+    def _complaint(self) -> str:
+        """What bpftrace says is wrong, in one line."""
+        said = self._said.read_text(errors="replace").splitlines()
+        lines = [line.strip() for line in said if line.strip() and _ATTACHED not in line]
+        wrong = [line for line in lines if "ERROR" in line and "RLIMIT_MEMLOCK" not in line]
+        return "; ".join(wrong or lines[-1:]).replace("ERROR: ", "") or "it does not say why"
+
+    def _about(self, tables: EventTables, printed: tp.Printed, lost: int) -> Iterator[str]:
+        """What a reader of the tables must know."""
+        if not tables:
+            libraries = dict.fromkeys(str(point.file) for point in self._points)
+            yield f"no event was traced: nothing that ran has called {', '.join(libraries)}."
+        unknown = set(_callbacks(tables)) - self._functions.keys()
+        if unknown and "rclcpp_callback_register" not in tables:
+            yield (
+                f"{len(unknown)} callbacks' functions have no name: the application had ended, or"
+                " its files were stripped."
+            )
+        if lost:
+            pages = os.environ.get(_PAGES, _SETTINGS[_PAGES])
+            yield (
+                f"{lost} events were lost: bpftrace could not keep up. Record again with larger "
+                f"buffers (environment variable {_PAGES}, a power of two above {pages}), or leave "
+                "it a core that is less busy."
+            )
+        if printed.cut_names:
+            yield f"{printed.cut_names} names are longer than {tp.TEXT_BYTES} bytes and cut."
+
+
+def lost_events(*paths: Path) -> int:
+    """How many events bpftrace says it has lost, in what it wrote into these files."""
+    count = 0
+    for path in paths:
+        if path.is_file() and path.stat().st_size:
+            with (
+                path.open("rb") as stream,
+                mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as said,
+            ):
+                count += sum(int(found[1]) for found in _LOST.finditer(said))
+    return count
+
+
+def _in_the_background(parent_pid: int) -> None:
+    """Have a new process end with its parent, and disturb the threads little that it watches.
+
+    Every event wakes it: if it pre-empted the thread then, these were two more events, and so on.
+    """
+    signalled_with_parent(parent_pid, signal.SIGINT)
+    os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
+    os.nice(_NICE)
+
+
+def _callbacks(tables: EventTables) -> Iterator[tuple[int, int]]:
+    """Processes and handles of all callbacks that were added or started."""
+    for name in (*ADDED, "callback_start"):
+        yield from events.table(tables, name).select("pid", "callback").unique().iter_rows()
+
+
+def _check_privileges() -> None:
+    """bpftrace would say it as well, but not what else can be done."""
+    (own,) = status_field(read_proc("/proc/self/status"), "CapEff", base=16)
+    enough = all(own >> capability & 1 for capability in (_CAP_BPF, _CAP_PERFMON))
+    if not (enough or own >> _CAP_SYS_ADMIN & 1):
+        raise PlatformError(
+            "tracing with eBPF needs root, or bpftrace 0.25 and the capabilities CAP_BPF, "
+            "CAP_PERFMON, CAP_DAC_READ_SEARCH and CAP_DAC_OVERRIDE: start the application as "
+            "yourself, then attach to it with `sudo chainshaper record --source ebpf -o REC "
+            "--duration 30s`; or record with `--source lttng`, which needs neither"
+        )
+
+
+def _boot_time_ahead() -> int:
+    """CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns: how long the machine has been suspended.
+
+    The narrowest of several brackets counts; without a suspension the clocks are the same.
+    """
+    brackets = []
+    for _ in range(10):
+        before = time.monotonic_ns()
+        boot_time = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
+        after = time.monotonic_ns()
+        brackets.append((after - before, boot_time - (before + after) // 2))
+    _, ahead = min(brackets)
+    return ahead if ahead > _SHORTEST_SUSPENSION_NS else 0

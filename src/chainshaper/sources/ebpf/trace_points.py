@@ -170,6 +170,11 @@ def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary,
     return tuple(dict.fromkeys(_found([file.absolute() for file in files if file.is_file()], {})))
 
 
+def library_at(path: Path) -> TracingLibrary:
+    """The library at a path; one that is not there exports nothing, and has no version."""
+    return TracingLibrary(path, exported_functions(path), _version(path))
+
+
 def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...]]:
     """Process → the libraries that it has mapped; only those that have one."""
     known: dict[tuple[int, int], TracingLibrary] = {}
@@ -197,7 +202,7 @@ def _found(
         status = path.stat()
         key = status.st_dev, status.st_ino
         if key not in known:
-            known[key] = TracingLibrary(path, exported_functions(path), _version(path))
+            known[key] = library_at(path)
         yield known[key]
 
 

@@ -1,1 +1,418 @@
-"""LTTng: sessions that record, and reading and writing its traces as event tables."""
+"""Tracing with LTTng: a recording session of our own, and the session daemon that it needs.
+
+A root daemon that runs already, which we may use as root or in the group `tracing`, traces
+everybody's processes, and the kernel: we add a session to it, and leave out of the tables what
+other applications did. Otherwise we start a daemon and end it afterwards. It listens in a home
+directory of our own, which the command gets as its `LTTNG_HOME`, so it traces the command alone.
+Root's run directory is /var/run/lttng whatever its environment says, so root's daemon and clients
+have one of ours mounted there, in mount namespaces that they alone see. Where root may not mount
+(most containers), there can be one recording at a time.
+
+We may be killed. The kernel then ends a daemon of ours; a shell that waits for our end destroys our
+sessions in another's daemon and removes the home directory.
+
+Upstream: lttng(1), lttng-sessiond(8), lttng-enable-channel(1); lttng-tools, `utils_get_rundir`;
+lttng-ust, `setup_local_apps`; `tracetools_trace` of ros2_tracing.
+"""
+
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from functools import partial
+from pathlib import Path
+from xml.etree import ElementTree
+
+import polars as pl
+
+from chainshaper.linux.own_processes import is_installed, tool_environment
+from chainshaper.linux.processes import descendants, process_folder, run_users, user_in
+from chainshaper.linux.scheduling import signalled_with_parent
+from chainshaper.linux.threads import parents, read_proc
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import RecordingInfo
+
+__all__ = ["LttngSession", "buffer_size"]
+
+EVENTS = ("ros2:*", "ros2_caret:*", "dds:*")
+"""Everything that `tracetools` of any distribution, CARET, and a traced Cyclone DDS emit."""
+CONTEXTS = ("procname", "vpid", "vtid")
+REGISTER_TIMEOUT_MS = 30_000
+"""A starting process waits that long for the session daemon, which many may occupy at once."""
+MARK = "CHAINSHAPER_RECORDING"
+"""In the environment of the command, and of everything that it starts."""
+
+MIB = 1 << 20
+DEFAULT_BUFFER = 4 * MIB
+_SUB_BUFFERS = 4
+_SMALLEST = _SUB_BUFFERS * 4096
+_ENLARGED_BY = 4
+_ANSWER_S, _START_S = 60.0, 15.0
+
+_PACKAGES = (
+    "install LTTng (Debian and Ubuntu: `apt-get install lttng-tools liblttng-ust-dev`), or record "
+    "with `--source ebpf`, which needs neither"
+)
+_RUN_DIRECTORY = Path("/var/run/lttng")
+_APART = (
+    *("unshare", "--mount", "--propagation=slave", "sh", "-c"),
+    f'mkdir -p {_RUN_DIRECTORY} && mount --bind "$0" {_RUN_DIRECTORY} && exec "$@"',
+)
+_AFTERWARDS = """
+read -r _
+for name in $(timeout 60 lttng --no-sessiond --mi xml list | grep -o "$0-[0-9]*"); do
+    timeout 60 lttng --no-sessiond destroy "$name"
+done
+rm -rf "$LTTNG_HOME"
+"""
+
+
+class Lttng:
+    """A connection to the session daemon that traces our applications, or to one of our own.
+
+    ``home`` is a directory of our own, whose unique name sessions are called after. ``daemon`` is
+    the daemon's process where we have started it.
+
+    Raises PlatformError: LTTng is not installed, or cannot make two recordings at a time here.
+    OperationError: the daemon does not start.
+    """
+
+    def __init__(self) -> None:
+        if not is_installed("lttng"):
+            raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
+        # Sockets lie in it, whose paths may have 108 characters only: not beside the recording.
+        self.home = Path(tempfile.mkdtemp(prefix="chainshaper-lttng-"))
+        self.daemon: subprocess.Popen[bytes] | None = None
+        self._environment = {**tool_environment(), "LTTNG_HOME": str(self.home)}
+        self._inside: tuple[str, ...] = ()  # what commands begin with that see its run directory
+        self._afterwards = subprocess.Popen(  # clears up when we are gone
+            ["sh", "-c", _AFTERWARDS, self.home.name],
+            env=self._environment,
+            stdin=subprocess.PIPE,  # ends with us, however that happens
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            found = self._answers()
+            if not found or _hears_one_command_only():
+                self._start_daemon(found)
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What an application needs to find the daemon."""
+        return {} if self.daemon is None else {"LTTNG_HOME": str(self.home)}
+
+    def ask(self, *arguments: str) -> ElementTree.Element:
+        """Run `lttng ARGUMENTS`; its answer. Raises OperationError: it fails; in its own words."""
+        what = f"`{shlex.join(('lttng', *arguments))}`"
+        try:
+            run = subprocess.run(
+                [*self._inside, "lttng", "--no-sessiond", "--mi", "xml", *arguments],
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=_ANSWER_S,
+                check=False,
+                start_new_session=True,  # Ctrl-C is ours to react to
+            )
+            if run.returncode == 0:
+                return ElementTree.fromstring(run.stdout)  # noqa: S314 - LTTng's own, no stranger's
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise OperationError(f"{what} does not answer: {error}") from None
+        except ElementTree.ParseError as error:
+            raise OperationError(f"{what} answers no XML: {error}") from None
+        said = _last_line(run.stderr).removeprefix("Error: ")
+        raise OperationError(f"{what} failed: {said or f'exit code {run.returncode}'}")
+
+    def _answers(self) -> bool:
+        """Whether a session daemon does."""
+        with suppress(OperationError):
+            self.ask("list")
+            return True
+        return False
+
+    def _start_daemon(self, another: bool) -> None:
+        """Start a daemon of ours, with a run directory of its own if there is ``another``."""
+        if os.getuid() == 0:  # all other users' is in the home directory anyway
+            (self.home / "run").mkdir()
+            inside = (*_APART, str(self.home / "run"))
+            with suppress(OSError):  # no `unshare` here
+                trial, environment = [*inside, "true"], self._environment
+                run = subprocess.run(trial, env=environment, capture_output=True, check=False)
+                self._inside = inside if run.returncode == 0 else ()
+        if another and not self._inside:
+            raise PlatformError(
+                "another recording runs, and LTTng can make one at a time here, because root may "
+                "not mount: wait for its end, or record where mounting is permitted (Docker: "
+                "`--privileged`)"
+            )
+        if not is_installed("lttng-sessiond"):
+            raise PlatformError(
+                f"no LTTng session daemon runs, and `lttng-sessiond` is not there: {_PACKAGES}"
+            )
+        said, folder = self.home / "daemon.log", self.home / ".lttng"
+        folder.mkdir()
+        for version in range(5, 20):  # applications look for one with their ABI's version
+            (folder / f"lttng-ust-sock-{version}").symlink_to("applications")
+        sockets = f"--apps-sock={folder / 'applications'}"
+        with said.open("wb") as log:
+            self.daemon = subprocess.Popen(
+                [*self._inside, "lttng-sessiond", "--quiet", sockets],
+                env=self._environment,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
+                # It ends in order, with its consumers, should we be killed.
+                preexec_fn=partial(signalled_with_parent, os.getpid(), signal.SIGINT),  # noqa: PLW1509 - one call
+            )
+        deadline = time.monotonic() + _START_S
+        while not self._answers():
+            if self.daemon.poll() is not None or time.monotonic() > deadline:
+                reason = _last_line(said.read_text(errors="replace")) or "it says nothing"
+                raise OperationError(f"the LTTng session daemon does not start: {reason}")
+            time.sleep(0.05)
+
+    def close(self) -> None:
+        """End the daemon if it is ours, and remove the home directory; harmless when repeated."""
+        if self.daemon is not None:
+            self.daemon.terminate()
+            try:
+                self.daemon.wait(_START_S)
+            except subprocess.TimeoutExpired:
+                self.daemon.kill()
+                self.daemon.wait()
+        self._afterwards.communicate()
+
+
+def _hears_one_command_only() -> bool:
+    """Whether the root daemon that runs is another recording's: no other application finds it."""
+    with suppress(OSError, ValueError):
+        pid = int((_RUN_DIRECTORY / "lttng-sessiond.pid").read_text())
+        return b"--apps-sock=" in read_proc(f"/proc/{pid}/cmdline")
+    return False
+
+
+def _last_line(text: str) -> str:
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
+
+
+class LttngSession:
+    """Records with LTTng: a :class:`~chainshaper.sources.Tracer`.
+
+    ``buffer`` is the size of the ring buffer of each core in bytes (:func:`buffer_size`).
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        command: Sequence[str],
+        pids: Sequence[int],
+        buffer: int | None = None,
+        users: Collection[int] | None = None,
+    ) -> None:
+        if pids or not command:
+            raise InputError(
+                "LTTng does not trace processes that run already: give the COMMAND that starts "
+                "the application behind `--`, or attach with `--source ebpf`"
+            )
+        self._folder = folder
+        self._buffer = buffer_size(wanted=buffer)
+        self._users = run_users() if users is None else users
+        self._lttng: Lttng | None = None
+        self._kernel = False
+        self._strangers: set[int] = set()
+        self._sessions: list[str] = []
+        self._notes: list[str] = []
+
+    def start(self) -> Mapping[str, str]:
+        """Have a session daemon, and a session that is on."""
+        self._lttng = lttng = Lttng()
+        try:
+            lttng.ask("list", "--kernel")
+            self._kernel = True
+        except OperationError as error:
+            reason = str(error).partition("failed: ")[2]
+            self._notes.append(
+                f"no execution times, since LTTng cannot record sched_switch here: {reason}. It "
+                "needs its kernel modules (`apt-get install lttng-modules-dkms`), and root or the "
+                "group `tracing`; `--source ebpf` needs root only."
+            )
+        lttng.ask("start", self._new_session(lttng))
+        timeout = str(REGISTER_TIMEOUT_MS)
+        environment = {"LTTNG_UST_REGISTER_TIMEOUT": timeout, MARK: self._sessions[0]}
+        return {**environment, **lttng.environment}
+
+    def failure(self) -> str | None:
+        """Look whether the daemon is there and the session loses nothing; enlarge the buffers."""
+        if self._lttng is None:
+            return None
+        self._look_for_strangers(self._lttng)
+        try:
+            answer = self._lttng.ask("list", self._sessions[-1])
+            kinds = ("discarded_events", "lost_packets")
+            counts = [one.text for kind in kinds for one in answer.iterfind(f".//{{*}}{kind}")]
+            if sum(int(count or 0) for count in counts):
+                self._enlarge(self._lttng)
+        except OperationError as error:
+            daemon = self._lttng.daemon
+            if daemon is not None and daemon.poll() is not None:
+                return f"the LTTng session daemon ended with code {daemon.returncode}"
+            return str(error)
+        return None
+
+    def stop(self) -> None:
+        """Stop the session; LTTng waits until its buffers are on disk."""
+        if self._lttng is not None and self._sessions:
+            self._look_for_strangers(self._lttng)
+            self._lttng.ask("stop", self._sessions[-1])
+
+    def remove(self) -> None:
+        """Destroy the sessions, and end the daemon if it is ours."""
+        if self._lttng is None:
+            return
+        for name in self._sessions:
+            with suppress(OperationError):
+                self._lttng.ask("destroy", name)
+        self._lttng.close()
+        self._lttng = None
+
+    def recording(self) -> tuple[EventTables, RecordingInfo]:
+        """The trace that was written."""
+        tables: EventTables = {}
+        if any(self._folder.rglob("metadata")):
+            from chainshaper.sources.lttng.trace import open_lttng_trace
+
+            trace = open_lttng_trace([self._folder])
+            tables, info = _without_processes(self._strangers, trace.events, trace.info)
+        if not any(tables[name].height for name in tables):
+            shutil.rmtree(self._folder)  # other applications' events are in it at most
+            self._folder.mkdir()
+            raise OperationError(
+                "no process with LTTng trace points was seen: is tracing compiled into this ROS 2 "
+                "(`ros2 run tracetools status`), and do the nodes run as your user, here and not "
+                "in a container? `--source ebpf` does not need LTTng"
+            )
+        notes = [*info.notes, *self._notes]
+        if lost := sum(info.lost.values()):
+            larger = self._buffer * (1 if len(self._sessions) > 1 else _ENLARGED_BY)
+            notes.append(
+                f"{lost} events were lost: buffers were too small. Record again with `--buffer "
+                f"{max(1, larger // MIB)}` (MiB a core)."
+            )
+        return tables, info.model_copy(update={"notes": tuple(notes)})
+
+    def _look_for_strangers(self, lttng: Lttng) -> None:
+        """Note who else runs, if the daemon is not ours and so hears every application.
+
+        What descends from us is the command's, and what has our mark in its environment: a process
+        whose parent is gone still has that; what `sudo` starts has lost it.
+        """
+        if lttng.daemon is None:
+            parent_of, mark = parents(), f"{MARK}={self._sessions[0]}"
+            unrelated = parent_of.keys() - descendants(parent_of, os.getpid())
+            others = {pid for pid in unrelated if not _is_marked(pid, mark, self._users)}
+            self._strangers = (self._strangers | others) - (parent_of.keys() - others)
+
+    def _new_session(self, lttng: Lttng) -> str:
+        """Prepare a session with buffers of the present size; its name."""
+        number = len(self._sessions) + 1
+        name = f"{lttng.home.name}-{number}"
+        answer = lttng.ask("version")
+        version = [int(answer.findtext(f".//{{*}}{part}") or 0) for part in ("major", "minor")]
+        # LTTng 2.15 began to write CTF 2, which no analysis reads yet.
+        old_format = ("--trace-format=ctf-1.8",) if version >= [2, 15] else ()
+        output = self._folder.absolute() / f"session-{number}"
+        lttng.ask("create", name, f"--output={output}", *old_format)
+        self._sessions.append(name)
+        size = f"--subbuf-size={self._buffer // _SUB_BUFFERS}"
+        # The application need not wake the consumer, which looks every 200 ms.
+        channel: tuple[str, ...] = (size, f"--num-subbuf={_SUB_BUFFERS}", f"--session={name}")
+        channel += ("--discard", "--switch-timer=0", "--read-timer=200000", "events")
+        of_channel = (f"--session={name}", "--channel=events")
+        lttng.ask("enable-channel", "--userspace", "--buffers-uid", *channel)
+        lttng.ask("enable-event", "--userspace", *of_channel, ",".join(EVENTS))
+        contexts = [f"--type={context}" for context in CONTEXTS]
+        lttng.ask("add-context", "--userspace", *of_channel, *contexts)
+        if self._kernel:
+            lttng.ask("enable-channel", "--kernel", *channel)
+            lttng.ask("enable-event", "--kernel", *of_channel, "sched_switch")
+        return name
+
+    def _enlarge(self, lttng: Lttng) -> None:
+        """Go on in a session with larger buffers, if there is room: one that runs gets none."""
+        before, larger = self._buffer, buffer_size(wanted=self._buffer * _ENLARGED_BY)
+        if larger <= before:
+            return
+        former, self._buffer = self._sessions[-1], larger
+        successor = self._new_session(lttng)
+        stopped = time.monotonic_ns()
+        lttng.ask("stop", former, "--no-wait")
+        lttng.ask("start", successor)
+        gap = time.monotonic_ns() - stopped
+        lttng.ask("destroy", former)  # once all of it is on disk
+        self._notes.append(
+            f"events were lost, so the buffers were enlarged from {before >> 10} KiB to "
+            f"{larger >> 10} KiB a core while the application ran; nothing was recorded for "
+            f"{format_duration(round(gap, -6))} meanwhile."
+        )
+
+
+def buffer_size(
+    wanted: int | None = None, free: int | None = None, cores: int | None = None
+) -> int:
+    """The ring buffer of each core in bytes, a power of two: what is wanted, as far as possible.
+
+    The buffers of all cores get half of the ``free`` bytes of /dev/shm at most.
+    """
+    cores = cores or os.sysconf("SC_NPROCESSORS_CONF")
+    if free is None:
+        free = shutil.disk_usage("/dev/shm").free if Path("/dev/shm").is_dir() else 0  # noqa: S108
+    size = min(wanted or DEFAULT_BUFFER, max(_SMALLEST, free // 2 // cores))
+    return max(_SMALLEST, 1 << (size.bit_length() - 1))
+
+
+def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
+    """Whether a process of these users has the mark: others can read and write it as well."""
+    try:
+        with process_folder(pid) as folder:
+            marked = mark.encode() in read_proc("environ", folder).split(b"\0")
+            return marked and user_in(folder) in users
+    except OSError:  # it has ended, or is another user's
+        return False
+
+
+def _without_processes(
+    strangers: Collection[int], tables: EventTables, info: RecordingInfo
+) -> tuple[EventTables, RecordingInfo]:
+    """The events without those of processes that are none of the command's, if there are any."""
+    traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
+    foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
+    if not foreign:
+        return tables, info
+    is_own = ~pl.col("pid").is_in(foreign).fill_null(False)
+    own = {name: frame.filter(is_own) for name, frame in tables.items()}
+    names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
+    note = f"processes that the command has not started are left out: {names}."
+    facts = {
+        "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
+        "notes": (*info.notes, note),
+        "trace_events": {
+            name if name == "sched_switch" else f"ros2:{name}": frame.height
+            for name, frame in own.items()
+        },
+    }
+    return own, info.model_copy(update=facts)

@@ -1,0 +1,436 @@
+"""Tracing by a library that `LD_PRELOAD` puts in front of ROS 2: no root, no daemon, no module.
+
+`preload.c` is that library. It sends us the memory of its process with the process's first event,
+over a socket whose name is in no file system. A thread reads all memories ten times a second: a
+process that was killed in between has lost nothing, since its memory is ours as well.
+
+Nothing is locked: who writes never waits for who reads. So a reader copies what is new in a ring,
+then looks again how much has been written: what may have been overwritten meanwhile is thrown away
+and counted as lost.
+"""
+
+import fcntl
+import functools
+import hashlib
+import mmap
+import os
+import platform
+import re
+import secrets
+import shutil
+import socket
+import struct
+import subprocess
+import tempfile
+import threading
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from chainshaper.gate.decision import clock_offset
+from chainshaper.linux.own_processes import tool_environment
+from chainshaper.linux.processes import run_users
+from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary, library_at
+from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+from chainshaper.values import events
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.events import EventTables
+from chainshaper.values.files import why_distrusted
+from chainshaper.values.recording import RecordingInfo
+
+__all__ = [
+    "PreloadTracer",
+    "TracedProcess",
+    "build_library",
+    "creation_tables",
+    "event_names",
+    "event_tables",
+    "installed_library",
+    "preloading",
+]
+
+
+SOURCE = Path(__file__).with_name("preload.c")
+
+RECORD = np.dtype(
+    [
+        ("time", "<i8"),
+        ("tid", "<u4"),
+        ("cpu", "<u2"),
+        ("event", "<u2"),
+        ("values", "<u8", 6),
+    ]
+)
+"""`struct record`: one event, or a part of a text."""
+
+_HEADER = np.dtype(
+    [
+        *((name, "<u4") for name in ("magic", "format", "pid", "rings")),
+        *((name, "<u4") for name in ("ring_records", "object_records")),
+        *((name, "<u8") for name in ("objects", "dropped")),
+        ("unused", "<u8", 3),
+    ]
+)
+_RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
+_MAGIC, _FORMAT = 0x63687368, 1
+_TEXT, _LIBRARY, _FIRST_EVENT = 1, 2, 3
+_TEXT_BYTES, _PLACES = 40, 16
+_LARGEST = 1 << 30
+_F_GET_SEALS, _F_SEAL_SHRINK = 1034, 2  # linux/fcntl.h
+_THREAD_TIME = 2  # the value of callback_start and callback_end that is no argument
+
+_NAME = re.compile(r"^  (?:EVENT|TIMED|CREATION)\((\w+),", re.MULTILINE)
+
+
+@functools.cache
+def event_names() -> tuple[str, ...]:
+    """The events in the order of their numbers, as the library's source has them."""
+    return tuple(_NAME.findall(SOURCE.read_text()))
+
+
+class TracedProcess:
+    """The memory of one process; ``pid`` is what it calls itself, ``lost`` what was overwritten.
+
+    Raises InputError: the descriptor is of no such memory, or of one that may shrink.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        size = os.fstat(descriptor).st_size
+        try:
+            is_sealed = fcntl.fcntl(descriptor, _F_GET_SEALS) & _F_SEAL_SHRINK
+        except OSError:  # no memfd
+            is_sealed = 0
+        if not is_sealed or not _HEADER.itemsize <= size <= _LARGEST:
+            raise InputError("what was sent is no memory of a traced process")
+        memory = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
+        self.header: NDArray[Any] = np.frombuffer(memory, _HEADER, count=1)
+        one = {name: int(self.header[name][0]) for name in _HEADER.names[:6]}  # type: ignore[index]
+        rings, records, objects = one["rings"], one["ring_records"], one["object_records"]
+        of_rings = _HEADER.itemsize + rings * _RING.itemsize
+        wanted = of_rings + (objects + rings * records) * RECORD.itemsize
+        if (one["magic"], one["format"]) != (_MAGIC, _FORMAT) or size < wanted or not records:
+            raise InputError("what was sent is the memory of another version of chainshaper")
+        self.pid = one["pid"]
+        self._rings = np.frombuffer(memory, _RING, count=rings, offset=_HEADER.itemsize)
+        self._objects = np.frombuffer(memory, RECORD, count=objects, offset=of_rings)
+        behind = of_rings + objects * RECORD.itemsize
+        self._records = np.frombuffer(memory, RECORD, count=rings * records, offset=behind)
+        self._records = self._records.reshape(rings, records)
+        self._read = np.zeros(rings, np.uint64)
+        self.lost = 0
+
+    @property
+    def dropped(self) -> int:
+        """Events for which the process itself had no room."""
+        return int(self.header["dropped"][0])
+
+    def new_records(self) -> list[NDArray[Any]]:
+        """What came into the rings since the last time, each ring's in the order of writing."""
+        found = []
+        for number in np.flatnonzero(self._rings["written"] != self._read):
+            ring, read = self._records[number], int(self._read[number])
+            written = int(self._rings["written"][number])
+            oldest = max(read, written - ring.size)
+            places = np.arange(oldest, written) % ring.size
+            copied = ring[places]
+            # The record behind `written` may be half there, in the place of the oldest of all.
+            whole = max(oldest, int(self._rings["written"][number]) + 1 - ring.size)
+            self.lost += min(whole, written) - read
+            self._read[number] = written
+            if whole < written:
+                found.append(copied[whole - oldest :])
+        return found
+
+    def objects(self) -> tuple[NDArray[Any], dict[int, dict[int, str]]]:
+        """The events of creation so far, and by the number of one of these the texts of it.
+
+        Texts are by the place of the argument. An event that is being written is left out.
+        """
+        asked = min(int(self.header["objects"][0]), self._objects.size)
+        records = self._objects[:asked].copy()
+        own = np.flatnonzero(records["event"] > _TEXT)
+        texts: dict[int, dict[int, bytearray]] = {}
+        lengths: dict[tuple[int, int], int] = {}
+        for at in np.flatnonzero(records["event"] == _TEXT):
+            number = int(np.searchsorted(own, at)) - 1
+            length, place = divmod(int(records["values"][at, 0]), _PLACES)
+            part = records["values"][at, 1:].tobytes()
+            texts.setdefault(number, {}).setdefault(place, bytearray()).extend(part)
+            lengths[number, place] = length
+        read = {
+            number: {
+                place: bytes(text[: lengths[number, place]]).decode(errors="replace")
+                for place, text in of_event.items()
+            }
+            for number, of_event in texts.items()
+        }
+        return records[own], read
+
+
+def creation_tables(process: TracedProcess) -> tuple[dict[str, pl.DataFrame], TracingLibrary]:
+    """The tables of what a process has created, and the tracing library behind ours.
+
+    The library's version says which arguments functions have.
+    """
+    objects, texts = process.objects()
+    path = next((texts[int(n)][0] for n in np.flatnonzero(objects["event"] == _LIBRARY)), "")
+    library = library_at(Path(path))
+    pids = np.full(objects.size, process.pid, np.int32)
+    return _tables(objects, pids, texts, library, events.CREATION), library
+
+
+def event_tables(
+    records: NDArray[Any], pids: NDArray[np.int32], library: TracingLibrary
+) -> dict[str, pl.DataFrame]:
+    """The tables of records of :meth:`TracedProcess.new_records`, each of a process."""
+    return _tables(records, pids, {}, library, frozenset(events.FIELDS) - events.CREATION)
+
+
+def _tables(
+    records: NDArray[Any],
+    pids: NDArray[np.int32],
+    texts: Mapping[int, Mapping[int, str]],
+    library: TracingLibrary,
+    names: Collection[str],
+) -> dict[str, pl.DataFrame]:
+    tables = {}
+    for number, name in enumerate(event_names(), _FIRST_EVENT):
+        places = np.flatnonzero(records["event"] == number) if name in names else np.array([])
+        if places.size:
+            own = records[places]
+            said = [texts.get(int(place), {}) for place in places] if texts else []
+            columns = dict(_columns(TracePoint(name, library.path, library), own, said))
+            tables[name] = _table(name, own, {"pid": pids[places], **columns})
+    return tables
+
+
+def _columns(
+    point: TracePoint, records: NDArray[Any], texts: Sequence[Mapping[int, str]]
+) -> Iterator[tuple[str, Any]]:
+    values = records["values"]
+    for argument in point.arguments:
+        if argument.kind == "text":
+            yield argument.column, [one.get(argument.place) for one in texts]
+        elif argument.kind == "gid":
+            gids = np.ascontiguousarray(values[:, argument.place : argument.place + 2])
+            yield argument.column, pl.Series(gids.view(np.uint8)).cast(pl.List(pl.UInt8))
+        elif argument.kind == "flag":
+            yield argument.column, values[:, argument.place] & 0xFF
+        else:
+            yield argument.column, np.ascontiguousarray(values[:, argument.place])
+    if point.event == "rcl_init":
+        yield "version", [point.tracing_library.version] * records.size
+    if point.event in ("callback_start", "callback_end"):
+        yield "thread_time", np.ascontiguousarray(values[:, _THREAD_TIME])
+
+
+def _table(name: str, records: NDArray[Any], columns: Mapping[str, Any]) -> pl.DataFrame:
+    types = events.column_types(name)
+    common = {one: np.ascontiguousarray(records[one]) for one in ("time", "tid", "cpu")}
+    frame = pl.DataFrame({**common, **columns})
+    signed = (
+        pl.col(one).reinterpret(signed=True) if kind == pl.Int64() else pl.col(one).cast(kind)
+        for one, kind in types.items()
+        if one in frame.columns
+    )
+    return frame.select(signed).sort("time", maintain_order=True)
+
+
+VARIABLE = "CHAINSHAPER_TRACE"
+_FILE = "libchainshaper_trace.so"
+_BETWEEN_LOOKS_S = 0.1
+_OPTIONS = ("-O2", "-std=gnu11", "-shared", "-fPIC", "-ftls-model=initial-exec")
+_LIBRARIES = ("-ldl", "-lpthread")
+_CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
+
+
+def build_library(folder: Path) -> Path:
+    """Compile the library into a folder. Raises PlatformError: no compiler, or it fails."""
+    compiler = shutil.which("cc", path=tool_environment()["PATH"])
+    if compiler is None:
+        raise PlatformError(
+            "`--source preload` needs a C compiler, and there is none: install one (Debian and "
+            "Ubuntu: `apt-get install gcc libc6-dev`), or record with `--source lttng`"
+        )
+    library = folder.absolute() / _FILE
+    words = [compiler, *_OPTIONS, "-o", str(library), str(SOURCE), *_LIBRARIES]
+    done = subprocess.run(
+        words, env=tool_environment(), capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        last = "; ".join(done.stderr.splitlines()[-2:])
+        raise PlatformError(f"{compiler} cannot compile {SOURCE}: {last}; see `{compiler} -v`")
+    return library
+
+
+def installed_library() -> Path:
+    """The library in the user's cache, built at the first use: for what runs longer than we do.
+
+    Raises PlatformError: as :func:`build_library`, or others may write to the cache.
+    """
+    digest = hashlib.sha256(SOURCE.read_bytes() + platform.machine().encode()).hexdigest()[:16]
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    cache = cache if cache.is_absolute() else Path.home() / ".cache"
+    library = cache / "chainshaper" / f"preload-{digest}" / _FILE
+    if not library.exists():
+        try:
+            library.parent.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=library.parent.parent) as folder:
+                built = build_library(Path(folder))
+                library.parent.mkdir(exist_ok=True)
+                built.replace(library)  # whole, also where two of us build at once
+        except OSError as error:
+            raise PlatformError(
+                f"{library} cannot be written ({error.strerror}): name another cache in "
+                "$XDG_CACHE_HOME"
+            ) from error
+    if (reason := why_distrusted(library)) is not None:
+        raise PlatformError(
+            f"{library} is not loaded into nodes: {reason}; remove it, or name another cache in "
+            "$XDG_CACHE_HOME"
+        )
+    return library
+
+
+def preloading(library: Path) -> str:
+    """`LD_PRELOAD` with the library in front of those that it names already."""
+    before = os.environ.get("LD_PRELOAD", "").split(":")
+    return ":".join([str(library), *(one for one in before if one and one != str(library))])
+
+
+class PreloadTracer:
+    """Records with the library in front: a :class:`~chainshaper.sources.Tracer`."""
+
+    def __init__(
+        self,
+        folder: Path,
+        command: Sequence[str],
+        pids: Sequence[int],
+        users: Collection[int] | None = None,
+    ) -> None:
+        if pids or not command:
+            raise InputError(
+                "the library is loaded as a process starts: give the COMMAND that starts the "
+                "application behind `--`, or attach with `--source ebpf`"
+            )
+        self._folder = folder
+        self._users = {os.geteuid(), *(run_users() if users is None else users)}
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self._reader = threading.Thread(target=self._read_until_over, daemon=True)
+        self._over = threading.Event()
+        self._failure: str | None = None
+        self._clock_offset_ns = 0
+        self._processes: list[TracedProcess] = []
+        self._names: dict[int, str] = {}
+
+    def start(self) -> Mapping[str, str]:
+        """Compile the library, and wait for the processes that have it."""
+        library = build_library(self._folder)
+        name = f"chainshaper-{os.getpid()}-{secrets.token_hex(8)}"
+        self._socket.bind(f"\0{name}")
+        self._socket.listen(128)
+        self._socket.settimeout(_BETWEEN_LOOKS_S)
+        self._clock_offset_ns = clock_offset()
+        self._reader.start()
+        return {"LD_PRELOAD": preloading(library), VARIABLE: name}
+
+    def failure(self) -> str | None:
+        """Why events are no longer read."""
+        return self._failure
+
+    def stop(self) -> None:
+        """Read what has been written until now."""
+        self._over.set()
+        if self._reader.ident is not None:
+            self._reader.join()
+
+    def remove(self) -> None:
+        """Close the socket; the memories are gone with the last process that has them."""
+        self.stop()
+        self._socket.close()
+
+    def recording(self) -> tuple[EventTables, RecordingInfo]:
+        """The tables of all processes together."""
+        if not self._processes:
+            raise OperationError(
+                "no process has loaded the tracing library: is tracing compiled into this ROS 2 "
+                "(`ros2 run tracetools status`), and do the nodes run here, not in a container, "
+                "and without more rights than you (LD_PRELOAD is ignored then)?"
+            )
+        found: dict[str, list[pl.DataFrame]] = {}
+        versions: list[str | None] = []
+        for place, process in enumerate(self._processes):
+            records = np.fromfile(self._file(place), RECORD)
+            created, library = creation_tables(process)
+            pids = np.full(records.size, process.pid, np.int32)
+            versions.append(library.version)
+            for name, table in {**created, **event_tables(records, pids, library)}.items():
+                found.setdefault(name, []).append(table)
+        tables = {
+            name: pl.concat(parts, how="diagonal").sort("time", maintain_order=True)
+            for name, parts in found.items()
+        }
+        lost = sum(process.lost + process.dropped for process in self._processes)
+        notes = [] if self._failure is None else [f"{self._failure}."]
+        if lost:
+            notes.append(f"{lost} events were lost: this process was not scheduled often enough.")
+        said = pl.DataFrame({"version": [one for one in versions if one][:1]})
+        info = RecordingInfo(
+            source="preload",
+            distribution=distribution_of({"rcl_init": said}, {}),
+            rmw=rmw_of_gids(tables),
+            clock_offset_ns=self._clock_offset_ns,
+            processes=processes_of(tables, self._names),
+            lost={"lost_events": lost},
+            notes=tuple(notes),
+        )
+        return tables, info
+
+    def _file(self, place: int) -> Path:
+        return self._folder / f"process_{place}.records"
+
+    def _read_until_over(self) -> None:
+        try:
+            while not self._over.is_set():
+                self._welcome()
+                self._read_all()
+            self._read_all()
+        except OSError as error:
+            self._failure = f"events can no longer be written down ({error.strerror})"
+
+    def _welcome(self) -> None:
+        """Take the memories that were sent, for as long as it is until the next look."""
+        with suppress(TimeoutError):
+            while not self._over.is_set():
+                peer, _ = self._socket.accept()
+                with peer:
+                    self._take_memory(peer)
+
+    def _take_memory(self, peer: socket.socket) -> None:
+        """The memory of one process, which runs as one of the users that are recorded."""
+        credentials = peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
+        pid, user, _ = _CREDENTIALS.unpack(credentials)
+        peer.settimeout(_BETWEEN_LOOKS_S)
+        try:
+            _, descriptors, _, _ = socket.recv_fds(peer, 64, 1)
+        except OSError:
+            return
+        for descriptor in descriptors:
+            with suppress(InputError):
+                if user in self._users:
+                    process = TracedProcess(descriptor)
+                    self._processes.append(process)
+                    with suppress(OSError):
+                        self._names[process.pid] = Path(f"/proc/{pid}/comm").read_text().strip()
+            os.close(descriptor)
+
+    def _read_all(self) -> None:
+        for place, process in enumerate(self._processes):
+            with self._file(place).open("ab") as file:
+                for part in process.new_records():
+                    file.write(part.tobytes())

@@ -1,0 +1,338 @@
+// The tracer in front of ROS 2: `LD_PRELOAD` loads it into a node, where it stands before
+// libtracetools. Each of a library's calls of `ros_trace_<event>(…)` becomes a record in shared
+// memory, then goes on to the function behind, so that LTTng and uprobes go on working.
+//
+// The memory is a memfd: it is gone with its last process, whoever is killed. Its name shows it to
+// who attaches to a running node; where CHAINSHAPER_TRACE names a socket, it is sent there at once.
+//
+//     header | objects, appended by all threads | ring of thread 0 | ring of thread 1 | …
+//
+// * Events of creation, which say what all others are about, are appended to the objects, and stay.
+// * All other events go to the ring of their thread, over its oldest. A thread takes a ring at its
+//   first event, and gives it back as it ends. `written` counts: who reads sees what it has missed.
+// * Nothing waits, nothing is allocated behind a thread's first event. What finds no room is counted.
+//
+// A record is 64 bytes; times are ns of CLOCK_MONOTONIC, values are a function's arguments as they
+// are in registers (of a bool the lowest byte counts). The third one of callback_start and
+// callback_end is the CPU time of the thread. Texts follow their event in records of their own.
+//
+// Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1: all arguments are
+// integers or pointers, at most five, so that any of its versions can be called, and answered, alike.
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <fcntl.h>
+#include <pthread.h>
+#include <sched.h>
+#include <stdatomic.h>
+#include <stdbool.h>
+#include <stddef.h>
+#include <stdint.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <sys/un.h>
+#include <time.h>
+#include <unistd.h>
+
+#define NAME "chainshaper-trace"
+#define FORMAT 1
+#define RINGS 64u
+#define RING_RECORDS (1u << 14)  // 0.8 s of 20,000 events a second, of each thread
+#define OBJECT_RECORDS (1u << 15)
+#define LONGEST_TEXT 4096u
+#define TEXT_BYTES 40u  // in one record
+enum { TEXT = 1, LIBRARY = 2, FIRST_EVENT = 3 };
+
+struct record {
+  uint64_t time;
+  uint32_t tid;
+  uint16_t cpu;
+  _Atomic uint16_t event;  // 0: not written yet
+  uint64_t values[6];      // of a text: 16 × its length + the argument's place, then its bytes
+};
+
+struct ring {
+  _Atomic uint64_t written;
+  _Atomic uint32_t taken;  // by a thread
+  uint32_t unused[13];
+};
+
+struct memory {
+  uint32_t magic, format, pid, rings, ring_records, object_records;
+  _Atomic uint64_t objects;  // records that were asked for: more than there are, when it is full
+  _Atomic uint64_t dropped;  // events that found no room
+  uint64_t unused[3];
+  struct ring ring[RINGS];
+  struct record object[OBJECT_RECORDS];
+  struct record records[RINGS][RING_RECORDS];
+};
+_Static_assert(sizeof(struct record) == 64 && sizeof(struct ring) == 64, "a cache line each");
+
+static _Atomic(struct memory *) memory;
+static _Atomic int state;  // 0: none yet, 1: being made, 2: there, 3: cannot be had
+static int descriptor = -1;
+static pthread_key_t at_end;
+static __thread struct {
+  struct ring *ring;
+  struct record *records;
+  uint32_t tid;
+} own;
+
+static inline uint64_t now(clockid_t clock) {
+  struct timespec time;
+  clock_gettime(clock, &time);
+  return (uint64_t)time.tv_sec * 1000000000u + (uint64_t)time.tv_nsec;
+}
+
+static void stamp(struct record *record, uint64_t time) {
+  record->time = time;
+  record->tid = own.tid;
+  record->cpu = (uint16_t)sched_getcpu();
+}
+
+// Send the memory to who waits for it; whoever is not there gets nothing.
+static void send_memory(const char *name) {
+  struct sockaddr_un address = {.sun_family = AF_UNIX};
+  size_t length = strlen(name);
+  int peer = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
+  if (peer < 0 || length >= sizeof address.sun_path) return;
+  memcpy(address.sun_path + 1, name, length);  // in no file system: nothing of it is left behind
+  socklen_t size = (socklen_t)(offsetof(struct sockaddr_un, sun_path) + 1 + length);
+  if (connect(peer, (struct sockaddr *)&address, size) == 0) {
+    union {
+      struct cmsghdr header;
+      char room[CMSG_SPACE(sizeof(int))];
+    } control = {.header = {CMSG_LEN(sizeof(int)), SOL_SOCKET, SCM_RIGHTS}};
+    memcpy(CMSG_DATA(&control.header), &descriptor, sizeof(int));
+    struct iovec content = {.iov_base = NAME, .iov_len = sizeof NAME};
+    struct msghdr message = {.msg_iov = &content, .msg_iovlen = 1, .msg_control = &control,
+                             .msg_controllen = sizeof control.room};
+    sendmsg(peer, &message, MSG_NOSIGNAL);
+  }
+  close(peer);
+}
+
+static void append(uint16_t event, const uint64_t *values, const void *const *texts,
+                   const unsigned *places, unsigned count);
+
+static bool make_memory(void) {
+  descriptor = memfd_create(NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING);
+  if (descriptor < 0 || ftruncate(descriptor, sizeof(struct memory))) return false;
+  struct memory *made =
+    mmap(NULL, sizeof(struct memory), PROT_READ | PROT_WRITE, MAP_SHARED, descriptor, 0);
+  if (made == MAP_FAILED) return false;
+  // It stays as long as it is: who has it mapped elsewhere relies on that.
+  if (fcntl(descriptor, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)) return false;
+  made->format = FORMAT;
+  made->pid = (uint32_t)getpid();
+  made->rings = RINGS;
+  made->ring_records = RING_RECORDS;
+  made->object_records = OBJECT_RECORDS;
+  made->magic = 0x63687368;
+  memory = made;
+  return true;
+}
+
+static void give_back(void *ring) { ((struct ring *)ring)->taken = 0; }
+
+// A child of fork() has its parent's memory mapped, and gets its own at its first event.
+static void in_child(void) {
+  if (descriptor >= 0) close(descriptor);
+  descriptor = -1;
+  memory = NULL;
+  state = 0;
+  own.ring = NULL;
+  own.tid = 0;
+}
+
+static bool is_ready(void) {
+  int none = 0, before = errno;
+  if (state == 2) return true;
+  if (atomic_compare_exchange_strong(&state, &none, 1)) {
+    static bool once;
+    if (!once && (pthread_key_create(&at_end, give_back) || pthread_atfork(NULL, NULL, in_child)))
+      state = 3;
+    once = true;
+    if (state == 1) state = make_memory() ? 2 : 3;
+    if (state == 2) {
+      Dl_info behind;
+      void *function = dlsym(RTLD_NEXT, "ros_trace_callback_start");
+      own.tid = (uint32_t)syscall(SYS_gettid);
+      if (function && dladdr(function, &behind) && behind.dli_fname) {
+        const void *path = behind.dli_fname;
+        append(LIBRARY, (uint64_t[6]){0}, &path, (unsigned[]){0}, 1);
+      }
+      const char *reader = getenv("CHAINSHAPER_TRACE");
+      if (reader) send_memory(reader);
+    }
+  }
+  while (state == 1) sched_yield();  // at a process's first event only
+  errno = before;
+  return state == 2;
+}
+
+static bool has_ring(void) {
+  if (own.ring) return true;
+  if (!is_ready()) return false;
+  own.tid = (uint32_t)syscall(SYS_gettid);
+  struct memory *all = memory;
+  for (unsigned number = 0; number < RINGS; number++) {
+    uint32_t none = 0;
+    if (!atomic_compare_exchange_strong(&all->ring[number].taken, &none, 1)) continue;
+    own.records = all->records[number];
+    own.ring = &all->ring[number];
+    pthread_setspecific(at_end, own.ring);
+    return true;
+  }
+  atomic_fetch_add(&all->dropped, 1);
+  return false;
+}
+
+static inline __attribute__((always_inline)) void write_record(uint16_t event, unsigned count,
+                                                               const uint64_t *values) {
+  if (__builtin_expect(!own.ring, 0) && !has_ring()) return;
+  uint64_t number = atomic_load_explicit(&own.ring->written, memory_order_relaxed);
+  struct record *record = &own.records[number & (RING_RECORDS - 1)];
+  // Who sees any of this record sees the count of those before, and that its room is taken again.
+  atomic_thread_fence(memory_order_release);
+  stamp(record, now(CLOCK_MONOTONIC));
+  atomic_store_explicit(&record->event, event, memory_order_relaxed);
+  for (unsigned place = 0; place < count; place++) record->values[place] = values[place];
+  atomic_store_explicit(&own.ring->written, number + 1, memory_order_release);
+}
+
+static unsigned records_of(size_t length) { return 1 + (unsigned)(length / TEXT_BYTES); }
+
+// An event of creation and its texts, one behind the other, so that no other one is between them.
+static void append(uint16_t event, const uint64_t *values, const void *const *texts,
+                   const unsigned *places, unsigned count) {
+  struct memory *all = memory;
+  size_t length[2] = {0, 0};
+  unsigned wanted = 1;
+  for (unsigned text = 0; text < count; text++) {
+    length[text] = texts[text] ? strnlen(texts[text], LONGEST_TEXT) : 0;
+    wanted += records_of(length[text]);
+  }
+  uint64_t at = atomic_fetch_add(&all->objects, wanted);
+  if (at + wanted > OBJECT_RECORDS) {
+    atomic_fetch_add(&all->dropped, 1);
+    return;
+  }
+  uint64_t time = now(CLOCK_MONOTONIC);
+  struct record *record = &all->object[at];
+  memcpy(record->values, values, sizeof record->values);
+  stamp(record, time);
+  for (unsigned text = 0; text < count; text++) {
+    const char *from = texts[text];
+    size_t left = length[text];
+    for (unsigned part = records_of(left); part > 0; part--) {
+      size_t here = left < TEXT_BYTES ? left : TEXT_BYTES;
+      struct record *next = ++record;
+      next->values[0] = 16 * length[text] + places[text];
+      if (here) memcpy(&next->values[1], from, here);
+      stamp(next, time);
+      atomic_store_explicit(&next->event, TEXT, memory_order_release);
+      from += here;
+      left -= here;
+    }
+  }
+  atomic_store_explicit(&all->object[at].event, event, memory_order_release);
+}
+
+static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *values) {
+  const void *pointers[2];
+  unsigned places[2], count = 0;
+  if (!own.tid) own.tid = (uint32_t)syscall(SYS_gettid);
+  if (!is_ready()) return;
+  for (unsigned place = 0; place < 5; place++)
+    if (texts >> place & 1) {
+      places[count] = place;
+      pointers[count++] = (const void *)(uintptr_t)values[place];
+    }
+  if (gid && values[gid]) memcpy(&values[gid], (const void *)(uintptr_t)values[gid], 16);
+  append(event, values, pointers, places, count);
+}
+
+#define BIT(place) (1u << (place))
+// EVENT: name, arguments that are values. TIMED: the same, CPU time behind them. CREATION: name, the
+// places of texts as bits, that of a gid (0: none). A record's number is the place in this list.
+#define ALL_EVENTS \
+  CREATION(rcl_init, 0, 0) \
+  CREATION(rcl_node_init, BIT(2) | BIT(3), 0) \
+  CREATION(rmw_publisher_init, 0, 1) \
+  CREATION(rcl_publisher_init, BIT(3), 0) \
+  CREATION(rmw_subscription_init, 0, 1) \
+  CREATION(rcl_subscription_init, BIT(3), 0) \
+  CREATION(rclcpp_subscription_init, 0, 0) \
+  CREATION(rclcpp_subscription_callback_added, 0, 0) \
+  CREATION(rcl_service_init, BIT(3), 0) \
+  CREATION(rclcpp_service_callback_added, 0, 0) \
+  CREATION(rcl_client_init, BIT(3), 0) \
+  CREATION(rcl_timer_init, 0, 0) \
+  CREATION(rclcpp_timer_callback_added, 0, 0) \
+  CREATION(rclcpp_timer_link_node, 0, 0) \
+  CREATION(rclcpp_callback_register, BIT(1), 0) \
+  CREATION(rclcpp_construct_ring_buffer, 0, 0) \
+  CREATION(rclcpp_buffer_to_ipb, 0, 0) \
+  CREATION(rclcpp_ipb_to_subscription, 0, 0) \
+  TIMED(callback_start, 2) \
+  TIMED(callback_end, 1) \
+  EVENT(rclcpp_publish, 2) \
+  EVENT(rclcpp_intra_publish, 2) \
+  EVENT(rcl_publish, 2) \
+  EVENT(rmw_publish, 3) \
+  EVENT(rmw_take, 4) \
+  EVENT(rcl_take, 1) \
+  EVENT(rclcpp_take, 1) \
+  EVENT(rclcpp_ring_buffer_enqueue, 4) \
+  EVENT(rclcpp_ring_buffer_dequeue, 3) \
+  EVENT(rclcpp_ring_buffer_clear, 1) \
+  EVENT(rclcpp_executor_get_next_ready, 0) \
+  EVENT(rclcpp_executor_wait_for_work, 1) \
+  EVENT(rclcpp_executor_execute, 1)
+
+#define EVENT(name, ...) number_##name,
+#define TIMED EVENT
+#define CREATION EVENT
+enum { before_first = FIRST_EVENT - 1, ALL_EVENTS };
+#undef EVENT
+#undef TIMED
+#undef CREATION
+
+#define ARGUMENTS uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e
+typedef void (*function)(ARGUMENTS);
+typedef bool (*question)(void);
+
+// What stands behind us: `ros_trace_<event>`, `ros_trace_do_<event>` since tracetools 6, which has
+// asked `ros_trace_enabled_<event>` before. We say yes to that, for a callback's name is computed
+// only then. Resolved at the first call; that several threads do it at once does no harm.
+#define HOOK(name, write) \
+  void ros_trace_##name(ARGUMENTS) { \
+    static _Atomic(function) behind; \
+    static _Atomic bool looked; \
+    write; \
+    if (!looked) { \
+      behind = (function)dlsym(RTLD_NEXT, "ros_trace_" #name); \
+      looked = true; \
+    } \
+    if (behind) behind(a, b, c, d, e); \
+  } \
+  void ros_trace_do_##name(ARGUMENTS) { \
+    write; \
+    function behind = (function)dlsym(RTLD_NEXT, "ros_trace_do_" #name); \
+    question enabled = (question)dlsym(RTLD_NEXT, "ros_trace_enabled_" #name); \
+    if (behind && enabled && enabled()) behind(a, b, c, d, e); \
+  } \
+  bool ros_trace_enabled_##name(void) { return true; }
+
+#define EVENT(name, count) \
+  HOOK(name, write_record(number_##name, count, ((uint64_t[6]){a, b, c, d, e})))
+#define TIMED(name, count) \
+  HOOK(name, write_record(number_##name, 3, \
+                          ((uint64_t[6]){a, b, now(CLOCK_THREAD_CPUTIME_ID)})))
+#define CREATION(name, texts, gid) \
+  HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
+ALL_EVENTS

@@ -1,0 +1,314 @@
+"""The library in front of ROS 2: real processes that have it loaded, killed, forked and crowded."""
+
+import ctypes
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from command_line import called, json_of
+from processes import wait_for
+from traced_program import Traced, assert_same, built, of_process, traced
+
+from chainshaper.sources.ebpf.trace_points import TracePoint, library_at
+from chainshaper.sources.preload import (
+    SOURCE,
+    VARIABLE,
+    PreloadTracer,
+    TracedProcess,
+    build_library,
+    event_names,
+)
+from chainshaper.values import events
+from chainshaper.values.errors import InputError, OperationError, PlatformError
+
+RING, RINGS = 1 << 14, 64
+CYCLES, PERIOD_NS = 20, 50_000_000
+
+CALLER = """
+import ctypes, os, sys, threading
+library = ctypes.CDLL(None)
+def take(message): library.ros_trace_rcl_take(ctypes.c_uint64(message))
+"""
+"""The beginning of a program in Python whose process has the library in front, and nothing else."""
+
+
+def tracer_of(folder: Path) -> PreloadTracer:
+    return PreloadTracer(folder, ["command"], ())
+
+
+def python(program: str) -> list[list[str]]:
+    subprocess.run([sys.executable, "-c", CALLER + program], check=True, timeout=60)
+    return []
+
+
+def taken(run: Traced) -> list[int]:
+    return run.tables["rcl_take"]["message"].to_list()
+
+
+@pytest.fixture(scope="module")
+def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Traced, dict[str, Any]]:
+    """`every` of two versions, and a chain: one recording; what the former printed, by version."""
+    programs = {"8.2.3": built(), "4.1.1": built("-DHUMBLE", version="4.1.1")}
+    printed = {}
+
+    def run_all() -> list[list[str]]:
+        printed.update({version: one.run("every") for version, one in programs.items()})
+        return programs["8.2.3"].run("chain", str(CYCLES))
+
+    return traced(tracer_of(tmp_path_factory.mktemp("trace")), run_all), printed
+
+
+def test_every_argument_of_every_function_arrives_as_it_was_passed(
+    everything: tuple[Traced, dict[str, Any]],
+) -> None:
+    run, printed = everything
+    assert run.info.lost == {"lost_events": 0}
+    assert run.info.distribution == "jazzy"
+    for version, rows in printed.items():
+        own = of_process(run.tables, int(rows[0][1]))
+        assert_same(own, rows, version)
+        assert own["rcl_take"].item(0, "tid") != int(rows[0][1])
+
+
+def test_execution_times_are_the_threads_own_cpu_time(
+    everything: tuple[Traced, dict[str, Any]],
+) -> None:
+    run, printed = everything
+    every = {int(rows[0][1]) for rows in printed.values()}
+    (chain,) = set(run.tables["callback_start"]["pid"]) - every
+    starts, ends = (
+        of_process(run.tables, chain)[name]["thread_time"].to_numpy()
+        for name in ("callback_start", "callback_end")
+    )
+    used = np.array([int(row[4]) for row in run.printed if row[0] == "instance"])
+    assert len(used) == 2 * CYCLES
+    # The program reads the clock around both calls, so it counts them too.
+    assert ((ends - starts) <= used).all()
+    assert np.median(used - (ends - starts)) < 50_000
+
+
+def test_the_library_has_the_arguments_that_trace_points_have() -> None:
+    """Texts and gids of events of creation; how many values others have."""
+    source = SOURCE.read_text()
+    assert set(event_names()) <= events.FIELDS.keys()
+    version = library_at(built().tracetools)
+    for kind, name, rest in re.findall(
+        r"^  (EVENT|TIMED|CREATION)\((\w+), (.*)\) *\\?$", source, re.M
+    ):
+        arguments = TracePoint(name, version.path, version).arguments
+        of_kind = {
+            wanted: [one.place for one in arguments if one.kind == wanted]
+            for wanted in ("text", "gid")
+        }
+        assert (kind == "CREATION") == (name in events.CREATION)
+        if kind == "CREATION":
+            *texts, gid = [int(number) for number in re.findall(r"\d+", rest)]
+            assert [place for place in texts if place] == of_kind["text"], name
+            assert [gid] == (of_kind["gid"] or [0]), name
+        else:
+            assert int(rest) == max((one.place + 1 for one in arguments), default=0), name
+
+
+def test_what_comes_faster_than_it_is_read_is_counted(tmp_path: Path) -> None:
+    count = 40 * RING
+    run = traced(
+        tracer_of(tmp_path),
+        lambda: python(f"for n in range({count}): library.ros_trace_rcl_take(None)"),
+    )
+    assert run.tables["rcl_take"].height + run.info.lost["lost_events"] == count
+    assert ("events were lost" in "".join(run.info.notes)) == (run.info.lost["lost_events"] > 0)
+
+
+def test_a_ring_that_runs_over_has_the_newest_and_counts_the_others(tmp_path: Path) -> None:
+    """Read once, behind ten rings' worth of events: a reader that was not scheduled meanwhile."""
+    library = build_library(tmp_path)
+    reading, writing = os.pipe()
+    program = f"for n in range(10 * {RING} + 7): take(n)\nprint(os.getpid(), flush=True)\ninput()"
+    with subprocess.Popen(
+        [sys.executable, "-c", CALLER + program],
+        env={**os.environ, "LD_PRELOAD": str(library)},
+        stdin=reading,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        assert int(process.stdout.readline()) == process.pid
+        folder = Path(f"/proc/{process.pid}/fd")
+        (found,) = (one for one in folder.iterdir() if "chainshaper-trace" in str(one.readlink()))
+        descriptor = os.open(found, os.O_RDONLY)
+        memory = TracedProcess(descriptor)
+        os.close(descriptor)
+        (records,) = memory.new_records()
+        messages = records["values"][:, 0]
+        assert messages[-1] == 10 * RING + 6
+        assert (np.diff(messages) == 1).all()
+        assert records.size == RING - 1  # the room of the oldest may be being written
+        assert memory.lost + records.size == 10 * RING + 7
+        assert memory.new_records() == []
+        os.write(writing, b"\n")
+    os.close(reading)
+    os.close(writing)
+
+
+def test_a_process_that_is_killed_has_lost_nothing_and_leaves_nothing(tmp_path: Path) -> None:
+    def run() -> list[list[str]]:
+        with pytest.raises(subprocess.CalledProcessError):
+            python("for n in range(100): take(n)\nos.kill(os.getpid(), 9)")
+        return []
+
+    before = set(Path("/dev/shm").iterdir())
+    assert taken(traced(tracer_of(tmp_path), run)) == list(range(100))
+    assert set(Path("/dev/shm").iterdir()) == before
+
+
+def test_a_reader_that_is_killed_disturbs_nothing_and_leaves_nothing(tmp_path: Path) -> None:
+    program = built()
+    output, ran = tmp_path / "recording", tmp_path / "ran"
+    script = f'"{program.executable}" chain 40 > "{ran}"; mv "{ran}" "{ran}.whole"'
+    before = set(Path("/dev/shm").iterdir())
+    record = [sys.executable, "-m", "chainshaper", "record", "--source", "preload"]
+    recorder = subprocess.Popen(
+        [*record, "-o", str(output), "--", "setsid", "bash", "-c", script],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    wait_for(ran.exists, "the application to run")
+    time.sleep(0.5)
+    recorder.send_signal(signal.SIGKILL)
+    recorder.wait()
+    wait_for(Path(f"{ran}.whole").exists, "the application to end by itself")
+    instances = [
+        line for line in Path(f"{ran}.whole").read_text().splitlines() if "instance" in line
+    ]
+    assert len(instances) == 80
+    assert set(Path("/dev/shm").iterdir()) == before
+    assert f"chainshaper-{recorder.pid}-" not in Path("/proc/net/unix").read_text()
+
+
+def test_children_have_memories_of_their_own(tmp_path: Path) -> None:
+    program = """
+for n in range(3): take(n)
+child = os.fork()
+for n in range(3, 6) if child else range(10, 15): take(n)
+if child: os.waitpid(child, 0)
+else: os._exit(0)
+"""
+    run = traced(tracer_of(tmp_path), lambda: python(program))
+    by_process = run.tables["rcl_take"].group_by("pid").agg("message")["message"].to_list()
+    assert sorted(by_process) == [list(range(6)), list(range(10, 15))]
+
+
+def test_threads_that_end_give_their_rings_back(tmp_path: Path) -> None:
+    program = """
+for n in range(300):
+    thread = threading.Thread(target=take, args=(n,))
+    thread.start()
+    thread.join()
+"""
+    run = traced(tracer_of(tmp_path), lambda: python(program))
+    assert sorted(taken(run)) == list(range(300))
+    assert run.info.lost == {"lost_events": 0}
+
+
+def test_more_threads_than_rings_are_counted(tmp_path: Path) -> None:
+    program = f"""
+all_there = threading.Barrier({RINGS} + 6)
+def run(n):
+    take(n)
+    all_there.wait()
+threads = [threading.Thread(target=run, args=(n,)) for n in range({RINGS} + 6)]
+for thread in threads: thread.start()
+for thread in threads: thread.join()
+"""
+    run = traced(tracer_of(tmp_path), lambda: python(program))
+    assert len(taken(run)) == RINGS
+    assert run.info.lost == {"lost_events": 6}
+
+
+def test_objects_that_find_no_room_are_counted(tmp_path: Path) -> None:
+    name = b"/a" * 3000  # is cut
+    program = f"""
+for n in range(400):
+    library.ros_trace_rcl_node_init(ctypes.c_uint64(n), None, {name!r}, b"/")
+"""
+    run = traced(tracer_of(tmp_path), lambda: python(program))
+    nodes = run.tables["rcl_node_init"]
+    assert nodes.height + run.info.lost["lost_events"] == 400
+    assert nodes.height > 250
+    assert set(nodes["node_name"]) == {name[:4096].decode()}
+
+
+def test_what_cannot_have_memory_runs_on(tmp_path: Path) -> None:
+    """No descriptor is left: nothing is traced, and nobody is told."""
+
+    def run() -> list[list[str]]:
+        return python(
+            "import resource\nresource.setrlimit(resource.RLIMIT_NOFILE, (3, 3))\ntake(1)"
+        )
+
+    tracer = tracer_of(tmp_path)
+    with pytest.raises(OperationError, match="no process has loaded the tracing library"):
+        traced(tracer, run)
+
+
+def test_memory_of_others_is_refused(tmp_path: Path) -> None:
+    plain = os.open(tmp_path / "file", os.O_RDWR | os.O_CREAT)
+    os.ftruncate(plain, 1 << 20)
+    shrinking, garbage = (
+        os.memfd_create("chainshaper-trace", os.MFD_ALLOW_SEALING) for _ in range(2)
+    )
+    for descriptor in (shrinking, garbage):
+        os.write(descriptor, os.urandom(1 << 20))
+    libc = ctypes.CDLL(None)
+    assert libc.fcntl(garbage, 1033, 2) == 0  # F_ADD_SEALS, F_SEAL_SHRINK
+    for descriptor, message in (
+        (plain, "no memory of a traced process"),
+        (shrinking, "no memory of a traced process"),
+        (garbage, "another version"),
+    ):
+        with pytest.raises(InputError, match=message):
+            TracedProcess(descriptor)
+        os.close(descriptor)
+
+
+def test_the_command_records_and_the_chain_is_measured(tmp_path: Path) -> None:
+    program, recording = built(), tmp_path / "recording"
+    made = called(
+        *("record", "--source", "preload", "-o", recording, "--"),
+        *program.command("chain", str(CYCLES)),
+    )
+    assert made.code == 0, made.err
+    measured = json_of("latency", recording, "--chain", "/ebpf1../ebpf2", "--json")
+    assert measured["count"] >= CYCLES - 1
+    callbacks = json_of("callbacks", recording, "--json")
+    assert all(2_000_000 <= one["execution_ns"]["mean"] < 3_000_000 for one in callbacks)
+    assert json_of("info", recording, "--json")["source"] == "preload"
+
+
+def test_wrong_use_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    attached = called("record", "--source", "preload", "-o", tmp_path / "r", "--pid", "1")
+    assert attached.code == 2
+    assert "attach with `--source ebpf`" in attached.err
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(PlatformError, match="needs a C compiler, and there is none"):
+        build_library(tmp_path)
+
+
+def test_an_environment_with_other_libraries_in_front_has_them_still(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("LD_PRELOAD", "/other.so")
+    tracer = tracer_of(tmp_path)
+    try:
+        given = tracer.start()
+    finally:
+        tracer.remove()
+    assert given["LD_PRELOAD"].endswith(":/other.so")
+    assert given.keys() == {"LD_PRELOAD", VARIABLE}

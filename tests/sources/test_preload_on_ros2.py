@@ -1,0 +1,90 @@
+"""The library in front of a real ROS 2, LTTng behind it: both record one and the same run."""
+
+import subprocess
+from pathlib import Path
+
+import polars as pl
+import pytest
+from command_line import called, json_of
+from ros2 import ros2_environment
+from small_chain import small_chain
+
+import chainshaper as cs
+from chainshaper.flow.record import record_command
+from chainshaper.sources.preload import PreloadTracer
+
+SECONDS = 6
+LENGTHS = {"gid": 16}  # LTTng has what follows the gid as well
+
+
+@pytest.fixture
+def launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The command that launches a generated package of C++ nodes."""
+    for name, value in ros2_environment().items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    workspace = tmp_path / "ws"
+    (workspace / "src").mkdir(parents=True)
+    cs.generate_package(small_chain(tmp_path), workspace / "src/small")
+    build = ["colcon", "build", "--merge-install", "--packages-select", "small"]
+    subprocess.run(build, cwd=workspace, check=True, capture_output=True)
+    prefixes = f"{workspace}/install:{ros2_environment()['AMENT_PREFIX_PATH']}"
+    monkeypatch.setenv("AMENT_PREFIX_PATH", prefixes)
+    return ["ros2", "launch", "small", "small.launch.py"]
+
+
+@pytest.mark.ros2
+@pytest.mark.timeout(300)
+def test_events_are_those_of_lttng_one_by_one(
+    launch: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "trace").mkdir()
+    tracer = PreloadTracer(tmp_path / "trace", launch, ())
+    for name, value in tracer.start().items():
+        monkeypatch.setenv(name, value)
+    try:
+        done = record_command(tmp_path / "lttng", launch, duration_ns=SECONDS * 1_000_000_000)
+    finally:
+        tracer.remove()
+    ours, info = tracer.recording()
+    theirs = {
+        name: table
+        for name, table in done.recording.events.items()
+        if name != "sched_switch" and table.height
+    }
+    assert info.lost == {"lost_events": 0}
+    assert theirs.keys() <= ours.keys()
+    assert {"rmw_take", "rmw_publish", "callback_end", "rclcpp_callback_register"} <= theirs.keys()
+    ended = max(int(table["time"][-1]) for table in theirs.values())
+    for name, table in theirs.items():
+        same = [one for one in table.columns if one in ours[name].columns]
+        same = [one for one in same if one not in ("time", "cpu")]
+        threads = ours[name].partition_by("pid", "tid", as_dict=True, maintain_order=True)
+        for thread, expected in table.group_by("pid", "tid", maintain_order=True):
+            found = threads[thread]
+            assert (found["time"][expected.height :] > ended - 1_000_000_000).all(), name
+            found = found.head(expected.height)
+            assert cut(found.select(same)).equals(cut(expected.select(same))), (name, thread)
+            assert (found["time"] <= expected["time"]).all(), "ours is written first"
+    assert info.distribution == done.recording.info.distribution
+    assert info.rmw in (None, done.recording.info.rmw)
+
+
+def cut(table: pl.DataFrame) -> pl.DataFrame:
+    return table.with_columns(
+        pl.col(name).list.head(length) for name, length in LENGTHS.items() if name in table.columns
+    )
+
+
+@pytest.mark.ros2
+@pytest.mark.timeout(300)
+def test_the_command_shows_latencies_and_execution_times(launch: list[str], tmp_path: Path) -> None:
+    recording = tmp_path / "recording"
+    made = called(
+        *("record", "--source", "preload", "-o", recording, "--duration", f"{SECONDS}s", "--"),
+        *launch,
+    )
+    assert made.code == 0, made.err
+    callbacks = json_of("callbacks", recording, "--json")
+    assert all(one["execution_ns"]["mean"] > 0 for one in callbacks if one["count"])
+    assert json_of("latency", recording, "--chain", "/t1../t3")["count"] > 10
