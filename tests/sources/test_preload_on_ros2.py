@@ -1,8 +1,12 @@
 """The library in front of a real ROS 2, LTTng behind it: both record one and the same run."""
 
+import os
 import subprocess
+import time
 from pathlib import Path
+from threading import Event, Thread
 
+import numpy as np
 import polars as pl
 import pytest
 from command_line import called, json_of
@@ -11,7 +15,8 @@ from small_chain import small_chain
 
 import chainshaper as cs
 from chainshaper.flow.record import record_command
-from chainshaper.sources.preload import PreloadTracer
+from chainshaper.sources.preload import PreloadTracer, build_library
+from chainshaper.verify.watch import SECOND, Watch
 
 SECONDS = 6
 LENGTHS = {"gid": 16}  # LTTng has what follows the gid as well
@@ -88,3 +93,38 @@ def test_the_command_shows_latencies_and_execution_times(launch: list[str], tmp_
     callbacks = json_of("callbacks", recording, "--json")
     assert all(one["execution_ns"]["mean"] > 0 for one in callbacks if one["count"])
     assert json_of("latency", recording, "--chain", "/t1../t3")["count"] > 10
+
+
+@pytest.mark.ros2
+@pytest.mark.timeout(300)
+def test_what_is_watched_is_what_lttng_records(
+    launch: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Attached and detached while LTTng records: the same cycles, but for where both are unsure."""
+    monkeypatch.setenv("LD_PRELOAD", str(build_library(tmp_path)))
+    watch, over = Watch(["/t1../t3"], users={os.geteuid()}, longest_ns=SECOND // 2), Event()
+
+    def follow() -> None:
+        while not over.wait(0.1):
+            watch.read()
+            if int(time.monotonic() * 10) % 5 == 0:
+                watch.look()
+
+    thread = Thread(target=follow)
+    thread.start()
+    try:
+        record_command(tmp_path / "lttng", launch, duration_ns=SECONDS * SECOND)
+    finally:
+        over.set()
+        thread.join()
+    (seen,) = watch.chains
+    known = cs.measure_latency(tmp_path / "lttng", "/t1../t3").analysis.traversals
+    whole = seen.latency >= 0
+    start, latency = seen.begun[whole], seen.latency[whole]
+    assert start.size > 40
+    theirs = known.drop_nulls("latency_ns")
+    nearest = np.abs(theirs["start"].to_numpy()[:, None] - start).argmin(axis=0)
+    assert np.unique(nearest).size == start.size, "one of theirs for each of ours"
+    assert (np.diff(nearest) == 1).all(), "none is passed over"
+    expected = theirs["latency_ns"].to_numpy()[nearest]
+    assert np.median(np.abs(latency - expected) / expected) < 0.01

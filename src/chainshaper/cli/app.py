@@ -20,7 +20,7 @@ USAGE_ERROR: Any = typer.BadParameter.__base__
 _MODULES = (
     ("runs", "demo run simulate generate"),
     ("plans", "sweep"),
-    ("runs", "record profile"),
+    ("runs", "record profile watch"),
     ("traces", "info graph callbacks chains latency convert"),
     ("plans", "plan offsets splice"),
     ("runs", "shape"),

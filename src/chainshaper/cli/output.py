@@ -191,3 +191,33 @@ def stop_on_signals() -> Iterator[threading.Event]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextmanager
+def asked_for(number: int) -> Iterator[threading.Event]:
+    """An event that a signal sets, inside."""
+    asked = threading.Event()
+    before = signal.signal(number, lambda *_: asked.set())
+    try:
+        yield asked
+    finally:
+        signal.signal(number, before)
+
+
+@contextmanager
+def live() -> "Iterator[Callable[[Sequence[RenderableType]], None]]":
+    """Tables that take the place of those before, on a terminal; else they follow each other."""
+    if not sys.stdout.isatty():
+        yield lambda tables: show(*tables)
+        return
+    from rich.console import Group
+    from rich.live import Live
+
+    with Live(auto_refresh=False) as place:
+        yield lambda tables: place.update(Group(*tables), refresh=True)
+
+
+def print_json_line(value: Any) -> None:
+    """One JSON document on a line of its own, out at once."""
+    with _written():
+        sys.stdout.write(json.dumps(value).replace("\x7f", "\\u007f") + "\n")

@@ -1,6 +1,10 @@
 """Verbs that run an application: live, simulated, recorded, profiled, shaped; and the demo."""
 
+import shlex
+import signal
 import sys
+import time
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -228,6 +232,83 @@ def _record_and_show(
             f"the command {end_in_words(recorded.exit_code)}; what was recorded until then is in "
             f"{recording.path}"
         )
+
+
+def watch(
+    command: list[str] | None = opt.argument(
+        "[-- COMMAND…]",
+        "Starts the application with the library in front, and ends it with Ctrl-C. Default: "
+        "what runs already with the library is watched, and left running.",
+    ),
+    chain: list[str] | None = opt.option(
+        "--chain FIRST..LAST", "A chain, by topics or nodes: /t1../t5 (may be repeated)."
+    ),
+    plan: Path | None = opt.option(
+        "--plan plan.yaml", "The plan in force: its chains, slots, and which outputs are late."
+    ),
+    longest: int = opt.option(
+        "--longest DURATION", "What takes longer counts as incomplete.", 2_000_000_000
+    ),
+    every: int = opt.option("--every DURATION", "How often to look.", 1_000_000_000),
+    recorder: Path = opt.option(
+        "--recorder DIR",
+        "Where Ctrl-\\ writes the last ten seconds, a recording in a folder named by its time.",
+        Path(),
+    ),
+    user: list[str] | None = opt.USERS,
+    environment: bool = opt.option(
+        "--environment",
+        "Print the variable that puts the library in front of ROS 2; no more.",
+        False,
+    ),
+    json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),
+) -> None:
+    """Watch the chains of a running application: latency now, over a minute, over an hour.
+
+    The application needs the library in front of ROS 2: `eval "$(chainshaper watch --environment)"`
+    before it is started, or start it here, as COMMAND. Watching needs no root and changes nothing.
+    """
+    from chainshaper.linux.own_processes import check_command, end_command, start_command
+    from chainshaper.linux.processes import run_users
+    from chainshaper.planning import load_application_plan
+    from chainshaper.reporting.overviews import watch_tables
+    from chainshaper.sources.preload import installed_library, preloading
+    from chainshaper.verify.watch import Watch
+
+    if environment:
+        out.show_line(f"export LD_PRELOAD={shlex.quote(preloading(installed_library()))}")
+        return
+    known = None if plan is None else load_application_plan(plan)
+    chains = chain or (
+        [] if known is None else [one.chain.spec for one in known.chains if one.chain.spec]
+    )
+    if not chains:
+        raise InputError("no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan")
+    if command:
+        check_command(command)
+    with out.stop_on_signals() as stop, ExitStack() as until:
+        started = None
+        if command:
+            variables = {"LD_PRELOAD": preloading(installed_library())}
+            started = start_command(command, variables, STDERR)
+            until.callback(end_command, started)
+        show = until.enter_context(out.live())
+        saved = until.enter_context(out.asked_for(signal.SIGQUIT))
+        watched = Watch(chains, users=run_users(user or []), plan=known, longest_ns=longest)
+        next_look = time.monotonic_ns() + every
+        while not stop.wait(0.1) and (started is None or started.poll() is None):
+            watched.read()
+            if saved.is_set():
+                saved.clear()
+                folder = recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}"
+                out.say(f"the last ten seconds are in {watched.save(folder).path}")
+            if time.monotonic_ns() >= next_look:
+                next_look += every
+                seen = watched.look()
+                if json:
+                    out.print_json_line(seen.as_json())
+                else:
+                    show(watch_tables(seen))
 
 
 @opt.takes_wishes("cores", "policy")

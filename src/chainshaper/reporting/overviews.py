@@ -21,6 +21,7 @@ from chainshaper.reporting.tables import (
     YES_NO,
     Column,
     ResultTable,
+    count,
     figures,
     listed,
     min_mean_max,
@@ -43,6 +44,7 @@ from chainshaper.values.recording import (
     lost_text,
 )
 from chainshaper.verify.measure import Measurement
+from chainshaper.verify.watch import Seen
 
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
@@ -484,6 +486,33 @@ def runs_table(runs: Iterable[tuple[Journal, RunState | None]]) -> ResultTable:
         owner = "gone" if journal.owner is None else str(journal.owner)
         table.add(journal.path.parent.name, plan, back_end, owner, condition)
     return table
+
+
+def watch_tables(seen: Seen) -> list[ResultTable]:
+    """What is to be seen of each chain now: its spans, then its hops."""
+    nodes = ", ".join(sorted(filter(None, seen.processes.values()))) or "no node"
+    tables = []
+    for one in seen.chains:
+        title = f"{one.chain}: {one.rate_hz:.2f} cycles a second"
+        if one.promised_ns is not None:
+            shares = ", ".join(map(percent, one.shares)) or "no output yet"
+            title += f"; the plan's last slot ends at {ms(one.promised_ns)} ms, in slots: {shares}"
+        names = ("cycles", "min", "p50", "p99", "max", "jitter", "late", "incomplete")
+        table = ResultTable(title, [*words("last [ms]"), *figures(*names)], one.problem)
+        for span, own in one.spans.items():
+            percentiles = (ms(own.percentiles_ns.get(which)) for which in ("50", "99"))
+            late = count(own.late)
+            values = (ms(own.min_ns), *percentiles, ms(own.max_ns), ms(own.jitter_ns), late)
+            table.add(span, str(own.count), *values, str(own.incomplete))
+        tables.append(table)
+        if one.hops:
+            hops = ResultTable("", [*words("node", "topic"), *figures("waits", "computes")])
+            for hop in one.hops:
+                hops.add(hop.node, hop.topic, ms(hop.communication_ns), ms(hop.computation_ns))
+            tables.append(hops)
+    lost = f"; {seen.lost} events lost" if seen.lost else ""
+    tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
+    return tables
 
 
 def changes_table(changes: Iterable[WantedScheduling]) -> ResultTable:

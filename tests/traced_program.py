@@ -30,7 +30,7 @@ __all__ = [
     "traced",
 ]
 
-_SOURCES = Path(__file__).parent / "tracetools"
+_SOURCES = Path(__file__).parent / "sources/tracetools"
 _PACKAGE = "<package><name>tracetools</name><version>{}</version></package>"
 
 

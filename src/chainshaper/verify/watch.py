@@ -1,0 +1,333 @@
+"""Watching the chains of an application that runs: `chainshaper watch`.
+
+    memories of the nodes ─► events of the last seconds ─► traversals ─► figures over three spans
+
+The library of :mod:`chainshaper.sources.preload` is in front of ROS 2 in each process; whoever may
+read the process's memory can follow it, several at a time, and go away without a trace. Every look
+runs the same analysis as `chainshaper latency` over the last few seconds and takes over the cycles
+that are surely over: those that began longer ago than a cycle may take. So figures are those of a
+recording of the same time, and memory does not grow: events are there for seconds, cycles for an
+hour, and only as three numbers each.
+"""
+
+import contextlib
+import re
+import time
+from collections import deque
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import polars as pl
+from numpy.typing import NDArray
+
+from chainshaper.analysis import analyse_latency, data_flow
+from chainshaper.analysis.latency import LatencyStatistics, latency_statistics
+from chainshaper.gate.decision import clock_offset
+from chainshaper.linux.threads import innermost_id, read_proc
+from chainshaper.planning import ApplicationPlan
+from chainshaper.planning.plan_file import plan_values
+from chainshaper.sources.ebpf.trace_points import TracingLibrary
+from chainshaper.sources.preload import TracedProcess, creation_tables, event_tables
+from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.events import EventTables
+from chainshaper.values.recording import (
+    InForceInfo,
+    Recording,
+    RecordingInfo,
+    refuse_existing,
+    write_recording,
+)
+from chainshaper.verify.predictions import due_of
+
+__all__ = ["SPANS", "ChainNow", "Hop", "Seen", "Watch"]
+
+SECOND = 1_000_000_000
+SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
+RECORDER_NS = 10 * SECOND
+"""So much of the past the flight recorder has."""
+
+_SEARCH_NS = 5 * SECOND  # between two looks for new processes
+_AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave before their slot
+_MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
+
+
+@dataclass(frozen=True)
+class Hop:
+    """A callback of the chain: mean shares of the latency over the last minute (ns)."""
+
+    node: str
+    topic: str
+    communication_ns: float
+    computation_ns: float
+
+
+@dataclass(frozen=True)
+class ChainNow:
+    """One chain: statistics by span (:data:`SPANS`), over all cycles that began in it.
+
+    ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of outputs that left in
+    each of the plan's slots, over the hour (empty: without a plan); ``promised_ns`` is the end of
+    its last slot. ``problem`` says why there is nothing to be seen.
+    """
+
+    chain: str
+    spans: Mapping[str, LatencyStatistics]
+    rate_hz: float
+    hops: tuple[Hop, ...]
+    shares: tuple[float, ...]
+    promised_ns: int | None
+    problem: str | None
+
+
+@dataclass(frozen=True)
+class Seen:
+    """One look: its instant (CLOCK_MONOTONIC, ns), the nodes by process, and the chains.
+
+    ``lost`` counts events that were overwritten before we read them, or found no room.
+    """
+
+    at_ns: int
+    processes: Mapping[int, str]
+    lost: int
+    chains: tuple[ChainNow, ...]
+
+    def as_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+@dataclass
+class _Chain:
+    """What is known of a chain: arrays by cycle, in the order of beginning, for an hour."""
+
+    text: str
+    slots: tuple[tuple[int, int], ...]
+    begun: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    latency: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    late: NDArray[np.int8] = field(default_factory=lambda: np.empty(0, np.int8))
+    place: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
+    names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
+    problem: str | None = None
+
+    def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
+        """Cycles that are over; −1 stands for what is not known."""
+        keep = self.begun > now_ns - SPANS["hour"]
+        for name, column in (
+            ("begun", "start"),
+            ("latency", "latency_ns"),
+            ("late", "late"),
+            ("place", "place_ns"),
+        ):
+            old = getattr(self, name)
+            new = traversals[column].cast(pl.Int64).fill_null(-1).to_numpy().astype(old.dtype)
+            setattr(self, name, np.concatenate([old[keep], new]))
+        own = hops.join(traversals.filter("complete"), on="traversal", how="semi")
+        if own.height:
+            shares = (pl.col("communication_ns", "computation_ns")).sum()
+            self.hops.append((now_ns, own.group_by("hop").agg(shares, count=pl.len())))
+        while self.hops and self.hops[0][0] < now_ns - SPANS["minute"]:
+            self.hops.popleft()
+
+    def statistics(self, since_ns: int) -> LatencyStatistics:
+        within = self.begun >= since_ns
+        whole = within & (self.latency >= 0)
+        late = self.late[whole]
+        known = bool((late >= 0).all())
+        return latency_statistics(
+            self.latency[whole],
+            incomplete=int(np.count_nonzero(within & ~whole)),
+            late=int(np.count_nonzero(late > 0)) if known else None,
+        )
+
+    def shares(self) -> tuple[float, ...]:
+        """Of the outputs by slot: each counts for the last slot that had opened as it left."""
+        places = self.place[self.latency >= 0]
+        if not self.slots or not places.size:
+            return ()
+        opens = [start for start, _ in self.slots]
+        found = np.searchsorted(opens, places + _AHEAD_NS, side="right") - 1
+        counted = np.bincount(found.clip(0), minlength=len(opens))
+        return tuple((counted / places.size).tolist())
+
+
+class Watch:
+    """The chains of what runs, or will run, with the library in front.
+
+    ``chains`` as `--chain` has them; ``users`` are whose processes are followed, ``longest_ns`` is
+    what a cycle may take: one that takes longer counts as incomplete. ``plan`` says when outputs
+    are due. Between two looks :meth:`read` wants to be called every tenth of a second or so.
+    """
+
+    def __init__(
+        self,
+        chains: Sequence[str],
+        *,
+        users: Collection[int],
+        plan: ApplicationPlan | None = None,
+        longest_ns: int = 2 * SECOND,
+    ) -> None:
+        self.users, self.plan, self.longest_ns = users, plan, longest_ns
+        self.due = [] if plan is None else [due for one in plan.chains for due in due_of(one)]
+        self.chains = [_Chain(text, self._slots(text)) for text in chains]
+        self.processes: dict[int, TracedProcess] = {}
+        self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
+        self._recent: dict[int, deque[NDArray[Any]]] = {}
+        self._clock_offset_ns = clock_offset()
+        self._searched_ns = 0
+        self._lost_with_ended = 0
+        self._over_ns = time.monotonic_ns()  # cycles that began until then have been taken over
+
+    def _slots(self, chain: str) -> tuple[tuple[int, int], ...]:
+        output = chain.rpartition("..")[2]
+        return next((due.slots for due in self.due if due.output in (None, output)), ())
+
+    def read(self) -> None:
+        """Take what is new in all memories, and look for new processes now and then."""
+        now = time.monotonic_ns()
+        if now - self._searched_ns > _SEARCH_NS:
+            self._searched_ns = now
+            self._search()
+        for pid, process in self.processes.items():
+            recent = self._recent[pid]
+            recent.extend(process.new_records())
+            while recent and recent[0]["time"][-1] < now - RECORDER_NS - self.longest_ns:
+                recent.popleft()
+
+    def _search(self) -> None:
+        """Follow processes that have a memory, and leave those that have ended and are silent."""
+        for pid, memory in memories(self.users, self.processes):
+            self.processes[pid] = memory
+            self._recent[pid] = deque()
+        for pid in [one for one in self.processes if not Path(f"/proc/{one}").exists()]:
+            if not self._recent[pid]:
+                process = self.processes.pop(pid)
+                self._lost_with_ended += process.lost + process.dropped
+                self._created.pop(pid, None)
+                del self._recent[pid]
+
+    def look(self) -> Seen:
+        """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
+        self.read()
+        now = time.monotonic_ns()
+        over = now - self.longest_ns
+        tables = self._tables(now - 2 * self.longest_ns - (over - self._over_ns))
+        flow = data_flow(tables, self._clock_offset_ns)
+        for one in self.chains:
+            try:
+                found = analyse_latency(flow, one.text, due=self.due)
+            except InputError as error:
+                one.problem = str(error)
+                continue
+            one.problem = None
+            new = found.traversals.filter(pl.col("start").is_between(self._over_ns, over, "right"))
+            one.take_over(new, found.hops, now)
+            topics, nodes = found.chain.topics, {c.id: c.node for c in found.graph.callbacks}
+            one.names = [
+                (nodes[number] or "", topic)
+                for number, topic in zip(found.chain.callbacks, topics, strict=True)
+            ]
+        self._over_ns = over
+        lost = sum(one.lost + one.dropped for one in self.processes.values())
+        return Seen(
+            at_ns=now,
+            processes=processes_of(tables, dict.fromkeys(self.processes, "")),
+            lost=lost + self._lost_with_ended,
+            chains=tuple(self._now(one, over) for one in self.chains),
+        )
+
+    def _now(self, one: _Chain, over_ns: int) -> ChainNow:
+        within = one.begun > over_ns - SPANS["minute"]
+        begun = one.begun[within]
+        lasted = int(begun[-1] - begun[0]) if begun.size > 1 else 0
+        return ChainNow(
+            chain=one.text,
+            spans={name: one.statistics(over_ns - span) for name, span in SPANS.items()},
+            rate_hz=(begun.size - 1) * SECOND / lasted if lasted else 0.0,
+            hops=tuple(_hops(one)),
+            shares=one.shares(),
+            promised_ns=one.slots[-1][1] if one.slots else None,
+            problem=one.problem,
+        )
+
+    def _tables(self, since_ns: int) -> EventTables:
+        """All that was created, and what happened since an instant."""
+        tables: dict[str, list[pl.DataFrame]] = {}
+        by_library: dict[TracingLibrary, list[tuple[NDArray[Any], int]]] = {}
+        for pid, process in self.processes.items():
+            asked = int(process.header["objects"][0])
+            if pid not in self._created or self._created[pid][0] != asked:
+                self._created[pid] = (asked, *creation_tables(process))
+            _, created, library = self._created[pid]
+            for name, table in created.items():
+                tables.setdefault(name, []).append(table)
+            recent = (part for part in self._recent[pid] if part["time"][-1] >= since_ns)
+            by_library.setdefault(library, []).extend((part, process.pid) for part in recent)
+        for library, own in by_library.items():
+            if own:
+                records = np.concatenate([part for part, _ in own])
+                pids = np.repeat([pid for _, pid in own], [part.size for part, _ in own])
+                for name, table in event_tables(records, pids.astype(np.int32), library).items():
+                    tables.setdefault(name, []).append(table)
+        return {
+            name: pl.concat(parts, how="diagonal").sort("time", maintain_order=True)
+            for name, parts in tables.items()
+        }
+
+    def save(self, output: str | Path) -> Recording:
+        """Write the last ten seconds as a recording: the flight recorder.
+
+        Raises InputError: the folder exists. OperationError: it cannot be written, or there is
+        nothing to be written.
+        """
+        output = refuse_existing(output)
+        self.read()
+        now = time.monotonic_ns()
+        tables = self._tables(now - RECORDER_NS)
+        if not tables:
+            raise OperationError(f"{output} is not written: no event has been seen yet")
+        versions = [one[2].version for one in self._created.values() if one[2].version]
+        chains = [one.text for one in self.chains]
+        info = RecordingInfo(
+            source="preload",
+            distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions[:1]})}, {}),
+            rmw=rmw_of_gids(tables),
+            clock_offset_ns=self._clock_offset_ns,
+            processes=processes_of(tables, {}),
+            lost={"lost_events": sum(one.lost + one.dropped for one in self.processes.values())},
+            chain=chains[0] if chains else None,
+            plan=None if self.plan is None else plan_values(self.plan),
+            in_force=None if self.plan is None else InForceInfo(since_ns=now - RECORDER_NS),
+            notes=("the last seconds before it was asked for; objects from before them are there",),
+        )
+        return write_recording(output, tables, info)
+
+
+def _hops(one: _Chain) -> Iterator[Hop]:
+    if not one.hops:
+        return
+    sums = pl.concat([frame for _, frame in one.hops]).group_by("hop").sum().sort("hop")
+    for number, communication, computation, count in sums.iter_rows():
+        node, topic = one.names[number]
+        yield Hop(node, topic, communication / count, computation / count)
+
+
+def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
+    """Processes of some users that have the library in front, but for those that are ``known``."""
+    for process in Path("/proc").iterdir():
+        if not process.name.isdigit() or int(process.name) in known:
+            continue
+        with contextlib.suppress(OSError):  # it has ended, or may not be looked into
+            if process.stat().st_uid not in users:
+                continue
+            own = innermost_id(read_proc(f"{process}/status"))
+            for descriptor in (process / "fd").iterdir():
+                if _MEMORY.match(str(descriptor.readlink())):
+                    with contextlib.suppress(InputError), descriptor.open("rb") as file:
+                        memory = TracedProcess(file.fileno())
+                        if memory.pid == own:  # else it is one that reads it, as we do
+                            yield int(process.name), memory
+                            break

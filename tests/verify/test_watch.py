@@ -1,0 +1,230 @@
+"""Watching real processes that run with the library in front: attached to, left, recorded."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import polars as pl
+import pytest
+from command_line import called
+from processes import wait_for
+from traced_program import built
+
+from chainshaper import plan_recording
+from chainshaper.analysis import analyse_latency
+from chainshaper.planning import publish_slots
+from chainshaper.planning.application_plan import ApplicationPlan, whole
+from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library
+from chainshaper.values.errors import InputError, OperationError
+from chainshaper.verify.measure import measure_latency
+from chainshaper.verify.watch import SECOND, Seen, Watch
+
+CHAIN, PERIOD_NS = "/ebpf1../ebpf2", 50_000_000
+LONGEST_NS = SECOND // 5
+
+
+@contextmanager
+def running(folder: Path, cycles: int, **environment: str) -> "Iterator[subprocess.Popen[str]]":
+    """The application, with the library in front; its chain begins when this is entered."""
+    variables = {**os.environ, "LD_PRELOAD": str(build_library(folder)), **environment}
+    with subprocess.Popen(
+        built().command("chain", str(cycles), "wait"),
+        env=variables,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdin is not None
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.stdin.write("\n")
+        process.stdin.flush()
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def watched(watch: Watch, seconds: float, every: float = 0.25) -> list[Seen]:
+    seen, until = [], time.monotonic() + seconds
+    next_look = time.monotonic() + every
+    while time.monotonic() < until:
+        watch.read()
+        if time.monotonic() >= next_look:
+            next_look += every
+            seen.append(watch.look())
+        time.sleep(0.02)
+    return [*seen, watch.look()]
+
+
+def own_watch(*chains: str, plan: ApplicationPlan | None = None) -> Watch:
+    return Watch(chains or (CHAIN,), users={os.geteuid()}, plan=plan, longest_ns=LONGEST_NS)
+
+
+def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> None:
+    """Attached in the middle, two at a time: cycle by cycle what the whole recording has."""
+    (tmp_path / "trace").mkdir()
+    tracer = PreloadTracer(tmp_path / "trace", ["command"], ())
+    with running(tmp_path, 80, **{VARIABLE: tracer.start()[VARIABLE]}) as process:
+        time.sleep(0.5)
+        watch, other = own_watch(), own_watch()
+        seen = watched(watch, 2.0)
+        other_seen = other.look()
+        process.communicate()
+    tracer.remove()
+    tables, info = tracer.recording()
+    whole = analyse_latency(tables, CHAIN, info.clock_offset_ns).traversals
+    (chain,) = watch.chains
+    known = dict(whole.select("start", "latency_ns").iter_rows())
+    assert 30 <= chain.begun.size <= 50
+    assert [known[begun] for begun in chain.begun.tolist()] == chain.latency.tolist()
+    begun = whole.filter(whole["start"].is_between(int(chain.begun[0]), int(chain.begun[-1])))
+    assert begun.height == chain.begun.size, "none is passed over, none counted twice"
+    last = seen[-1].chains[0]
+    assert last.spans["hour"].count == chain.begun.size
+    assert last.spans["hour"].max_ns == int(chain.latency.max())
+    lasted = int(chain.begun[-1] - chain.begun[0]) / SECOND
+    assert last.rate_hz == pytest.approx((chain.begun.size - 1) / lasted)
+    assert sum(h.communication_ns + h.computation_ns for h in last.hops) == pytest.approx(
+        float(chain.latency.mean()), rel=1e-6
+    )
+    assert [hop.node for hop in last.hops] == ["/first", "/second"]
+    assert abs(other_seen.chains[0].spans["hour"].count - chain.begun.size) <= 5
+    assert seen[-1].lost == 0
+
+
+def test_the_flight_recorder_has_the_last_seconds(tmp_path: Path) -> None:
+    with running(tmp_path, 200):
+        watch = own_watch()
+        watched(watch, 1.5)
+        recording = watch.save(tmp_path / "flight")
+        with pytest.raises(InputError, match="exists"):
+            watch.save(tmp_path / "flight")
+    measured = measure_latency(recording)
+    assert measured.analysis.statistics.count >= 20
+    assert list(recording.info.processes.values()) == ["/first, /second"]
+    shown = called("latency", tmp_path / "flight")
+    assert shown.code == 0, shown.err
+
+
+def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path: Path) -> None:
+    watch = own_watch()
+    assert watch.look().chains[0].problem is not None
+    with pytest.raises(OperationError, match="no event has been seen"):
+        watch.save(tmp_path / "nothing")
+    for _ in range(2):
+        with running(tmp_path, 1000):
+            watch._searched_ns = 0
+            watched(watch, 1.0)
+            assert len(watch.processes) >= 1
+    counted = watch.look().chains[0].spans["hour"].count
+    assert counted > 15
+    watch._searched_ns = 0
+    for recent in watch._recent.values():
+        recent.clear()  # as twelve seconds later
+    watch.read()
+    assert not watch.processes
+
+
+def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> None:
+    """The plan is made from what the flight recorder has, for a cycle that outputs cannot hold."""
+    with running(tmp_path, 400):
+        watch = own_watch()
+        watched(watch, 1.5)
+        recording = watch.save(tmp_path / "flight")
+        plan = plan_recording(recording, CHAIN)
+        (slot,) = publish_slots(plan)
+        beside = own_watch(plan=whole(plan))
+        in_time = watched(beside, 1.0)[-1].chains[0]
+        latest = replace(beside.due[0], cycle_ns=1_000_000, slots=())
+        beside.due = [latest]
+        too_late = watched(beside, 1.0)[-1].chains[0]
+    assert in_time.promised_ns == slot[1]
+    assert in_time.shares == (1.0,)
+    assert in_time.spans["hour"].late is not None
+    assert in_time.spans["hour"].late <= 2, "of a machine that stands still"
+    counted = too_late.spans["hour"].count - in_time.spans["hour"].count
+    assert counted > 10
+    assert too_late.spans["hour"].late == in_time.spans["hour"].late + counted
+
+
+def test_memory_does_not_grow(tmp_path: Path) -> None:
+    """An hour of cycles stays, events of seconds: days are simulated by setting the clock on."""
+    watch = own_watch()
+    (chain,) = watch.chains
+
+    from chainshaper.analysis.traversals import traverse  # noqa: F401 - the frame's columns
+
+    hops = pl.DataFrame(
+        schema={
+            "traversal": pl.UInt32(),
+            "hop": pl.UInt32(),
+            "communication_ns": pl.Int64(),
+            "computation_ns": pl.Int64(),
+        }
+    )
+    rate = 100
+    for second in range(2 * 3600):
+        start = np.arange(rate) * (SECOND // rate) + second * SECOND
+        frame = pl.DataFrame(
+            {
+                "traversal": np.arange(rate, dtype=np.uint32),
+                "start": start,
+                "latency_ns": np.full(rate, 5_000_000),
+                "late": np.zeros(rate, bool),
+                "place_ns": np.full(rate, 5_000_000),
+                "complete": np.ones(rate, bool),
+            }
+        )
+        chain.take_over(frame, hops, (second + 1) * SECOND)
+    assert chain.begun.size == pytest.approx(3600 * rate, rel=0.001)
+
+
+def test_the_command_shows_and_streams(tmp_path: Path) -> None:
+    with running(tmp_path, 400) as process:
+        words = [sys.executable, "-m", "chainshaper", "watch", "--chain", CHAIN, "--longest"]
+        words += ["200ms", "--every", "500ms"]
+        streaming = subprocess.Popen(
+            [*words, "--json", "--recorder", str(tmp_path)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+        assert streaming.stdout is not None
+        objects = [json.loads(streaming.stdout.readline()) for _ in range(3)]
+        streaming.send_signal(signal.SIGQUIT)
+        wait_for(lambda: any(tmp_path.glob("watch-*/recording.json")), "the flight recorder")
+        streaming.send_signal(signal.SIGINT)
+        assert streaming.wait(20) == 0
+        assert process.poll() is None, "what is watched runs on"
+        assert objects[-1]["chains"][0]["spans"]["hour"]["count"] > 5
+        assert objects[-1]["processes"] == {str(process.pid): "/first, /second"}
+        shown = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        time.sleep(3)
+        shown.send_signal(signal.SIGINT)
+        text, _ = shown.communicate(timeout=20)
+    assert re.search(rf"{CHAIN}: \d\d\.\d\d cycles a second", text)
+    assert "incomplete" in text
+    assert "/second" in text
+
+
+def test_wrong_use_and_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    said = called("watch", "--environment")
+    assert said.code == 0
+    library = Path(said.out.removeprefix("export LD_PRELOAD=").strip())
+    assert library.is_file()
+    assert library.is_relative_to(tmp_path)
+    assert called("watch", "--environment").out == said.out, "it is built once"
+    unnamed = called("watch")
+    assert unnamed.code == 2
+    assert "no chain is named" in unnamed.err
