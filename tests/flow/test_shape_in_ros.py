@@ -144,9 +144,11 @@ def run(attempt: Callable[..., Attempt]) -> Callable[..., Result]:
     return run
 
 
-def test_two_chains_are_shaped_by_one_command(run: Callable[..., Result]) -> None:
+@pytest.mark.parametrize("source", ["lttng", "preload"])
+def test_two_chains_are_shaped_by_one_command(run: Callable[..., Result], source: str) -> None:
     (first, *_, last), chains = available_cores(), ["/raw../rear../pose", "/ticked../commands"]
     options = ["--cores", f"{last},{first}", "--epsilon", "2ms", "--duration", "30s"]
+    options += ["--source", source]
     options += [word for chain in chains for word in ("--chain", chain)]
     values, folder = run(PARKING, "shape", "shaped", *options)
 

@@ -4,19 +4,27 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from threading import Thread
+from typing import ClassVar
+from urllib.request import urlopen
 
 import numpy as np
 import polars as pl
 import pytest
 from command_line import called
+from known import known
+from opentelemetry.proto.collector.metrics.v1.metrics_service_pb2 import ExportMetricsServiceRequest
 from processes import wait_for
+from prometheus_client.parser import text_string_to_metric_families
 from traced_program import built
 
 from chainshaper import plan_recording
@@ -26,7 +34,7 @@ from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.verify.measure import measure_latency
-from chainshaper.verify.watch import SECOND, Seen, Watch
+from chainshaper.verify.watch import SECOND, Seen, Watch, exporting
 
 CHAIN, PERIOD_NS = "/ebpf1../ebpf2", 50_000_000
 LONGEST_NS = SECOND // 5
@@ -84,9 +92,9 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     tables, info = tracer.recording()
     whole = analyse_latency(tables, CHAIN, info.clock_offset_ns).traversals
     (chain,) = watch.chains
-    known = dict(whole.select("start", "latency_ns").iter_rows())
+    latencies = dict(whole.select("start", "latency_ns").iter_rows())
     assert 30 <= chain.begun.size <= 50
-    assert [known[begun] for begun in chain.begun.tolist()] == chain.latency.tolist()
+    assert [latencies[begun] for begun in chain.begun.tolist()] == chain.latency.tolist()
     begun = whole.filter(whole["start"].is_between(int(chain.begun[0]), int(chain.begun[-1])))
     assert begun.height == chain.begun.size, "none is passed over, none counted twice"
     last = seen[-1].chains[0]
@@ -215,6 +223,61 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
     assert re.search(rf"{CHAIN}: \d\d\.\d\d cycles a second", text)
     assert "incomplete" in text
     assert "/second" in text
+
+
+class Collector(BaseHTTPRequestHandler):
+    """Takes OTLP over HTTP, as an OpenTelemetry collector does."""
+
+    received: ClassVar[list[bytes]] = []
+
+    def do_POST(self) -> None:
+        self.received.append(self.rfile.read(int(self.headers["Content-Length"])))
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *_: object) -> None:
+        pass
+
+
+def test_metrics_are_the_figures_that_are_shown(tmp_path: Path) -> None:
+    with running(tmp_path, 200):
+        seen = watched(own_watch(), 1.5)[-1]
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    with HTTPServer(("127.0.0.1", 0), Collector) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        endpoint = f"http://127.0.0.1:{server.server_port}/v1/metrics"
+        with exporting(port, endpoint) as export:
+            export(seen)
+            with pytest.raises(OperationError, match="cannot be served"), exporting(port):
+                pass
+            text = urlopen(f"http://127.0.0.1:{port}/metrics").read().decode()
+        server.shutdown()
+    (chain,) = seen.chains
+    hour = chain.spans["hour"]
+    families = {one.name: one for one in text_string_to_metric_families(text)}
+    found = {
+        (one.labels["span"], one.labels["statistic"]): one.value
+        for one in families["chainshaper_chain_latency_seconds"].samples
+    }
+    assert found["hour", "max"] == known(hour.max_ns) / SECOND
+    assert found["hour", "p50"] == hour.percentiles_ns["50"] / SECOND
+    counted = {s.labels["outcome"]: s.value for s in families["chainshaper_chain_cycles"].samples}
+    assert counted["complete"] == hour.count > 10
+    assert len(families["chainshaper_hop_time_seconds"].samples) == 4
+    request = ExportMetricsServiceRequest.FromString(Collector.received[-1])
+    (metrics,) = request.resource_metrics[0].scope_metrics
+    sent = {
+        one.name: {
+            tuple(sorted((a.key, a.value.string_value) for a in point.attributes)): point
+            for point in (one.gauge.data_points or one.sum.data_points)
+        }
+        for one in metrics.metrics
+    }
+    key = (("chain", CHAIN), ("span", "hour"), ("statistic", "max"))
+    assert sent["chainshaper.chain.latency"][key].as_double == known(hour.max_ns) / SECOND
+    assert "chainshaper.events.lost" in sent
 
 
 def test_wrong_use_and_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

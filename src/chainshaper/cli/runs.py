@@ -255,6 +255,12 @@ def watch(
         "Where Ctrl-\\ writes the last ten seconds, a recording in a folder named by its time.",
         Path(),
     ),
+    metrics: int | None = opt.option(
+        "--metrics PORT", "Serve OpenMetrics (Prometheus) on this port of this machine.", min=1
+    ),
+    otlp: str | None = opt.option(
+        "--otlp URL", "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry)."
+    ),
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
         "--environment",
@@ -273,7 +279,7 @@ def watch(
     from chainshaper.planning import load_application_plan
     from chainshaper.reporting.overviews import watch_tables
     from chainshaper.sources.preload import installed_library, preloading
-    from chainshaper.verify.watch import Watch
+    from chainshaper.verify.watch import Watch, exporting
 
     if environment:
         out.show_line(f"export LD_PRELOAD={shlex.quote(preloading(installed_library()))}")
@@ -293,6 +299,7 @@ def watch(
             started = start_command(command, variables, STDERR)
             until.callback(end_command, started)
         show = until.enter_context(out.live())
+        export = until.enter_context(exporting(metrics, otlp))
         saved = until.enter_context(out.asked_for(signal.SIGQUIT))
         watched = Watch(chains, users=run_users(user or []), plan=known, longest_ns=longest)
         next_look = time.monotonic_ns() + every
@@ -304,7 +311,7 @@ def watch(
                 out.say(f"the last ten seconds are in {watched.save(folder).path}")
             if time.monotonic_ns() >= next_look:
                 next_look += every
-                seen = watched.look()
+                export(seen := watched.look())
                 if json:
                     out.print_json_line(seen.as_json())
                 else:

@@ -42,8 +42,8 @@ class PlatformError(ChainshaperError):
     exit_code = 3
 
 
-def extra_library(name: str, purpose: str) -> Any:
-    """Import a library that only some uses need, or one module of it.
+def extra_library(name: str, purpose: str, extra: str | None = None) -> Any:
+    """Import a library that only some uses need, or one module of it, which an ``extra`` installs.
 
     Raises PlatformError: it is not installed; says what it is needed for and how to get it.
     """
@@ -51,9 +51,10 @@ def extra_library(name: str, purpose: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         package = name.partition(".")[0]
+        wanted = package if extra is None else f"'chainshaper[{extra}]'"
         raise PlatformError(
             f"{purpose} needs the Python package {package} ({error}): install it with"
-            f" `pip install {package}`"
+            f" `pip install {wanted}`"
         ) from error
 
 

@@ -13,11 +13,12 @@ hour, and only as three numbers each.
 import contextlib
 import re
 import time
-from collections import deque
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections import Counter, deque
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import polars as pl
@@ -32,7 +33,7 @@ from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import TracedProcess, creation_tables, event_tables
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import (
     InForceInfo,
@@ -43,7 +44,7 @@ from chainshaper.values.recording import (
 )
 from chainshaper.verify.predictions import due_of
 
-__all__ = ["SPANS", "ChainNow", "Hop", "Seen", "Watch"]
+__all__ = ["SPANS", "ChainNow", "Hop", "Seen", "Watch", "exporting"]
 
 SECOND = 1_000_000_000
 SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
@@ -71,7 +72,8 @@ class ChainNow:
 
     ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of outputs that left in
     each of the plan's slots, over the hour (empty: without a plan); ``promised_ns`` is the end of
-    its last slot. ``problem`` says why there is nothing to be seen.
+    its last slot; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
+    and ``incomplete``. ``problem`` says why there is nothing to be seen.
     """
 
     chain: str
@@ -80,6 +82,7 @@ class ChainNow:
     hops: tuple[Hop, ...]
     shares: tuple[float, ...]
     promised_ns: int | None
+    counted: Mapping[str, int]
     problem: str | None
 
 
@@ -111,6 +114,7 @@ class _Chain:
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
+    counted: Counter[str] = field(default_factory=Counter)
     problem: str | None = None
 
     def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
@@ -125,6 +129,10 @@ class _Chain:
             old = getattr(self, name)
             new = traversals[column].cast(pl.Int64).fill_null(-1).to_numpy().astype(old.dtype)
             setattr(self, name, np.concatenate([old[keep], new]))
+        whole = int(traversals["complete"].sum())
+        self.counted["complete"] += whole
+        self.counted["incomplete"] += traversals.height - whole
+        self.counted["late"] += int(traversals["late"].sum() or 0)
         own = hops.join(traversals.filter("complete"), on="traversal", how="semi")
         if own.height:
             shares = (pl.col("communication_ns", "computation_ns")).sum()
@@ -250,6 +258,7 @@ class Watch:
             hops=tuple(_hops(one)),
             shares=one.shares(),
             promised_ns=one.slots[-1][1] if one.slots else None,
+            counted=dict(one.counted),
             problem=one.problem,
         )
 
@@ -331,3 +340,101 @@ def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[i
                         if memory.pid == own:  # else it is one that reads it, as we do
                             yield int(process.name), memory
                             break
+
+
+@contextlib.contextmanager
+def exporting(
+    port: int | None = None, endpoint: str | None = None
+) -> Iterator[Callable[[Seen], None]]:
+    """Metrics of what was seen last: OpenMetrics on a local port, OTLP to an HTTP endpoint.
+
+    What it gives wants every look. Times are in seconds, as both conventions have it; cycles count
+    from the beginning of the watch.
+
+    Raises PlatformError: the OpenTelemetry SDK is not installed. OperationError: no such port.
+    """
+    if port is None and endpoint is None:
+        yield lambda _: None
+        return
+    library = partial(extra_library, purpose="exporting metrics", extra="metrics")
+    metrics, export = (library(f"opentelemetry.sdk.metrics{sub}") for sub in ("", ".export"))
+    observed = library("opentelemetry.metrics").Observation
+    readers = []
+    with contextlib.ExitStack() as until:
+        if port is not None:
+            serving = library("prometheus_client")
+            try:
+                server, _ = serving.start_http_server(port, addr="127.0.0.1")
+            except OSError as error:
+                raise OperationError(
+                    f"port {port} cannot be served ({error.strerror}): name another with --metrics"
+                ) from error
+            until.callback(server.server_close)
+            until.callback(server.shutdown)
+            readers.append(library("opentelemetry.exporter.prometheus").PrometheusMetricReader())
+        if endpoint is not None:
+            otlp = library("opentelemetry.exporter.otlp.proto.http.metric_exporter")
+            exporter = otlp.OTLPMetricExporter(endpoint=endpoint)
+            readers.append(export.PeriodicExportingMetricReader(exporter, 10_000))
+        provider = metrics.MeterProvider(metric_readers=readers)
+        until.callback(provider.shutdown)
+        meter, last = provider.get_meter("chainshaper"), list[Seen]()
+        for kind, name, unit, about, values in _METRICS:
+            create = getattr(meter, f"create_observable_{kind}")
+            found = partial(_observations, last, values, observed)
+            create(f"chainshaper.{name}", [found], unit=unit, description=about)
+
+        def take(seen: Seen) -> None:
+            last[:] = [seen]
+
+        yield take
+
+
+_Values: TypeAlias = Iterator[tuple[float, dict[str, str]]]
+
+
+def _observations(
+    last: Sequence[Seen],
+    values: Callable[[Seen], _Values],
+    observed: Callable[[float, dict[str, str]], Any],
+    _options: object,
+) -> Iterator[Any]:
+    for seen in last:
+        yield from (observed(value, about) for value, about in values(seen))
+
+
+def _latencies(seen: Seen) -> _Values:
+    for one in seen.chains:
+        for span, own in one.spans.items():
+            percentiles = {f"p{which}": ns for which, ns in own.percentiles_ns.items()}
+            for which, ns in {"min": own.min_ns, "max": own.max_ns, **percentiles}.items():
+                if ns is not None:
+                    yield ns / SECOND, {"chain": one.chain, "span": span, "statistic": which}
+
+
+def _hop_times(seen: Seen) -> _Values:
+    for one in seen.chains:
+        for hop in one.hops:
+            about = {"chain": one.chain, "node": hop.node, "topic": hop.topic}
+            yield hop.communication_ns / SECOND, {**about, "part": "communication"}
+            yield hop.computation_ns / SECOND, {**about, "part": "computation"}
+
+
+def _counted(seen: Seen) -> _Values:
+    for one in seen.chains:
+        for outcome, count in one.counted.items():
+            yield count, {"chain": one.chain, "outcome": outcome}
+
+
+_METRICS: tuple[tuple[str, str, str, str, Callable[[Seen], _Values]], ...] = (
+    ("gauge", "chain.latency", "s", "End-to-end latency of a chain over a span", _latencies),
+    ("gauge", "hop.time", "s", "Mean share of a hop over the last minute", _hop_times),
+    ("counter", "chain.cycles", "1", "Cycles of a chain by outcome", _counted),
+    (
+        "counter",
+        "events.lost",
+        "1",
+        "Events that were overwritten before they were read",
+        lambda seen: iter([(float(seen.lost), {})]),
+    ),
+)
