@@ -1,7 +1,10 @@
 """The library in front of a real ROS 2, LTTng behind it: both record one and the same run."""
 
+import json
 import os
+import signal
 import subprocess
+import sys
 import time
 from pathlib import Path
 from threading import Event, Thread
@@ -128,3 +131,31 @@ def test_what_is_watched_is_what_lttng_records(
     assert (np.diff(nearest) == 1).all(), "none is passed over"
     expected = theirs["latency_ns"].to_numpy()[nearest]
     assert np.median(np.abs(latency - expected) / expected) < 0.01
+
+
+@pytest.mark.ros2
+@pytest.mark.timeout(300)
+def test_diagnostics_are_published_where_ros_2_reads_them(launch: list[str]) -> None:
+    import_it = ["env", "python3", "-c", "import diagnostic_msgs.msg"]
+    if subprocess.run(import_it, capture_output=True, check=False).returncode:
+        pytest.skip("diagnostic_msgs is not installed in this ROS 2")
+    words = [sys.executable, "-m", "chainshaper", "watch", "--chain", "/t1../t3", "--longest"]
+    words += ["500ms", "--diagnostics", "--json", "--", *launch]
+    with subprocess.Popen(
+        words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as watching:
+        time.sleep(6)
+        echo = ["ros2", "topic", "echo", "--once", "--full-length", "/diagnostics"]
+        heard = subprocess.run(
+            ["env", *echo], capture_output=True, text=True, check=False, timeout=60
+        )
+        watching.send_signal(signal.SIGINT)
+        streamed, said = watching.communicate(timeout=60)
+    assert watching.returncode == 0, said
+    assert "chainshaper: /t1../t3" in heard.stdout, heard.stderr + said
+    assert "max of the last minute [ms]" in heard.stdout
+    counted = [
+        json.loads(line)["chains"][0]["counted"]["complete"] for line in streamed.split("\n")[:-1]
+    ]
+    assert counted == sorted(counted)
+    assert counted[-1] > 20

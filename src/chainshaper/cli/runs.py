@@ -16,11 +16,14 @@ from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
 if TYPE_CHECKING:
+    from collections.abc import Callable, Mapping, Sequence
+
     from chainshaper.analysis import ChainEnumeration
     from chainshaper.values.application import ApplicationGraph
+    from chainshaper.verify.watch import Seen, Watch
 
 MIB = 1 << 20
 STDERR = 2
@@ -261,6 +264,9 @@ def watch(
     otlp: str | None = opt.option(
         "--otlp URL", "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry)."
     ),
+    diagnostics: bool = opt.option(
+        "--diagnostics", "Publish the chains on /diagnostics, with the ROS 2 of the nodes.", False
+    ),
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
         "--environment",
@@ -285,9 +291,8 @@ def watch(
         out.show_line(f"export LD_PRELOAD={shlex.quote(preloading(installed_library()))}")
         return
     known = None if plan is None else load_application_plan(plan)
-    chains = chain or (
-        [] if known is None else [one.chain.spec for one in known.chains if one.chain.spec]
-    )
+    specs = () if known is None else (one.chain.spec for one in known.chains)
+    chains = chain or [spec for spec in specs if spec]
     if not chains:
         raise InputError("no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan")
     if command:
@@ -300,22 +305,53 @@ def watch(
             until.callback(end_command, started)
         show = until.enter_context(out.live())
         export = until.enter_context(exporting(metrics, otlp))
-        saved = until.enter_context(out.asked_for(signal.SIGQUIT))
+        asked = until.enter_context(out.asked_for(signal.SIGQUIT))
         watched = Watch(chains, users=run_users(user or []), plan=known, longest_ns=longest)
+        publish = _publisher(watched, until) if diagnostics else lambda _: None
         next_look = time.monotonic_ns() + every
         while not stop.wait(0.1) and (started is None or started.poll() is None):
             watched.read()
-            if saved.is_set():
-                saved.clear()
-                folder = recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}"
-                out.say(f"the last ten seconds are in {watched.save(folder).path}")
+            if asked.is_set():
+                asked.clear()
+                _save(watched, recorder)
             if time.monotonic_ns() >= next_look:
                 next_look += every
                 export(seen := watched.look())
+                publish(seen)
                 if json:
                     out.print_json_line(seen.as_json())
                 else:
                     show(watch_tables(seen))
+
+
+def _save(watched: "Watch", recorder: Path) -> None:
+    """Have the flight recorder write; that it cannot is no reason to stop watching."""
+    folder = recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}"
+    try:
+        out.say(f"the last ten seconds are in {watched.save(folder).path}")
+    except ChainshaperError as error:
+        out.say(f"the flight recorder has not written: {error}")
+
+
+def _publisher(watched: "Watch", until: ExitStack) -> "Callable[[Seen], None]":
+    """What publishes `/diagnostics`, with the ROS 2 of the first node that is seen."""
+    from chainshaper.sources.ros import environment_of, publishing_diagnostics
+
+    publish: Callable[[Sequence[Mapping[str, Any]]], str | None] | None = None
+
+    def take(seen: "Seen") -> None:
+        nonlocal publish
+        try:
+            if publish is None and watched.processes:
+                environment = environment_of(next(iter(watched.processes)))
+                publish = until.enter_context(publishing_diagnostics(environment))
+            problem = None if publish is None else publish(seen.as_diagnostics())
+        except OperationError as error:
+            problem, publish = str(error), lambda _: None
+        if problem is not None:
+            out.say(f"/diagnostics is not published: {problem}")
+
+    return take
 
 
 @opt.takes_wishes("cores", "policy")

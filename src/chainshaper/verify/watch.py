@@ -101,6 +101,31 @@ class Seen:
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
 
+    def as_diagnostics(self) -> list[dict[str, Any]]:
+        """A status for each chain, for :func:`~chainshaper.sources.ros.publishing_diagnostics`.
+
+        ERROR: nothing was to be seen in the last minute. WARN: an output was late or never came.
+        """
+        statuses = []
+        for one in self.chains:
+            minute = one.spans["minute"]
+            missing = (minute.late or 0) + minute.incomplete
+            text = one.problem or "no output in the last minute"
+            if minute.count:
+                text = f"{minute.count} outputs in the last minute, {missing} late or missing"
+            values = {"cycles per second": f"{one.rate_hz:.3f}"}
+            for span, own in one.spans.items():
+                found = {"p50": own.percentiles_ns.get("50"), "max": own.max_ns}
+                values |= {
+                    f"{which} of the last {span} [ms]": f"{ns / 1e6:.3f}"
+                    for which, ns in found.items()
+                    if ns is not None
+                }
+            level = 2 if not minute.count else int(missing > 0)
+            about = {"name": f"chainshaper: {one.chain}", "level": level, "message": text}
+            statuses.append({**about, "values": values})
+        return statuses
+
 
 @dataclass
 class _Chain:

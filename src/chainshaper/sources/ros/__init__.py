@@ -17,8 +17,8 @@ import re
 import signal
 import subprocess
 import time
-from collections.abc import Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -145,8 +145,10 @@ def run_with_rclpy(
         return "", str(error)
 
 
-def start_with_rclpy(environment: Environment, script: str, *arguments: str) -> Script:
-    """Start a script file in an environment, as the user whose it is.
+def start_with_rclpy(
+    environment: Environment, script: str, *arguments: str, pass_fds: Sequence[int] = ()
+) -> Script:
+    """Start a script file in an environment, as the user whose it is; it keeps ``pass_fds`` open.
 
     Raises OperationError: we may not become that user, or nothing can be started.
     """
@@ -163,6 +165,7 @@ def start_with_rclpy(environment: Environment, script: str, *arguments: str) -> 
                 stdout=printed,
                 stderr=said,
                 start_new_session=True,
+                pass_fds=pass_fds,
                 preexec_fn=partial(_confine, os.getpid()),  # noqa: PLW1509 - a few system calls
                 **as_user,
             )
@@ -239,6 +242,47 @@ def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str |
         return tuple(one for one in endpoints if _is_ros(one)), None
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         return (), str(error)
+
+
+@contextmanager
+def publishing_diagnostics(
+    environment: Environment,
+) -> Iterator[Callable[[Sequence[Mapping[str, Any]]], str | None]]:
+    """A node in this environment that publishes on `/diagnostics` what it is given.
+
+    It gives a function that takes statuses (``name``, ``level``, ``message``, ``values``), and
+    returns why they are not published, once.
+
+    Raises OperationError: as :func:`start_with_rclpy`.
+    """
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)  # a node that does not read must not stop who watches
+    try:
+        asked = (ros_script.__file__, "diagnostics", str(reading))
+        script = start_with_rclpy(environment, *asked, pass_fds=(reading,))
+    finally:
+        os.close(reading)
+    over = False
+
+    def publish(statuses: Sequence[Mapping[str, Any]]) -> str | None:
+        nonlocal over
+        if over:
+            return None
+        try:
+            os.write(writing, json.dumps(statuses).encode() + b"\n")
+        except BlockingIOError:  # these are passed over
+            return None
+        except BrokenPipeError:
+            over = True
+            return script.end(_START_S)[1] or "the node that publishes it has ended"
+        return None
+
+    try:
+        yield publish
+    finally:
+        os.close(writing)
+        if not over:
+            script.end(_START_S)
 
 
 def _is_ros(one: EndpointInfo) -> bool:

@@ -2,6 +2,7 @@
 
     python3 script.py graph [SECONDS]
     python3 script.py parameter NAME VALUE NODE...
+    python3 script.py diagnostics DESCRIPTOR
 
 This file is run, not imported: by the interpreter that has `rclpy` (Humble or later), where nothing
 of ours may be installed.
@@ -16,6 +17,9 @@ parameter, refuses the value, or does not answer; all together have five seconds
 whoever offers the service under the node's name: DDS does not prove who that is without its
 security plug-ins (SROS 2). Where several offer it (rclpy counts them since Jazzy), an answer says
 nothing, and that is an error.
+
+`diagnostics` publishes each line that it reads from DESCRIPTOR on `/diagnostics`, until that ends:
+a JSON list of objects with ``name``, ``level`` (0: OK, 1: WARN, 2: ERROR), ``message``, ``values``.
 """
 
 import importlib
@@ -28,6 +32,7 @@ from typing import Any
 
 SNAPSHOT = "_chainshaper_snapshot"  # nodes' names; hidden: `ros2 node list` does not show them
 SETTER = "_chainshaper_parameter"
+WATCHER = "_chainshaper_watch"
 QUIET_S, LOOK_S = 2.0, 0.2
 ANSWER_S, SPIN_S = 5.0, 0.05
 INFINITE_NS = 1 << 62
@@ -45,6 +50,28 @@ def node_named(name: str) -> "Iterator[tuple[Any, Any]]":
     finally:
         node.destroy_node()
         rclpy.shutdown()
+
+
+def publish_diagnostics(descriptor: int) -> None:
+    """Publish what is read as `diagnostic_msgs/DiagnosticArray`."""
+    messages = importlib.import_module("diagnostic_msgs.msg")
+    kind = messages.DiagnosticStatus
+    with node_named(WATCHER) as (_, node), open(descriptor) as lines:
+        publisher = node.create_publisher(messages.DiagnosticArray, "/diagnostics", 10)
+        for line in lines:
+            array = messages.DiagnosticArray()
+            array.header.stamp = node.get_clock().now().to_msg()
+            try:
+                found = json.loads(line)
+            except ValueError:  # a pipe that was full took a part of it
+                continue
+            for one in found:
+                status = kind(name=one["name"], message=one["message"], hardware_id="chainshaper")
+                status.level = (kind.OK, kind.WARN, kind.ERROR)[one["level"]]
+                values = one["values"].items()
+                status.values = [messages.KeyValue(key=key, value=text) for key, text in values]
+                array.status.append(status)
+            publisher.publish(array)
 
 
 def print_graph(patience: float = 10.0) -> None:
@@ -138,5 +165,7 @@ def problem(node: str, name: str, answer: Any, offered: int) -> "str | None":
 if __name__ == "__main__":
     if sys.argv[1] == "graph":
         print_graph(*(float(seconds) for seconds in sys.argv[2:]))
+    elif sys.argv[1] == "diagnostics":
+        publish_diagnostics(int(sys.argv[2]))
     else:
         set_parameter(*sys.argv[2:])
