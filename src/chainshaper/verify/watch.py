@@ -53,6 +53,10 @@ RECORDER_NS = 10 * SECOND
 
 _SEARCH_NS = 5 * SECOND  # between two looks for new processes
 _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave before their slot
+_NO_PROCESS = (
+    "no process of these users runs with the library in front: set what `chainshaper watch "
+    "--environment` prints before the application is started"
+)
 _MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
 
 
@@ -253,7 +257,7 @@ class Watch:
             try:
                 found = analyse_latency(flow, one.text, due=self.due)
             except InputError as error:
-                one.problem = str(error)
+                one.problem = str(error) if self.processes else _NO_PROCESS
                 continue
             one.problem = None
             new = found.traversals.filter(pl.col("start").is_between(self._over_ns, over, "right"))

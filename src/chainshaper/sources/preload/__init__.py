@@ -365,7 +365,8 @@ class PreloadTracer:
         found: dict[str, list[pl.DataFrame]] = {}
         versions: list[str | None] = []
         for place, process in enumerate(self._processes):
-            records = np.fromfile(self._file(place), RECORD)
+            file = self._file(place)
+            records = np.fromfile(file, RECORD) if file.exists() else np.empty(0, RECORD)
             created, library = creation_tables(process)
             pids = np.full(records.size, process.pid, np.int32)
             versions.append(library.version)
@@ -378,7 +379,9 @@ class PreloadTracer:
         lost = sum(process.lost + process.dropped for process in self._processes)
         notes = [] if self._failure is None else [f"{self._failure}."]
         if lost:
-            notes.append(f"{lost} events were lost: this process was not scheduled often enough.")
+            notes.append(
+                f"{lost} events were lost: recording did not run often enough to read them."
+            )
         said = pl.DataFrame({"version": [one for one in versions if one][:1]})
         info = RecordingInfo(
             source="preload",
@@ -431,6 +434,6 @@ class PreloadTracer:
 
     def _read_all(self) -> None:
         for place, process in enumerate(self._processes):
-            with self._file(place).open("ab") as file:
-                for part in process.new_records():
-                    file.write(part.tobytes())
+            if parts := process.new_records():
+                with self._file(place).open("ab") as file:
+                    file.writelines(part.tobytes() for part in parts)

@@ -136,11 +136,16 @@ static bool make_memory(void) {
   return true;
 }
 
-static void give_back(void *ring) { ((struct ring *)ring)->taken = 0; }
+// As a thread ends. What it emits behind this gets a ring anew, and gives it back again.
+static void give_back(void *ring) {
+  own.ring = NULL;
+  ((struct ring *)ring)->taken = 0;
+}
 
 // A child of fork() has its parent's memory mapped, and gets its own at its first event.
 static void in_child(void) {
   if (descriptor >= 0) close(descriptor);
+  if (memory) munmap(memory, sizeof(struct memory));
   descriptor = -1;
   memory = NULL;
   state = 0;
