@@ -8,7 +8,7 @@ import polars as pl
 from chainshaper import open_source
 from chainshaper.analysis import DataFlow, data_flow
 from chainshaper.analysis.disturbance import stalled_after
-from chainshaper.simulation.samples import samples
+from chainshaper.simulation.simulating import samples
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording

@@ -50,7 +50,7 @@ from table_4 import ROW_1, plans, slots_text
 from chainshaper import load_application
 from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import Plan, PlanRequest, load_plan, publish_slots
-from chainshaper.simulation.samples import with_recorded_times
+from chainshaper.simulation.simulating import with_recorded_times
 from chainshaper.values.errors import ChainshaperError
 from chainshaper.workload.description import Application
 

@@ -32,7 +32,12 @@ TIMELESS |= {"gate/test_decision", "workload/test_description", "workload/test_e
 TIMELESS |= {"enforcement/test_dispatcher", "workload/test_event_log"}
 TIMELESS |= {"flow/test_drift", "gate/test_throttling", "verify/test_several_chains"}
 TIMELESS |= {"enforcement/test_node_threads", "flow/test_profiles", "linux/test_processes"}
-TIMELESS |= {"verify/test_predictions", "verify/test_watch", "workload/test_ros_package"}
+TIMELESS |= {
+    "verify/test_budgets",
+    "verify/test_predictions",
+    "verify/test_watch",
+    "workload/test_ros_package",
+}
 LIVE_RUNS = {"unshaped", "shaped"}
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)

@@ -17,7 +17,7 @@ from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import Plan
 from chainshaper.simulation import arrays, simulate, simulate_latencies
-from chainshaper.simulation.samples import with_recorded_times
+from chainshaper.simulation.simulating import with_recorded_times
 from chainshaper.values.durations import parse_duration
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, open_recording

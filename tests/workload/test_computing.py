@@ -9,7 +9,7 @@ from small_chain import DDS_CORE, EXECUTOR_CORE
 
 from chainshaper import run_application, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.simulation.samples import with_recorded_times
+from chainshaper.simulation.simulating import with_recorded_times
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.workload import dds

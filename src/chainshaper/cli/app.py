@@ -24,7 +24,7 @@ _MODULES = (
     ("traces", "info graph callbacks chains latency convert"),
     ("plans", "plan offsets splice"),
     ("runs", "shape"),
-    ("traces", "compare report export"),
+    ("traces", "compare budget check report export"),
     ("applying", "threads apply status release doctor"),
 )
 VERBS = {verb: module for module, verbs in _MODULES for verb in verbs.split()}

@@ -123,7 +123,7 @@ def simulate(
     """
     described = cs.load_application(application)
     if execution_times is not None:
-        from chainshaper.simulation.samples import with_recorded_times
+        from chainshaper.simulation.simulating import with_recorded_times
 
         described = with_recorded_times(described, execution_times, block=block)
     with out.late_progress(f"simulating {described.name}") as report:

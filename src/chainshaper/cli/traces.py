@@ -1,12 +1,13 @@
 """Verbs that look at recordings and traces, one or several, and write what they find elsewhere."""
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
-from chainshaper.values.errors import InputError
+from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
     from chainshaper.reporting.tables import ResultTable
@@ -144,6 +145,62 @@ def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) 
         written = cs.convert_recording(recording, output)
     out.show_line(written.path.absolute())
     out.notes((*written.info.notes, out.lost_events(written)))
+
+
+def budget(
+    trace: list[Path] = opt.TRACE,
+    output: Path = opt.option("--output -o FILE", "The budget file.", ...),
+    chain: list[str] | None = opt.option(
+        "--chain FIRST..LAST", "A chain (may be repeated). Default: the one the recording names."
+    ),
+    room: float = opt.option("--room SHARE", "How far limits lie beyond what was measured.", 0.1),
+) -> None:
+    """Propose a budget: limits for chains, their hops and callbacks, as a recording has them.
+
+    It is a YAML file that you edit; `chainshaper check` says which recordings keep to it.
+    """
+    from chainshaper.values.files import new_file
+    from chainshaper.verify.budgets import propose_budget, save_budget
+
+    new_file(output)
+    with out.opened("budget", trace) as (recording, _):
+        proposed = propose_budget(recording, chain or [], room)
+    out.show_line(save_budget(proposed, output))
+
+
+def check(
+    recordings: list[Path] = opt.argument("REC...", "Recordings' or traces' folders.", ...),
+    budget: Path = opt.option("--budget FILE", "What they have to keep to.", ...),
+    junit: Path | None = opt.option("--junit FILE", "Also write JUnit XML, for a CI system."),
+    markdown: Path | None = opt.option("--markdown FILE", "Also write Markdown, for a review."),
+    json: bool = opt.JSON,
+) -> None:
+    """Check recordings against a budget; exit code 1 if a limit is broken.
+
+    Limits are of all cycles. Where only disturbed cycles break one, that is said.
+    """
+    from chainshaper.reporting.overviews import broken_table
+    from chainshaper.values.files import new_file, write_whole
+    from chainshaper.verify import budgets
+
+    limits, judged = budgets.load_budget(budget), list[budgets.Judged]()
+    for wanted in filter(None, (junit, markdown)):
+        new_file(wanted)
+    for path in recordings:
+        with out.opened("check", [path]) as (recording, _):
+            judged += budgets.check_budget(recording, limits, str(path))
+    for file, write in ((junit, budgets.junit_report), (markdown, budgets.markdown_report)):
+        if file is not None:
+            write_whole(file, [write(judged).encode()])
+    broken = [one for one in judged if not one.kept]
+    if json:
+        out.print_json([{**asdict(one), "kept": one.kept} for one in judged])
+    elif broken:
+        out.show(broken_table(broken))
+    if broken:
+        raise OperationError(f"{len(broken)} of {len(judged)} limits of {budget} are broken")
+    if not json:
+        out.show_line(f"all {len(judged)} limits of {budget} are kept")
 
 
 def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":

@@ -43,6 +43,7 @@ from chainshaper.values.recording import (
     event_counts,
     lost_text,
 )
+from chainshaper.verify.budgets import Judged
 from chainshaper.verify.measure import Measurement
 from chainshaper.verify.watch import Seen
 
@@ -513,6 +514,20 @@ def watch_tables(seen: Seen) -> list[ResultTable]:
     lost = f"; {seen.lost} events lost" if seen.lost else ""
     tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
     return tables
+
+
+def broken_table(broken: Sequence[Judged]) -> ResultTable:
+    """Limits of a budget that are broken, and why."""
+    names = ("recording", "where", "limit")
+    title = "Limits that are broken"
+    table = ResultTable(title, [*words(*names), *figures("budget", "found"), *words("because")])
+    for one in broken:
+        limit, found = (
+            ABSENT if value is None else percent(value) if one.what == "missing" else ms(value)
+            for value in (one.limit, one.found)
+        )
+        table.add(one.recording, one.where, one.what, limit, found, one.because or "")
+    return table
 
 
 def changes_table(changes: Iterable[WantedScheduling]) -> ResultTable:

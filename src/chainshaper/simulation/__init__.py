@@ -3,7 +3,7 @@
 The same description, the same execution times for the same seed, the same event tables:
 a simulated recording differs from a live one in its `source` only. `arrays` and `layout` say what
 runs, in words and in integers; `engine` and `callbacks` are compiled by Numba and run it;
-`simulating` writes the events; `samples` takes execution times from a recording.
+`simulating` writes the events, and takes execution times from a recording where that is asked for.
 """
 
 from chainshaper.simulation.simulating import simulate, simulate_latencies

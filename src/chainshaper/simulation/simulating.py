@@ -3,21 +3,29 @@
 One entry of the log often stands for several events of the same instant: what an executor chose
 is got ready and executed, a publication passes rclcpp, rcl and rmw, and so does a message that is
 taken.
+
+Instead of described times, measured ones may be drawn: the CPU times of each callback's instances
+in a recording, in the order in which they happened, so that stretches of them stay correlated in
+time. Callbacks that all ran once a cycle have as many, so that their stretches are of the same
+cycles. What publishing costs is not in them: a callback computes before it publishes.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from chainshaper.analysis import data_flow
+from chainshaper.analysis.flow import DataFlow
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, X
+from chainshaper.sources import open_source
 from chainshaper.splicing.application import check_periods, splice_application
 from chainshaper.values.compiled import kernel
 from chainshaper.values.durations import format_duration
@@ -30,15 +38,18 @@ from chainshaper.values.recording import (
     write_recording,
 )
 from chainshaper.workload import live
-from chainshaper.workload.description import Application, application_as_written
+from chainshaper.workload.description import Application, ExecutionTime, application_as_written
 from chainshaper.workload.event_log import LAYOUT, EventLog
+from chainshaper.workload.live import node_name
 
-__all__ = ["simulate", "simulate_latencies"]
+__all__ = ["samples", "simulate", "simulate_latencies", "with_recorded_times"]
 
 _run_engine = kernel("chainshaper.simulation.engine", "run")
 
 START_NS = 1_000_000_000
 LONGEST_NS = 1 << 62
+MOST = 100_000
+"""Enough samples for any distribution."""
 
 Progress = Callable[[float, str], None]
 
@@ -309,3 +320,62 @@ def _switches(system: System, machine: Machine) -> pl.DataFrame:
         "next_prio": priorities[following],
     }
     return live.typed_table("sched_switch", pl.DataFrame(columns))
+
+
+def with_recorded_times(
+    application: Application, recording: Recording | str | Path, *, block: int = 1
+) -> Application:
+    """The application with execution times drawn from a recording of it, in stretches of ``block``.
+
+    Gates keep what they have: they compute nothing.
+
+    Raises InputError: a callback of the application is not in the recording, or its CPU time is
+    not.
+    """
+    recording = recording if isinstance(recording, Recording) else open_source(recording)
+    times = _computing_times(data_flow(recording.events, recording.info.clock_offset_ns))
+    nodes = {}
+    for name, node in application.nodes.items():
+        callbacks = []
+        for callback in node.callbacks:
+            if callback.gate is not None:
+                callbacks.append(callback)
+                continue
+            trigger = callback.timer_ns or callback.subscription or callback.synchronises[-1]
+            if (node_name(name), trigger) not in times:
+                raise InputError(
+                    f"{recording.path} has no CPU times of {node_name(name)}'s callback"
+                    f" {callback.subscription or callback.synchronises or 'of its timer'}: record"
+                    " the application that is described, with its threads' CPU times or"
+                    " sched_switch"
+                )
+            drawn = samples(times[node_name(name), trigger]).model_copy(update={"block": block})
+            callbacks.append(callback.model_copy(update={"execution": drawn, "computes": None}))
+        nodes[name] = node.model_copy(update={"callbacks": tuple(callbacks)})
+    return application.model_copy(update={"nodes": nodes})
+
+
+def _computing_times(flow: DataFlow) -> Mapping[tuple[str, str | int], pl.Series]:
+    """CPU times up to the first publication, by node and topic or period, in order of start."""
+    published = flow.publications.group_by("instance").agg(first=pl.col("time").min())
+    frame = (
+        flow.instances.join(published, on="instance", how="left", maintain_order="left")
+        .join(
+            flow.objects.callbacks.select("callback_id", "node", "topic", "period_ns").unique(
+                "callback_id"
+            ),
+            on="callback_id",
+        )
+        .with_columns(used=pl.col("execution_ns") - (pl.col("end") - pl.col("first")).fill_null(0))
+        .drop_nulls("used")
+        .sort("start")
+    )
+    found: dict[tuple[str, str | int], pl.Series] = {}
+    for (node, topic, period), group in frame.group_by("node", "topic", "period_ns"):
+        found[str(node), int(period) if period is not None else str(topic)] = group["used"]
+    return found
+
+
+def samples(values: pl.Series) -> ExecutionTime:
+    """Times that are drawn as they were measured (ns)."""
+    return ExecutionTime(samples_ns=tuple(values.drop_nulls().clip(0).head(MOST).to_list()))

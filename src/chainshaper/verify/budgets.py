@@ -1,0 +1,351 @@
+"""Budgets: what a chain, its hops and callbacks may take, and which recordings keep to it.
+
+    format: 1
+    chains:
+      - {chain: /t1../t5, maximum: 80ms, percentiles: {'99': 75ms}, jitter: 40ms, missing: 1%,
+         hops: [{topic: /t3, communication: 1ms, computation: 22ms}]}
+    callbacks:
+      - {node: /filter, starts: /t2, response: 25ms, execution: 22ms}
+
+Limits are of all cycles, those that the machine disturbed included: a limit that is broken by these
+alone is broken, and says so. ``missing`` is the share of outputs that were late or never came;
+``starts`` is the topic or period that starts a callback, as `chainshaper callbacks` shows it.
+"""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, Literal
+from xml.etree import ElementTree
+
+import polars as pl
+import yaml
+from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
+
+from chainshaper.analysis import data_flow
+from chainshaper.analysis.latency import PERCENTILES, LatencyAnalysis, callback_statistics
+from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError, shown
+from chainshaper.values.files import new_file, write_whole
+from chainshaper.values.recording import Recording
+from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
+from chainshaper.verify.measure import chain_of, hop_breakdown, measure_latency
+
+__all__ = [
+    "Budget",
+    "Judged",
+    "check_budget",
+    "junit_report",
+    "load_budget",
+    "markdown_report",
+    "propose_budget",
+    "save_budget",
+]
+
+ROOM = 0.1
+"""A proposal leaves as much room beyond what was measured."""
+GRAIN_NS = 10_000
+"""Proposed limits are whole multiples of it."""
+LEAST_MISSING = 0.01
+
+
+def _share_in(value: object) -> object:
+    if isinstance(value, str) and value.endswith("%"):
+        try:
+            return float(value[:-1]) / 100
+        except ValueError:
+            raise ValueError(f"{value!r} is no share: write 1% or 0.01") from None
+    return value
+
+
+def _share_out(value: float, info: SerializationInfo) -> float | str:
+    return f"{100 * value:g}%" if info.context == AS_YAML else value
+
+
+Share = Annotated[
+    float, BeforeValidator(_share_in), PlainSerializer(_share_out), Field(ge=0, le=1, strict=False)
+]
+Percentile = Literal["0.5", "1", "5", "25", "50", "75", "95", "99", "99.5"]
+assert {f"{one:g}" for one in PERCENTILES} == set(Percentile.__args__)  # type: ignore[attr-defined]  # noqa: S101
+
+
+class HopBudget(Part):
+    """The longest that one hop may take; ``topic`` is what it publishes."""
+
+    topic: str
+    communication_ns: PositiveDuration | None = None
+    computation_ns: PositiveDuration | None = None
+
+
+class ChainBudget(Part):
+    """What the latency of a chain may be."""
+
+    chain: str
+    maximum_ns: PositiveDuration | None = None
+    percentiles: dict[Percentile, PositiveDuration] = Field(default_factory=dict)
+    jitter_ns: PositiveDuration | None = None
+    missing: Share | None = None
+    hops: tuple[HopBudget, ...] = Field(default=(), strict=False)
+
+
+class CallbackBudget(Part):
+    """The longest that one callback may take, from start to end, and of CPU time."""
+
+    node: str
+    starts: str
+    response_ns: PositiveDuration | None = None
+    execution_ns: PositiveDuration | None = None
+
+
+class Budget(Part):
+    """A budget file."""
+
+    format: Literal[1] = 1
+    chains: tuple[ChainBudget, ...] = Field(default=(), strict=False)
+    callbacks: tuple[CallbackBudget, ...] = Field(default=(), strict=False)
+
+
+@dataclass(frozen=True)
+class Judged:
+    """One limit and what was found in one recording: ns, or a share for ``missing``.
+
+    ``found`` is None where nothing was measured, which breaks the limit; ``undisturbed`` is the
+    figure of cycles that the machine did not disturb (None: not known). ``because`` says where a
+    broken limit of a chain comes from, or why nothing was measured.
+    """
+
+    recording: str
+    where: str
+    what: str
+    limit: float
+    found: float | None
+    undisturbed: float | None = None
+    because: str | None = None
+
+    @property
+    def kept(self) -> bool:
+        return self.found is not None and self.found <= self.limit
+
+    @property
+    def text(self) -> str:
+        """In one line: ``/t1../t5: maximum 81.2ms, budget 80ms (only in disturbed cycles)``."""
+        found = "nothing measured" if self.found is None else self._value(self.found)
+        line = f"{self.where}: {self.what} {found}, budget {self._value(self.limit)}"
+        if not self.kept and self.undisturbed is not None and self.undisturbed <= self.limit:
+            line += f", {self._value(self.undisturbed)} where the machine disturbed nothing"
+        return line if self.because is None else f"{line}; {self.because}"
+
+    def _value(self, value: float) -> str:
+        return f"{value:.2%}" if self.what == "missing" else format_duration(round(value))
+
+
+def load_budget(path: str | Path) -> Budget:
+    """Read a budget file. Raises InputError: as :func:`.read_model`."""
+    return read_model(path, Budget, made_by="written by `chainshaper budget`")
+
+
+def save_budget(budget: Budget, path: str | Path) -> Path:
+    """Write a budget file. Raises InputError: it exists. OperationError: it cannot be written."""
+    values = budget.model_dump(
+        mode="json", by_alias=True, exclude_none=True, exclude_defaults=True, context=AS_YAML
+    )
+    text = yaml.safe_dump({"format": 1, **values}, sort_keys=False, default_flow_style=None)
+    return write_whole(new_file(path), [text.encode()])
+
+
+def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float = ROOM) -> Budget:
+    """What was measured, and ``room`` beyond it, as limits for chains, hops and callbacks.
+
+    Without ``chains``, of the chain that the recording names. Raises InputError: no such chain.
+    """
+
+    def limit(ns: float | None) -> int | None:
+        return None if ns is None else -int(-ns * (1 + room) // GRAIN_NS) * GRAIN_NS or None
+
+    of_chains = []
+    for chain in chains or [chain_of(recording, None)]:
+        analysis = measure_latency(recording, chain).analysis
+        figures = analysis.statistics
+        wanted: tuple[Percentile, ...] = ("50", "99")
+        percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}
+        hops = tuple(
+            HopBudget(
+                topic=hop["topic"],
+                communication_ns=limit(_most(hop["communication_ns"])),
+                computation_ns=limit(_most(hop["computation_ns"])),
+            )
+            for hop in hop_breakdown(analysis).to_dicts()
+        )
+        of_chains.append(
+            ChainBudget(
+                chain=chain,
+                maximum_ns=limit(figures.max_ns),
+                percentiles={which: ns for which, ns in percentiles.items() if ns},
+                jitter_ns=limit(figures.jitter_ns),
+                missing=max(LEAST_MISSING, round((_missing(analysis) or 0) * (1 + room), 4)),
+                hops=hops,
+            )
+        )
+    callbacks = tuple(
+        CallbackBudget(
+            node=row["node"],
+            starts=trigger_text(row["topic"], row["period_ns"]),
+            response_ns=limit(_most(row["response_ns"])),
+            execution_ns=limit(_most(row["execution_ns"])),
+        )
+        for row in _callbacks(recording).to_dicts()
+    )
+    return Budget(chains=tuple(of_chains), callbacks=callbacks)
+
+
+def check_budget(recording: Recording, budget: Budget, name: str | None = None) -> list[Judged]:
+    """Every limit of a budget beside what one recording has, in the budget's order.
+
+    What is not in the recording breaks its limits. ``name`` stands for the recording.
+    """
+    found: list[Judged] = []
+    name = name or str(recording.path)
+    for chain in budget.chains:
+        try:
+            analysis = measure_latency(recording, chain.chain).analysis
+        except InputError as error:
+            limits = (what for what in _chain_limits(chain))
+            found += (
+                Judged(name, chain.chain, what, limit, None, because=str(error))
+                for what, limit, _ in limits
+            )
+            continue
+        hops = list(_judged_hops(name, chain, analysis))
+        because = _from_where(hops, analysis)
+        for what, limit, of in _chain_limits(chain):
+            one = Judged(name, chain.chain, what, limit, of(analysis), of(_calm(analysis)))
+            found.append(one if one.kept else replace(one, because=because))
+        found += hops
+    rows = {
+        (row["node"], trigger_text(row["topic"], row["period_ns"])): row
+        for row in _callbacks(recording).to_dicts()
+    }
+    for callback in budget.callbacks:
+        row = rows.get((callback.node, callback.starts), {})
+        where = f"{callback.node} ({callback.starts})"
+        for what in ("response", "execution"):
+            limit = getattr(callback, f"{what}_ns")
+            if limit is not None:
+                most = _most(row.get(f"{what}_ns"))
+                why = None if most is not None else "the recording has no such time"
+                found.append(Judged(name, where, what, limit, most, because=why))
+    return found
+
+
+_Figure = Callable[[LatencyAnalysis], float | None]
+
+
+def _chain_limits(chain: ChainBudget) -> Iterator[tuple[str, float, _Figure]]:
+    """The limits that a chain has, and how their figures are taken."""
+    if chain.maximum_ns is not None:
+        yield "maximum", chain.maximum_ns, lambda found: found.statistics.max_ns
+    for which, limit in chain.percentiles.items():
+        yield f"p{which}", limit, lambda f, w=which: f.statistics.percentiles_ns.get(w)  # type: ignore[misc]
+    if chain.jitter_ns is not None:
+        yield "jitter", chain.jitter_ns, lambda found: found.statistics.jitter_ns
+    if chain.missing is not None:
+        yield "missing", chain.missing, _missing
+
+
+def _calm(analysis: LatencyAnalysis) -> LatencyAnalysis:
+    """The same analysis of undisturbed cycles."""
+    frame = analysis.traversals.filter(~pl.col("disturbed"))
+    return replace(analysis, statistics=analysis.undisturbed, traversals=frame)
+
+
+def _missing(analysis: LatencyAnalysis) -> float | None:
+    """The share of outputs that were late or never came; what was under way at the end is not."""
+    frame = analysis.traversals
+    over = frame.filter(
+        pl.col("complete") | (pl.col("start") <= pl.col("start").filter("complete").max())
+    )
+    if not over.height:
+        return None
+    gone = over.select((~pl.col("complete") | pl.col("late").fill_null(False)).sum()).item()
+    return float(gone) / over.height
+
+
+def _judged_hops(name: str, chain: ChainBudget, analysis: LatencyAnalysis) -> Iterator[Judged]:
+    rows = {row["topic"]: row for row in hop_breakdown(analysis).to_dicts()}
+    for hop in chain.hops:
+        for part in ("communication", "computation"):
+            limit = getattr(hop, f"{part}_ns")
+            if limit is not None:
+                most = _most(rows.get(hop.topic, {}).get(f"{part}_ns"))
+                why = None if most is not None else "the chain has no such hop here"
+                what = f"{part} of {hop.topic}"
+                yield Judged(name, chain.chain, what, limit, most, because=why)
+
+
+def _from_where(hops: Sequence[Judged], analysis: LatencyAnalysis) -> str | None:
+    """The hop that exceeds its budget by most; without one, that with the longest mean."""
+    broken = [one for one in hops if one.found is not None and not one.kept]
+    if broken:
+        worst = max(broken, key=lambda one: (one.found or 0) - one.limit)
+        return f"from {worst.text.partition(': ')[2]}"
+    shares = hop_breakdown(analysis)
+    if not shares["count"].sum():
+        return None
+    longest = shares.sort(pl.col("computation_share"), descending=True, nulls_last=True).row(
+        0, named=True
+    )
+    mean = format_duration(round(longest["computation_ns"]["mean"]))
+    return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
+
+
+def _callbacks(recording: Recording) -> pl.DataFrame:
+    """Callbacks that ran and are named alike in every run, without those that every node has."""
+    frame = callback_statistics(data_flow(recording.events, recording.info.clock_offset_ns))
+    return frame.filter(
+        pl.col("node").is_not_null()
+        & pl.col("kind").is_in(["timer", "subscription"])
+        & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
+    ).unique(["node", "topic", "period_ns"], keep="first", maintain_order=True)
+
+
+def _most(times: dict[str, float] | None) -> float | None:
+    return None if times is None else times["max"]
+
+
+def junit_report(judged: Sequence[Judged]) -> str:
+    """JUnit XML: a suite for each recording, a test case for each limit."""
+    root = ElementTree.Element("testsuites", name="chainshaper budget")
+    for recording in dict.fromkeys(one.recording for one in judged):
+        own = [one for one in judged if one.recording == recording]
+        broken = sum(not one.kept for one in own)
+        counts = {"tests": str(len(own)), "failures": str(broken)}
+        suite = ElementTree.SubElement(root, "testsuite", {"name": shown(recording), **counts})
+        for one in own:
+            named = {"classname": shown(one.where), "name": shown(one.what)}
+            case = ElementTree.SubElement(suite, "testcase", named)
+            if not one.kept:
+                ElementTree.SubElement(case, "failure", {"message": shown(one.text)})
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
+
+
+def markdown_report(judged: Sequence[Judged]) -> str:
+    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are kept."""
+    broken = [one for one in judged if not one.kept]
+    kept = len(judged) - len(broken)
+    lines = [
+        f"**{len(broken)} of {len(judged)} limits are broken**"
+        if broken
+        else f"**All {kept} limits are kept**"
+    ]
+    if broken:
+        lines += ["", "| recording | limit |", "|---|---|"]
+        lines += [
+            f"| {cell} |"
+            for one in broken
+            for cell in [
+                " | ".join(shown(t).replace("|", "\\|") for t in (one.recording, one.text))
+            ]
+        ]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,181 @@
+"""Budgets: proposed, edited, kept, broken; recordings of known latencies."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree
+
+import polars as pl
+import pytest
+from command_line import called, json_of
+from small_chain import small_chain
+
+from chainshaper import simulate
+from chainshaper.values.errors import InputError
+from chainshaper.values.events import empty
+from chainshaper.values.recording import Recording, write_recording
+from chainshaper.verify.budgets import (
+    Budget,
+    ChainBudget,
+    Judged,
+    check_budget,
+    junit_report,
+    load_budget,
+    markdown_report,
+    propose_budget,
+    save_budget,
+)
+from chainshaper.verify.measure import hop_breakdown, measure_latency
+
+MS = 1_000_000
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    folder = tmp_path_factory.mktemp("budgets")
+    return simulate(small_chain(folder), folder / "recording", cycles=200)
+
+
+def slowed(recording: Recording, folder: Path, node: str, by_ns: int) -> Recording:
+    """The same application, whose node computes longer by a constant."""
+    application = small_chain(folder)
+    (callback,) = application.nodes[node].callbacks
+    low, high = callback.execution.uniform_ns or (0, 0)
+    execution = callback.execution.model_copy(update={"uniform_ns": (low + by_ns, high + by_ns)})
+    nodes = dict(application.nodes)
+    changed = callback.model_copy(update={"execution": execution})
+    nodes[node] = nodes[node].model_copy(update={"callbacks": (changed,)})
+    return simulate(application.model_copy(update={"nodes": nodes}), folder / "slowed", cycles=200)
+
+
+def test_a_recording_keeps_the_budget_that_was_proposed_from_it(
+    recording: Recording, tmp_path: Path
+) -> None:
+    budget = propose_budget(recording)
+    measured = measure_latency(recording).analysis
+    (chain,) = budget.chains
+    assert chain.chain == "/t1../t3"
+    longest = measured.statistics.max_ns or 0
+    assert chain.maximum_ns == -(-longest * 11 // (10 * 10_000)) * 10_000
+    assert [hop.topic for hop in chain.hops] == ["/t1", "/t2", "/t3"]
+    assert chain.hops[0].communication_ns is None, "a chain begins with its first callback"
+    worst = hop_breakdown(measured)["computation_ns"].struct.field("max").to_list()
+    for hop, most in zip(chain.hops, worst, strict=True):
+        assert most * 1.1 <= (hop.computation_ns or 0) <= most * 1.1 + 10_000
+    assert {(one.node, one.starts) for one in budget.callbacks} == {
+        *(("/first", "every 50ms"), ("/second", "/t1"), ("/third", "/t2"), ("/actuator", "/t3"))
+    }
+    save_budget(budget, tmp_path / "budget.yaml")
+    assert load_budget(tmp_path / "budget.yaml") == budget
+    judged = check_budget(recording, budget)
+    assert all(one.kept for one in judged)
+    # maximum, p50, p99, jitter, missing; five parts of hops; two of each callback
+    assert len(judged) == 5 + 5 + 8
+
+
+def test_a_slower_callback_breaks_limits_and_is_named(recording: Recording, tmp_path: Path) -> None:
+    budget = propose_budget(recording)
+    after = slowed(recording, tmp_path, "second", 3 * MS)
+    broken = [one for one in check_budget(after, budget) if not one.kept]
+    found = {(one.where, one.what) for one in broken}
+    assert {("/t1../t3", "maximum"), ("/t1../t3", "p50"), ("/t1../t3", "p99")} <= found
+    assert ("/t1../t3", "computation of /t2") in found
+    assert {("/second (/t1)", "response"), ("/second (/t1)", "execution")} <= found
+    assert not any("/third" in where or "/first" in where for where, _ in found)
+    (maximum,) = (one for one in broken if one.what == "maximum")
+    assert maximum.found == measure_latency(after).analysis.statistics.max_ns
+    assert "from computation of /t2" in (maximum.because or "")
+    assert maximum.text.startswith("/t1../t3: maximum ")
+
+
+def test_what_is_missing_in_a_recording_breaks_its_limits(recording: Recording) -> None:
+    budget = Budget(
+        chains=(ChainBudget(chain="/t1../nothing", maximum_ns=MS, missing=0.5),),
+    )
+    judged = check_budget(recording, budget)
+    assert [one.kept for one in judged] == [False, False]
+    assert all("/nothing" in (one.because or "") for one in judged)
+
+
+def test_missing_counts_late_outputs_and_those_that_never_came(
+    recording: Recording, tmp_path: Path
+) -> None:
+    """Every tenth message of /t2 is not taken; the last is under way and does not count."""
+    takes = recording.events["rmw_take"]
+    third = measure_latency(recording).analysis.hops.filter(hop=2)["source_timestamp"]
+    gone = third.gather_every(10)
+    events = {
+        **recording.events,
+        "rmw_take": takes.filter(~pl.col("source_timestamp").is_in(gone.implode())),
+    }
+    holes = write_recording(tmp_path / "holes", events, recording.info)
+    budget = Budget(chains=(ChainBudget(chain="/t1../t3", missing=0.05),))
+    (judged,) = check_budget(holes, budget)
+    assert judged.found == pytest.approx(0.1, abs=0.006)
+    assert not judged.kept
+    assert "missing 10" in judged.text
+
+
+def test_a_limit_that_only_disturbed_cycles_break_says_so(recording: Recording) -> None:
+    analysis = measure_latency(recording).analysis
+    longest = analysis.traversals.sort("latency_ns").row(-1, named=True)
+    cores = recording.events["callback_start"]["cpu"].unique().to_list()
+    rows = [(longest["start"] + MS, None, None, core, 3 * MS) for core in cores]
+    stalls = pl.DataFrame(rows, schema=empty("machine_stall").schema, orient="row")
+    hit = replace(recording, events={**recording.events, "machine_stall": stalls})
+    limit = longest["latency_ns"] - 1
+    budget = Budget(chains=(ChainBudget(chain="/t1../t3", maximum_ns=limit),))
+    (judged,) = check_budget(hit, budget)
+    assert not judged.kept
+    assert (judged.undisturbed or limit + 1) <= limit
+    assert "where the machine disturbed nothing" in judged.text
+
+
+def test_the_commands(recording: Recording, tmp_path: Path) -> None:
+    file, junit, markdown = (tmp_path / name for name in ("b.yaml", "j.xml", "m.md"))
+    assert called("budget", recording.path, "-o", file).code == 0
+    again = called("budget", recording.path, "-o", file)
+    assert again.code == 2, "nothing is overwritten"
+    kept = called("check", recording.path, "--budget", file)
+    assert kept.code == 0, kept.err
+    assert "limits of" in kept.out
+    after = slowed(recording, tmp_path, "second", 3 * MS)
+    words = ("--budget", file, "--junit", junit, "--markdown", markdown)
+    broken = called("check", recording.path, after.path, *words)
+    assert broken.code == 1
+    assert "computation of /t2" in broken.out
+    suites = ElementTree.parse(junit).getroot()  # noqa: S314 - ours
+    assert [one.get("failures") for one in suites] == ["0", str(len(list(suites.iter("failure"))))]
+    assert "limits are broken**" in markdown.read_text()
+    assert "| /t1../t3: maximum" in markdown.read_text().replace(str(after.path), "").replace(
+        "|  |", "|"
+    )
+    values = json.loads(called("check", after.path, "--budget", file, "--json").out)
+    assert any(not one["kept"] for one in values)
+    assert json_of("check", recording.path, "--budget", file)[0]["kept"]
+
+
+def test_hostile_names_stay_text() -> None:
+    one = Judged("rec|\x1b[31m", "/a../b", "maximum", 1, 2, because="<&>")
+    report = junit_report([one])
+    assert "\x1b" not in report
+    assert 'testsuite name="rec|\\x1b[31m"' in report
+    assert "rec\\|\\x1b[31m" in markdown_report([one])
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("chains: [{chain: /a../b, maximum: 80}]", "write a number and a unit"),
+        ("chains: [{chain: /a../b, percentiles: {'98': 1ms}}]", "98"),
+        ("chains: [{chain: /a../b, missing: 200%}]", "less than or equal to 1"),
+        ("chains: [{chain: /a../b, missing: much%}]", "is no share"),
+        ("chains: [{chain: /a../b, longest: 1ms}]", "longest"),
+    ],
+)
+def test_wrong_budgets_are_refused_with_their_line(tmp_path: Path, text: str, message: str) -> None:
+    file = tmp_path / "budget.yaml"
+    file.write_text(f"format: 1\n{text}\n")
+    with pytest.raises(InputError, match=message) as refused:
+        load_budget(file)
+    assert f"{file}:2" in str(refused.value)
