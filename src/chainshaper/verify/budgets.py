@@ -177,13 +177,14 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             )
             for hop in hop_breakdown(analysis).to_dicts()
         )
+        missing = _missing(analysis) or 0.0
         of_chains.append(
             ChainBudget(
                 chain=chain,
                 maximum_ns=limit(figures.max_ns),
                 percentiles={which: ns for which, ns in percentiles.items() if ns},
                 jitter_ns=limit(figures.jitter_ns),
-                missing=max(LEAST_MISSING, round((_missing(analysis) or 0) * (1 + room), 4)),
+                missing=min(1.0, max(LEAST_MISSING, round(missing * (1 + room), 4))),
                 hops=hops,
             )
         )
