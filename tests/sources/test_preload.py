@@ -16,7 +16,7 @@ from command_line import called, json_of
 from processes import wait_for
 from traced_program import Traced, assert_same, built, of_process, traced
 
-from chainshaper.sources.ebpf.trace_points import TracePoint, library_at
+from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary
 from chainshaper.sources.preload import (
     SOURCE,
     VARIABLE,
@@ -98,11 +98,11 @@ def test_the_library_has_the_arguments_that_trace_points_have() -> None:
     """Texts and gids of events of creation; how many values others have."""
     source = SOURCE.read_text()
     assert set(event_names()) <= events.FIELDS.keys()
-    version = library_at(built().tracetools)
+    library = TracingLibrary(built().tracetools, frozenset(), "8.2.3")
     for kind, name, rest in re.findall(
         r"^  (EVENT|TIMED|CREATION)\((\w+), (.*)\) *\\?$", source, re.M
     ):
-        arguments = TracePoint(name, version.path, version).arguments
+        arguments = TracePoint(name, library.path, library).arguments
         of_kind = {
             wanted: [one.place for one in arguments if one.kind == wanted]
             for wanted in ("text", "gid")

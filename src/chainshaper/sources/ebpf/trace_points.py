@@ -170,11 +170,6 @@ def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary,
     return tuple(dict.fromkeys(_found([file.absolute() for file in files if file.is_file()], {})))
 
 
-def library_at(path: Path) -> TracingLibrary:
-    """The library at a path; one that is not there exports nothing, and has no version."""
-    return TracingLibrary(path, exported_functions(path), _version(path))
-
-
 def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...]]:
     """Process → the libraries that it has mapped; only those that have one."""
     known: dict[tuple[int, int], TracingLibrary] = {}
@@ -202,12 +197,12 @@ def _found(
         status = path.stat()
         key = status.st_dev, status.st_ino
         if key not in known:
-            known[key] = library_at(path)
+            known[key] = TracingLibrary(path, exported_functions(path), version_of(path))
         yield known[key]
 
 
-def _version(library: Path) -> str | None:
-    """The version of tracetools, as its package says beside the library."""
+def version_of(library: Path) -> str | None:
+    """The version of tracetools, as its package says beside the library; None if none does."""
     for folder in library.parents[1:3]:  # `lib`, or `lib/x86_64-linux-gnu`, is in the prefix
         with suppress(OSError):
             package = read_regular(folder / "share/tracetools/package.xml", _LONGEST_PACKAGE)

@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import run_users
-from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary, library_at
+from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary, version_of
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -179,7 +179,7 @@ def creation_tables(process: TracedProcess) -> tuple[dict[str, pl.DataFrame], Tr
     """
     objects, texts = process.objects()
     path = next((texts[int(n)][0] for n in np.flatnonzero(objects["event"] == _LIBRARY)), "")
-    library = library_at(Path(path))
+    library = TracingLibrary(Path(path), frozenset(), version_of(Path(path)))
     pids = np.full(objects.size, process.pid, np.int32)
     return _tables(objects, pids, texts, library, events.CREATION), library
 
