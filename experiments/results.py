@@ -191,33 +191,38 @@ def lines_of(
     runs: Sequence[Run],
     paper: Mapping[str, Value],
     *,
-    late_from_ns: int | None = None,
+    late_from_ns: int | Mapping[Column, int] | None = None,
     why: str = "",
     no_evidence: Mapping[Column, str] | None = None,
 ) -> list[Line]:
     """The lines of one configuration, simulated and live, whose runs are both called ``name``.
 
     ``paper`` has the paper's value for each line that is wanted: ``average``, ``maximum`` and
-    ``jitter`` (maximum − minimum) in ms, ``late`` in cycles: those that took ``late_from_ns`` or
-    longer, which missed the slot that they were due in. Figures of undisturbed cycles leave the
+    ``jitter`` (maximum − minimum) in ms, ``late`` in cycles: those that took ``late_from_ns`` (of
+    their column) or longer, which missed the slot that they were due in. Figures of undisturbed cycles leave the
     late ones out, figures of all cycles leave out nothing.
     """
     found = {run.column: run for run in runs if run.name == name}
-    limit = np.inf if late_from_ns is None else late_from_ns
+    limits = late_from_ns if isinstance(late_from_ns, Mapping) else {}
+    anywhere = late_from_ns if isinstance(late_from_ns, int) else np.inf
 
-    def calm(what: str, latency: NDArray[np.int64], disturbed: NDArray[np.bool_]) -> Value:
+    def calm(
+        what: str, limit: float, latency: NDArray[np.int64], disturbed: NDArray[np.bool_]
+    ) -> Value:
         return figure(what, latency[(latency >= 0) & ~disturbed], limit)
 
-    def every(what: str, latency: NDArray[np.int64], _: NDArray[np.bool_]) -> Value:
+    def every(what: str, limit: float, latency: NDArray[np.int64], _: NDArray[np.bool_]) -> Value:
         return figure(what, latency[latency >= 0], limit if what == "late" else np.inf)
 
     def line(what: str, value: Value) -> Line:
         values: dict[str, Any] = dict.fromkeys(("simulated", "live"))
         intervals: dict[str, tuple[float, float]] = {}
         for column, run in found.items():
-            for name_of, of in ((column, calm), (f"{column}_all", every)):
-                values[name_of] = of(what, run.latency_ns, run.disturbed)
-                again = None if column == "simulated" else drawn_again(run, partial(of, what))
+            limit = limits.get(column, anywhere)
+            for name_of, judge in ((column, calm), (f"{column}_all", every)):
+                of = partial(judge, what, limit)
+                values[name_of] = of(run.latency_ns, run.disturbed)
+                again = None if column == "simulated" else drawn_again(run, of)
                 if again is not None:
                     intervals[name_of] = again
         unit = "cycles" if what == "late" else "ms"

@@ -66,6 +66,8 @@ TOPICS = {
 
 LATE_MS = {"synthetic": (100, 550, 150), "valet parking": (100, 450, 150)}
 """What takes longer has missed a slot: shaping's next one is a cycle later, and so is LET's."""
+LATER_ON_ROS_MS = {"valet parking, LET per callback": 100}
+"""On ROS 2 the throttler is a callback of the chain as well, and waits for the next cycle, too."""
 
 WHY = {
     "1-band shaping": "our longest latency under SCHED_FIFO, on the next whole ms, and the sending",
@@ -90,12 +92,12 @@ NOTES = (
     "The synthetic chain has execution times of 5 to 12 ms, which the paper's 59.2 ms fit, as in"
     " figure 8. Outputs that came half a period or more after the slot they were due in are counted"
     " as late, and not part of maximum and jitter.\n\n"
-    "The slot of shaping follows the longest cycle of the run under SCHED_FIFO, so one stall that"
-    " is not noticed as such moves it. The synthetic chain was run live twice on 2026-11-21: in the"
-    " first run a cycle whose drawn times add up to 52 ms took 63.7 ms without being marked, and"
-    " 1-band shaping came to 64.1 ms (jitter 0.09 ms). The values above are the second run's, made"
-    " to have valet parking beside it and with a newer marking of disturbed cycles. Under LET per"
-    " callback a cycle is under way for 400 to 500 ms, and nearly every one is marked."
+    "The slot of shaping follows the longest cycle that was measured before, on 2026-11-23 57 ms"
+    " live (58.0). On ROS 2 the machine stood still for 33.5 ms during that measurement, and the"
+    " command adds what it has seen of stalls to the margin ε: its slot begins at 90.7 ms. Under"
+    " LET per callback the command on ROS 2 has valet parking's throttler wait for the next cycle"
+    " as well, so that its chain takes five periods instead of four. There a cycle is under way for"
+    " 400 to 500 ms, and nearly every one is marked as disturbed."
 )
 
 
@@ -172,11 +174,12 @@ def lines(runs: Sequence[Run]) -> list[Line]:
     made = []
     for chain, row in PAPER.items():
         for column, paper, late in zip(KINDS, row, LATE_MS[chain], strict=True):
+            on_ros = late + LATER_ON_ROS_MS.get(f"{chain}, {column}", 0)
             made += lines_of(
                 f"{chain}, {column}",
                 runs,
                 {"maximum": paper, "jitter": None, "late": None},
-                late_from_ns=late * MS,
+                late_from_ns=dict.fromkeys(OURS, late * MS) | dict.fromkeys(ROS, on_ros * MS),
                 why=WHY_FAILS if isinstance(paper, str) else WHY[column],
                 no_evidence=FITTED if column == "1-band shaping" else {},
             )
