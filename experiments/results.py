@@ -199,8 +199,8 @@ def lines_of(
 
     ``paper`` has the paper's value for each line that is wanted: ``average``, ``maximum`` and
     ``jitter`` (maximum − minimum) in ms, ``late`` in cycles: those that took ``late_from_ns`` (of
-    their column) or longer, which missed the slot that they were due in. Figures of undisturbed cycles leave the
-    late ones out, figures of all cycles leave out nothing.
+    their column) or longer, which missed the slot that they were due in. Figures of undisturbed
+    cycles leave the late ones out, figures of all cycles leave out nothing.
     """
     found = {run.column: run for run in runs if run.name == name}
     limits = late_from_ns if isinstance(late_from_ns, Mapping) else {}

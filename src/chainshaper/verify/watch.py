@@ -51,7 +51,7 @@ SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
 RECORDER_NS = 10 * SECOND
 """So much of the past the flight recorder has."""
 
-_SEARCH_NS = 5 * SECOND  # between two looks for new processes
+_SEARCH_NS, _FIRST_SEARCH_NS = 5 * SECOND, SECOND  # between two looks for new processes
 _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave before their slot
 _NO_PROCESS = (
     "no process of these users runs with the library in front: set what `chainshaper watch "
@@ -225,7 +225,7 @@ class Watch:
     def read(self) -> None:
         """Take what is new in all memories, and look for new processes now and then."""
         now = time.monotonic_ns()
-        if now - self._searched_ns > _SEARCH_NS:
+        if now - self._searched_ns > (_SEARCH_NS if self.processes else _FIRST_SEARCH_NS):
             self._searched_ns = now
             self._search()
         for pid, process in self.processes.items():
