@@ -19,6 +19,7 @@ from chainshaper.verify.budgets import (
     ChainBudget,
     Judged,
     check_budget,
+    check_budgets,
     junit_report,
     load_budget,
     markdown_report,
@@ -153,6 +154,23 @@ def test_the_commands(recording: Recording, tmp_path: Path) -> None:
     values = json.loads(called("check", after.path, "--budget", file, "--json").out)
     assert any(not one["kept"] for one in values)
     assert json_of("check", recording.path, "--budget", file)[0]["kept"]
+
+
+def test_a_fleet_is_judged_side_by_side(recording: Recording, tmp_path: Path) -> None:
+    """As one by one; what cannot be read is named, and the others are judged all the same."""
+    file = save_budget(propose_budget(recording), tmp_path / "b.yaml")
+    after = slowed(recording, tmp_path, "second", 3 * MS)
+    paths = [recording.path, after.path, tmp_path / "gone", recording.path]
+    found = check_budgets(paths, load_budget(file))
+    assert [[replace(one, recording="") for one in own] for own in (found[0], found[3])] == [
+        [replace(one, recording="") for one in check_budget(recording, load_budget(file))]
+    ] * 2
+    assert [sum(not one.kept for one in own) > 0 for own in found] == [False, True, True, False]
+    (gone,) = found[2]
+    assert "its events could not be measured" in gone.text
+    shown = called("check", *paths, "--budget", file)
+    assert shown.code == 1
+    assert "Recordings against the budget" in shown.out
 
 
 def test_hostile_names_stay_text() -> None:

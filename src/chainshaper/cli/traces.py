@@ -147,6 +147,10 @@ def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) 
     out.notes((*written.info.notes, out.lost_events(written)))
 
 
+FEW = 3
+"""More recordings than these get an overview."""
+
+
 def budget(
     trace: list[Path] = opt.TRACE,
     output: Path = opt.option("--output -o FILE", "The budget file.", ...),
@@ -179,16 +183,16 @@ def check(
 
     Limits are of all cycles. Where only disturbed cycles break one, that is said.
     """
-    from chainshaper.reporting.overviews import broken_table
+    from chainshaper.reporting.overviews import broken_table, fleet_table
     from chainshaper.values.files import new_file, write_whole
     from chainshaper.verify import budgets
 
-    limits, judged = budgets.load_budget(budget), list[budgets.Judged]()
+    limits = budgets.load_budget(budget)
     for wanted in filter(None, (junit, markdown)):
         new_file(wanted)
-    for path in recordings:
-        with out.opened("check", [path]) as (recording, _):
-            judged += budgets.check_budget(recording, limits, str(path))
+    with out.late_progress("check") as report:
+        found = budgets.check_budgets(recordings, limits, report)
+    judged = [one for own in found for one in own]
     for file, write in ((junit, budgets.junit_report), (markdown, budgets.markdown_report)):
         if file is not None:
             write_whole(file, [write(judged).encode()])
@@ -196,7 +200,7 @@ def check(
     if json:
         out.print_json([{**asdict(one), "kept": one.kept} for one in judged])
     elif broken:
-        out.show(broken_table(broken))
+        out.show(*([fleet_table(found)] if len(found) > FEW else []), broken_table(broken))
     if broken:
         raise OperationError(f"{len(broken)} of {len(judged)} limits of {budget} are broken")
     if not json:

@@ -12,8 +12,12 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 ``starts`` is the topic or period that starts a callback, as `chainshaper callbacks` shows it.
 """
 
+import os
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Literal
 from xml.etree import ElementTree
@@ -24,9 +28,10 @@ from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.latency import PERCENTILES, LatencyAnalysis, callback_statistics
+from chainshaper.sources import open_source
 from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import InputError, shown
+from chainshaper.values.errors import ChainshaperError, InputError, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
@@ -36,6 +41,7 @@ __all__ = [
     "Budget",
     "Judged",
     "check_budget",
+    "check_budgets",
     "junit_report",
     "load_budget",
     "markdown_report",
@@ -130,8 +136,10 @@ class Judged:
     @property
     def text(self) -> str:
         """In one line: ``/t1../t5: maximum 81.2ms, budget 80ms (only in disturbed cycles)``."""
-        found = "nothing measured" if self.found is None else self._value(self.found)
-        line = f"{self.where}: {self.what} {found}, budget {self._value(self.limit)}"
+        if self.found is None:
+            return f"{self.where}: {self.what} could not be measured; {self.because}"
+        line = f"{self.where}: {self.what} {self._value(self.found)}"
+        line += f", budget {self._value(self.limit)}"
         if not self.kept and self.undisturbed is not None and self.undisturbed <= self.limit:
             line += f", {self._value(self.undisturbed)} where the machine disturbed nothing"
         return line if self.because is None else f"{line}; {self.because}"
@@ -237,6 +245,48 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
                 why = None if most is not None else "the recording has no such time"
                 found.append(Judged(name, where, what, limit, most, because=why))
     return found
+
+
+def check_budgets(
+    paths: Sequence[Path],
+    budget: Budget,
+    progress: Callable[[float, str], None] = lambda *_: None,
+) -> list[list[Judged]]:
+    """Recordings and traces against a budget, in their order, as many at a time as there are cores.
+
+    What cannot be read breaks the budget as well, with the reason: the others are judged all the
+    same.
+    """
+    if len(paths) < 2:
+        return [_checked(path, budget) for path in paths]
+    workers = min(len(paths), len(os.sched_getaffinity(0)))
+    found: dict[int, list[Judged]] = {}
+    with one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+        running = {pool.submit(_checked, path, budget): n for n, path in enumerate(paths)}
+        for done in as_completed(running):
+            found[running[done]] = done.result()
+            progress(len(found) / len(paths), f"{len(found)} of {len(paths)} recordings")
+    return [found[number] for number in range(len(paths))]
+
+
+@contextmanager
+def one_thread_each() -> Iterator[None]:
+    """Processes that are started inside have Polars compute in one thread: cores are taken."""
+    before = os.environ.get("POLARS_MAX_THREADS")
+    os.environ["POLARS_MAX_THREADS"] = "1"
+    try:
+        yield
+    finally:
+        os.environ.pop("POLARS_MAX_THREADS")
+        if before is not None:
+            os.environ["POLARS_MAX_THREADS"] = before
+
+
+def _checked(path: Path, budget: Budget) -> list[Judged]:
+    try:
+        return check_budget(open_source(path), budget, str(path))
+    except ChainshaperError as error:
+        return [Judged(str(path), str(path), "its events", 0, None, because=str(error))]
 
 
 _Figure = Callable[[LatencyAnalysis], float | None]
