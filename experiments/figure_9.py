@@ -49,8 +49,11 @@ NOTES = (
     " says. The three sinks are planned from the recording of the graph with one, in which they are"
     " no earlier.\n\n"
     "Cycles that the machine disturbed do not count as evidence for the plan, and the shaped runs"
-    " have other cycles than the one that it is made from: with ε between 1 and 2 ms behind 100"
-    " cycles, a longer one is late by a period."
+    " have other draws of execution times than the one that it is made from: with ε between 1 and"
+    " 2 ms behind 100 cycles, a longer one is late by a period. On ROS 2 the command planned one"
+    " sink from 77 undisturbed cycles with the longest of 505.6 ms, and says itself that 2.9 % will"
+    " overrun; unshaped, one of 100 later took 516 ms. Of its 9 late outputs 7 are of disturbed"
+    " cycles. For three sinks it planned from another measurement, with a slot 34 ms later."
 )
 
 WHY_SINK = "not in the paper, which says that it can be done"
