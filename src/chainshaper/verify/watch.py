@@ -143,7 +143,7 @@ class _Chain:
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
-    counted: Counter[str] = field(default_factory=Counter)
+    counted: Counter[str] = field(default_factory=lambda: Counter(complete=0, late=0, incomplete=0))
     problem: str | None = None
 
     def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
