@@ -14,10 +14,8 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 
 import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Literal
 from xml.etree import ElementTree
@@ -261,25 +259,12 @@ def check_budgets(
         return [_checked(path, budget) for path in paths]
     workers = min(len(paths), len(os.sched_getaffinity(0)))
     found: dict[int, list[Judged]] = {}
-    with one_thread_each(), ProcessPoolExecutor(workers, get_context("spawn")) as pool:
+    with ThreadPoolExecutor(workers) as pool:  # decoding and analysis run without Python's lock
         running = {pool.submit(_checked, path, budget): n for n, path in enumerate(paths)}
         for done in as_completed(running):
             found[running[done]] = done.result()
             progress(len(found) / len(paths), f"{len(found)} of {len(paths)} recordings")
     return [found[number] for number in range(len(paths))]
-
-
-@contextmanager
-def one_thread_each() -> Iterator[None]:
-    """Processes that are started inside have Polars compute in one thread: cores are taken."""
-    before = os.environ.get("POLARS_MAX_THREADS")
-    os.environ["POLARS_MAX_THREADS"] = "1"
-    try:
-        yield
-    finally:
-        os.environ.pop("POLARS_MAX_THREADS")
-        if before is not None:
-            os.environ["POLARS_MAX_THREADS"] = before
 
 
 def _checked(path: Path, budget: Budget) -> list[Judged]:
