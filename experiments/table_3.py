@@ -88,10 +88,9 @@ WHY_LATE = (
     " margin, and those behind them; " + WHY_LIVE
 )
 WHY_PACE = (
-    "live, where a cycle's latency falls among the bands depends on the machine's pace, which"
-    " changes from run to run: SCHED_FIFO took 45.3 ms on average in this table's run and 52.6 in"
-    " table 2's, and the last band took 37 % of the cycles with PSO where the run that it was"
-    " planned from has 14 %, so PSO came out behind random places; "
+    "live, where a cycle's latency falls among the bands depends on the machine's pace; in turns,"
+    " over all cycles, PSO took 46.5 ms on average and random places 50.4, in the paper's order,"
+    " which a run without turns had the other way round on 2026-11-21; "
 )
 WHY_BANDS = "outputs leave as their slot opens, or at once while it is open; " + WHY_LATE
 
