@@ -246,7 +246,7 @@ for n in range(400):
 
 
 def test_what_cannot_have_memory_runs_on(tmp_path: Path) -> None:
-    """No descriptor is left: nothing is traced, and nobody is told."""
+    """No descriptor is left: nothing is traced, and the application runs on."""
 
     def run() -> list[list[str]]:
         return python(

@@ -1,4 +1,4 @@
-"""Budgets: proposed, edited, kept, broken; recordings of known latencies."""
+"""Budgets: proposed, edited, met, broken; recordings of known latencies."""
 
 import json
 from dataclasses import replace
@@ -69,7 +69,7 @@ def test_a_recording_keeps_the_budget_that_was_proposed_from_it(
     save_budget(budget, tmp_path / "budget.yaml")
     assert load_budget(tmp_path / "budget.yaml") == budget
     judged = check_budget(recording, budget)
-    assert all(one.kept for one in judged)
+    assert all(one.met for one in judged)
     # maximum, p50, p99, jitter, missing; five parts of hops; two of each callback
     assert len(judged) == 5 + 5 + 8
 
@@ -77,7 +77,7 @@ def test_a_recording_keeps_the_budget_that_was_proposed_from_it(
 def test_a_slower_callback_breaks_limits_and_is_named(recording: Recording, tmp_path: Path) -> None:
     budget = propose_budget(recording)
     after = slowed(recording, tmp_path, "second", 3 * MS)
-    broken = [one for one in check_budget(after, budget) if not one.kept]
+    broken = [one for one in check_budget(after, budget) if not one.met]
     found = {(one.where, one.what) for one in broken}
     assert {("/t1../t3", "maximum"), ("/t1../t3", "p50"), ("/t1../t3", "p99")} <= found
     assert ("/t1../t3", "computation of /t2") in found
@@ -94,7 +94,7 @@ def test_what_is_missing_in_a_recording_breaks_its_limits(recording: Recording) 
         chains=(ChainBudget(chain="/t1../nothing", maximum_ns=MS, missing=0.5),),
     )
     judged = check_budget(recording, budget)
-    assert [one.kept for one in judged] == [False, False]
+    assert [one.met for one in judged] == [False, False]
     assert all("/nothing" in (one.because or "") for one in judged)
 
 
@@ -113,7 +113,7 @@ def test_missing_counts_late_outputs_and_those_that_never_came(
     budget = Budget(chains=(ChainBudget(chain="/t1../t3", missing=0.05),))
     (judged,) = check_budget(holes, budget)
     assert judged.found == pytest.approx(0.1, abs=0.006)
-    assert not judged.kept
+    assert not judged.met
     assert "missing 10" in judged.text
 
 
@@ -127,7 +127,7 @@ def test_a_limit_that_only_disturbed_cycles_break_says_so(recording: Recording) 
     limit = longest["latency_ns"] - 1
     budget = Budget(chains=(ChainBudget(chain="/t1../t3", maximum_ns=limit),))
     (judged,) = check_budget(hit, budget)
-    assert not judged.kept
+    assert not judged.met
     assert (judged.undisturbed or limit + 1) <= limit
     assert "where the machine disturbed nothing" in judged.text
 
@@ -137,9 +137,9 @@ def test_the_commands(recording: Recording, tmp_path: Path) -> None:
     assert called("budget", recording.path, "-o", file).code == 0
     again = called("budget", recording.path, "-o", file)
     assert again.code == 2, "nothing is overwritten"
-    kept = called("check", recording.path, "--budget", file)
-    assert kept.code == 0, kept.err
-    assert "limits of" in kept.out
+    met = called("check", recording.path, "--budget", file)
+    assert met.code == 0, met.err
+    assert "limits of" in met.out
     after = slowed(recording, tmp_path, "second", 3 * MS)
     words = ("--budget", file, "--junit", junit, "--markdown", markdown)
     broken = called("check", recording.path, after.path, *words)
@@ -152,8 +152,8 @@ def test_the_commands(recording: Recording, tmp_path: Path) -> None:
         "|  |", "|"
     )
     values = json.loads(called("check", after.path, "--budget", file, "--json").out)
-    assert any(not one["kept"] for one in values)
-    assert json_of("check", recording.path, "--budget", file)[0]["kept"]
+    assert any(not one["met"] for one in values)
+    assert json_of("check", recording.path, "--budget", file)[0]["met"]
 
 
 def test_a_fleet_is_judged_side_by_side(recording: Recording, tmp_path: Path) -> None:
@@ -165,7 +165,7 @@ def test_a_fleet_is_judged_side_by_side(recording: Recording, tmp_path: Path) ->
     assert [[replace(one, recording="") for one in own] for own in (found[0], found[3])] == [
         [replace(one, recording="") for one in check_budget(recording, load_budget(file))]
     ] * 2
-    assert [sum(not one.kept for one in own) > 0 for own in found] == [False, True, True, False]
+    assert [sum(not one.met for one in own) > 0 for own in found] == [False, True, True, False]
     (gone,) = found[2]
     assert "its events could not be measured" in gone.text
     shown = called("check", *paths, "--budget", file)

@@ -196,15 +196,15 @@ def check(
     for file, write in ((junit, budgets.junit_report), (markdown, budgets.markdown_report)):
         if file is not None:
             write_whole(file, [write(judged).encode()])
-    broken = [one for one in judged if not one.kept]
+    broken = [one for one in judged if not one.met]
     if json:
-        out.print_json([{**asdict(one), "kept": one.kept} for one in judged])
+        out.print_json([{**asdict(one), "met": one.met} for one in judged])
     elif broken:
         out.show(*([fleet_table(found)] if len(found) > FEW else []), broken_table(broken))
     if broken:
         raise OperationError(f"{len(broken)} of {len(judged)} limits of {budget} are broken")
     if not json:
-        out.show_line(f"all {len(judged)} limits of {budget} are kept")
+        out.show_line(f"all {len(judged)} limits of {budget} are met")
 
 
 def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":

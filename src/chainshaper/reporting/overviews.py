@@ -520,7 +520,7 @@ def fleet_table(judged: Sequence[Sequence[Judged]]) -> ResultTable:
     """How many limits each recording breaks, the worst first, and which comes first."""
     columns = [*words("recording"), *figures("limits", "broken"), *words("first of them")]
     table = ResultTable("Recordings against the budget", columns)
-    rows = [(own, [one for one in own if not one.kept]) for own in judged if own]
+    rows = [(own, [one for one in own if not one.met]) for own in judged if own]
     for own, broken in sorted(rows, key=lambda row: -len(row[1])):
         first = broken[0].text if broken else ""
         table.add(own[0].recording, str(len(own)), str(len(broken)), first)

@@ -128,7 +128,7 @@ class Judged:
     because: str | None = None
 
     @property
-    def kept(self) -> bool:
+    def met(self) -> bool:
         return self.found is not None and self.found <= self.limit
 
     @property
@@ -138,7 +138,7 @@ class Judged:
             return f"{self.where}: {self.what} could not be measured; {self.because}"
         line = f"{self.where}: {self.what} {self._value(self.found)}"
         line += f", budget {self._value(self.limit)}"
-        if not self.kept and self.undisturbed is not None and self.undisturbed <= self.limit:
+        if not self.met and self.undisturbed is not None and self.undisturbed <= self.limit:
             line += f", {self._value(self.undisturbed)} where the machine disturbed nothing"
         return line if self.because is None else f"{line}; {self.because}"
 
@@ -227,7 +227,7 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         because = _from_where(hops, analysis)
         for what, limit, of in _chain_limits(chain):
             one = Judged(name, chain.chain, what, limit, of(analysis), of(_calm(analysis)))
-            found.append(one if one.kept else replace(one, because=because))
+            found.append(one if one.met else replace(one, because=because))
         found += hops
     rows = {
         (row["node"], trigger_text(row["topic"], row["period_ns"])): row
@@ -321,7 +321,7 @@ def _judged_hops(name: str, chain: ChainBudget, analysis: LatencyAnalysis) -> It
 
 def _from_where(hops: Sequence[Judged], analysis: LatencyAnalysis) -> str | None:
     """The hop that exceeds its budget by most; without one, that with the longest mean."""
-    broken = [one for one in hops if one.found is not None and not one.kept]
+    broken = [one for one in hops if one.found is not None and not one.met]
     if broken:
         worst = max(broken, key=lambda one: (one.found or 0) - one.limit)
         return f"from {worst.text.partition(': ')[2]}"
@@ -354,26 +354,26 @@ def junit_report(judged: Sequence[Judged]) -> str:
     root = ElementTree.Element("testsuites", name="chainshaper budget")
     for recording in dict.fromkeys(one.recording for one in judged):
         own = [one for one in judged if one.recording == recording]
-        broken = sum(not one.kept for one in own)
+        broken = sum(not one.met for one in own)
         counts = {"tests": str(len(own)), "failures": str(broken)}
         suite = ElementTree.SubElement(root, "testsuite", {"name": shown(recording), **counts})
         for one in own:
             named = {"classname": shown(one.where), "name": shown(one.what)}
             case = ElementTree.SubElement(suite, "testcase", named)
-            if not one.kept:
+            if not one.met:
                 ElementTree.SubElement(case, "failure", {"message": shown(one.text)})
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
 def markdown_report(judged: Sequence[Judged]) -> str:
-    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are kept."""
-    broken = [one for one in judged if not one.kept]
-    kept = len(judged) - len(broken)
+    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met."""
+    broken = [one for one in judged if not one.met]
+    met = len(judged) - len(broken)
     lines = [
         f"**{len(broken)} of {len(judged)} limits are broken**"
         if broken
-        else f"**All {kept} limits are kept**"
+        else f"**All {met} limits are met**"
     ]
     if broken:
         lines += ["", "| recording | limit |", "|---|---|"]
