@@ -25,6 +25,7 @@ import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
 from chainshaper.analysis import data_flow
+from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.latency import PERCENTILES, LatencyAnalysis, callback_statistics
 from chainshaper.sources import open_source
 from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
@@ -169,9 +170,9 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
     def limit(ns: float | None) -> int | None:
         return None if ns is None else -int(-ns * (1 + room) // GRAIN_NS) * GRAIN_NS or None
 
-    of_chains = []
+    of_chains, flow = [], data_flow(recording.events, recording.info.clock_offset_ns)
     for chain in chains or [chain_of(recording, None)]:
-        analysis = measure_latency(recording, chain).analysis
+        analysis = measure_latency(recording, chain, flow=flow).analysis
         figures = analysis.statistics
         wanted: tuple[Percentile, ...] = ("50", "99")
         percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}
@@ -201,7 +202,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             response_ns=limit(_most(row["response_ns"])),
             execution_ns=limit(_most(row["execution_ns"])),
         )
-        for row in _callbacks(recording).to_dicts()
+        for row in _callbacks(flow).to_dicts()
     )
     return Budget(chains=tuple(of_chains), callbacks=callbacks)
 
@@ -213,25 +214,26 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
     """
     found: list[Judged] = []
     name = name or str(recording.path)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
     for chain in budget.chains:
         try:
-            analysis = measure_latency(recording, chain.chain).analysis
+            analysis = measure_latency(recording, chain.chain, flow=flow).analysis
         except InputError as error:
-            limits = (what for what in _chain_limits(chain))
             found += (
                 Judged(name, chain.chain, what, limit, None, because=str(error))
-                for what, limit, _ in limits
+                for what, limit, _ in _chain_limits(chain)
             )
             continue
-        hops = list(_judged_hops(name, chain, analysis))
-        because = _from_where(hops, analysis)
+        calm, parts = _calm(analysis), hop_breakdown(analysis)
+        hops = list(_judged_hops(name, chain, parts))
+        because = _from_where(hops, parts)
         for what, limit, of in _chain_limits(chain):
-            one = Judged(name, chain.chain, what, limit, of(analysis), of(_calm(analysis)))
+            one = Judged(name, chain.chain, what, limit, of(analysis), of(calm))
             found.append(one if one.met else replace(one, because=because))
         found += hops
     rows = {
         (row["node"], trigger_text(row["topic"], row["period_ns"])): row
-        for row in _callbacks(recording).to_dicts()
+        for row in _callbacks(flow).to_dicts()
     }
     for callback in budget.callbacks:
         row = rows.get((callback.node, callback.starts), {})
@@ -307,8 +309,8 @@ def _missing(analysis: LatencyAnalysis) -> float | None:
     return float(gone) / over.height
 
 
-def _judged_hops(name: str, chain: ChainBudget, analysis: LatencyAnalysis) -> Iterator[Judged]:
-    rows = {row["topic"]: row for row in hop_breakdown(analysis).to_dicts()}
+def _judged_hops(name: str, chain: ChainBudget, parts: pl.DataFrame) -> Iterator[Judged]:
+    rows = {row["topic"]: row for row in parts.to_dicts()}
     for hop in chain.hops:
         for part in ("communication", "computation"):
             limit = getattr(hop, f"{part}_ns")
@@ -319,30 +321,31 @@ def _judged_hops(name: str, chain: ChainBudget, analysis: LatencyAnalysis) -> It
                 yield Judged(name, chain.chain, what, limit, most, because=why)
 
 
-def _from_where(hops: Sequence[Judged], analysis: LatencyAnalysis) -> str | None:
+def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
     """The hop that exceeds its budget by most; without one, that with the longest mean."""
     broken = [one for one in hops if one.found is not None and not one.met]
     if broken:
         worst = max(broken, key=lambda one: (one.found or 0) - one.limit)
         return f"from {worst.text.partition(': ')[2]}"
-    shares = hop_breakdown(analysis)
-    if not shares["count"].sum():
+    if not parts["count"].sum():
         return None
-    longest = shares.sort(pl.col("computation_share"), descending=True, nulls_last=True).row(
-        0, named=True
-    )
+    parts = parts.sort("computation_share", descending=True, nulls_last=True)
+    longest = parts.row(0, named=True)
     mean = format_duration(round(longest["computation_ns"]["mean"]))
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
 
 
-def _callbacks(recording: Recording) -> pl.DataFrame:
+def _callbacks(flow: DataFlow) -> pl.DataFrame:
     """Callbacks that ran and are named alike in every run, without those that every node has."""
-    frame = callback_statistics(data_flow(recording.events, recording.info.clock_offset_ns))
-    return frame.filter(
-        pl.col("node").is_not_null()
-        & pl.col("kind").is_in(["timer", "subscription"])
-        & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
-    ).unique(["node", "topic", "period_ns"], keep="first", maintain_order=True)
+    return (
+        callback_statistics(flow)
+        .filter(
+            pl.col("node").is_not_null()
+            & pl.col("kind").is_in(["timer", "subscription"])
+            & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
+        )
+        .unique(["node", "topic", "period_ns"], keep="first", maintain_order=True)
+    )
 
 
 def _most(times: dict[str, float] | None) -> float | None:

@@ -14,7 +14,7 @@ from pathlib import Path
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
-from chainshaper.analysis.flow import left_when_taken
+from chainshaper.analysis.flow import DataFlow, left_when_taken
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.application_plan import plan_of_chain, whole
@@ -107,12 +107,14 @@ def measure_latency(
     recording: Recording | str | Path,
     chain: str | None = None,
     plan: Plan | ApplicationPlan | None = None,
+    flow: DataFlow | None = None,
 ) -> Measurement:
     """Analyse the end-to-end latency of one chain in a recording.
 
-    ``plan`` is the plan in force, for recordings that do not know it themselves.
+    ``plan`` is the plan in force, for recordings that do not know it themselves; ``flow`` the
+    recording's data flow, where that has been resolved already.
     """
-    return _measured(_opened(recording), (chain,), plan)[0]
+    return _measured(_opened(recording), (chain,), plan, flow)[0]
 
 
 def _opened(recording: Recording | str | Path) -> Recording:
@@ -127,13 +129,16 @@ def _plan_of(recording: Recording, plan: Plan | ApplicationPlan | None) -> Appli
 
 
 def _measured(
-    recording: Recording, chains: Sequence[str | None], plan: Plan | ApplicationPlan | None
+    recording: Recording,
+    chains: Sequence[str | None],
+    plan: Plan | ApplicationPlan | None,
+    flow: DataFlow | None = None,
 ) -> list[Measurement]:
     """The measurements of several chains in one recording, whose events are resolved once."""
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for one in joint.chains for due in due_of(one)]
     spell, left_out = _in_force(recording)
-    flow = data_flow(recording.events, info.clock_offset_ns)
+    flow = flow or data_flow(recording.events, info.clock_offset_ns)
     if gated := [one for one in joint.chains if any(publisher_servers(one))] if joint else []:
         flow = left_when_taken(flow, [one.chain.output for one in gated])
     if spell is not None:
