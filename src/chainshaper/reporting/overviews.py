@@ -4,7 +4,7 @@ a machine (abilities, threads), in a plan (slots, bands, figure 7's curve), in f
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from datetime import datetime, timezone
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import polars as pl
 
@@ -43,9 +43,11 @@ from chainshaper.values.recording import (
     event_counts,
     lost_text,
 )
-from chainshaper.verify.budgets import Judged
 from chainshaper.verify.measure import Measurement
-from chainshaper.verify.watch import Seen
+
+if TYPE_CHECKING:  # only their verbs import them
+    from chainshaper.verify.budgets import Judged
+    from chainshaper.verify.watch import Seen
 
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}
@@ -489,7 +491,7 @@ def runs_table(runs: Iterable[tuple[Journal, RunState | None]]) -> ResultTable:
     return table
 
 
-def watch_tables(seen: Seen) -> list[ResultTable]:
+def watch_tables(seen: "Seen") -> list[ResultTable]:
     """What is to be seen of each chain now: its spans, then its hops."""
     nodes = ", ".join(sorted(filter(None, seen.processes.values()))) or "no node"
     tables = []
@@ -516,7 +518,7 @@ def watch_tables(seen: Seen) -> list[ResultTable]:
     return tables
 
 
-def fleet_table(judged: Sequence[Sequence[Judged]]) -> ResultTable:
+def fleet_table(judged: "Sequence[Sequence[Judged]]") -> ResultTable:
     """How many limits each recording breaks, the worst first, and which comes first."""
     columns = [*words("recording"), *figures("limits", "broken"), *words("first of them")]
     table = ResultTable("Recordings against the budget", columns)
@@ -527,7 +529,7 @@ def fleet_table(judged: Sequence[Sequence[Judged]]) -> ResultTable:
     return table
 
 
-def broken_table(broken: Sequence[Judged]) -> ResultTable:
+def broken_table(broken: "Sequence[Judged]") -> ResultTable:
     """Limits of a budget that are broken, and why."""
     names = ("recording", "where", "limit")
     title = "Limits that are broken"
