@@ -29,6 +29,7 @@ from chainshaper.linux.scheduling import available_cores, check_cores, may_use_f
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together
+from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording
@@ -63,7 +64,7 @@ def profiling_condition(
     cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     servers = [ReservationServer(f"the executors of core {one}", one, 1, ()) for one in cores]
     recorded = recorded_processes(like)[0] if like is not None else ()
-    first = {chain_nodes(like, one)[0] for one in chains} if like is not None else ()
+    first = _first_nodes(like, chains) if like is not None else ()
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
 
     def see_to_it(processes: Sequence[Process]) -> bool:
@@ -125,9 +126,21 @@ def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
 
     Raises InputError: no such chain.
     """
-    graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
+    graph = _graph(recording)
     stages = (graph_stages(graph, find_chain(graph, chain)) for chain in chains)
     return tuple(dict.fromkeys(stage.node for one in stages for stage in one))
+
+
+def _first_nodes(recording: Recording, chains: Sequence[str]) -> set[str]:
+    """The nodes that begin chains."""
+    graph = _graph(recording) if chains else None
+    return {
+        graph.callbacks[find_chain(graph, chain).callbacks[0]].node for chain in chains if graph
+    }
+
+
+def _graph(recording: Recording) -> ApplicationGraph:
+    return graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
 
 
 def profiled_cores(
