@@ -31,14 +31,19 @@ from chainshaper.linux.threads import innermost_id, read_proc
 from chainshaper.planning import ApplicationPlan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources.ebpf.trace_points import TracingLibrary
-from chainshaper.sources.preload import TracedProcess, creation_tables, event_tables
-from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+from chainshaper.sources.preload import (
+    TracedProcess,
+    creation_tables,
+    event_tables,
+    info_of,
+    joined_tables,
+)
+from chainshaper.sources.system import processes_of
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import (
     InForceInfo,
     Recording,
-    RecordingInfo,
     refuse_existing,
     write_recording,
 )
@@ -268,11 +273,10 @@ class Watch:
                 for number, topic in zip(found.chain.callbacks, topics, strict=True)
             ]
         self._over_ns = over
-        lost = sum(one.lost + one.dropped for one in self.processes.values())
         return Seen(
             at_ns=now,
             processes=processes_of(tables, dict.fromkeys(self.processes, "")),
-            lost=lost + self._lost_with_ended,
+            lost=self.lost,
             chains=tuple(self._now(one, over) for one in self.chains),
         )
 
@@ -291,29 +295,30 @@ class Watch:
             problem=one.problem,
         )
 
+    @property
+    def lost(self) -> int:
+        """Events that were overwritten before they were read, or found no room."""
+        there = sum(one.lost + one.dropped for one in self.processes.values())
+        return there + self._lost_with_ended
+
     def _tables(self, since_ns: int) -> EventTables:
         """All that was created, and what happened since an instant."""
-        tables: dict[str, list[pl.DataFrame]] = {}
+        parts: list[dict[str, pl.DataFrame]] = []
         by_library: dict[TracingLibrary, list[tuple[NDArray[Any], int]]] = {}
         for pid, process in self.processes.items():
             asked = int(process.header["objects"][0])
             if pid not in self._created or self._created[pid][0] != asked:
                 self._created[pid] = (asked, *creation_tables(process))
             _, created, library = self._created[pid]
-            for name, table in created.items():
-                tables.setdefault(name, []).append(table)
+            parts.append(created)
             recent = (part for part in self._recent[pid] if part["time"][-1] >= since_ns)
             by_library.setdefault(library, []).extend((part, process.pid) for part in recent)
         for library, own in by_library.items():
             if own:
                 records = np.concatenate([part for part, _ in own])
                 pids = np.repeat([pid for _, pid in own], [part.size for part, _ in own])
-                for name, table in event_tables(records, pids.astype(np.int32), library).items():
-                    tables.setdefault(name, []).append(table)
-        return {
-            name: pl.concat(parts, how="diagonal").sort("time", maintain_order=True)
-            for name, parts in tables.items()
-        }
+                parts.append(event_tables(records, pids.astype(np.int32), library))
+        return joined_tables(parts)
 
     def save(self, output: str | Path) -> Recording:
         """Write the last ten seconds as a recording: the flight recorder.
@@ -327,20 +332,18 @@ class Watch:
         tables = self._tables(now - RECORDER_NS)
         if not tables:
             raise OperationError(f"{output} is not written: no event has been seen yet")
-        versions = [one[2].version for one in self._created.values() if one[2].version]
-        chains = [one.text for one in self.chains]
-        info = RecordingInfo(
-            source="preload",
-            distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions[:1]})}, {}),
-            rmw=rmw_of_gids(tables),
-            clock_offset_ns=self._clock_offset_ns,
-            processes=processes_of(tables, {}),
-            lost={"lost_events": sum(one.lost + one.dropped for one in self.processes.values())},
-            chain=chains[0] if chains else None,
-            plan=None if self.plan is None else plan_values(self.plan),
-            in_force=None if self.plan is None else InForceInfo(since_ns=now - RECORDER_NS),
-            notes=("the last seconds before it was asked for; objects from before them are there",),
-        )
+        versions = [library.version for _, _, library in self._created.values()]
+        facts: dict[str, Any] = {
+            "chain": self.chains[0].text if self.chains else None,
+            "notes": (
+                "the last seconds before it was asked for; objects from before them are there",
+            ),
+        }
+        if self.plan is not None:
+            facts["plan"] = plan_values(self.plan)
+            facts["in_force"] = InForceInfo(since_ns=now - RECORDER_NS)
+        info = info_of(tables, versions, self._clock_offset_ns, self.lost, {})
+        info = info.model_copy(update=facts)
         return write_recording(output, tables, info)
 
 

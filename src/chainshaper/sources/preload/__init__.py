@@ -23,7 +23,7 @@ import struct
 import subprocess
 import tempfile
 import threading
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -50,7 +50,9 @@ __all__ = [
     "creation_tables",
     "event_names",
     "event_tables",
+    "info_of",
     "installed_library",
+    "joined_tables",
     "preloading",
 ]
 
@@ -189,6 +191,37 @@ def event_tables(
 ) -> dict[str, pl.DataFrame]:
     """The tables of records of :meth:`TracedProcess.new_records`, each of a process."""
     return _tables(records, pids, {}, library, frozenset(events.FIELDS) - events.CREATION)
+
+
+def joined_tables(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:
+    """The tables of several processes as those of one application, in order of time."""
+    found: dict[str, list[pl.DataFrame]] = {}
+    for tables in parts:
+        for name, table in tables.items():
+            found.setdefault(name, []).append(table)
+    return {
+        name: pl.concat(own, how="diagonal").sort("time", maintain_order=True)
+        for name, own in found.items()
+    }
+
+
+def info_of(
+    tables: EventTables,
+    versions: Iterable[str | None],
+    clock_offset_ns: int,
+    lost: int,
+    names: Mapping[int, str],
+) -> RecordingInfo:
+    """What is known of a system: ``versions`` of tracetools, ``names`` of nodeless processes."""
+    known = pl.DataFrame({"version": [one for one in versions if one][:1]})
+    return RecordingInfo(
+        source="preload",
+        distribution=distribution_of({"rcl_init": known}, {}),
+        rmw=rmw_of_gids(tables),
+        clock_offset_ns=clock_offset_ns,
+        processes=processes_of(tables, names),
+        lost={"lost_events": lost},
+    )
 
 
 def _tables(
@@ -362,7 +395,7 @@ class PreloadTracer:
                 "(`ros2 run tracetools status`), and do the nodes run here, not in a container, "
                 "and without more rights than you (LD_PRELOAD is ignored then)?"
             )
-        found: dict[str, list[pl.DataFrame]] = {}
+        parts: list[dict[str, pl.DataFrame]] = []
         versions: list[str | None] = []
         for place, process in enumerate(self._processes):
             file = self._file(place)
@@ -370,29 +403,16 @@ class PreloadTracer:
             created, library = creation_tables(process)
             pids = np.full(records.size, process.pid, np.int32)
             versions.append(library.version)
-            for name, table in {**created, **event_tables(records, pids, library)}.items():
-                found.setdefault(name, []).append(table)
-        tables = {
-            name: pl.concat(parts, how="diagonal").sort("time", maintain_order=True)
-            for name, parts in found.items()
-        }
+            parts += (created, event_tables(records, pids, library))
+        tables = joined_tables(parts)
         lost = sum(process.lost + process.dropped for process in self._processes)
         notes = [] if self._failure is None else [f"{self._failure}."]
         if lost:
             notes.append(
                 f"{lost} events were lost: recording did not run often enough to read them."
             )
-        said = pl.DataFrame({"version": [one for one in versions if one][:1]})
-        info = RecordingInfo(
-            source="preload",
-            distribution=distribution_of({"rcl_init": said}, {}),
-            rmw=rmw_of_gids(tables),
-            clock_offset_ns=self._clock_offset_ns,
-            processes=processes_of(tables, self._names),
-            lost={"lost_events": lost},
-            notes=tuple(notes),
-        )
-        return tables, info
+        info = info_of(tables, versions, self._clock_offset_ns, lost, self._names)
+        return tables, info.model_copy(update={"notes": tuple(notes)})
 
     def _file(self, place: int) -> Path:
         return self._folder / f"process_{place}.records"
