@@ -38,9 +38,9 @@ from chainshaper.linux.processes import (
     user_name,
 )
 from chainshaper.linux.scheduling import Scheduling
-from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole
+from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole, gate_thread_name
 from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Plan, Server, shaping_nodes
+from chainshaper.planning.plan import Plan, Server, ShapingNode, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -161,6 +161,18 @@ def allocate(
     notes = (f"process {o.process.pid} of {', '.join(o.nodes)}: {IN_ORDER}" for o in in_order)
     threads = tuple(thread for one in chosen for thread in _threads_of(one))
     return Allocation(threads, (*guesses, *ambiguities, *notes))
+
+
+def with_gates(found: Allocation, nodes: Iterable[ShapingNode]) -> Allocation:
+    """The threads, of which those that work for gates in publishers' processes are these nodes'."""
+    names = {gate_thread_name(one.name): one.thread.node for one in nodes if one.in_process}
+    threads = tuple(
+        replace(one, thread=replace(one.thread, role="executor"), nodes=(node,), known_by="name")
+        if (node := names.get(one.thread.comm))
+        else one
+        for one in found.threads
+    )
+    return replace(found, threads=threads)
 
 
 def new_and_ended(

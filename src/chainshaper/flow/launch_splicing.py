@@ -24,9 +24,12 @@ from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (
+    GATES,
     STANDBY,
     NodeKind,
     ShapingProcess,
+    gate_library,
+    gate_settings,
     write_shaping_process,
     write_throttler,
 )
@@ -53,7 +56,7 @@ THROTTLER_PRIORITY = 85  # of SCHED_FIFO, until `apply` puts it into its server
 DRY_RUN_S = 120.0  # how long a dry run may take
 
 _Names: TypeAlias = Mapping[str, Sequence[str]]
-_Written: TypeAlias = tuple[list[ShapingProcess], list[Redirect]]
+_Written: TypeAlias = tuple[list[ShapingProcess], list[Redirect], dict[str, str]]
 
 
 @dataclass(frozen=True)
@@ -121,7 +124,9 @@ def splice_launch_files(
         )
     folder = usable(Path(output))
     publishers = _endpoints(recording, "publisher")
-    nodes = [(chain, node) for chain in joint.chains for node in shaping_nodes(chain)]
+    every = [(chain, node) for chain in joint.chains for node in shaping_nodes(chain)]
+    nodes = [(chain, one) for chain, one in every if not one.in_process]
+    gates = [(chain, one) for chain, one in every if one.in_process]
     redirects = [
         Redirect(
             *("publisher", one.output, one.input, (_publisher(chain, one, publishers),)),
@@ -143,11 +148,20 @@ def splice_launch_files(
             )
             for chain, one in nodes
         ]
-        return made, redirects
+        if not gates:
+            return made, redirects, {}
+        blocks = (
+            gate_settings(chain, one, _publisher(chain, one, publishers), logs[one.name])
+            for chain, one in gates
+        )
+        into.mkdir(parents=True, exist_ok=True)
+        (into / "gates").write_text("".join(blocks), encoding="utf-8")
+        loaded = {"LD_PRELOAD": str(gate_library()), GATES: str(folder / NODES / "gates")}
+        return made, redirects, loaded
 
     dry = dict(arguments or {}) if dry_run else None
     spliced = _spliced(launch_files, folder, written, throttled=False, dry=dry)
-    standbys = [log.with_stem(f"{log.stem}{STANDBY}") for log in logs.values()]
+    standbys = [logs[one.name].with_stem(f"{one.name}{STANDBY}") for _, one in nodes]
     return replace(spliced, logs=(*logs.values(), *standbys))
 
 
@@ -207,7 +221,7 @@ def splice_throttlers(
                 Redirect("subscription", topic, targets[topic], nodes, (f"/{name}",))
                 for topic, nodes in topics.items()
             ]
-        return made, redirects
+        return made, redirects, {}
 
     dry = dict(arguments or {}) if dry_run else None
     return _spliced(launch_files, folder, written, throttled=True, dry=dry)
@@ -242,13 +256,13 @@ def _spliced(
     copy, found = folder / name, []
     if dry is not None:
         with tempfile.TemporaryDirectory() as nowhere:
-            made, redirects = written(Path(nowhere))
-        text = launch_text(words, made, redirects)
+            made, redirects, environment = written(Path(nowhere))
+        text = launch_text(words, made, redirects, environment)
         found = _tried(words, redirects, dry)
     else:
         with new_folder(folder, {name: words}, throttled=throttled) as partial:
-            made, redirects = written(partial / NODES)
-            text = launch_text(words, made, redirects)
+            made, redirects, environment = written(partial / NODES)
+            text = launch_text(words, made, redirects, environment)
             (partial / name).write_text(text, encoding="utf-8")
     diff = difflib.unified_diff([], text.splitlines(keepends=True), "/dev/null", str(copy))
     return Splicing(

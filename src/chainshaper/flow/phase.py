@@ -27,6 +27,7 @@ from chainshaper.enforcement.threads import Allocation
 from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.planning.plan import ShapingNode
+from chainshaper.splicing.shaping_process import GATES, set_phase
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -305,6 +306,7 @@ def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int)
     The nodes of a chain are in one domain: any of them has the environment in which all are found.
     """
     names = [node.thread.node for node in nodes]
+    loaded = {node.thread.node for node in nodes if node.in_process}
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:
         return NO_NODE
@@ -314,6 +316,11 @@ def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int)
 
     try:
         environments = {node: _environment_for(pid) for node, pid in pids.items()}
+        for node in loaded & pids.keys():
+            file = environments.pop(node).variables.get(GATES)
+            if file is None:
+                raise OperationError(f"process {pids[node]} was started without ${GATES}")
+            set_phase(Path(file), node.strip("/"), phase_ns)
         ours = tuple(node for node, one in environments.items() if _is_ros(one))
         if not ours:  # they are the live workload's
             return NO_NODE

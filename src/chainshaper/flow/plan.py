@@ -154,6 +154,7 @@ def _profile_of(
         longest_publication_ns=_longest_publication(flow, stages[-1].node, chain.topics[-1]),
         lost_events=sum(recording.info.lost.values()) or None,
         asynchronous=_publishes_asynchronously(recording, stages[-1].node),
+        intra_process=_goes_without_dds(flow, stages[-1].node, chain.topics[-1]),
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
         all_disturbed=all_disturbed or None,
     )
@@ -504,6 +505,12 @@ def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
     pids = {thread.pid for thread in threads if thread.node == node}
     roles = {thread.role for thread in threads if thread.pid in pids}
     return "publisher" in roles if "dds" in roles else None
+
+
+def _goes_without_dds(flow: DataFlow, node: str, topic: str) -> bool:
+    """Whether messages of a node's topic are handed to subscribers of the same process."""
+    sent = flow.publications.filter((pl.col("topic") == topic) & (pl.col("node") == node))
+    return sent["intra_time"].count() > 0
 
 
 def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:

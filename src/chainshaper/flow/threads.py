@@ -35,7 +35,7 @@ from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import Writer, check_publication
-from chainshaper.planning.plan import Plan, Server, publisher_servers
+from chainshaper.planning.plan import Plan, Server, ShapingNode, publisher_servers
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -66,7 +66,8 @@ def find_threads(
     """
     processes, taken = list_processes(), run_users(users)
     notes: tuple[str, ...] = ()
-    strangers = None
+    strangers: str | None = None
+    gates: Sequence[ShapingNode] = ()
     if recording is not None:
         recorded, notes = recorded_processes(recording)
     if isinstance(where, int):
@@ -77,6 +78,9 @@ def find_threads(
         taken |= {process.user for process in chosen if process.user is not None}
     else:
         found = allocate(find_applications(processes), recorded, processes, taken)
+        if where is not None:
+            gates = whole(where).shaping_nodes
+        found = allocation.with_gates(found, gates)
         running = defaultdict[int, set[str]](set)
         for one in found.threads:
             running[one.thread.pid].update(one.nodes)
@@ -84,7 +88,7 @@ def find_threads(
         hosted = None
         if where is not None:  # receivers need not run
             joint = whole(where)
-            gates, servers = joint.shaping_nodes, joint.servers
+            servers = joint.servers
             hosted = {receiver for gate in gates for receiver in gate.receivers}
             hosted |= {thread.node for server in servers for thread in server.threads}
         chosen = tuple(
@@ -101,7 +105,7 @@ def find_threads(
         notes += _missing(set().union(*running.values()), servers)
         if where is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
-    found = allocate(chosen, recorded, processes, taken)
+    found = allocation.with_gates(allocate(chosen, recorded, processes, taken), gates)
     if recorded and not any(one.nodes_known_by == "recording" for one in found.threads):
         notes += ("none of these processes is in the recording: they were started after it",)
     notes += found.notes + (() if strangers is None else (strangers,))

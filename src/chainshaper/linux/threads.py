@@ -9,6 +9,7 @@ Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and
 import functools
 import os
 import re
+import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -75,6 +76,11 @@ def dds_kind(comm: str) -> DdsKind | None:
     """What a DDS thread of this name does; None when it is no DDS thread's name."""
     found = (kind for name, kind in _DDS_NAMES if re.fullmatch(name, comm, re.DOTALL))
     return next(found, None)
+
+
+def gate_thread_name(node: str) -> str:
+    """What a gate in its publisher's process calls its thread, which fits into 15 characters."""
+    return f"gate-{zlib.crc32(node.strip('/').encode()):08x}"
 
 
 def role_of(comm: str, is_main: bool) -> ThreadRole:

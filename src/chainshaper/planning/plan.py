@@ -198,6 +198,8 @@ class ShapingNode(Part):
     it takes, where that is not `chain.publisher`. The executors of ``receivers``, which subscribe
     to the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait
     in it; None: as many as the history of the output's publisher has room for, and 10 at least.
+    With ``in_process`` it is no node of its own but a thread in the publisher's process, where a
+    library takes what is published: ``input`` is what tracers call that.
     """
 
     name: Annotated[str, _plain_name("node")]
@@ -210,6 +212,7 @@ class ShapingNode(Part):
     pause_ns: Duration
     receivers: tuple[FullName, ...] = ()
     depth: FromOne | None = None
+    in_process: bool = False
 
     @property
     def thread(self) -> Thread:

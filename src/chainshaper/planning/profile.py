@@ -52,7 +52,8 @@ class Profile:
     :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
     are what each callback of the chain took, a row per latency, see
     :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
-    ``asynchronous`` whether its process has a thread that publishes (None: not known), ``together``
+    ``asynchronous`` whether its process has a thread that publishes (None: not known),
+    ``intra_process`` whether subscribers of the output get it without DDS, ``together``
     are nodes that share a process,
     ``of_modes`` has what was measured in each mode of the system. The rest is
     :class:`~chainshaper.planning.plan.Evidence`.
@@ -86,6 +87,7 @@ class Profile:
     longest_send_ns: int | None = None
     longest_publication_ns: int | None = None
     asynchronous: bool | None = None
+    intra_process: bool = False
     lost_events: int | None = None
     all_disturbed: bool | None = None
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
@@ -148,7 +150,7 @@ def with_interference(
         return list(profiles)
     alone = [_alone(profile) for profile in profiles]
     delayed = list(alone)
-    gates = wishes.policy != "server-per-chain" and wishes.publication == "synchronous"
+    gates = wishes.policy != "server-per-chain" and wishes.publication != "asynchronous"
     better: list[list[Profile]] = []  # the chains of each group so far
     for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):
         for k in group:

@@ -135,10 +135,11 @@ def plan_chain(
             publisher=sink.nodes[-1] if sink.nodes else None,
             receivers=sink.receivers if request.with_receivers else (),
         )
-    if request.fallback != _STANDARD.fallback and plan.shaping_node is None:
+    alone = plan.shaping_node is None or plan.shaping_node.in_process
+    if request.fallback != _STANDARD.fallback and alone:
         raise InputError(
-            f"--fallback {request.fallback} is for an output with a shaping node, and the plan has"
-            " none: leave it out, or plan with synchronous publication"
+            f"--fallback {request.fallback} is for a shaping node that is a process, and the"
+            " plan has none: leave it out, or plan with --publication synchronous"
         )
     plan = with_executors(plan, [one.executors for one in (profile, *sinks)])
     plan = with_turns(revised(plan, modes=modes), request.equal_priorities)
@@ -310,6 +311,12 @@ def _shaped(
                 " --publication synchronous"
             )
         values["output_depth"] = profile.output_depth
+    if request.publication == "in-process" and profile.intra_process:
+        raise InputError(
+            f"subscribers of {profile.topics[-1]} get its messages inside the process of {last},"
+            " without DDS, and a gate before DDS would not see these: switch intra-process"
+            " communication off for it, or plan with --publication synchronous"
+        )
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it
     length = _slot_ns(profile, request)

@@ -146,6 +146,7 @@ def _gate(
         spin_ns=wishes.spin_ns,
         pause_ns=pause,
         receivers=tuple(receivers),
+        in_process=wishes.publication == "in-process",
     )
     return node, (node.thread,)
 

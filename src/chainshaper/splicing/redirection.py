@@ -17,7 +17,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -227,12 +227,16 @@ def _names(names: Sequence[str]) -> str:
 
 
 def launch_description(
-    files: Sequence[str], processes: Sequence[dict[str, Any]], redirects: Sequence[dict[str, Any]]
+    files: Sequence[str],
+    processes: Sequence[dict[str, Any]],
+    redirects: Sequence[dict[str, Any]],
+    environment: Mapping[str, str],
 ) -> Any:
     """What the launch file beside this module launches: our nodes, and the user's launch files.
 
-    ``processes`` are keyword arguments of `Node` or `ExecuteProcess`. Arguments that the files
-    require are declared here too, because launch wants to see them handed on.
+    ``processes`` are keyword arguments of `Node` or `ExecuteProcess`. A library of the
+    ``environment`` is loaded before those that are loaded anyway. Arguments that the files require
+    are declared here too, because launch wants to see them handed on.
     """
     from launch import LaunchContext, LaunchDescription, LaunchDescriptionSource
     from launch.actions import (
@@ -240,6 +244,7 @@ def launch_description(
         ExecuteProcess,
         IncludeLaunchDescription,
         OpaqueFunction,
+        SetEnvironmentVariable,
     )
     from launch.launch_description_sources import AnyLaunchDescriptionSource
     from launch.substitutions import LaunchConfiguration
@@ -252,6 +257,9 @@ def launch_description(
         description="after how many seconds a topic that was not redirected ends the launch",
     )
     actions: list[Any] = [within, OpaqueFunction(function=_begin, args=[parts])]
+    for name, value in environment.items():
+        others = os.environ.get(name, "") if name == "LD_PRELOAD" else ""
+        actions.append(SetEnvironmentVariable(name, f"{value}:{others}" if others else value))
     actions += [(Node if "package" in one else ExecuteProcess)(**one) for one in processes]
     for file in files:
         description = AnyLaunchDescriptionSource(file).get_launch_description(LaunchContext())

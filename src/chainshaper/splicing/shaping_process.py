@@ -2,7 +2,8 @@
 
 Three kinds do the same: ``python`` needs no building, ``cpp`` is one package for all types,
 ``typed`` is the paper's package (section 4.2), generated for one type. All read the same
-parameters, which say what the plan says, and write the same log.
+parameters, which say what the plan says, and write the same log. So does the gate in the
+publisher's process, for plans with ``in_process``: a library that stands in front of rmw.
 """
 
 import ast
@@ -21,8 +22,10 @@ import yaml
 from chainshaper.analysis.chains import close_names
 from chainshaper.gate import decision, handover, throttling
 from chainshaper.gate.decision import DEPTH, Gate, Modes, NodeParameters, gate_parameters
+from chainshaper.linux.threads import gate_thread_name
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
+from chainshaper.sources.preload import compile_library, in_cache
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.files import write_whole
 
@@ -275,6 +278,68 @@ def _add_part(path: Path, parts: dict[Path, str]) -> None:
             if imported not in parts:
                 _add_part(imported, parts)
     parts[path] = "".join(lines)
+
+
+# The gate in the publisher's process --------------------------------------------------------------
+
+GATES = "CHAINSHAPER_GATES"
+"""The variable that names the file with all gates of an application (`publisher_gate.cpp`)."""
+_GATE_FILE = "libchainshaper_gate.so"
+_GATE_OPTIONS = ("-O2", "-std=c++17", "-shared", "-fPIC", "-static-libstdc++", "-static-libgcc")
+_EXPORTED = "{ global: rmw_*; ros_trace_*; local: *; };\n"
+
+
+def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
+    """The block of an output in the file that :data:`GATES` names, a line for each value."""
+    values: dict[str, Any] = {
+        "output": node.output,
+        "input": node.input,
+        "node": node.name,
+        "publisher": publisher,
+        "thread": gate_thread_name(node.name),
+        "changes": log.with_suffix(".changes").absolute(),
+    }
+    values |= shaping_parameters(plan, node, log)
+    several = {name: one if isinstance(one, list) else [one] for name, one in values.items()}
+    return "".join(f"{name} {value}\n" for name, own in several.items() for value in own)
+
+
+def set_phase(file: Path, node: str, phase_ns: int) -> None:
+    """Have the cycles of the gate of this node, in such a file, begin elsewhere.
+
+    Raises OperationError: the file has no such gate, or what changes it cannot be written.
+    """
+    try:
+        values: dict[str, str] = {}
+        for line in file.read_text(encoding="utf-8").splitlines():
+            name, _, value = line.partition(" ")
+            values = {} if name == "output" else values
+            values[name] = value
+            if (values.get("node"), name) == (node, "changes"):
+                write_whole(Path(value), [b"phase_ns %d\n" % phase_ns])
+                return
+    except OSError as error:
+        raise OperationError(f"{error.filename}: {error.strerror}") from error
+    raise OperationError(f"{file} has no gate of {node}: splice again")
+
+
+def gate_library() -> Path:
+    """The library with the gate, in the user's cache; compiled at the first use.
+
+    Raises PlatformError: there is no C++ compiler, or as :func:`.in_cache`.
+    """
+    program = _NODES / "publisher_gate.cpp"
+    headers = {path: text for path, text in generic_package().items() if path.endswith(".hpp")}
+
+    def build(folder: Path) -> Path:
+        files = {**headers, "exported.map": _EXPORTED}
+        _write(folder, files)
+        included = (f"-I{folder / 'include'}", f"-Wl,--version-script={folder / 'exported.map'}")
+        words = (*_GATE_OPTIONS, *included, str(program), "-ldl", "-lpthread")
+        options = "--publication in-process", "--publication synchronous"
+        return compile_library("c++", words, folder / _GATE_FILE, options)
+
+    return in_cache(_GATE_FILE, [program.read_text(), *headers.values()], build)
 
 
 # Packages in C++ ----------------------------------------------------------------------------------

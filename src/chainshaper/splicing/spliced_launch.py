@@ -51,13 +51,15 @@ PROCESSES = {processes}
 
 REDIRECTS = {redirects}
 
+ENVIRONMENT = {environment}
+
 
 def generate_launch_description():
     path = Path(__file__).resolve().with_name("redirection.py")
     spec = importlib.util.spec_from_file_location("redirection", path)
     redirection = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(redirection)
-    return redirection.launch_description(LAUNCH_FILES, PROCESSES, REDIRECTS)
+    return redirection.launch_description(LAUNCH_FILES, PROCESSES, REDIRECTS, ENVIRONMENT)
 '''
 
 
@@ -135,10 +137,11 @@ def launch_text(
     words: Sequence[str],
     processes: Sequence[ShapingProcess],
     redirects: Sequence[Redirect],
+    environment: Mapping[str, str],
 ) -> str:
     """The text of the launch file that starts processes and includes launch files.
 
-    ``words`` are the files, or `ros2 run …`.
+    ``words`` are the files, or `ros2 run …`; what is launched gets the ``environment`` as well.
     """
     run = [{"cmd": [*words], "output": "screen"}] if is_run(words) else []
     every = [one for process in processes for one in (process, process.standby) if one is not None]
@@ -148,6 +151,7 @@ def launch_text(
         files=pformat([] if run else list(words), width=96),
         processes=pformat([*map(_keywords, every), *run], width=96, sort_dicts=False),
         redirects=pformat([one.values() for one in redirects], width=96, sort_dicts=False),
+        environment=pformat(dict(environment), width=96, sort_dicts=False),
     )
 
 

@@ -22,8 +22,8 @@ Policy: TypeAlias = Literal[
 Fallback: TypeAlias = Literal["bypass", "silence"]
 """What becomes of an output while its shaping node is not there."""
 
-Publication: TypeAlias = Literal["synchronous", "asynchronous"]
-"""By a shaping node, or by the publisher's own thread (section 3.2)."""
+Publication: TypeAlias = Literal["synchronous", "asynchronous", "in-process"]
+"""By a shaping node, by the publisher's own thread (section 3.2), or by a gate in its process."""
 
 ShapingThread: TypeAlias = Literal["free", "in-slots"]
 """Whether a shaping node's thread is timed by its gate alone, or runs in its server's slots."""
@@ -68,7 +68,8 @@ class Wishes:
 
     policy: Annotated[Policy, Option("How it is scheduled.")] = "shaped"
     publication: Annotated[Publication, Option(
-        "By a shaping node, or the publisher's own thread.")] = "synchronous"
+        "By a shaping node; by the asynchronous publisher's own thread; or in-process: by a gate"
+        " that is loaded into the publisher's process, without another node.")] = "synchronous"
     publish_slot_ns: Annotated[int | None, Option(
         "Length of the publish slot. Default: the longest publication measured, at least 1ms.")
     ] = None

@@ -23,10 +23,10 @@ import struct
 import subprocess
 import tempfile
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
@@ -47,9 +47,11 @@ __all__ = [
     "PreloadTracer",
     "TracedProcess",
     "build_library",
+    "compile_library",
     "creation_tables",
     "event_names",
     "event_tables",
+    "in_cache",
     "info_of",
     "installed_library",
     "joined_tables",
@@ -283,21 +285,37 @@ _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
 def build_library(folder: Path) -> Path:
-    """Compile the library into a folder. Raises PlatformError: no compiler, or it fails."""
-    compiler = shutil.which("cc", path=tool_environment()["PATH"])
-    if compiler is None:
+    """Compile the library into a folder. Raises: as :func:`compile_library`."""
+    words = (*_OPTIONS, str(SOURCE), *_LIBRARIES)
+    return compile_library("cc", words, folder / _FILE, ("--source preload", "--source lttng"))
+
+
+def compile_library(
+    compiler: Literal["cc", "c++"], words: Sequence[str], library: Path, options: tuple[str, str]
+) -> Path:
+    """Compile a library with the system's compiler; its path.
+
+    ``options`` are of the command line: the one that needs it, and the one that does without.
+    Raises PlatformError: there is no compiler, or it fails.
+    """
+    (needs, without), package = options, {"cc": "gcc", "c++": "g++"}[compiler]
+    path = shutil.which(compiler, path=tool_environment()["PATH"])
+    if path is None:
         raise PlatformError(
-            "`--source preload` needs a C compiler, and there is none: install one (Debian and "
-            "Ubuntu: `apt-get install gcc libc6-dev`), or record with `--source lttng`"
+            f"`{needs}` needs a compiler ({compiler}), and there is none: install one (Debian and "
+            f"Ubuntu: `apt-get install {package} libc6-dev`), or choose `{without}`"
         )
-    library = folder.absolute() / _FILE
-    words = [compiler, *_OPTIONS, "-o", str(library), str(SOURCE), *_LIBRARIES]
+    library = library.absolute()
     done = subprocess.run(
-        words, env=tool_environment(), capture_output=True, text=True, check=False
+        [path, "-o", str(library), *words],
+        env=tool_environment(),
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         last = "; ".join(done.stderr.splitlines()[-2:])
-        raise PlatformError(f"{compiler} cannot compile {SOURCE}: {last}; see `{compiler} -v`")
+        raise PlatformError(f"{path} cannot compile {library.name}: {last}; see `{path} -v`")
     return library
 
 
@@ -306,15 +324,24 @@ def installed_library() -> Path:
 
     Raises PlatformError: as :func:`build_library`, or others may write to the cache.
     """
-    digest = hashlib.sha256(SOURCE.read_bytes() + platform.machine().encode()).hexdigest()[:16]
+    return in_cache(_FILE, [SOURCE.read_text()], build_library)
+
+
+def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -> Path:
+    """A library of these sources in the user's cache, which ``build`` makes in a folder.
+
+    Raises PlatformError: what ``build`` raises, or others may write to the cache.
+    """
+    content = "\0".join([*sources, platform.machine()]).encode()
+    digest = hashlib.sha256(content).hexdigest()[:16]
     cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
     cache = cache if cache.is_absolute() else Path.home() / ".cache"
-    library = cache / "chainshaper" / f"preload-{digest}" / _FILE
+    library = cache / "chainshaper" / f"preload-{digest}" / name
     if not library.exists():
         try:
             library.parent.parent.mkdir(parents=True, exist_ok=True)
             with tempfile.TemporaryDirectory(dir=library.parent.parent) as folder:
-                built = build_library(Path(folder))
+                built = build(Path(folder))
                 library.parent.mkdir(exist_ok=True)
                 built.replace(library)  # whole, also where two of us build at once
         except OSError as error:

@@ -1,0 +1,606 @@
+// The gate in the process that publishes: `LD_PRELOAD` loads it into a node, where it stands before
+// rmw. What the node publishes on a shaped output is serialized and waits in a thread of this
+// library, which sends it in the slots of the output's server. The node's executor goes on at once.
+//
+// CHAINSHAPER_GATES names a file with the outputs, a block of lines `NAME VALUE` each, which begins
+// with `output`: what ROS parameters say to a shaping node, and `node`, `input`, `publisher`,
+// `thread`, `changes`. A line in the file `changes`, which may come later, goes before them.
+//
+// Tracers see what they would see of a shaping node (`node`): the node of the application publishes
+// on `input`, our thread takes that, as a callback of `node`, and publishes it on `output`.
+//
+// Upstream: rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling. The first fields of these structs
+// and the arguments of these functions are the same in all of them. Where ROS 2 is another one,
+// everything passes as if we were not here, and a line on stderr says so.
+
+#include <dlfcn.h>
+#include <pthread.h>
+#include <semaphore.h>
+#include <sys/stat.h>
+
+#include <atomic>
+#include <fstream>
+#include <map>
+#include <memory>
+#include <thread>
+
+#include "chainshaper_shaping/gate_log.hpp"
+
+#define EXPORTED extern "C" __attribute__((visibility("default")))
+
+namespace {
+
+using namespace chainshaper;  // NOLINT
+
+// What we need of rmw's structs.
+struct RmwNode {
+  const char * implementation;
+  void * data;
+  const char * name;
+  const char * name_space;
+};
+
+struct RmwPublisher {
+  const char * implementation;
+  void * data;
+  const char * topic;
+};
+
+struct RmwQos {
+  int history;
+  std::size_t depth;
+  int reliability;
+  int durability;
+  std::uint64_t deadline[2];
+  std::uint64_t lifespan[2];
+  int liveliness;
+  std::uint64_t liveliness_lease[2];
+  bool avoid_ros_namespace_conventions;
+};
+enum { keep_last = 1, reliable = 1, best_available_reliability = 4 };
+enum { volatile_durability = 2, best_available_durability = 4 };
+
+struct Allocator {
+  void * (*allocate)(std::size_t, void *);
+  void (*deallocate)(void *, void *);
+  void * (*reallocate)(void *, std::size_t, void *);
+  void * (*zero_allocate)(std::size_t, std::size_t, void *);
+  void * state;
+};
+
+struct Bytes {  // rcutils_uint8_array_t
+  std::uint8_t * buffer;
+  std::size_t length;
+  std::size_t capacity;
+  Allocator allocator;
+};
+
+struct SubscriptionOptions {
+  void * room[16];  // returned by value: more than any version has
+};
+
+template <typename... Values>
+void say(const char * format, Values... values) {
+  const std::string line = std::string("[chainshaper] ") + format + "\n";
+  std::fprintf(stderr, line.c_str(), values...);
+}
+
+// The function behind ours. The libraries of Python's nodes are in no global scope: asked by name.
+void * behind(const char * library, const char * name) {
+  if (void * const found = dlsym(RTLD_NEXT, name)) return found;
+  void * const loaded = dlopen(library, RTLD_LAZY | RTLD_NOLOAD);
+  return loaded == nullptr ? nullptr : dlsym(loaded, name);
+}
+
+// Calls a function of rmw, which is there: `usable` has looked, or its caller has linked to it.
+#define RMW(type, name) \
+  (*[] { \
+    static const auto found = reinterpret_cast<type>(behind("librmw_implementation.so", name)); \
+    return found; \
+  }())
+
+// Emits an event of ros2_tracing, whose arguments are all integers or pointers.
+template <typename... Values>
+void emit(void * event, Values... values) {
+  using Emit = void (*)(std::uintptr_t, std::uintptr_t, std::uintptr_t, std::uintptr_t,
+                        std::uintptr_t);
+  std::array<std::uintptr_t, 5> all{std::uintptr_t(values)...};
+  if (event != nullptr)
+    reinterpret_cast<Emit>(event)(all[0], all[1], all[2], all[3], all[4]);
+}
+#define EMIT(name, ...) \
+  do { \
+    static void * const event = behind("libtracetools.so", "ros_trace_" #name); \
+    emit(event, __VA_ARGS__); \
+  } while (false)
+
+bool is_humble() {
+  const char * const distribution = std::getenv("ROS_DISTRO");
+  return distribution != nullptr && std::strcmp(distribution, "humble") == 0;
+}
+
+// `rmw_publish` as the distribution has it: from Jazzy on with publisher and time stamp.
+void emit_write(const void * publisher, const void * message, std::int64_t stamp) {
+  if (is_humble())
+    EMIT(rmw_publish, message);
+  else
+    EMIT(rmw_publish, publisher, message, stamp);
+}
+
+// Whether we know this ROS 2; said once where we do not.
+bool usable() {
+  static const bool known = [] {
+    const char * const distribution = std::getenv("ROS_DISTRO");
+    const auto is_one_of = [](const char * word, std::initializer_list<const char *> words) {
+      return word != nullptr && std::any_of(words.begin(), words.end(), [&](const char * one) {
+               return std::strcmp(one, word) == 0;
+             });
+    };
+    const auto identify =
+        reinterpret_cast<const char * (*)()>(behind("librmw_implementation.so",
+                                                    "rmw_get_implementation_identifier"));
+    const char * const rmw = identify == nullptr ? "no rmw" : identify();
+    bool all = is_one_of(distribution, {"humble", "jazzy", "kilted", "lyrical", "rolling"}) &&
+               is_one_of(rmw, {"rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp",
+                               "rmw_zenoh_cpp", "rmw_connextdds"});
+    for (const char * name : {"rmw_serialize", "rmw_publish", "rmw_publish_serialized_message"})
+      all = all && behind("librmw_implementation.so", name) != nullptr;
+    all = all && behind("librcutils.so", "rcutils_get_default_allocator") != nullptr;
+    if (!all)
+      say("ROS 2 %s with %s is not known to the gate: outputs leave at once",
+          distribution == nullptr ? "(no ROS_DISTRO)" : distribution, rmw);
+    return all;
+  }();
+  return known;
+}
+
+// A message as it is sent.
+class Serialized {
+public:
+  Serialized() {
+    using Get = Allocator (*)();
+    static const auto get =
+        reinterpret_cast<Get>(behind("librcutils.so", "rcutils_get_default_allocator"));
+    bytes.allocator = get();
+  }
+
+  Serialized(const Serialized &) = delete;
+  Serialized & operator=(const Serialized &) = delete;
+
+  ~Serialized() {
+    if (bytes.buffer != nullptr) bytes.allocator.deallocate(bytes.buffer, bytes.allocator.state);
+  }
+
+  Bytes bytes{};
+  std::int64_t stamp{0};       // CLOCK_REALTIME, when it was published
+  Serialized * next{nullptr};  // that came before
+};
+using Message = std::unique_ptr<Serialized>;
+
+// A block of the file.
+struct Settings {
+  using Values = std::map<std::string, std::vector<std::string>>;
+
+  explicit Settings(const Values & values) {
+    const auto text = [&](const char * name) {
+      const auto found = values.find(name);
+      return found == values.end() ? std::string() : found->second.front();
+    };
+    output = text("output"), input = text("input"), node = text("node");
+    publisher = text("publisher"), thread = text("thread"), changes = text("changes");
+    parameters.each([&](const char * name, auto & value) {
+      const auto found = values.find(name);
+      if (found != values.end()) assign(value, found->second);
+    });
+  }
+
+  static void assign(std::string & value, const std::vector<std::string> & words) {
+    value = words.front();
+  }
+  static void assign(std::int64_t & value, const std::vector<std::string> & words) {
+    value = std::stoll(words.front());
+  }
+  static void assign(std::vector<std::string> & value, const std::vector<std::string> & words) {
+    value = words;
+  }
+  static void assign(std::vector<std::int64_t> & value, const std::vector<std::string> & words) {
+    value.clear();
+    for (const auto & word : words) value.push_back(std::stoll(word));
+  }
+
+  std::string output, input, node, publisher, thread, changes;
+  Parameters parameters;
+};
+
+std::vector<Settings::Values> blocks_of(const std::string & path) {
+  std::vector<Settings::Values> blocks;
+  std::ifstream file(path);
+  for (std::string line; std::getline(file, line);) {
+    const auto space = line.find(' ');
+    if (space == std::string::npos) continue;
+    const auto name = line.substr(0, space);
+    if (name == "output" || blocks.empty()) blocks.emplace_back();
+    blocks.back()[name].push_back(line.substr(space + 1));
+  }
+  return blocks;
+}
+
+// The settings of an output, if it is one of the file's, and published by the node that is meant.
+std::optional<Settings> settings_of(const std::string & topic, const RmwNode & node) {
+  const char * const path = std::getenv("CHAINSHAPER_GATES");
+  if (path == nullptr) return std::nullopt;
+  const std::string within = node.name_space;
+  const std::string name = (within == "/" ? "" : within) + "/" + node.name;
+  for (const auto & block : blocks_of(path)) {
+    const auto & of = [&](const char * key) {
+      const auto found = block.find(key);
+      return found == block.end() ? std::string() : found->second.front();
+    };
+    const auto publisher = of("publisher");
+    if (of("output") == topic && (publisher.empty() || publisher == name)) return Settings(block);
+  }
+  return std::nullopt;
+}
+
+// The topic on which modes are announced, as the gate's thread reads it: a std_msgs/String.
+class ModeTopic {
+public:
+  ModeTopic(const RmwNode * node, const std::string & topic) {
+    static constexpr const char * support =
+        "rosidl_typesupport_c__get_message_type_support_handle__std_msgs__msg__String";
+    void * const library = dlopen("libstd_msgs__rosidl_typesupport_c.so", RTLD_LAZY);
+    void * const get = library == nullptr ? nullptr : dlsym(library, support);
+    if (get != nullptr) {
+      using Create = void * (*)(const RmwNode *, const void *, const char *, const RmwQos *,
+                                const SubscriptionOptions *);
+      RmwQos qos{};
+      qos.history = keep_last;
+      qos.depth = 10;
+      qos.reliability = is_humble() ? reliable : best_available_reliability;
+      qos.durability = is_humble() ? volatile_durability : best_available_durability;
+      const auto options =
+          RMW(SubscriptionOptions(*)(), "rmw_get_default_subscription_options")();
+      const void * const type = reinterpret_cast<const void * (*)()>(get)();
+      subscription_ =
+          RMW(Create, "rmw_create_subscription")(node, type, topic.c_str(), &qos, &options);
+    }
+    if (subscription_ == nullptr) say("modes on %s cannot be read", topic.c_str());
+  }
+
+  // The modes that were announced since the last time.
+  template <typename Announced>
+  void read(Announced announced) {
+    using Take = int (*)(const void *, Bytes *, bool *, void *);
+    for (bool taken = subscription_ != nullptr; taken;) {
+      Serialized text;
+      taken = false;
+      if (RMW(Take, "rmw_take_serialized_message")(subscription_, &text.bytes, &taken, nullptr))
+        return;
+      // Encapsulation, length with the final NUL, characters.
+      const auto * const bytes = text.bytes.buffer;
+      if (!taken || text.bytes.length < 8) continue;
+      std::size_t size = 0;
+      for (int i = 3; i >= 0; --i) size = size << 8 | bytes[4 + (bytes[1] & 1 ? i : 3 - i)];
+      if (size >= 1 && size <= text.bytes.length - 8)
+        announced(std::string(reinterpret_cast<const char *>(bytes + 8), size - 1));
+    }
+  }
+
+private:
+  void * subscription_{nullptr};
+};
+
+struct Over {};  // the publisher is destroyed
+
+// A publisher whose messages we send, with the thread that does it.
+class Output {
+public:
+  Output(Settings settings, const RmwNode * node, const RmwPublisher * publisher,
+         const void * type_support, std::size_t depth)
+      : publisher(publisher),
+        settings_(std::move(settings)),
+        node_(node),
+        type_support_(type_support),
+        shaper_(
+            gate_of(settings_.parameters, depth), settings_.parameters.spin_ns,
+            [](std::int64_t) {}, [this] { look(); }) {
+    const auto & parameters = settings_.parameters;
+    if (!parameters.log.empty() && !log_.open_file(parameters.log, parameters.log_bytes))
+      say("no log is written to %s: %s", parameters.log.c_str(), std::strerror(errno));
+    sem_init(&more_, 0, 0);
+    thread_ = std::thread([this] { run(); });
+  }
+
+  ~Output() {
+    over_ = true;
+    sem_post(&more_);
+    thread_.join();
+    Message all(arrived_.exchange(nullptr));
+    std::size_t left = shaper_.queue.waiting.size();
+    for (; all; all.reset(all->next)) ++left;
+    if (left > 0)
+      say("%s: its publisher has ended: %zu messages were not published",
+          settings_.output.c_str(), left);
+    sem_destroy(&more_);
+  }
+
+  // Creation events: the application's node publishes on `input`, `node` takes that, and publishes.
+  void describe(const void * rcl_publisher, const void * rcl_node, std::uintptr_t depth) {
+    const char * const input = settings_.input.c_str();
+    EMIT(rcl_node_init, &node_handle_, &rmw_node_, settings_.node.c_str(), "/");
+    EMIT(rcl_publisher_init, &input_handle_, rcl_node, &rmw_input_, input, depth);
+    EMIT(rcl_publisher_init, rcl_publisher, &node_handle_, publisher, settings_.output.c_str(),
+         depth);
+    EMIT(rcl_subscription_init, &subscription_handle_, &node_handle_, &rmw_subscription_, input,
+         depth);
+    EMIT(rclcpp_subscription_init, &subscription_handle_, &subscription_);
+    EMIT(rclcpp_subscription_callback_added, &subscription_, &callback_);
+    EMIT(rclcpp_callback_register, &callback_, "chainshaper::gate");
+    rcl_publisher_ = rcl_publisher;
+  }
+
+  const void * rcl_publisher() const { return rcl_publisher_; }
+  const void * input_handle() const { return &input_handle_; }
+
+  // In the thread that publishes; it waits for nothing. `fill` serializes the message. rmw's code.
+  template <typename Fill>
+  int take(const void * ros_message, Fill fill) {
+    auto message = std::make_unique<Serialized>();
+    message->stamp = next_stamp();
+    emit_write(&rmw_input_, ros_message, message->stamp);
+    if (const int failed = fill(message->bytes)) return failed;
+    Serialized * const own = message.release();
+    own->next = arrived_.load(std::memory_order_relaxed);
+    while (!arrived_.compare_exchange_weak(own->next, own)) continue;
+    sem_post(&more_);
+    return 0;
+  }
+
+  const void * type_support() const { return type_support_; }
+
+  const RmwPublisher * const publisher;
+
+private:
+  // Of CLOCK_REALTIME, and each once: it tells a message from the others.
+  std::int64_t next_stamp() {
+    std::int64_t before = stamp_.load();
+    std::int64_t now = 0;
+    do now = std::max(before + 1, clock_ns(CLOCK_REALTIME));
+    while (!stamp_.compare_exchange_weak(before, now));
+    return now;
+  }
+
+  void run() {
+    become_realtime();
+    try {
+      for (;;) {
+        if (shaper_.queue.waiting.empty())
+          while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
+        look();
+        for (const auto & gone : shaper_.overflowed) log_.write(shaper_.queue.gate, gone);
+        shaper_.overflowed.clear();
+        if (!shaper_.queue.waiting.empty()) serve();
+      }
+    } catch (const Over &) {
+      return;
+    }
+  }
+
+  void become_realtime() {
+    const auto & parameters = settings_.parameters;
+    pthread_setname_np(pthread_self(), settings_.thread.c_str());
+    sched_param wanted{};
+    wanted.sched_priority = static_cast<int>(parameters.fifo_priority);
+    if (parameters.fifo_priority > 0 &&
+        sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) != 0)
+      say("%s: SCHED_FIFO is refused: %s; give the user an rtprio limit of 98",
+          settings_.output.c_str(), std::strerror(errno));
+    if (parameters.core < 0) return;
+    cpu_set_t cores;
+    CPU_ZERO(&cores);
+    CPU_SET(static_cast<std::size_t>(parameters.core), &cores);
+    if (sched_setaffinity(0, sizeof(cores), &cores) != 0)
+      say("%s: core %d is refused: %s", settings_.output.c_str(),
+          static_cast<int>(parameters.core), std::strerror(errno));
+  }
+
+  // Take all that has come, and what has changed.
+  void look() {
+    if (over_) throw Over();
+    Serialized * newest = arrived_.exchange(nullptr);
+    Serialized * oldest = nullptr;
+    while (newest != nullptr) {
+      Serialized * const before = newest->next;
+      newest->next = oldest;
+      oldest = newest;
+      newest = before;
+    }
+    if (oldest != nullptr) read_changes();
+    while (oldest != nullptr) {
+      Message message(oldest);
+      oldest = oldest->next;
+      const auto & [bytes, stamp, next] = *message;
+      const auto origin = origin_of(bytes.buffer, bytes.length);
+      const auto source = stamp;
+      shaper_.arrive(std::move(message), origin, source, true, 0);
+    }
+    if (settings_.parameters.mode_topic.empty()) return;
+    if (!modes_) modes_.emplace(node_, settings_.parameters.mode_topic);
+    modes_->read([this](const std::string & mode) {
+      if (!shaper_.announce(mode, monotonic_ns()))
+        say("%s: there is no mode '%s'", settings_.output.c_str(), mode.c_str());
+    });
+  }
+
+  // Where cycles begin is found while the application runs.
+  void read_changes() {
+    struct stat known {};
+    if (settings_.changes.empty() || stat(settings_.changes.c_str(), &known) != 0) return;
+    const auto version = std::pair(known.st_ino, known.st_mtim.tv_nsec);
+    if (version == changes_) return;
+    changes_ = version;
+    for (const auto & block : blocks_of(settings_.changes))
+      if (const auto found = block.find("phase_ns"); found != block.end())
+        shaper_.set_phase(std::stoll(found->second.front()), monotonic_ns());
+  }
+
+  // The oldest message leaves, or is dropped.
+  void serve() {
+    const auto & oldest = shaper_.queue.waiting.front();
+    EMIT(rmw_take, &rmw_subscription_, oldest.message.get(), oldest.message->stamp, true);
+    EMIT(callback_start, &callback_, false);
+    const auto outcome = shaper_.hold();
+    Maybe published_ns;
+    Maybe stalled_ns;
+    if (outcome && outcome->release.at_ns) {
+      publish(*outcome->waiting.message);
+      published_ns = monotonic_ns();
+    }
+    EMIT(callback_end, &callback_);
+    if (!outcome) return;
+    if (published_ns) {
+      stalled_ns = shaper_.time_lost(*outcome);
+      shaper_.rest(*published_ns, settings_.parameters.pause_ns);
+    }
+    log_.write(shaper_.queue.gate, *outcome, published_ns, stalled_ns);
+  }
+
+  void publish(const Serialized & message) {
+    using Publish = int (*)(const RmwPublisher *, const Bytes *, void *);
+    EMIT(rcl_publish, rcl_publisher_, &message.bytes);
+    // Before Jazzy rmw has no trace point on the way of serialized messages.
+    if (is_humble()) emit_write(publisher, &message.bytes, 0);
+    const int code =
+        RMW(Publish, "rmw_publish_serialized_message")(publisher, &message.bytes, nullptr);
+    if (code != 0 && !failed_) say("%s cannot be published: %d", settings_.output.c_str(), code);
+    failed_ = code != 0;
+  }
+
+  const Settings settings_;
+  const RmwNode * node_;
+  const void * type_support_;
+  const void * rcl_publisher_{nullptr};
+  // What traces call the things that are not there: addresses of their own.
+  char node_handle_, rmw_node_, input_handle_, rmw_input_, subscription_handle_, rmw_subscription_,
+      subscription_, callback_;
+  std::atomic<Serialized *> arrived_{nullptr};  // the newest first
+  std::atomic<std::int64_t> stamp_{0};
+  std::atomic<bool> over_{false};
+  bool failed_{false};
+  std::pair<ino_t, long> changes_{};  // NOLINT(runtime/int)
+  sem_t more_{};
+  Shaper<Message> shaper_;
+  GateLog log_;
+  std::optional<ModeTopic> modes_;
+  std::thread thread_;
+};
+
+// The outputs of this process, in the order of their making; room is given back, but never moved.
+std::array<std::atomic<Output *>, 32> outputs;
+
+Output * output_of(const RmwPublisher * publisher) {
+  for (const auto & one : outputs)
+    if (Output * const output = one; output != nullptr && output->publisher == publisher)
+      return output;
+  return nullptr;
+}
+
+void shape(const RmwNode * node, const RmwPublisher * publisher, const void * type_support,
+           const RmwQos & qos) {
+  if (node == nullptr || publisher == nullptr || publisher->topic == nullptr) return;
+  try {
+    auto settings = settings_of(publisher->topic, *node);
+    if (!settings || !usable()) return;
+    const auto wanted = static_cast<std::size_t>(settings->parameters.depth);
+    const auto depth = wanted > 0 ? wanted : std::max<std::size_t>(schema::depth, qos.depth);
+    auto output = std::make_unique<Output>(*settings, node, publisher, type_support, depth);
+    Output * none = nullptr;
+    for (auto & one : outputs)
+      if (none = nullptr; one.compare_exchange_strong(none, output.get())) {
+        output.release();
+        return;
+      }
+    say("%s: this process has too many shaped outputs: it leaves at once", publisher->topic);
+  } catch (const std::exception & error) {
+    say("%s leaves at once: its gate in %s is wrong: %s", publisher->topic,
+        std::getenv("CHAINSHAPER_GATES"), error.what());
+  }
+}
+
+}  // namespace
+
+EXPORTED RmwPublisher * rmw_create_publisher(const RmwNode * node, const void * type_support,
+                                             const char * topic, const RmwQos * qos,
+                                             const void * options) {
+  using Create = RmwPublisher * (*)(const RmwNode *, const void *, const char *, const RmwQos *,
+                                    const void *);
+  auto * const publisher =
+      RMW(Create, "rmw_create_publisher")(node, type_support, topic, qos, options);
+  shape(node, publisher, type_support, qos == nullptr ? RmwQos{} : *qos);
+  return publisher;
+}
+
+EXPORTED int rmw_destroy_publisher(RmwNode * node, RmwPublisher * publisher) {
+  using Destroy = int (*)(RmwNode *, RmwPublisher *);
+  for (auto & one : outputs)
+    if (Output * const output = one; output != nullptr && output->publisher == publisher) {
+      one = nullptr;
+      delete output;
+    }
+  return RMW(Destroy, "rmw_destroy_publisher")(node, publisher);
+}
+
+EXPORTED int rmw_publish(const RmwPublisher * publisher, const void * message, void * allocation) {
+  using Publish = int (*)(const RmwPublisher *, const void *, void *);
+  using Serialize = int (*)(const void *, const void *, Bytes *);
+  if (Output * const output = output_of(publisher))
+    return output->take(message, [&](Bytes & bytes) {
+      return RMW(Serialize, "rmw_serialize")(message, output->type_support(), &bytes);
+    });
+  return RMW(Publish, "rmw_publish")(publisher, message, allocation);
+}
+
+EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, const Bytes * message,
+                                            void * allocation) {
+  using Publish = int (*)(const RmwPublisher *, const Bytes *, void *);
+  if (Output * const output = output_of(publisher))
+    return output->take(message, [&](Bytes & bytes) {
+      bytes.buffer = static_cast<std::uint8_t *>(
+          bytes.allocator.allocate(message->length, bytes.allocator.state));
+      if (bytes.buffer == nullptr) return 10;  // RMW_RET_BAD_ALLOC
+      std::memcpy(bytes.buffer, message->buffer, message->length);
+      bytes.length = bytes.capacity = message->length;
+      return 0;
+    });
+  return RMW(Publish, "rmw_publish_serialized_message")(publisher, message, allocation);
+}
+
+EXPORTED int rmw_publish_loaned_message(const RmwPublisher * publisher, void * message,
+                                        void * allocation) {
+  using Publish = int (*)(const RmwPublisher *, void *, void *);
+  static std::atomic<bool> said;
+  if (output_of(publisher) != nullptr && !said.exchange(true))
+    say("%s: loaned messages leave at once: they cannot be copied without giving up what they are"
+        " loaned for; plan with --publication synchronous",
+        publisher->topic);
+  return RMW(Publish, "rmw_publish_loaned_message")(publisher, message, allocation);
+}
+
+// Called by rcl for each publisher, behind rmw_create_publisher.
+EXPORTED void ros_trace_rcl_publisher_init(const void * handle, const void * node,
+                                           const void * rmw_publisher, const char * topic,
+                                           std::uintptr_t depth) {
+  if (Output * const output = output_of(static_cast<const RmwPublisher *>(rmw_publisher)))
+    output->describe(handle, node, depth);
+  else
+    EMIT(rcl_publisher_init, handle, node, rmw_publisher, topic, depth);
+}
+
+EXPORTED void ros_trace_rcl_publish(const void * handle, const void * message) {
+  for (const auto & one : outputs)
+    if (const Output * const output = one; output != nullptr && output->rcl_publisher() == handle) {
+      EMIT(rcl_publish, output->input_handle(), message);
+      return;
+    }
+  EMIT(rcl_publish, handle, message);
+}
