@@ -299,7 +299,11 @@ def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> s
         "thread": gate_thread_name(node.name),
         "changes": log.with_suffix(".changes").absolute(),
     }
-    values |= shaping_parameters(plan, node, log)
+    return settings_text(values | shaping_parameters(plan, node, log))
+
+
+def settings_text(values: Mapping[str, Any]) -> str:
+    """A block of that file: ``NAME VALUE``, once for each value of a list; ``output`` is first."""
     several = {name: one if isinstance(one, list) else [one] for name, one in values.items()}
     return "".join(f"{name} {value}\n" for name, own in several.items() for value in own)
 

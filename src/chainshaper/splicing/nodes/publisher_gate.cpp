@@ -79,6 +79,11 @@ struct SubscriptionOptions {
   void * room[16];  // returned by value: more than any version has
 };
 
+struct MessageInfo {
+  std::int64_t source_timestamp;  // CLOCK_REALTIME
+  std::uint64_t others[31];       // more than any version has
+};
+
 template <typename... Values>
 void say(const char * format, Values... values) {
   const std::string line = std::string("[chainshaper] ") + format + "\n";
@@ -267,22 +272,26 @@ public:
     if (subscription_ == nullptr) say("modes on %s cannot be read", topic.c_str());
   }
 
-  // The modes that were announced since the last time.
+  // The modes that were announced since the last time, each with the time (CLOCK_MONOTONIC).
   template <typename Announced>
   void read(Announced announced) {
-    using Take = int (*)(const void *, Bytes *, bool *, void *);
+    using Take = int (*)(const void *, Bytes *, bool *, MessageInfo *, void *);
+    const auto take = RMW(Take, "rmw_take_serialized_message_with_info");
     for (bool taken = subscription_ != nullptr; taken;) {
       Serialized text;
+      MessageInfo info{};
       taken = false;
-      if (RMW(Take, "rmw_take_serialized_message")(subscription_, &text.bytes, &taken, nullptr))
-        return;
+      if (take(subscription_, &text.bytes, &taken, &info, nullptr) != 0) return;
+      const auto now = monotonic_ns();
+      const auto sent = info.source_timestamp;
+      const auto at = sent > 0 ? std::min(now, sent - clock_offset()) : now;
       // Encapsulation, length with the final NUL, characters.
       const auto * const bytes = text.bytes.buffer;
       if (!taken || text.bytes.length < 8) continue;
       std::size_t size = 0;
       for (int i = 3; i >= 0; --i) size = size << 8 | bytes[4 + (bytes[1] & 1 ? i : 3 - i)];
       if (size >= 1 && size <= text.bytes.length - 8)
-        announced(std::string(reinterpret_cast<const char *>(bytes + 8), size - 1));
+        announced(std::string(reinterpret_cast<const char *>(bytes + 8), size - 1), at);
     }
   }
 
@@ -407,6 +416,7 @@ private:
   // Take all that has come, and what has changed.
   void look() {
     if (over_) throw Over();
+    read_modes();
     Serialized * newest = arrived_.exchange(nullptr);
     Serialized * oldest = nullptr;
     while (newest != nullptr) {
@@ -424,10 +434,13 @@ private:
       const auto source = stamp;
       shaper_.arrive(std::move(message), origin, source, true, 0);
     }
+  }
+
+  void read_modes() {
     if (settings_.parameters.mode_topic.empty()) return;
     if (!modes_) modes_.emplace(node_, settings_.parameters.mode_topic);
-    modes_->read([this](const std::string & mode) {
-      if (!shaper_.announce(mode, monotonic_ns()))
+    modes_->read([this](const std::string & mode, std::int64_t at_ns) {
+      if (!shaper_.announce(mode, at_ns))
         say("%s: there is no mode '%s'", settings_.output.c_str(), mode.c_str());
     });
   }

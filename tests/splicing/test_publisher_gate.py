@@ -1,0 +1,262 @@
+"""The gate in the publisher's process, loaded into a process that publishes.
+
+`rmw_stand_in.cpp` stands in for ROS 2, which is not here; `test_shape_in_ros.py` has the real one.
+"""
+
+import os
+import shutil
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from gate_table import Case, cases, walk
+
+from chainshaper.gate.decision import Gate, gate_parameters
+from chainshaper.linux.threads import gate_thread_name
+from chainshaper.sources.gate_log import read_gate_log
+from chainshaper.splicing.shaping_process import gate_library, set_phase, settings_text
+from chainshaper.values.errors import OperationError
+
+MS = 1_000_000
+pytestmark = pytest.mark.skipif(
+    shutil.which("g++") is None, reason="g++ is not installed, so the gate cannot be compiled"
+)
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a process that publishes has printed, and the logs of its gates by output."""
+
+    lines: list[list[str]]
+    errors: str
+    logs: Mapping[str, list[dict[str, Any]]]
+    start_ns: int
+
+    def of(self, *words: str) -> list[list[str]]:
+        return [line for line in self.lines if line[: len(words)] == [*words]]
+
+    def written(self, topic: str = "/t5") -> list[int]:
+        """The numbers of the messages that were sent serialized, in their order."""
+        return [int(line[2]) for line in self.of("serialized", topic)]
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder, source = tmp_path_factory.mktemp("rmw"), Path(__file__).with_name("rmw_stand_in.cpp")
+    library = folder / "libstd_msgs__rosidl_typesupport_c.so"
+    options = ["g++", "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", str(source), "-o"]
+    subprocess.run([*options, library, "-shared", "-fPIC"], check=True, timeout=100)
+    subprocess.run([*options, folder / "program", "-DPROGRAM", library], check=True, timeout=100)
+    return folder / "program"
+
+
+@pytest.fixture
+def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
+    def started(
+        gates: Mapping[str, Gate],
+        lines: list[tuple[int, str]],
+        meanwhile: Callable[[Path], None] = lambda _: None,
+        change: tuple[str, str] = ("", ""),
+        **env: str,
+    ) -> Run:
+        """Publish as the lines say, each at a time (ns), on outputs with gates, and /other.
+
+        The process lives for half a second behind the last.
+        """
+        start, logs = time.monotonic_ns() + 300 * MS, {}
+        blocks, makes = [], ["publisher /other /nobody 10"]
+        for topic, gate in gates.items():
+            logs[topic] = tmp_path / f"{topic[1:]}.csv"
+            logs[topic].unlink(missing_ok=True)
+            node = f"shaping_{topic[1:]}"
+            about = {"output": topic, "input": f"{topic}_tmp", "node": node, "log": logs[topic]}
+            about |= {"thread": gate_thread_name(node), "publisher": "/node5"}
+            about |= {"changes": logs[topic].with_suffix(".changes"), "depth": gate.depth}
+            values = gate_parameters(gate, f"/modes{topic}")
+            values["phase_ns"] = (start + gate.phase_ns) % gate.cycle_ns
+            blocks.append(settings_text(about | values))
+            makes.append(f"publisher {topic} node5 {gate.depth}")
+        (tmp_path / "gates").write_text("".join(blocks).replace(*change))
+        over = max((ns for ns, _ in lines), default=0) + 500 * MS
+        ordered = [text for _, text in sorted([*lines, (over, f"until {over}")])]
+        with subprocess.Popen(
+            [program, str(start)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env={
+                **os.environ,
+                "ROS_DISTRO": "jazzy",
+                "LD_PRELOAD": str(gate_library()),
+                "LD_LIBRARY_PATH": str(program.parent),
+                "CHAINSHAPER_GATES": str(tmp_path / "gates"),
+                **env,
+            },
+        ) as process:
+            meanwhile(tmp_path / "gates")
+            out, err = process.communicate("\n".join([*makes, *ordered]) + "\n", timeout=30)
+        assert process.returncode == 0, err
+        rows = {
+            topic: read_gate_log(log).sort("row").to_dicts() if log.exists() else []
+            for topic, log in logs.items()
+        }
+        return Run([line.split() for line in out.splitlines()], err, rows, start)
+
+    return started
+
+
+def at(ns: int, publisher: int = 1, stamp: int | None = None, what: str = "at") -> tuple[int, str]:
+    said = "" if what == "loaned" else f" {'-' if stamp is None else stamp}"
+    return ns, f"{what} {ns} {publisher}{said}"
+
+
+def decided(rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
+    """What a log says of each message of a case, as they came."""
+    return [
+        (row["dropped"], row["slot"], row["cycles_waited"], row["overrun"], row["mode"])
+        for row in sorted(rows, key=lambda one: one["source_timestamp"])
+    ]
+
+
+def in_real_time(case: Case) -> bool:
+    """Whether no slot is short, nor a message there just as a slot that it may miss opens."""
+    opening = {start for start, _ in case.gate.slots}
+    just = any((arrival - (stamp or 0)) in opening for arrival, stamp in case.arrivals)
+    last = case.gate.into_open_slot == "next-slot" and just
+    return not last and min(end - start for start, end in case.gate.slots) >= MS
+
+
+def expected(case: Case) -> list[tuple[Any, ...]]:
+    outcomes = ((one.dropped, one.release) for one in walk(case))
+    return [
+        (dropped, one.slot, one.cycles_waited, one.overrun, one.mode) for dropped, one in outcomes
+    ]
+
+
+def test_it_does_what_the_table_of_all_gates_says(run: Callable[..., Run]) -> None:
+    """All cases at once, one that the machine disturbed again; in real time, so without those that
+    need it to the microsecond.
+    """
+    left = {f"/t{number}": case for number, case in enumerate(filter(in_real_time, cases()))}
+    assert len(left) > len(cases()) * 0.8
+    wrong: dict[str, Any] = {}
+    for _ in range(6):
+        for half in (0, 1):
+            chosen = dict(list(left.items())[half::2])
+            lines: list[tuple[int, str]] = []
+            for place, (topic, case) in enumerate(chosen.items(), start=1):
+                lines += [at(arrival, place, stamp) for arrival, stamp in case.arrivals]
+                lines += [(ns, f"mode {ns} /modes{topic} {mode}") for ns, mode in case.changes]
+            done = run({topic: case.gate for topic, case in chosen.items()}, lines)
+            wrong |= {t: (decided(done.logs[t]), expected(case)) for t, case in chosen.items()}
+        left = {topic: case for topic, case in left.items() if wrong[topic][0] != wrong[topic][1]}
+    assert not {case.name: wrong[topic] for topic, case in left.items()}
+
+
+SLOT = Gate(slots=((60 * MS, 65 * MS),), cycle_ns=100 * MS)
+
+
+def test_tracers_see_a_node_behind_the_publisher_which_waits_for_nothing(
+    run: Callable[..., Run],
+) -> None:
+    times = [n * 100 * MS + 20 * MS for n in range(4)]
+    done = run({"/t5": SLOT}, [at(ns, stamp=ns - 20 * MS) for ns in times] + [at(10 * MS, 0)])
+    assert done.written() == [1, 2, 3, 4]
+    assert [line[2] for line in done.of("typed", "/other")] == ["0"]
+    # Handing over is nothing beside the 40 ms for which each message waits.
+    assert max(int(line[1]) for line in done.of("took")) < 20 * MS
+    (other, unshaped, shaped) = done.of("trace", "rcl_publisher_init")
+    assert [line[5] for line in (other, unshaped, shaped)] == ["/other", "/t5_tmp", "/t5"]
+    assert unshaped[3] != shaped[3]  # the application's node, and ours
+    node, subscription = (
+        done.of("trace", "rcl_node_init")[0],
+        done.of("trace", "rcl_subscription_init")[0],
+    )
+    assert f"0x{node[2]}" == shaped[3]
+    assert subscription[3] == node[2]
+    # What was published unshaped is what our callback takes, between its start and end.
+    sent = [line[4] for line in done.of("trace", "rmw_publish")]
+    order = [
+        f"{line[1]} {line[4]}"
+        if line[1] == "rmw_take"
+        else line[1]
+        if line[0] == "trace"
+        else line[0]
+        for line in done.lines
+        if line[1] in ("rmw_take", "callback_start", "callback_end") or line[0] == "serialized"
+    ]
+    each = ("callback_start", "serialized", "callback_end")
+    assert len(sent) == 4
+    assert [row["source_timestamp"] for row in done.logs["/t5"]] == [
+        int(line.split()[1]) for line in order if line.startswith("rmw_take")
+    ]
+    assert order == [
+        word for line in done.of("trace", "rmw_take") for word in (f"rmw_take {line[4]}", *each)
+    ]
+    assert [line[2] for line in done.of("trace", "rcl_publish")] == [
+        other[2],
+        *[unshaped[2], shaped[2]] * 4,
+    ]
+
+
+def test_a_message_that_is_serialized_already_waits_like_any_other(run: Callable[..., Run]) -> None:
+    done = run({"/t5": SLOT}, [at(20 * MS, stamp=0, what="serialized"), at(30 * MS, stamp=0)])
+    assert done.written() == [0, 1]
+    assert all(row["slot"] == 0 for row in done.logs["/t5"])
+
+
+@pytest.mark.parametrize(
+    ("env", "line", "said"),
+    [
+        ({"ROS_DISTRO": "zebra"}, at(20 * MS), "ROS 2 zebra with rmw_cyclonedds_cpp is not known"),
+        ({"STAND_IN_FOR": "rmw_new"}, at(20 * MS), "ROS 2 jazzy with rmw_new is not known"),
+        ({"CHAINSHAPER_GATES": "/nowhere"}, at(20 * MS), ""),
+        ({}, at(20 * MS, what="loaned"), "/t5: loaned messages leave at once"),
+    ],
+)
+def test_what_it_cannot_shape_passes_at_once_and_it_says_so(
+    run: Callable[..., Run], env: dict[str, str], line: tuple[int, str], said: str
+) -> None:
+    done = run({"/t5": SLOT}, [line], **env)
+    assert len(done.of("typed", "/t5") + done.of("loaned", "/t5")) == 1
+    assert not done.written()
+    assert (said in done.errors) if said else not done.errors
+
+
+@pytest.mark.parametrize("change", [("anchor stamp", "anchor chain"), ("/node5", "/node6")])
+def test_a_wrong_gate_and_another_nodes_are_not_put_before_it(
+    run: Callable[..., Run], change: tuple[str, str]
+) -> None:
+    done = run({"/t5": SLOT}, [at(20 * MS)], change=change)
+    assert len(done.of("typed", "/t5")) == 1
+    wrong = "/t5 leaves at once: its gate in" in done.errors and "'chain'" in done.errors
+    assert wrong == (change[0] == "anchor stamp")
+
+
+def test_messages_that_wait_as_their_publisher_ends_are_counted(run: Callable[..., Run]) -> None:
+    done = run(
+        {"/t5": SLOT}, [at(10 * MS, stamp=0), at(20 * MS, stamp=0), (30 * MS, f"end {30 * MS} 1")]
+    )
+    assert not done.written()
+    assert "/t5: its publisher has ended: 2 messages were not published" in done.errors
+
+
+def test_cycles_begin_elsewhere_from_the_next_one_on(run: Callable[..., Run]) -> None:
+    gate, times = replace(SLOT, anchor="cycle"), [n * 100 * MS + 20 * MS for n in range(6)]
+
+    def move(gates: Path) -> None:
+        values = dict(line.split(" ", 1) for line in gates.read_text().splitlines())
+        time.sleep(0.5)
+        set_phase(gates, "shaping_t5", int(values["phase_ns"]) + 10 * MS)
+
+    done = run({"/t5": gate}, [at(ns) for ns in times], move)
+    origins = [(row["origin"] - done.start_ns) % (100 * MS) for row in done.logs["/t5"]]
+    assert sorted(set(origins)) == [0, 10 * MS]
+    assert origins == sorted(origins)
+    with pytest.raises(OperationError, match="has no gate of other"):
+        set_phase(Path(os.devnull), "other", 0)
