@@ -144,11 +144,16 @@ def run(attempt: Callable[..., Attempt]) -> Callable[..., Result]:
     return run
 
 
-@pytest.mark.parametrize("source", ["lttng", "preload"])
-def test_two_chains_are_shaped_by_one_command(run: Callable[..., Result], source: str) -> None:
+@pytest.mark.parametrize(
+    ("source", "publication"),
+    [("lttng", "synchronous"), ("preload", "in-process"), ("lttng", "in-process")],
+)
+def test_two_chains_are_shaped_by_one_command(
+    run: Callable[..., Result], source: str, publication: str
+) -> None:
     (first, *_, last), chains = available_cores(), ["/raw../rear../pose", "/ticked../commands"]
     options = ["--cores", f"{last},{first}", "--epsilon", "2ms", "--duration", "30s"]
-    options += ["--source", source]
+    options += ["--source", source, "--publication", publication]
     options += [word for chain in chains for word in ("--chain", chain)]
     values, folder = run(PARKING, "shape", "shaped", *options)
 
@@ -172,6 +177,10 @@ def test_two_chains_are_shaped_by_one_command(run: Callable[..., Result], source
         assert after["prediction"]
         assert after["spread_ns"] < before["spread_ns"]
     assert (folder / "chain_2" / "latency.png").is_file()
+    after = open_recording(folder / "after").info.threads
+    gates = [one.node for one in after if one.comm.startswith("gate-")]
+    publishers = ["/control", "/ndt"] if publication == "in-process" else []
+    assert sorted(gates) == publishers, "a thread of the process that publishes"
 
 
 def test_a_graph_of_18_callbacks_runs_on_two_cores(run: Callable[..., Result]) -> None:
@@ -214,9 +223,13 @@ def test_policies_that_shaping_is_compared_with(run: Callable[..., Result], poli
         assert after["undisturbed"]["spread_ns"] < before["spread_ns"]
 
 
-def test_each_mode_has_the_slot_of_its_own_profile(run: Callable[..., Result]) -> None:
+@pytest.mark.parametrize("publication", ["synchronous", "in-process"])
+def test_each_mode_has_the_slot_of_its_own_profile(
+    run: Callable[..., Result], publication: str
+) -> None:
     """Recorded apart, and then in turns, 4 s each."""
-    options = ["--modes", "/driving_mode:city,highway", "--chain", "/image../command"]
+    options = ["--publication", publication]
+    options += ["--modes", "/driving_mode:city,highway", "--chain", "/image../command"]
     for mode in ("city", "highway"):
         nodes = [word for node in ("camera", "slow", "planner") for word in ("--node", node)]
         _, place = run(MODES, "profile", mode, *nodes, "--duration", "20s", MODES=mode)
@@ -228,6 +241,8 @@ def test_each_mode_has_the_slot_of_its_own_profile(run: Callable[..., Result]) -
     assert plan.modes.bands == {"city": 1, "highway": 2}
     longest = {mode: one.max_latency_ns for mode, one in (plan.evidence.modes or {}).items()}
     assert 9 * MS < longest["city"] < 15 * MS < longest["highway"] < 26 * MS
+    after = open_recording(folder / "after").events["gate_release"]
+    assert {*after["mode"]} == {"city", "highway"}
     assert values["recordings"][1]["count"] > 100
 
 

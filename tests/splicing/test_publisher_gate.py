@@ -243,7 +243,7 @@ def test_messages_that_wait_as_their_publisher_ends_are_counted(run: Callable[..
         {"/t5": SLOT}, [at(10 * MS, stamp=0), at(20 * MS, stamp=0), (30 * MS, f"end {30 * MS} 1")]
     )
     assert not done.written()
-    assert "/t5: its publisher has ended: 2 messages were not published" in done.errors
+    assert "/t5: its publisher has ended, messages that were not published: 2" in done.errors
 
 
 def test_cycles_begin_elsewhere_from_the_next_one_on(run: Callable[..., Run]) -> None:

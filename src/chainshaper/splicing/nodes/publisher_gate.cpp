@@ -90,17 +90,17 @@ void say(const char * format, Values... values) {
   std::fprintf(stderr, line.c_str(), values...);
 }
 
-// The function behind ours. The libraries of Python's nodes are in no global scope: asked by name.
-void * behind(const char * library, const char * name) {
+// The function behind ours. What Python's nodes load is in no scope of ours: rcl needs all of it.
+void * behind(const char * name) {
   if (void * const found = dlsym(RTLD_NEXT, name)) return found;
-  void * const loaded = dlopen(library, RTLD_LAZY | RTLD_NOLOAD);
+  void * const loaded = dlopen("librcl.so", RTLD_LAZY | RTLD_NOLOAD);
   return loaded == nullptr ? nullptr : dlsym(loaded, name);
 }
 
 // Calls a function of rmw, which is there: `usable` has looked, or its caller has linked to it.
 #define RMW(type, name) \
   (*[] { \
-    static const auto found = reinterpret_cast<type>(behind("librmw_implementation.so", name)); \
+    static const auto found = reinterpret_cast<type>(behind(name)); \
     return found; \
   }())
 
@@ -115,7 +115,7 @@ void emit(void * event, Values... values) {
 }
 #define EMIT(name, ...) \
   do { \
-    static void * const event = behind("libtracetools.so", "ros_trace_" #name); \
+    static void * const event = behind("ros_trace_" #name); \
     emit(event, __VA_ARGS__); \
   } while (false)
 
@@ -142,15 +142,14 @@ bool usable() {
              });
     };
     const auto identify =
-        reinterpret_cast<const char * (*)()>(behind("librmw_implementation.so",
-                                                    "rmw_get_implementation_identifier"));
+        reinterpret_cast<const char * (*)()>(behind("rmw_get_implementation_identifier"));
     const char * const rmw = identify == nullptr ? "no rmw" : identify();
     bool all = is_one_of(distribution, {"humble", "jazzy", "kilted", "lyrical", "rolling"}) &&
                is_one_of(rmw, {"rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp",
                                "rmw_zenoh_cpp", "rmw_connextdds"});
     for (const char * name : {"rmw_serialize", "rmw_publish", "rmw_publish_serialized_message"})
-      all = all && behind("librmw_implementation.so", name) != nullptr;
-    all = all && behind("librcutils.so", "rcutils_get_default_allocator") != nullptr;
+      all = all && behind(name) != nullptr;
+    all = all && behind("rcutils_get_default_allocator") != nullptr;
     if (!all)
       say("ROS 2 %s with %s is not known to the gate: outputs leave at once",
           distribution == nullptr ? "(no ROS_DISTRO)" : distribution, rmw);
@@ -165,7 +164,7 @@ public:
   Serialized() {
     using Get = Allocator (*)();
     static const auto get =
-        reinterpret_cast<Get>(behind("librcutils.so", "rcutils_get_default_allocator"));
+        reinterpret_cast<Get>(behind("rcutils_get_default_allocator"));
     bytes.allocator = get();
   }
 
@@ -328,7 +327,7 @@ public:
     std::size_t left = shaper_.queue.waiting.size();
     for (; all; all.reset(all->next)) ++left;
     if (left > 0)
-      say("%s: its publisher has ended: %zu messages were not published",
+      say("%s: its publisher has ended, messages that were not published: %zu",
           settings_.output.c_str(), left);
     sem_destroy(&more_);
   }
