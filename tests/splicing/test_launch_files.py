@@ -5,6 +5,7 @@ And which launch file a `ros2 launch …` means, and the same command for anothe
 
 import ast
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import yaml
 from launch_cases import NDT, ROBOTS, plan_for
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
-from chainshaper.planning.plan import revised
+from chainshaper.flow.launch_splicing import undo_splice
+from chainshaper.planning.plan import publish_slots, revised
+from chainshaper.splicing.shaping_process import set_phase
 from chainshaper.splicing.spliced_launch import parse_launch_command
 from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.recording import Recording, open_recording
@@ -87,6 +90,33 @@ def test_the_user_s_file_is_included_as_it_is(name: str, tmp_path: Path) -> None
         "added": ("/chainshaper_pose", "/chainshaper_pose_standby"),
     }
     assert "+++ " + str(tmp_path / "out/robot.launch.py") in spliced.diff
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ compiles the gate")
+def test_a_gate_in_the_publisher_s_process_adds_no_node_and_redirects_nothing(robot: Path) -> None:
+    assert PLAN.shaping_node is not None
+    inside = PLAN.shaping_node.model_copy(update={"in_process": True})
+    plan, out = revised(PLAN, shaping_node=inside, anchor="cycle"), robot.parent / "out"
+    spliced = splice_launch_files(plan, [robot], out)
+    written = launched(spliced)
+    assert (written["PROCESSES"], written["REDIRECTS"]) == ([], [])
+    assert written["ENVIRONMENT"] == spliced.environment
+    assert Path(spliced.environment["LD_PRELOAD"]).is_file()
+    assert spliced.environment["CHAINSHAPER_GATES"] == str(out / "shaping_nodes/gates")
+    lines = (out / "shaping_nodes/gates").read_text().splitlines()
+    assert lines[:4] == [
+        "output /pose",
+        "input /pose_tmp",
+        "node chainshaper_pose",
+        "publisher /ndt",
+    ]
+    slots = [int(line.split()[1]) for line in lines if line.startswith("slots_ns")]
+    assert slots == [bound for slot in publish_slots(plan) for bound in slot]
+    # Where cycles begin goes to another file, beside the log: the folder stays as it was written.
+    set_phase(out / "shaping_nodes/gates", "chainshaper_pose", 42)
+    assert (out / "logs/chainshaper_pose.changes").read_text() == "phase_ns 42\n"
+    undo_splice(out)
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("folder", ["out", "two 'words'", 'a$"\\b#\nc'])

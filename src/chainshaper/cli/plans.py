@@ -349,6 +349,10 @@ def _show_splicing(splicing: "cs.Splicing", arguments: dict[str, str], setup: Pa
         verb = "publishes" if one.kind == "publisher" else "subscribes to"
         for node in one.nodes:
             out.show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
+    if splicing.environment:
+        loads = [f"{key}={value}" for key, value in splicing.environment.items()]
+        out.show_line("what is launched gets the gate; what starts otherwise, as a service, by:")
+        out.show_line(shlex.join(["env", *loads, "COMMAND"]))
     for found in splicing.redirected:
         for started in found["redirected"]:
             out.show_line(
@@ -373,6 +377,7 @@ def _splicing_json(splicing: "cs.Splicing", setup: Path | None) -> dict[str, Any
         "standbys": [one.standby.name for one in splicing.processes if one.standby is not None],
         "logs": [str(log) for log in splicing.logs],
         "setup": None if setup is None else str(setup),
+        "environment": dict(splicing.environment),
         "redirected": [dict(one) for one in splicing.redirected],
         "diff": splicing.diff,
         "notes": list(splicing.notes),

@@ -13,7 +13,7 @@ import difflib
 import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -72,6 +72,7 @@ class Splicing:
     notes: tuple[str, ...]  # what to know before relying on it
     redirects: tuple[Redirect, ...]  # nodes that get another topic
     redirected: tuple[Mapping[str, Any], ...] = ()  # what a dry run found of each
+    environment: Mapping[str, str] = field(default_factory=dict)  # that loads gates into processes
 
 
 class ThrottledInput(Part):
@@ -279,6 +280,7 @@ def _spliced(
         ),
         redirects=tuple(redirects),
         redirected=tuple(found),
+        environment=environment,
     )
 
 
