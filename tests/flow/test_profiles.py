@@ -337,3 +337,10 @@ def test_a_recorded_node_without_a_publishers_thread_is_not_planned_for_one() ->
     profile = replace(_profile(), asynchronous=False)
     with pytest.raises(InputError, match=r"/ndt has no thread that publishes.*ASYNCHRONOUS"):
         plan_chain(profile, PlanRequest(publication="asynchronous"))
+
+
+def test_what_passes_without_dds_is_not_planned_for_a_gate_before_dds() -> None:
+    profile = replace(_profile(), intra_process=True)
+    assert plan_chain(profile).shaping_node is not None
+    with pytest.raises(InputError, match=r"get its messages inside the process of /ndt.*synchr"):
+        plan_chain(profile, PlanRequest(publication="in-process"))
