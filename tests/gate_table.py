@@ -22,6 +22,7 @@ class Case:
     gate: Gate
     arrivals: tuple[tuple[int, int | None], ...]
     changes: tuple[tuple[int, str], ...] = ()
+    moves: tuple[tuple[int, int], ...] = ()
     name: str = ""
     leave: tuple[int | str, ...] = ()
     late_ns: int = 0  # a thread that slept wakes up so late
@@ -61,6 +62,7 @@ def _case(entry: dict[str, Any]) -> Case:
         gate=gate,
         arrivals=tuple((_ns(arrival), _ns(stamp)) for arrival, stamp in both),
         changes=tuple((_ns(time), mode) for time, mode in entry.get("changes", ())),
+        moves=tuple((_ns(time), _ns(by)) for time, by in entry.get("moves", ())),
         name=entry["name"],
         leave=tuple(one if isinstance(one, str) else _ns(one) for one in entry["leave"]),
     )
@@ -70,6 +72,7 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
     """What the Python gate does, without a clock; in the order in which messages come."""
     queue, now = Queue(case.gate), 0
     queue.changes.extend(case.changes)
+    queue.moves.extend(case.moves)
     found: dict[int, Outcome] = {}
     coming = deque(enumerate(case.arrivals))
 

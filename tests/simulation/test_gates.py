@@ -27,6 +27,7 @@ from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
 from chainshaper.workload.event_log import WORDS
+from chainshaper.workload.live import WARM_UP_CYCLES
 
 NAMES = ("city", "highway", "parking")
 
@@ -55,10 +56,10 @@ def gates(draw: st.DrawFn) -> Gate:
     )
 
 
-def as_array(gate: Gate) -> tuple[at.Int64s, int]:
+def as_array(gate: Gate, moves: list[tuple[int, int]]) -> tuple[at.Int64s, int]:
     """The gate as the engine has it: an array, and where its row stands there."""
     some: Any = SimpleNamespace
-    described = some(gate=some(**vars(gate), spin_ns=0, pause_ns=0))
+    described = some(gate=some(**vars(gate), spin_ns=0, pause_ns=0, moved=lambda _: moves))
     rows = Rows([0] * X.COLUMNS)
     place = _add_gate(rows, some(modes=NAMES), described, some(start_ns=0))
     return np.array(rows, dtype=np.int64), place
@@ -70,11 +71,19 @@ def as_array(gate: Gate) -> tuple[at.Int64s, int]:
     age=st.integers(-50, 2_500),
     announced=st.lists(st.tuples(st.integers(2_000, 6_000), st.sampled_from(NAMES)), max_size=4),
     late_by=st.integers(0, 400),
+    moves=st.lists(st.tuples(st.integers(2_000, 7_000), st.integers(-20, 20)), max_size=3).map(
+        sorted
+    ),
 )
-def test_the_compiled_gate_decides_as_the_live_one(
-    gate: Gate, arrival: int, age: int, announced: list[tuple[int, str]], late_by: int
+def test_the_compiled_gate_decides_as_the_live_one(  # noqa: PLR0917 - hypothesis names them
+    gate: Gate,
+    arrival: int,
+    age: int,
+    announced: list[tuple[int, str]],
+    late_by: int,
+    moves: list[tuple[int, int]],
 ) -> None:
-    memory, place = as_array(gate)
+    memory, place = as_array(gate, moves)
     changes: list[tuple[int, str]] = []
     current = None if gate.modes is None else gate.modes.default
     for time, name in sorted(announced, key=lambda change: change[0]):
@@ -85,11 +94,12 @@ def test_the_compiled_gate_decides_as_the_live_one(
         if name in gate.modes.bands and name != current:
             changes.append((time, name))
             current = name
-    expected = release_of(gate, arrival, arrival - age, changes)
+    expected = release_of(gate, arrival, arrival - age, changes, moves=moves)
     decide(memory, place, arrival, arrival - age)
     found = {column: None if (n := int(memory[place + column])) == at.NONE else n for column in G}
     assert (found[G.AT], found[G.ORIGIN]) == (expected.at_ns, expected.origin_ns)
     assert (found[G.SLOT], found[G.CYCLES]) == (expected.slot, expected.cycles_waited)
+    assert found[G.MOVED] == expected.moved_ns
     assert found[G.BY_STAMP] == (expected.anchor == "stamp")
     assert found[G.TREATED] == (expected.overrun and WORDS["overrun"].index(expected.overrun))
     assert found[G.MODE] == (expected.mode and NAMES.index(expected.mode))
@@ -123,6 +133,10 @@ def as_application(case: Case) -> Application:
         **{name: getattr(gate, name) for name in ("anchor", "overrun", "due_cycles", "messages")},
         "depth": gate.depth,
         "into_open_slot": gate.into_open_slot,
+        "moves": [
+            [f"{WARM_UP_CYCLES * 4_000 * MS + time}ns", f"{gate.slots[0][0] + by}ns"]
+            for time, by in case.moves
+        ],
     }
     if gate.modes is not None:
         changes = [(3_900_000_000, gate.modes.default), *case.changes]  # as it was, for the next

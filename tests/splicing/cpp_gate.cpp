@@ -72,6 +72,10 @@ void walk() {
     const auto time = number();
     queue.changes.emplace_back(time, static_cast<std::size_t>(number()));
   }
+  for (auto count = number(); count > 0; --count) {
+    const auto time = number();
+    queue.moves.emplace_back(time, number());
+  }
   const auto publishing_ns = number();
   const auto late_ns = number();
   std::vector<std::pair<std::int64_t, Maybe>> arrivals;
@@ -128,7 +132,7 @@ void walk() {
     show(release.overrun);
     show(release.mode);
     show(dropped);
-    std::cout << '\n';
+    std::cout << ' ' << release.moved_ns << '\n';
   }
 }
 

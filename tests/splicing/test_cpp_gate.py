@@ -44,6 +44,7 @@ def as_text(case: Case) -> str:
         words += [*modes.bands.values(), names.index(modes.default), LATE.index(modes.late)]
     words += [len(case.changes)]
     words += [word for time, mode in case.changes for word in (time, names.index(mode))]
+    words += [len(case.moves), *(word for move in case.moves for word in move)]
     words += [PUBLISHING_NS, case.late_ns, len(case.arrivals)]
     words += [word for arrival, stamp in case.arrivals for word in (arrival, _or_dash(stamp))]
     return " ".join(map(str, words))
@@ -63,6 +64,7 @@ def as_answer(case: Case, outcome: Outcome) -> str:
         "-" if release.overrun is None else LATE.index(release.overrun),
         "-" if release.mode is None else names.index(release.mode),
         "-" if outcome.dropped is None else DROPPED.index(outcome.dropped),
+        release.moved_ns,
     ]
     return " ".join(map(str, words))
 
@@ -99,7 +101,12 @@ def _any_case(draw: random.Random) -> Case:
     stamps = [draw.choice([None, draw.randint(0, 300) * scale]) for _ in times]
     late_ns = draw.choice([0, 0, draw.randint(1, 40) * scale])
     arrivals = tuple(zip(times, stamps, strict=True))
-    return Case(gate, arrivals, tuple(changes), late_ns=late_ns)
+    earliest, latest = -slots[0][0], gate.cycle_ns - slots[-1][1]
+    moves = sorted(
+        (draw.randint(0, 300) * scale, draw.randint(earliest, latest))
+        for _ in range(draw.choice([0, 1, 3]))
+    )
+    return Case(gate, arrivals, tuple(changes), tuple(moves), late_ns=late_ns)
 
 
 def test_both_gates_decide_alike(driver: Path) -> None:

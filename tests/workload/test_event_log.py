@@ -61,9 +61,9 @@ def test_the_layout_says_what_the_event_tables_say() -> None:
 def test_a_discarded_message_has_no_release_and_no_slot() -> None:
     log = EventLog()
     overrun = number_of("overrun", "discard")
-    log.point("gate_release")(9, 1, 2, 3, 4, ABSENT, ABSENT, 0, 0, overrun, ABSENT, 3)
+    log.point("gate_release")(9, 1, 2, 3, 4, ABSENT, ABSENT, 0, 0, overrun, ABSENT, 3, 0)
     in_time = number_of("overrun", None)
-    log.point("gate_release")(19, 1, 2, 3, 4, 18, 0, 0, 1, in_time, 1, ABSENT)
+    log.point("gate_release")(19, 1, 2, 3, 4, 18, 0, 0, 1, in_time, 1, ABSENT, 0)
     table = event_tables([_process(log)], from_ns=0)["gate_release"]
     assert table.select("release", "slot", "anchor", "overrun", "mode").rows() == [
         (None, None, "stamp", "discard", None),

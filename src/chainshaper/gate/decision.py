@@ -14,7 +14,8 @@ execution time a message is due in a later cycle than its own, and leaves in non
 Of several **messages** in a cycle leave ``all-in-order`` (the oldest is dropped where more than
 ``depth`` wait), the ``newest`` of those that wait, or the ``first`` that came. With **modes**
 (section 3.3) each mode has a slot of its own; a change is in force from the first cycle that begins
-after it, and ``late`` messages may also take the ``next-slot`` of their cycle.
+after it, and ``late`` messages may also take the ``next-slot`` of their cycle. Slots that follow
+latencies are **moved**, all by the same time, from the first cycle that begins after an instant.
 
 Words, limits, the log's columns and the nodes' ROS parameters are stated here for the node in C++,
 too: `schema.hpp` is generated from them. Every gate runs `tests/gate_conformance.yaml`. Only the
@@ -43,7 +44,7 @@ INTO_OPEN_SLOT, MESSAGES, DROPPED = get_args(IntoOpenSlot), get_args(Messages), 
 LOG_COLUMNS = (
     *("time", "pid", "tid", "cpu", "source_timestamp", "arrival", "origin", "release", "slot"),
     *("cycles_waited", "anchor", "overrun", "mode", "published", "stalled", "dropped", "lost"),
-    "row",
+    *("row", "moved"),
 )
 """Of a shaping node's log, comma-separated, a row per message: the event ``gate_release``."""
 
@@ -55,7 +56,7 @@ STALL_NS = 100_000  # a thread may wake up so late on a machine that does not st
 STEP_NS = 500_000  # of the wall clock; slewing moves it by at most 50 us in a cycle of 100 ms
 LOOK_NS = 50_000_000  # between two looks for messages: often enough for the reader's history
 OTHERS_NS = 2_000_000  # an executor's other callbacks take less
-CHANGES = 64  # so many changes of the mode reach back further than the oldest stamp of use
+CHANGES = 64  # so many changes of the mode, or moves, reach back further than the oldest stamp
 
 
 @dataclass(frozen=True)
@@ -134,6 +135,10 @@ class Gate:
                     f"{len(self.slots) - 1}"
                 )
 
+    def may_move(self, by_ns: int) -> bool:
+        """Whether slots that are moved by so much lie within the cycle still."""
+        return self.slots[0][0] + by_ns >= 0 and self.slots[-1][1] + by_ns <= self.cycle_ns
+
     @property
     def policy(self) -> str:
         """What becomes of a message that comes behind the last slot that is open to it."""
@@ -170,6 +175,7 @@ class Release:
     anchor: str  # what the slots were counted from
     overrun: str | None = None  # the policy that was applied to it; None: it came in time
     mode: str | None = None  # of its cycle; None: there are no modes
+    moved_ns: int = 0  # by so much the slots of the cycle in which it leaves
 
     def start_ns(self, cycle_ns: int) -> int:
         """When the cycle starts in which the message leaves."""
@@ -184,18 +190,22 @@ def release_of(
     *,
     ready_ns: int | None = None,
     phase_ns: int | None = None,
+    moves: Sequence[tuple[int, int]] = (),
 ) -> Release:
     """Decide when a message that arrived at ``arrival_ns`` may leave (ns of CLOCK_MONOTONIC).
 
     ``stamp_ns`` is its origin, None if it has none; ``changes`` are the modes that were announced,
     each with the time, ascending. It leaves at ``ready_ns`` at the earliest, where others are
-    before it. ``phase_ns`` is in force instead of the gate's own.
+    before it. ``phase_ns`` is in force instead of the gate's own. ``moves`` are from when on slots
+    are moved, ascending, and by how much from where the gate has them.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: it waits
         1060
         >>> release_of(gate, arrival_ns=1070, stamp_ns=1000).at_ns      # missed: the next cycle
         1160
+        >>> release_of(gate, arrival_ns=1140, stamp_ns=1100, moves=[(1050, 10)]).at_ns
+        1170
         >>> modes = Modes(bands={"city": 1, "highway": 0}, default="city", late="next-slot")
         >>> gate = Gate(slots=((20, 21), (60, 61)), cycle_ns=100, modes=modes)
         >>> release_of(gate, 1110, 1100, changes=[(1050, "highway")]).at_ns
@@ -216,30 +226,37 @@ def release_of(
     ready = arrival_ns if ready_ns is None else max(arrival_ns, ready_ns)
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
     cycle = max(0, (ready - origin) // cycle_ns)
-    due_from = origin + due * cycle_ns
-    known = (due_from, arrival_ns, ready)
+    moved = moved_at(moves, due_from := origin + due * cycle_ns)
+    known = (due_from + moved, arrival_ns, ready)
     overran, policy = not gate.lets_out(slots[-1], *known), gate.policy
     if overran and policy != "wait":
         at_once = ready if policy == "publish" else None
-        return Release(at_once, origin, None, cycle, anchor, policy, mode)
+        return Release(at_once, origin, None, cycle, anchor, policy, mode, moved)
     treated = "wait" if overran else None
     if mode is not None and not overran and not gate.lets_out(slots[0], *known):
         treated = "next-slot"
     cycle = max(due, cycle)
     while True:
         cycle_start = origin + cycle * cycle_ns
+        moved = moved_at(moves, cycle_start)
         for number, slot in enumerate(slots, first):
-            if gate.lets_out(slot, cycle_start, arrival_ns, ready):
-                at = max(ready, cycle_start + slot[0])
-                return Release(at, origin, number, cycle, anchor, treated, mode)
+            if gate.lets_out(slot, cycle_start + moved, arrival_ns, ready):
+                at = max(ready, cycle_start + moved + slot[0])
+                return Release(at, origin, number, cycle, anchor, treated, mode, moved)
         cycle += 1
+
+
+def moved_at(moves: Sequence[tuple[int, int]], cycle_start_ns: int) -> int:
+    """By how much the slots of a cycle that begins then are moved (ns)."""
+    return next((by for since, by in reversed(moves) if since <= cycle_start_ns), 0)
 
 
 def missed(gate: Gate, release: Release, now_ns: int) -> bool:
     """Whether the slot that a message was to leave in is over (ns of CLOCK_MONOTONIC)."""
     if release.slot is None:
         return False
-    return now_ns >= release.start_ns(gate.cycle_ns) + gate.slots[release.slot][1]
+    cycle_start = release.start_ns(gate.cycle_ns) + release.moved_ns
+    return now_ns >= cycle_start + gate.slots[release.slot][1]
 
 
 @dataclass
@@ -431,6 +448,7 @@ class Queue:
         self.phase_ns = gate.phase_ns
         self.waiting: deque[Waiting] = deque()
         self.changes: deque[tuple[int, str]] = deque(maxlen=CHANGES)
+        self.moves: deque[tuple[int, int]] = deque(maxlen=CHANGES)
         self.free_ns = 0  # when it is the turn of the oldest message, if it is there then
         # The starts of the cycle that the oldest message, or another for it, leaves in, and of
         # that in which one has left.
@@ -468,7 +486,8 @@ class Queue:
         if self._left is not None and self._same_cycle(release, self._left):
             if self.gate.messages == "first":
                 return _withheld(release), "surplus"
-            release = self._release(oldest, max(ready, self._left + self.gate.slots[-1][1]))
+            last_end = self._left + moved_at(self.moves, self._left) + self.gate.slots[-1][1]
+            release = self._release(oldest, max(ready, last_end))
             if release.at_ns is None:
                 return release, "discarded"
             if release.slot is None:
@@ -493,9 +512,8 @@ class Queue:
 
     def _release(self, message: Waiting, ready_ns: int) -> Release:
         arrival, stamp, phase = message.arrival_ns, message.stamp_ns, message.phase_ns
-        return release_of(
-            self.gate, arrival, stamp, self.changes, ready_ns=ready_ns, phase_ns=phase
-        )
+        known = {"ready_ns": ready_ns, "phase_ns": phase}
+        return release_of(self.gate, arrival, stamp, self.changes, **known, moves=self.moves)
 
     def _same_cycle(self, release: Release, start_ns: int) -> bool:
         """Stamps are not quite periodic: cycles are the same less than half a cycle apart."""
@@ -542,6 +560,16 @@ class Shaper:
     def set_phase(self, phase_ns: int, now_ns: int) -> None:
         """Cycles begin elsewhere, from the first such beginning after ``now_ns`` on."""
         self._next_phase = (now_ns + (phase_ns - now_ns) % self.gate.cycle_ns, phase_ns)
+
+    def move_slots(self, by_ns: int, from_ns: int) -> bool:
+        """Slots of cycles that begin at ``from_ns`` or later are moved by so much from where the
+        gate has them; False: that is where they are, or they would leave the cycle.
+        """
+        moves = self.queue.moves
+        if by_ns == (moves[-1][1] if moves else 0) or not self.gate.may_move(by_ns):
+            return False
+        moves.append((from_ns, by_ns))
+        return True
 
     def switch(self, mode: str | None, now_ns: int) -> bool:
         """A mode is announced, in force from the next cycle on; False: there is none like it."""

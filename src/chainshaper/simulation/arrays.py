@@ -550,10 +550,13 @@ def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing
     gate, number_of = described.gate, WORDS["overrun"].index
     assert gate is not None  # noqa: S101 - the caller has seen it
     slots, slots_end = rows.put([instant for slot in gate.slots for instant in slot])
+    moves, moves_end = rows.put([number for move in gate.moved(timing.start_ns) for number in move])
     (row,) = rows.add(1, at.GATE_COLUMNS, NONE)
     for column, value in {
         G.SLOTS: slots,
         G.SLOTS_END: slots_end,
+        G.MOVES: moves,
+        G.MOVES_END: moves_end,
         G.CYCLE: gate.cycle_ns,
         G.STAMPED: int(gate.anchor == "stamp"),
         G.OVERRUN: number_of(gate.overrun),

@@ -299,7 +299,7 @@ def arrive(m, message):
         oldest = m[m[entity + E.HISTORY] + m[entity + E.HEAD]]
         about = (m[entity + E.ROW], m[oldest + M.SOURCE], m[oldest + M.ARRIVAL])
         anchor = 1 - m[m[entity + E.BODY_ROW] + G.STAMPED]
-        never = (m[oldest + M.ORIGIN], NONE, NONE, 0, anchor, NONE, NONE, at.OVERFLOWED)
+        never = (m[oldest + M.ORIGIN], NONE, NONE, 0, anchor, NONE, NONE, at.OVERFLOWED, 0)
         log(m, at.L_RELEASE, now, thread, (*about, *never))
     put_newest(m, entity + E.HISTORY, message)
     # The event of the message that was overwritten is still in the queue, for this one to use.
@@ -465,7 +465,8 @@ def _leave_gate(m, thread):
     about = (m[entity + E.ROW], m[thread + T.SOURCE], m[gate + G.ARRIVAL])
     leaves = (m[gate + G.ORIGIN], m[gate + G.AT], m[gate + G.SLOT], m[gate + G.CYCLES])
     why = (1 - m[gate + G.BY_STAMP], m[gate + G.TREATED], m[gate + G.MODE], m[gate + G.DROPPED])
-    log(m, at.L_RELEASE, m[thread + T.BEGAN], thread, (*about, *leaves, *why))
+    row = (*about, *leaves, *why, m[gate + G.MOVED])
+    log(m, at.L_RELEASE, m[thread + T.BEGAN], thread, row)
     return _end(m, thread)
 
 
@@ -484,7 +485,7 @@ def decide(m, gate, arrival, stamp):
         if m[gate + G.MESSAGES] == at.FIRST:
             drop(m, gate, at.SURPLUS)
             return
-        last_end = m[m[gate + G.SLOTS_END] - 1]
+        last_end = m[m[gate + G.SLOTS_END] - 1] + _moved_at(m, gate, left)
         _release(m, gate, gate, arrival, stamp, max(ready, left + last_end))
         if m[gate + G.AT] == NONE:
             return
@@ -541,6 +542,8 @@ def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `releas
     ready = max(arrival, ready)
     cycle = max(0, (ready - origin) // cycle_ns)
     due_from = origin + due * cycle_ns
+    m[row + G.MOVED] = _moved_at(m, gate, due_from)
+    due_from += m[row + G.MOVED]
     overran = not _lets_out(m, gate, last - 2, due_from, arrival, ready)
     m[row + G.ARRIVAL], m[row + G.ORIGIN], m[row + G.MODE] = arrival, origin, mode
     m[row + G.BY_STAMP], m[row + G.TREATED] = stamped, NONE
@@ -557,6 +560,8 @@ def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `releas
     m[row + G.CYCLES] = max(due, cycle)
     while True:
         start = origin + m[row + G.CYCLES] * cycle_ns
+        m[row + G.MOVED] = _moved_at(m, gate, start)
+        start += m[row + G.MOVED]
         for slot in range(first, last, 2):
             if _lets_out(m, gate, slot, start, arrival, ready):
                 m[row + G.AT] = max(ready, start + m[slot])
@@ -578,7 +583,8 @@ def missed_slot(m, gate):
     slot = m[gate + G.SLOT]
     if policy != at.DISCARD or slot == NONE:
         return False
-    return m[X.NOW] >= _start(m, gate, gate) + m[m[gate + G.SLOTS] + 2 * slot + 1]
+    end = m[m[gate + G.SLOTS] + 2 * slot + 1] + m[gate + G.MOVED]
+    return m[X.NOW] >= _start(m, gate, gate) + end
 
 
 @compiled()
@@ -594,6 +600,15 @@ def switch_mode(m, gate, mode):
         place = changes + 2 * (count % at.CHANGES_KEPT)
         m[place], m[place + 1] = m[X.NOW], mode
         m[gate + G.CHANGED] = count + 1
+
+
+@compiled()
+def _moved_at(m, gate, cycle_start):
+    moved = 0
+    for move in range(m[gate + G.MOVES], m[gate + G.MOVES_END], 2):
+        if m[move] <= cycle_start:
+            moved = m[move + 1]
+    return moved
 
 
 @compiled()

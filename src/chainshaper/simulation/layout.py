@@ -74,16 +74,17 @@ R = IntEnum("R", "ENTITY LAST COLUMNS", start=0)
 """Readers: an entity, and the time of the last delivery to it from this publisher."""
 
 # Gates. SLOTS are pairs of start and end, BANDS has one per mode, NONE for those that the gate does
-# not know (DEFAULT is NONE where it knows none), CHANGES is a ring of pairs: time, mode. AT_ONCE: a
-# message may leave in a slot that is open when it comes. LEAVING and LEFT are starts of cycles, as
-# `Queue` has them. From ARRIVAL on: what was decided about the message in it; from OTHER on, the
-# same about one that waits behind.
+# not know (DEFAULT is NONE where it knows none), CHANGES is a ring of pairs: time, mode. MOVES are
+# pairs of an instant, ascending, and how far slots are moved from then on. AT_ONCE: a message may
+# leave in a slot that is open when it comes. LEAVING and LEFT are starts of cycles, as `Queue` has
+# them. From ARRIVAL on: what was decided about the message in it; from OTHER on, the same about one
+# that waits behind.
 G = IntEnum(
     "G",
     "SLOTS SLOTS_END CYCLE STAMPED OVERRUN DUE LATE SPIN PAUSE DEFAULT BANDS CHANGES MESSAGES"
-    " AT_ONCE"
+    " AT_ONCE MOVES MOVES_END"
     " PHASE CHANGED LEAVING LEFT FREE"
-    " ARRIVAL AT ORIGIN SLOT CYCLES BY_STAMP TREATED MODE DROPPED OTHER",
+    " ARRIVAL AT ORIGIN SLOT CYCLES BY_STAMP TREATED MODE DROPPED MOVED OTHER",
     start=0,
 )
 GATE_COLUMNS = int(G.OTHER + G.OTHER - G.ARRIVAL)
@@ -147,8 +148,8 @@ L_WAIT = 4  # timeout
 L_EXECUTE = 5  # entity
 L_SEND = 6  # publisher, source timestamp, outcome, duration
 L_SWITCH = 7  # core, previous thread, whether it is still runnable
-L_RELEASE = 8  # entity, source timestamp, and the gate's ARRIVAL to DROPPED
-LOG_FIELDS = (4, 4, 4, 6, 3, 3, 6, 5, 13)
+L_RELEASE = 8  # entity, source timestamp, and the gate's ARRIVAL to MOVED
+LOG_FIELDS = (4, 4, 4, 6, 3, 3, 6, 5, 14)
 
 A = IntEnum("A", "FIRST STRIDE COUNT COLUMNS", start=0)
 """Logs: entries stand column by column, which are STRIDE apart."""

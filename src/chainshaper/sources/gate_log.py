@@ -16,8 +16,8 @@ from chainshaper.gate.decision import LOG_COLUMNS, STALL_NS
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
-_LATER = ("dropped", "lost", "row")
-"""Columns that logs have since messages may wait at a gate."""
+_LATER = ("dropped", "lost", "row", "moved")
+"""Columns that logs have since messages may wait at a gate, and since slots may move."""
 _TYPES = events.column_types("gate_release")
 
 

@@ -162,6 +162,9 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
         # could not be written, or were in a file that has been removed since.
         "lost": pl.Int64(),
         "row": pl.Int64(),
+        # By how much the slots of the cycle in which it leaves are moved from where the plan has
+        # them; null: the recording is from before slots could follow the latencies.
+        "moved": _NANOSECONDS,
     },
 }
 # fmt: on

@@ -130,7 +130,8 @@ class GateDescription(Part):
     """A :class:`~chainshaper.gate.decision.Gate` in a callback: republishing in ``slots`` only.
 
     ``phase_ns`` is where cycles begin without a stamp, behind the common start (None: with the
-    timer that starts the application's chain).
+    timer that starts the application's chain). ``moves`` are from when on after that start, and
+    where the first slot begins in cycles from then on, the others as far behind it as before.
     """
 
     slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]
@@ -143,6 +144,7 @@ class GateDescription(Part):
     messages: Messages = "all-in-order"
     depth: Annotated[int, Field(ge=1)] = 10
     into_open_slot: IntoOpenSlot = "at-once"
+    moves: tuple[tuple[Duration, Duration], ...] = ()
     spin_ns: Duration = 0
     pause_ns: Duration = 0
 
@@ -154,10 +156,24 @@ class GateDescription(Part):
                 Gate(slots=self.slots, cycle_ns=self.cycle_ns, modes=known)
             except ValueError as error:
                 raise wrong_value(str(error), key) from error
+        gate = Gate(slots=self.slots, cycle_ns=self.cycle_ns)
+        for number, (since, by) in enumerate(self.moved(0)):
+            if not gate.may_move(by):
+                raise wrong_value(
+                    "the last slot would leave the cycle: write less", "moves", number
+                )
+            if number and since <= self.moves[number - 1][0]:
+                raise wrong_value(
+                    "comes before the one above: write later ones last", "moves", number
+                )
         for key, rest in (("spin", self.spin_ns), ("pause", self.pause_ns)):
             if rest >= self.cycle_ns:
                 raise wrong_value("must be shorter than the cycle: shorten it", key)
         return self
+
+    def moved(self, start_ns: int) -> list[tuple[int, int]]:
+        """The moves as a :class:`~chainshaper.gate.decision.Queue` has them."""
+        return [(start_ns + since, begin - self.slots[0][0]) for since, begin in self.moves]
 
 
 class CallbackDescription(Part):

@@ -30,13 +30,13 @@ LAYOUT: dict[str, tuple[str, ...]] = {
     "rclcpp_executor_get_next_ready": (),
     "rclcpp_executor_wait_for_work": ("timeout",),
     "rclcpp_executor_execute": ("handle",),
-    "gate_release": (*_RELEASE.split(), "dropped"),
+    "gate_release": (*_RELEASE.split(), "dropped", "moved"),
     "asynchronous_send": ("tid", "rmw_publisher_handle", "timestamp", "outcome", "duration"),
     "machine_stall": ("duration",),
 }
 """Event names and the order of their fields; an event's number is its place in this list."""
 
-WIDTH = 13  # event number, time, and up to eleven fields
+WIDTH = 14  # event number, time, and up to twelve fields
 
 ABSENT = -1
 """Stands for null in fields that may be."""

@@ -69,7 +69,7 @@ class NodeProcess:
         self.publishers: dict[str, dds.Publisher] = {}
         self.subscriptions: list[tuple[str, dds.Subscription]] = []
         self.publisher_thread: executor.PublisherThread | None = None
-        self.shapers: list[Shaper] = []
+        self.shapers: list[tuple[Shaper, list[tuple[int, int]]]] = []  # with their moves
         self.first_due: list[tuple[executor.Timer, int]] = []
         self.execution_times: list[ExecutionTimes] = []
         self._point = {name: self.log.point(name) for name in LAYOUT}
@@ -261,8 +261,9 @@ class NodeProcess:
             modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
             **{name: gate[name] for name in (*decision.SAME, "depth")},
         )
-        self.shapers.append(Shaper(own, gate["spin_ns"], get_ready))
-        return self.shapers[-1]
+        shaper, first = Shaper(own, gate["spin_ns"], get_ready), own.slots[0][0]
+        self.shapers.append((shaper, [(since, begin - first) for since, begin in gate["moves"]]))
+        return shaper
 
     def _listen(self, topic: str, shaper: Shaper) -> None:
         """Listen to the modes that are announced."""
@@ -294,6 +295,7 @@ class NodeProcess:
             number_of("overrun", release.overrun),
             ABSENT if release.mode is None else modes.index(release.mode),
             number_of("dropped", outcome.dropped),
+            release.moved_ns,
         )
 
     # Running ------------------------------------------------------------------------------
@@ -320,8 +322,9 @@ class NodeProcess:
         periods = [timer.period_ns for timer in self.executor.timers] or [100_000_000]
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
-        for shaper in self.shapers:
+        for shaper, moves in self.shapers:
             shaper.queue.phase_ns = start_ns + shaper.gate.phase_ns
+            shaper.queue.moves.extend((start_ns + since, by) for since, by in moves)
         stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
 

@@ -439,7 +439,7 @@ class GateLog:
                 *(outcome.awake_ns, self._process, core, message.about, message.arrival_ns),
                 *(release.origin_ns, release.at_ns, release.slot, release.cycles_waited),
                 *(release.anchor, release.overrun, release.mode, published, stalled),
-                *(outcome.dropped, message.lost, self._rows),
+                *(outcome.dropped, message.lost, self._rows, release.moved_ns),
             )
             line = ",".join("" if value is None else str(value) for value in values) + "\n"
             try:

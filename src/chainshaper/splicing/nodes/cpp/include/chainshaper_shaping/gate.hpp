@@ -58,6 +58,10 @@ struct Gate {
   std::size_t depth{schema::depth};
   Entry into_open_slot{Entry::at_once};
 
+  bool may_move(std::int64_t by_ns) const {
+    return slots.front().start + by_ns >= 0 && slots.back().end + by_ns <= cycle_ns;
+  }
+
   Policy policy() const {
     return modes && modes->late != Policy::next_slot ? modes->late : overrun;
   }
@@ -80,6 +84,15 @@ struct Gate {
 // A mode that was announced, and when.
 using Change = std::pair<std::int64_t, std::size_t>;
 
+// From when on slots are moved, and by how much from where the gate has them.
+using Move = std::pair<std::int64_t, std::int64_t>;
+
+inline std::int64_t moved_at(const std::deque<Move> & moves, std::int64_t cycle_start_ns) {
+  const auto before = [&](const Move & move) { return move.first <= cycle_start_ns; };
+  const auto found = std::find_if(moves.rbegin(), moves.rend(), before);
+  return found == moves.rend() ? 0 : found->second;
+}
+
 // The decision for one message. No `at_ns`: never; no `slot`: in none; no `overrun`: in time.
 struct Release {
   Maybe at_ns;
@@ -89,6 +102,7 @@ struct Release {
   Anchor anchor;
   std::optional<Policy> overrun;
   std::optional<std::size_t> mode;
+  std::int64_t moved_ns{0};  // the slots of the cycle in which it leaves
 
   std::int64_t start_ns(std::int64_t cycle_ns) const {
     return origin_ns + cycles_waited * cycle_ns;
@@ -154,7 +168,7 @@ inline std::int64_t modulo(std::int64_t value, std::int64_t cycle_ns) {
 
 inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stamp_ns,
                           const std::deque<Change> & changes, std::int64_t ready_ns,
-                          std::int64_t phase_ns) {
+                          std::int64_t phase_ns, const std::deque<Move> & moves = {}) {
   const std::int64_t cycle_ns = gate.cycle_ns;
   std::int64_t origin = arrival_ns - modulo(arrival_ns - phase_ns, cycle_ns);
   std::int64_t due = std::min<std::int64_t>(gate.due_cycles, 1);
@@ -178,23 +192,25 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   // A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
   std::int64_t cycle = std::max<std::int64_t>(0, (ready - origin) / cycle_ns);
   const std::int64_t due_from = origin + due * cycle_ns;
-  const bool overran = !gate.lets_out(gate.slots[last - 1], due_from, arrival_ns, ready);
+  std::int64_t moved = moved_at(moves, due_from);
+  const bool overran = !gate.lets_out(gate.slots[last - 1], due_from + moved, arrival_ns, ready);
   const Policy policy = gate.policy();
   if (overran && policy != Policy::wait) {
     const Maybe at_once = policy == Policy::publish ? Maybe(ready) : std::nullopt;
-    return {at_once, origin, std::nullopt, cycle, anchor, policy, mode};
+    return {at_once, origin, std::nullopt, cycle, anchor, policy, mode, moved};
   }
   std::optional<Policy> treated;
   if (overran)
     treated = Policy::wait;
-  else if (mode && !gate.lets_out(gate.slots[first], due_from, arrival_ns, ready))
+  else if (mode && !gate.lets_out(gate.slots[first], due_from + moved, arrival_ns, ready))
     treated = Policy::next_slot;
   for (cycle = std::max(due, cycle);; ++cycle) {
-    const std::int64_t cycle_start = origin + cycle * cycle_ns;
+    moved = moved_at(moves, origin + cycle * cycle_ns);
+    const std::int64_t cycle_start = origin + cycle * cycle_ns + moved;
     for (std::size_t slot = first; slot < last; ++slot) {
       if (gate.lets_out(gate.slots[slot], cycle_start, arrival_ns, ready)) {
         const std::int64_t at = std::max(ready, cycle_start + gate.slots[slot].start);
-        return {at, origin, slot, cycle, anchor, treated, mode};
+        return {at, origin, slot, cycle, anchor, treated, mode, moved};
       }
     }
   }
@@ -207,8 +223,8 @@ inline Release withheld(Release release) {
 }
 
 inline bool missed(const Gate & gate, const Release & release, std::int64_t now_ns) {
-  return release.slot &&
-         now_ns >= release.start_ns(gate.cycle_ns) + gate.slots[*release.slot].end;
+  return release.slot && now_ns >= release.start_ns(gate.cycle_ns) + release.moved_ns +
+                                       gate.slots[*release.slot].end;
 }
 
 // The header stamp of a serialized message in ns of its clock; none if it is zero or short.
@@ -272,7 +288,8 @@ public:
     if (!release.slot || gate.messages == Messages::all_in_order) return {release, std::nullopt};
     if (same_cycle(release, left_)) {
       if (gate.messages == Messages::first) return {withheld(release), Dropped::surplus};
-      release = release_at(oldest, std::max(ready_ns, *left_ + gate.slots.back().end));
+      const std::int64_t last_end = *left_ + moved_at(moves, *left_) + gate.slots.back().end;
+      release = release_at(oldest, std::max(ready_ns, last_end));
       if (!release.at_ns) return {release, Dropped::discarded};
       if (!release.slot) {
         release.at_ns = ready_ns;
@@ -302,6 +319,7 @@ public:
   std::int64_t phase_ns;
   std::deque<Waiting<Message>> waiting;
   std::deque<Change> changes;
+  std::deque<Move> moves;
   std::int64_t free_ns{0};  // when it is the turn of the oldest message, if it is there then
 
 private:
@@ -312,7 +330,7 @@ private:
   }
 
   Release release_at(const Waiting<Message> & one, std::int64_t ready_ns) const {
-    return release_of(gate, one.arrival_ns, one.stamp_ns, changes, ready_ns, one.phase_ns);
+    return release_of(gate, one.arrival_ns, one.stamp_ns, changes, ready_ns, one.phase_ns, moves);
   }
 
   bool same_cycle(const Release & release, Maybe start_ns) const {
@@ -403,6 +421,16 @@ public:
 
   void set_phase(std::int64_t phase_ns, std::int64_t now_ns) {
     next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
+  }
+
+  // False: that is where the slots are, or they would leave the cycle.
+  bool move_slots(std::int64_t by_ns, std::int64_t from_ns) {
+    auto & moves = queue.moves;
+    if (by_ns == (moves.empty() ? 0 : moves.back().second) || !queue.gate.may_move(by_ns))
+      return false;
+    moves.emplace_back(from_ns, by_ns);
+    if (moves.size() > schema::changes) moves.pop_front();
+    return true;
   }
 
   // False: there is no mode like it.

@@ -55,7 +55,8 @@ public:
         anchor_names[static_cast<std::size_t>(release.anchor)],
         release.overrun ? policy_names[static_cast<std::size_t>(*release.overrun)] : "",
         release.mode ? gate.modes->names[*release.mode].c_str() : "", published_ns, stalled_ns,
-        why ? dropped_names[static_cast<std::size_t>(*why)] : "", waiting.lost, rows);
+        why ? dropped_names[static_cast<std::size_t>(*why)] : "", waiting.lost, rows,
+        release.moved_ns);
     line_[size_ - 1] = '\n';  // in place of the last comma
     if (::write(ends_[1], line_.data(), size_) != static_cast<ssize_t>(size_)) ++unlogged;
   }
