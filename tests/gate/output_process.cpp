@@ -28,7 +28,7 @@ int main(int, char ** argv) {
       for (std::size_t i = 0; i <= number; ++i)
         turn.count(static_cast<chainshaper::Dropped>(number), static_cast<std::int64_t>(number),
                    number % 2 == 1);
-    turn.count({}, {}, false);
+    turn.count({}, {}, false, turn.moved() ? turn.moved()->first : 77);
     return 0;
   }
   const int inbox = socket(AF_INET, SOCK_DGRAM, 0);

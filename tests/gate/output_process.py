@@ -31,7 +31,8 @@ def main() -> None:
         for number, reason in enumerate(decision.DROPPED):
             for _ in range(number + 1):
                 turn.count(reason, number, late=number % 2 == 1)
-        turn.count(None, None, late=False)
+        moved, _ = turn.moved() or (77, 0)
+        turn.count(None, None, late=False, latency_ns=moved)
         return
     inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     if what == "shaping":

@@ -19,7 +19,7 @@ from cpp_program import compiled
 from processes import wait_for
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import RING, Page, Standby, Turn, open_page
+from chainshaper.gate.handover import MEASURED, MOVING, RING, Page, Standby, Turn, open_page
 
 MS = 1_000_000
 PROCESS = Path(__file__).parent / "output_process.py"
@@ -213,7 +213,7 @@ def test_a_page_that_is_removed_while_it_is_used_is_made_again(
     output.kill("shaping")
     output.send_many(5)
     output.check(begun)
-    assert [path.name for path in folder.iterdir()] == ["t5.0.v1"]
+    assert [path.name for path in folder.iterdir()] == ["t5.0.v2"]
 
 
 # Pages ------------------------------------------------------------------------------------------
@@ -241,7 +241,7 @@ def test_a_node_that_starts_again_goes_on_where_cycles_began(folder: Path) -> No
     turn.hold(None, 12_345, 2)
     again = Turn("t5", "/t5")
     assert (again.phase_ns, again.page["mode"], again.page.topic) == (12_345, 2, "/t5")
-    seen = Page(str(folder), "t5.0.v1")  # by who only looks
+    seen = Page(str(folder), "t5.0.v2")  # by who only looks
     assert (seen["starts"], seen.topic) == (2, "/t5")
     (folder / "other").write_bytes(b"short")
     with pytest.raises(ValueError, match="no page"):
@@ -256,11 +256,23 @@ def test_what_a_node_counts_is_in_the_page_for_those_who_look(
     command = [*program, str(folder), "counting", "t5", "0", "0"]
     for times in (1, 2):  # a node that starts again goes on counting
         subprocess.run(command, check=True, timeout=60)
-        page = Page(str(folder), "t5.0.v1")
+        page = Page(str(folder), "t5.0.v2")
         assert [page[reason] for reason in DROPPED] == [times, 2 * times, 3 * times, 4 * times]
         assert page["published"] == times
         assert page["lost_by_dds"] == times * (0 + 2 * 1 + 3 * 2 + 4 * 3)
         assert page["late"] == times * (2 + 4)
+    page = Page(str(folder), "t5.0.v2", "/t5", os.O_RDWR)
+    page["moved_ns"], page["moved_from_ns"] = -5, time.monotonic_ns() + 10**15
+    assert page.lock(MOVING)
+    subprocess.run(command, check=True, timeout=60)
+    page.unlock(MOVING)  # who moved the slots is gone
+    subprocess.run(command, check=True, timeout=60)
+    page["moved_from_ns"] = 0  # what follows is being written
+    subprocess.run(command, check=True, timeout=60)
+    assert [page.latest("measured", MEASURED, since) for since in (0, 4)] == [
+        [77, 77, -5, 0, 77],
+        [77],
+    ]
 
 
 @pytest.mark.parametrize("how", ["mode", "owner", "link", "file", "foreign page"])
@@ -278,14 +290,14 @@ def test_a_folder_that_is_not_ours_alone_is_not_used(
         folder.mkdir()
         folder.chmod(0o777 if how == "mode" else 0o700)
     if how == "foreign page":
-        (folder / "t5.0.v1").touch()
+        (folder / "t5.0.v2").touch()
     if how in ("owner", "foreign page"):
-        os.chown(folder if how == "owner" else folder / "t5.0.v1", 65534, -1)
+        os.chown(folder if how == "owner" else folder / "t5.0.v2", 65534, -1)
     with pytest.raises(OSError, match=r"outputs: .*(not a folder|exists|not a file of)"):
         open_page("t5", "/t5")
     spare = str(tmp_path / "spare")
     monkeypatch.setattr(FOLDERS, lambda: iter([str(folder), spare]))
-    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v1"
+    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v2"
 
 
 def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
@@ -294,7 +306,7 @@ def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
     folders = [f"{full_disk}/outputs", str(folder)]
     monkeypatch.setattr(FOLDERS, lambda: iter(folders))
     page = open_page("t5", "/t5")
-    assert page.path == f"{folder}/t5.0.v1"
+    assert page.path == f"{folder}/t5.0.v2"
     folders[0] = f"{folder.parent}/room"
     assert open_page("t5", "/t5").path == page.path
 

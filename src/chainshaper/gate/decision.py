@@ -534,9 +534,10 @@ class Shaper:
 
     One shaper belongs to one thread, which does nothing else at the time of a release: so it is a
     witness of the machine's own stalls (:meth:`time_lost`). ``look`` has new messages
-    :meth:`arrive`, while others wait, before each release and behind it. ``on_waking`` gets the
-    time of a release ``spin_ns`` before it, when the clock is watched from; ``on_decision`` each
-    decision, before it is waited for, and where cycles begin.
+    :meth:`arrive`, while others wait, before each release and behind it. ``moved`` says with each
+    message by how much slots are to be moved, and from when on (None: as before). ``on_waking``
+    gets the time of a release ``spin_ns`` before it, when the clock is watched from;
+    ``on_decision`` each decision, before it is waited for, and where cycles begin.
     """
 
     def __init__(
@@ -551,6 +552,7 @@ class Shaper:
         self.spin_ns = spin_ns
         self.overflowed: list[Outcome] = []  # since the owner has emptied it
         self.look = look
+        self.moved: Callable[[], tuple[int, int] | None] = lambda: None
         self._on_waking, self._on_decision = on_waking, on_decision
         self._looked_ns = self._waited_ns = self._turn_ns = 0
         self._offset = clock_offset()
@@ -602,6 +604,8 @@ class Shaper:
         if self._next_phase is not None and arrival >= self._next_phase[0]:
             self.queue.phase_ns = self._next_phase[1]
             self._next_phase = None
+        if (moved := self.moved()) is not None:
+            self.move_slots(*moved)
         stamp = None if stamp is None else stamp - offset
         if (full := self.queue.arrive(payload, arrival, stamp, about, lost)) is not None:
             self.overflowed.append(full)

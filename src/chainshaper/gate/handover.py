@@ -14,6 +14,9 @@ has published, the node leaves out. A node that is late for its own release by m
 patience hangs, or is stopped: the standby publishes what is due. What is left are the microseconds
 from a publication until it is noted: who is killed just there leaves it to be published again.
 
+Who has slots follow the latencies reads these in a third ring, and says there by how much slots are
+moved. They are so only while it has its own lock: however it ends, they go back.
+
 Standard library only, as the gate; `handover.hpp` is the node's side in C++, with the same page,
 whose layout is filled in from here.
 """
@@ -24,6 +27,7 @@ import os
 import select
 import stat
 import struct
+import sys
 import threading
 import time
 from collections import deque
@@ -56,14 +60,18 @@ FIELDS = (
     *DROPPED,  # how many they have dropped, for each of the gate's reasons
     "lost_by_dds",  # how many are missing in what they have received
     "late",  # how many came behind the last slot that they were due in
+    "measured",  # how many latencies, from origin to arrival, are in their ring
+    "moved_ns",  # by how much slots are moved from where the gate has them,
+    "moved_from_ns",  # for cycles that begin then or later; 0: it is being written, or never was
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 
-VERSION = 1  # of the page's layout: part of its name
+VERSION = 2  # of the page's layout: part of its name
 RING = 1024
-RELEASED, BYPASSED, TOPIC = 32, 32 + RING, 32 + 2 * RING  # places of two rings and the name
+RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings,
+TOPIC = 32 + 3 * RING  # and of the name
 TOPIC_BYTES = 256
-PUBLISHING, STANDING_BY, PASSING = 0, 1, 2  # the bytes of the file that are locked
+PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3  # the bytes of the file that are locked
 _AT = {name: place for place, name in enumerate(FIELDS)}
 _SIZE = 8 * TOPIC + TOPIC_BYTES
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
@@ -130,11 +138,8 @@ class Page:
             if topic is not None:  # memory that a full file system lacks later would be a SIGBUS
                 os.posix_fallocate(self._file, 0, _SIZE)
             self._memory = mmap.mmap(-1 if topic is None else self._file, _SIZE)
-            if topic is None:  # as it is now: another user's file may become shorter meanwhile
-                content = os.pread(self._file, _SIZE, 0)
-                if len(content) < _SIZE:
-                    raise ValueError(f"{name} is no page of an output")
-                self._memory[:] = content
+            if topic is None:
+                self.look()
         except BaseException:
             os.close(self._file)
             raise
@@ -148,6 +153,25 @@ class Page:
 
     def __setitem__(self, field: str, value: int) -> None:
         self._numbers[_AT[field]] = value
+
+    def look(self) -> None:
+        """Read how the page is now, for who only looks: another user's may become shorter.
+
+        ValueError: it has.
+        """
+        content = os.pread(self._file, _SIZE, 0)
+        if len(content) < _SIZE:
+            raise ValueError(f"{self.path} is no page of an output")
+        self._memory[:] = content
+
+    def put(self, field: str, value: int) -> None:
+        """Write a number of a page that is only looked at."""
+        os.pwrite(self._file, value.to_bytes(8, sys.byteorder, signed=True), 8 * _AT[field])
+
+    def latest(self, count: str, ring: int, since: int) -> list[int]:
+        """The numbers of a ring behind the first ``since``, as far as they are there."""
+        last = self[count]
+        return [self._numbers[ring + n % RING] for n in range(max(since, last - RING), last)]
 
     @property
     def topic(self) -> str:
@@ -165,8 +189,8 @@ class Page:
     # Locks of open files (F_OFD_…): several in one file, each visible without taking it.
 
     def lock(self, byte: int = PUBLISHING) -> bool:
-        """Take a right, if no process has it: to publish, to be the standby, or to publish as the
-        standby although the shaping node has the first. It ends with the process.
+        """Take a right, if no process has it: to publish, to be the standby, to publish as the
+        standby although the shaping node has the first, or to move slots. It ends with the process.
         """
         try:
             self._ask(fcntl.F_OFD_SETLK, fcntl.F_WRLCK, byte)
@@ -188,9 +212,12 @@ class Page:
 
     def note(self, key: int | None, *, bypassed: bool) -> None:
         """A message has been dealt with, by the standby or by the shaping node."""
-        count, ring = ("bypassed", BYPASSED) if bypassed else ("released", RELEASED)
+        self.add(*(("bypassed", BYPASSED) if bypassed else ("released", RELEASED)), key or 0)
+
+    def add(self, count: str, ring: int, value: int) -> None:
+        """Put a number into the ring at a place, whose numbers are counted under a name."""
         number = self[count]
-        self._numbers[ring + number % RING] = key or 0
+        self._numbers[ring + number % RING] = value
         self[count] = number + 1
 
     def noted(self, *, bypassed: bool) -> list[int]:
@@ -287,11 +314,26 @@ class Turn:
                     self.page.note(one, bypassed=False)
                 left.close()
 
-    def count(self, dropped: str | None, lost: int | None, *, late: bool) -> None:
+    def moved(self) -> tuple[int, int] | None:
+        """By how much slots are to be moved, and from when on, for :meth:`.Shaper.move_slots`.
+
+        None: as they are. Back, where the process that moved them is not there any more.
+        """
+        since, by = self.page["moved_from_ns"], self.page["moved_ns"]
+        if since == 0 or since != self.page["moved_from_ns"]:
+            return None
+        return (by, since) if self.page.is_locked(MOVING) else (0, time.monotonic_ns())
+
+    def count(
+        self, dropped: str | None, lost: int | None, *, late: bool, latency_ns: int | None = None
+    ) -> None:
         """A message has been published, or was ``dropped`` for that reason of the gate.
 
-        ``lost`` are those that are missing before it (None: not known).
+        ``lost`` are those that are missing before it (None: not known), ``latency_ns`` is from its
+        origin to its arrival.
         """
+        if latency_ns is not None:
+            self.page.add("measured", MEASURED, latency_ns)
         self.page[dropped or "published"] += 1
         self.page["lost_by_dds"] += lost or 0
         self.page["late"] += late

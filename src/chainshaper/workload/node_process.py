@@ -9,6 +9,7 @@ import os
 import signal
 import time
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
@@ -16,6 +17,7 @@ from typing import Any, TypeAlias
 from chainshaper.gate import decision
 from chainshaper.gate.clear_core import ClearCore
 from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
+from chainshaper.gate.handover import Turn
 from chainshaper.linux.scheduling import (
     lock_memory,
     set_thread_name,
@@ -82,11 +84,11 @@ class NodeProcess:
     # Building -----------------------------------------------------------------------------
 
     def _add_callback(self, index: int, callback: dict[str, Any]) -> None:
-        publishers = [self._publisher(topic) for topic in callback["publishes"]]
         symbol, topic = f"{self.spec['node']}::callback{index}", callback["subscription"]
         if callback["gate"] is not None:
-            self._add_gate(symbol, topic, callback["gate"], publishers[0])
+            self._add_gate(symbol, topic, callback["gate"], callback["publishes"][0])
             return
+        publishers = [self._publisher(topic) for topic in callback["publishes"]]
         work = self._work(index, callback, publishers)
         if callback["synchronises"]:
             topics = callback["synchronises"]
@@ -175,9 +177,7 @@ class NodeProcess:
 
     # Gates --------------------------------------------------------------------------------
 
-    def _add_gate(
-        self, symbol: str, topic: str, gate: dict[str, Any], publisher: TracedPublisher
-    ) -> None:
+    def _add_gate(self, symbol: str, topic: str, gate: dict[str, Any], output: str) -> None:
         """The latency-shaping callback (paper, section 3.2.2): delay, then republish unchanged.
 
         Between waking and writing nothing is computed, and after writing the thread pauses, so
@@ -190,7 +190,8 @@ class NodeProcess:
         Delay that no other thread caused is recorded like the stall meter's own findings. A
         message that is dropped is recorded, and not published.
         """
-        shaper, subscription = self._shaper(gate), self._subscription(topic, READER_DEPTH)
+        publisher, turn = self._publisher(output), self._turn(output)
+        shaper, subscription = self._shaper(gate, turn), self._subscription(topic, READER_DEPTH)
         if gate["modes"] is not None:  # before the messages that it concerns
             self._listen(gate["modes"]["topic"], shaper)
         handle = self.log.callback(symbol)
@@ -198,7 +199,7 @@ class NodeProcess:
         own_handle, rmw_handle = self.log.subscription(handle, topic, depth)
         start, end = self._point["callback_start"], self._point["callback_end"]
         stalled, pause_ns = self._point["machine_stall"], gate["pause_ns"]
-        note = partial(self._note_release, handle, gate)
+        note = partial(self._note_release, handle, gate, turn)
         waiting, overflowed = shaper.queue.waiting, shaper.overflowed
 
         def look() -> None:
@@ -246,7 +247,7 @@ class NodeProcess:
         entity = executor.SubscriptionEntity(own_handle, rmw_handle, subscription, body)
         self.executor.add_subscription(entity)
 
-    def _shaper(self, gate: dict[str, Any]) -> Shaper:
+    def _shaper(self, gate: dict[str, Any], turn: Turn | None) -> Shaper:
         modes, core = gate["modes"], self.spec["delivery_core"]
         delivery_core = None if core is None else ClearCore(core)
 
@@ -262,6 +263,8 @@ class NodeProcess:
             **{name: gate[name] for name in (*decision.SAME, "depth")},
         )
         shaper, first = Shaper(own, gate["spin_ns"], get_ready), own.slots[0][0]
+        if turn is not None:
+            shaper.moved = turn.moved
         self.shapers.append((shaper, [(since, begin - first) for since, begin in gate["moves"]]))
         return shaper
 
@@ -278,10 +281,26 @@ class NodeProcess:
 
         self._subscribe(handle, topic, body)
 
-    def _note_release(self, handle: int, gate: dict[str, Any], outcome: Outcome) -> None:
+    def _turn(self, output: str) -> Turn | None:
+        """The page by which others know an output, as that of a shaping node, but without standby.
+
+        None: there cannot be one, or another run has the same output.
+        """
+        with suppress(OSError):
+            turn = Turn(f"live{output.replace('/', '.')}", output)
+            if turn.take(None):
+                return turn
+        return None
+
+    def _note_release(
+        self, handle: int, gate: dict[str, Any], turn: Turn | None, outcome: Outcome
+    ) -> None:
         """Record what became of a message at a gate."""
         modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
         message, release = outcome.message, outcome.release
+        if turn is not None:
+            late, latency = release.overrun is not None, message.arrival_ns - release.origin_ns
+            turn.count(outcome.dropped, message.lost, late=late, latency_ns=latency)
         self._point["gate_release"](
             outcome.awake_ns,
             handle,

@@ -180,6 +180,7 @@ class Shaping:
         """Have cycles begin where they did for the node before this one, in its mode."""
         if self._turn is None:
             return
+        self._shaper.moved = self._turn.moved
         if self._turn.phase_ns is not None:  # from now on, not the next cycle
             now = time.monotonic_ns() - self._shaper.gate.cycle_ns
             self._shaper.set_phase(self._turn.phase_ns, now)
@@ -273,8 +274,9 @@ class Shaping:
         """Note what became of a message: in the log, and for the standby and `status`."""
         self._log.write(outcome, published, stalled)
         if self._turn is not None:
-            late = outcome.release.overrun is not None
-            self._turn.count(outcome.dropped, outcome.message.lost, late=late)
+            message, release = outcome.message, outcome.release
+            late, latency = release.overrun is not None, message.arrival_ns - release.origin_ns
+            self._turn.count(outcome.dropped, message.lost, late=late, latency_ns=latency)
 
     def _arrive(self, payload: bytes, info: dict[str, int], *, waited: bool) -> None:
         source, number = info.get("source_timestamp"), info.get("publication_sequence_number")

@@ -301,6 +301,8 @@ private:
 
   void arrive(Pointer message, const rmw_message_info_t & info, bool waited) {
     const auto stamp = stamp_of(*message);
+    if (const auto moved = turn_ ? turn_->moved() : std::nullopt)
+      shaper_.move_slots(moved->first, moved->second);
     const auto before = shaper_.overflowed.size();
     shaper_.arrive(std::move(message), stamp, info.source_timestamp, waited, missing_before(info));
     if (!turn_ || shaper_.overflowed.size() == before) return;
@@ -325,7 +327,8 @@ private:
   void note(const Outcome<Pointer> & outcome, Maybe published_ns = {}, Maybe stalled_ns = {}) {
     log_.write(shaper_.queue.gate, outcome, published_ns, stalled_ns);
     if (turn_)
-      turn_->count(outcome.dropped, outcome.waiting.lost, outcome.release.overrun.has_value());
+      turn_->count(outcome.dropped, outcome.waiting.lost, outcome.release.overrun.has_value(),
+                   outcome.waiting.arrival_ns - outcome.release.origin_ns);
     const std::int64_t now = monotonic_ns();
     if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) return;
     const std::string losses = log_.losses();

@@ -1,6 +1,6 @@
 // Which process publishes a shaped output: the shaping node, or the standby beside it. This is the
 // shaping node's side; what the two agree on, and why, is said in `handover.py` (`Turn`), which has
-// the same page: numbers of 8 bytes, two rings of messages, and the output's name. No ROS 2 here.
+// the same page: numbers of 8 bytes, three rings, and the output's name. No ROS 2 here.
 
 #pragma once
 
@@ -71,10 +71,13 @@ public:
     return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
   }
 
-  void note_released(std::int64_t key) {
-    const auto number = get(Field::released);
-    write(static_cast<std::size_t>(schema::released + number % schema::ring), key);
-    set(Field::released, number + 1);
+  void note_released(std::int64_t key) { add(Field::released, schema::released, key); }
+
+  // Put a number into the ring at this place.
+  void add(Field count, std::int64_t ring, std::int64_t value) {
+    const auto number = get(count);
+    write(static_cast<std::size_t>(ring + number % schema::ring), value);
+    set(count, number + 1);
   }
 
   // The latest messages of the ring at this place, ascending.
@@ -252,7 +255,17 @@ public:
   // A message that was received has no room any more, and is never published.
   void drop(std::int64_t key) { page_->note_released(key); }
 
-  void count(std::optional<Dropped> dropped, Maybe lost, bool late) {
+  // By how much slots are to be moved, and from when on; none: as they are.
+  std::optional<std::pair<std::int64_t, std::int64_t>> moved() const {
+    const auto since = page_->get(Field::moved_from_ns);
+    const auto by = page_->get(Field::moved_ns);
+    if (since == 0 || since != page_->get(Field::moved_from_ns)) return std::nullopt;
+    if (!page_->is_locked(schema::moving)) return std::make_pair(std::int64_t{0}, monotonic_ns());
+    return std::make_pair(by, since);
+  }
+
+  void count(std::optional<Dropped> dropped, Maybe lost, bool late, Maybe latency_ns = {}) {
+    if (latency_ns) page_->add(Field::measured, schema::measured, *latency_ns);
     const auto reason = [](Dropped why) {  // they stand in the page in their order
       return static_cast<Field>(static_cast<int>(Field::replaced) + static_cast<int>(why));
     };
