@@ -317,6 +317,11 @@ class Freezer:
             if not has_ended(tid, born):
                 raise
 
+    def change(self, table: ServerTable, anchor_ns: int) -> None:
+        """Other slots for the same servers, on all cores from the same end of a cycle on."""
+        self.table = table
+        self.arm(anchor_ns)
+
     def arm(self, anchor_ns: int) -> None:
         """See :meth:`BackEnd.arm`; returns when all dispatchers have heard of it.
 
@@ -330,7 +335,8 @@ class Freezer:
         else:
             anchoring = next_anchoring(self._anchoring, anchor_ns, self.table.cycle_ns, earliest)
         for core in self._pipes:
-            self._send(core, **asdict(anchoring))
+            slots = [server.slots for server in self.table.servers if server.core == core]
+            self._send(core, **asdict(anchoring), slots=slots)
         self._anchoring = anchoring
         self._await_answers()
 
@@ -450,7 +456,7 @@ class Freezer:
         if reason is not None:
             raise OperationError(f"the servers are no longer in force: {reason}")
 
-    def _send(self, core: int, **fields: str | int) -> None:
+    def _send(self, core: int, **fields: object) -> None:
         self._command += 1
         self._sent[core] = self._command
         line = json.dumps({"number": self._command, **fields}) + "\n"

@@ -257,6 +257,8 @@ class Dispatcher:
                 self._add(self.places[command["server"]], command["folder"])
             else:
                 anchoring = Anchoring(command["begin_ns"], command["end_ns"])
+                slots = tuple(tuple((a, b) for a, b in own) for own in command["slots"])
+                self.boundaries = boundaries_of(self.cycle_ns, slots)
                 ahead = chain([self.upcoming], self.ahead)
                 self.ahead = moved(ahead, anchoring, self.boundaries, self.cycle_ns)
                 self.upcoming = next(self.ahead)

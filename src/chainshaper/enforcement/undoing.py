@@ -30,6 +30,7 @@ from chainshaper.linux import cgroups, runs
 from chainshaper.linux.runs import Journal, find_journals, locked, process_of
 from chainshaper.linux.scheduling import state_of, state_text
 from chainshaper.linux.threads import find_thread, open_process
+from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError, PlatformError
 
 CLAIMS = "claims"
@@ -48,6 +49,24 @@ class ServerState(ReservationServer):
     threads: tuple[int, ...]
     kept_by: str
     counters: ServerCounters
+
+
+@dataclass(frozen=True)
+class SlotMove:
+    """The slots of a chain's output begin elsewhere from an instant on: ``moved_ns`` behind the
+    plan's, so that the last one begins ``start_ns`` after its origin.
+    """
+
+    from_ns: int
+    chain: str
+    moved_ns: int
+    start_ns: int
+    why: str
+
+    @property
+    def text(self) -> str:
+        start = format_duration(self.start_ns)
+        return f"the last slot of {self.chain} begins at {start} now: {self.why}"
 
 
 @dataclass(frozen=True)
@@ -76,6 +95,7 @@ class RunState:
     failure: str | None
     in_force_ns: int | None = None
     ended_ns: int | None = None
+    moves: tuple[SlotMove, ...] = ()  # the latest, of as many as a chain's gate has had
 
 
 def save_run_state(folder: Path, state: RunState) -> None:
@@ -110,7 +130,8 @@ def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | 
                 for server in content["servers"]
             )
             texts = {name: tuple(content[name]) for name in ("command", "notes")}
-            state = RunState(**{**content, **texts, "servers": servers})
+            moves = tuple(SlotMove(**move) for move in content.get("moves", ()))
+            state = RunState(**{**content, **texts, "servers": servers, "moves": moves})
         if journal.path.exists():  # not over meanwhile
             yield journal, state
 

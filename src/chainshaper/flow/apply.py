@@ -19,6 +19,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -26,14 +27,14 @@ from typing import TYPE_CHECKING
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
-from chainshaper.enforcement.freezer import groups_of, run_of
+from chainshaper.enforcement.freezer import Freezer, groups_of, run_of
 from chainshaper.enforcement.guardian import Guardians, run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
-from chainshaper.flow.drift import TimerTrack
+from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
 from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
@@ -41,11 +42,17 @@ from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.linux.threads import list_threads
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
+from chainshaper.planning.application_plan import (
+    ApplicationPlan,
+    open_until_done,
+    whole,
+    with_slots_moved,
+)
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
+from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -78,6 +85,8 @@ def apply_plan(
     back_end: str = "auto",
     recording: "Recording | None" = None,
     phase_ns: int | None = None,
+    adapt: bool = False,
+    max_latency_ns: int | None = None,
     wait_ns: int | None = None,
     users: Collection[str | int] = (),
     plan_path: str = "",
@@ -91,15 +100,17 @@ def apply_plan(
     ``command`` is started first (its output goes to ``command_stdout``); without one, the
     application runs already. Its nodes have ``wait_ns`` to appear (default: 30 s with a command,
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
-    (None: those of all chains are measured). ``recording`` is one of the very processes, or of an
-    earlier run of their programs. Only
+    (None: those of all chains are measured). With ``adapt`` slots follow the latencies of what
+    runs, to no later end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of
+    the very processes, or of an earlier run of their programs. Only
     processes of ``users`` (names or numbers; default: who launched us, and root) are nodes of the
     plan. ``watch`` gets the state every second; ``folder`` is where runs stand (default:
     `/run/chainshaper`).
 
     Raises:
         InputError: the plan names no threads, or has offsets, which priorities alone cannot carry
-            out; or a publisher does not publish as it asks; or there is no such user.
+            out; or a publisher does not publish as it asks; or no slot can follow its latencies;
+            or there is no such user.
         PlatformError: the machine lacks a core or the back end, or we a privilege.
         OperationError: another run governs a core or node, a node does not appear or is ambiguous,
             the chain has no regular beginning, the kernel refuses something, the servers failed,
@@ -110,6 +121,10 @@ def apply_plan(
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
     threads.refuse_unfit(given, choice.name)
+    if adapt:
+        given, followed = threads.followed_chains(given, choice.name, max_latency_ns)
+    else:
+        followed = threads.Followed({}, ())
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     recorded: tuple[RecordedProcess, ...] = ()
@@ -133,6 +148,8 @@ def apply_plan(
         table = threads.server_table(run.plan)
         run.servers = make_back_end(choice.name, table, journal, run.go_on)
         run.arm(run.servers, progress)
+        run.note(*followed.notes)
+        run.start_followers(followed.reaches_ns)
         run.watch_over(run.servers, watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
@@ -166,6 +183,9 @@ class _Run:
     telling: list[Telling] = field(default_factory=list)
     anchor_ns: int = 0
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
+    followers: dict[int, SlotFollower] = field(default_factory=dict)  # by their chains' places
+    moved_ns: dict[int, int] = field(default_factory=dict)  # by how much their slots are
+    arming: threading.Lock = field(default_factory=threading.Lock)  # followers move slots as well
     found: Allocation = field(init=False)
     state: RunState = field(init=False)
 
@@ -333,6 +353,47 @@ class _Run:
     def still_telling(self) -> bool:
         return not all(telling.is_over() for telling in self.telling)
 
+    def start_followers(self, reaches_ns: Mapping[int, tuple[int, int]]) -> None:
+        """Have the slots of chains follow the latencies, each within its reach."""
+        cores = set(available_cores()) - {server.core for server in self.plan.servers}
+        for place, reach_ns in reaches_ns.items():
+            chain = self.given.chains[place]
+            pids = [one.thread.pid for one in self.found.threads]
+            output = FollowedOutput(chain.shaping_node.output, pids)  # type: ignore[union-attr]
+            move = partial(self.move_slots, place)
+            self.followers[place] = SlotFollower(chain, output, reach_ns, move, cores=cores)
+
+    def move_slots(self, place: int, moved_ns: int) -> int:
+        """Move a chain's slots in the servers, if any of theirs change; from when on the gate has
+        to: half a cycle before the chain begins its first cycle with them.
+        """
+        with self.arming:
+            moves = {**self.moved_ns, place: moved_ns}
+            plan = open_until_done(with_slots_moved(self.given, moves), self.waits_ns)
+            before, table = threads.server_table(self.plan), threads.server_table(plan)
+            cycle_ns, anchor_ns = self.plan.chains[place].cycle_ns, self.state.anchor_ns or 0
+            since = time.monotonic_ns() + 2 * cycle_ns
+            if table != before and isinstance(self.servers, Freezer):
+                self.servers.change(table, anchor_ns)
+                since = (self.servers.in_force_from() or since) - cycle_ns // 4
+            self.plan, self.moved_ns = plan, moves
+        return since + (self.begins(place, anchor_ns) - since) % cycle_ns - cycle_ns // 2
+
+    def show_moves(self) -> None:
+        """The state shows where slots are by now, and what does not follow any more."""
+        slots = {server.name: server.slots for server in self.plan.servers}
+        moves = [move for one in self.followers.values() for move in one.moves]
+        self.state = replace(
+            self.state,
+            servers=tuple(replace(one, slots=slots[one.name]) for one in self.state.servers),
+            moves=tuple(sorted(moves, key=lambda move: move.from_ns)),
+        )
+        for place, follower in tuple(self.followers.items()):
+            if follower.failure is not None:
+                del self.followers[place]
+                follower.end()
+                self.note(f"slots are as planned, and do not follow any more: {follower.failure}")
+
     def assign(self, servers: BackEnd) -> None:
         """Put the threads that are not in their servers yet there."""
         themselves = {thread.node for thread in self.plan.free_threads}
@@ -343,7 +404,8 @@ class _Run:
                 self.go_on()
                 tid = member.thread.tid
                 if tid not in already[name] and themselves.isdisjoint(member.nodes):
-                    servers.assign(tid, name)
+                    with self.arming:
+                        servers.assign(tid, name)
         self.set_threads({n: tuple(m.thread.tid for m in group) for n, group in members.items()})
 
     def set_threads(self, tids: dict[str, tuple[int, ...]]) -> None:
@@ -365,6 +427,7 @@ class _Run:
                     drifts[k].look_soon = True
             moved = {k: ns + followed_ns for k, ns in seen.items() if ns is not None}
             self.end_telling()
+            self.show_moves()
             self.look_at(servers, max(moved.values(), key=abs, default=None))
             if is_over := is_over or self.state.failure is not None:
                 self.state = replace(self.state, ended_ns=time.monotonic_ns())
@@ -427,7 +490,8 @@ class _Run:
             if track.opens_ns != before_ns:
                 moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
                 try:
-                    servers.arm(moved_ns)
+                    with self.arming:
+                        servers.arm(moved_ns)
                 except OperationError:
                     if not self.stop.is_set():
                         raise
@@ -530,6 +594,8 @@ class _Run:
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""
         problems: list[str] = []
+        for follower in self.followers.values():
+            follower.end()
         if self.servers is not None:
             try:
                 self.servers.release()

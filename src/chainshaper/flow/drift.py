@@ -1,4 +1,4 @@
-"""Slots that follow a chain whose timer drifts against CLOCK_MONOTONIC.
+"""Slots that follow what runs: a chain's timer, and the latencies of its output.
 
 A chain that a sensor starts has the sensor's clock: 50 ppm off, it has moved by a whole cycle of
 100 ms after half an hour. Its servers' slots have to move with it, so that they open shortly after
@@ -12,11 +12,25 @@ On a busy machine a thread begins late without its timer. So slots soon open sti
 more: the timer stays where it is, while a thread that only begins late moves with the opening. What
 is late in spite of that is so in one direction only: the timer is the line beneath all sightings,
 the edge of their convex hull in the middle (Moon, Skelly and Towsley, INFOCOM 1999).
+
+The latencies of an output are in its gate's page of memory, and tell where its slots have to be
+(:class:`~chainshaper.planning.margins.Tail`). Slots move in the gate and in the servers with the
+same cycle.
 """
 
+import os
+import threading
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from itertools import pairwise
 from statistics import mean
+
+from chainshaper.enforcement.undoing import SlotMove
+from chainshaper.planning.margins import OVERRUN_PROBABILITY, Tail
+from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.plan import Adaptation, Plan, publish_slots
+from chainshaper.splicing.shaped_outputs import FollowedOutput
+from chainshaper.values.errors import OperationError
 
 SEEN_NS = 250_000  # so long behind the opening a thread begins that its timer woke, not the slot
 MOVE_NS = 250_000  # slots move by no less
@@ -117,3 +131,64 @@ class TimerTrack:
         """Slots behind the timer again, until it is time to look for it the next time."""
         self.opens_ns, self._step_ns = expected_ns + self.lead_ns, 0
         self._lost = self._lost + 1 if lost else 0
+
+
+MOVES = 20  # so many of the latest moves are shown
+
+
+class SlotFollower:
+    """Has the slots of a chain's output follow its latencies, in a thread of its own.
+
+    ``reach_ns`` is how far they may be moved. ``put_in_force`` has servers move their slots by so
+    much, and says from when on the gate has to. It ends by itself where that, or the gate, fails.
+    """
+
+    def __init__(
+        self,
+        chain: Plan,
+        output: FollowedOutput,
+        reach_ns: tuple[int, int],
+        put_in_force: Callable[[int], int],
+        *,
+        cores: Collection[int] = (),
+    ) -> None:
+        self.moves: tuple[SlotMove, ...] = ()
+        self.failure: OperationError | None = None
+        self._chain, self._output, self._put_in_force = chain, output, put_in_force
+        self._planned_ns = publish_slots(chain)[-1][0]
+        earliest, latest = (self._planned_ns + by for by in reach_ns)
+        promised = chain.margin.overrun_probability or OVERRUN_PROBABILITY
+        usual, rules = chain.evidence.mean_latency_ns, chain.adaptation or Adaptation()
+        self._tail = Tail(rules, promised, self._planned_ns, usual, latest, earliest)
+        self._cores, self._stop = cores, threading.Event()
+        self._thread = threading.Thread(target=self._follow, name="slot-follower", daemon=True)
+        self._thread.start()
+
+    def end(self) -> None:
+        """The slots go back to where the plan has them."""
+        self._stop.set()
+        self._thread.join()
+        self._output.close()
+
+    def _follow(self) -> None:
+        if self._cores:
+            os.sched_setaffinity(0, self._cores)  # the calling thread's alone
+        look_s = min(0.1, max(0.005, self._chain.cycle_ns / 2e9))
+        try:
+            while not self._stop.wait(look_s):
+                before_ns = self._tail.start_ns
+                for latency_ns in self._output.latencies():
+                    self._tail.saw(latency_ns)
+                if self._tail.start_ns != before_ns:
+                    self._move(self._tail.start_ns, before_ns)
+        except OperationError as error:
+            if not self._stop.is_set():
+                self.failure = error
+
+    def _move(self, start_ns: int, before_ns: int) -> None:
+        moved_ns = start_ns - self._planned_ns
+        from_ns = self._put_in_force(moved_ns)
+        self._output.move(moved_ns, from_ns)
+        why = "its promise did not hold any more" if start_ns > before_ns else "latency given back"
+        move = SlotMove(from_ns, chain_name(self._chain), moved_ns, start_ns, why)
+        self.moves = (*self.moves, move)[-MOVES:]

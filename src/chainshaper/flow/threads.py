@@ -9,12 +9,12 @@ Which nodes a process has, its creation events say; which threads execute, the c
 import platform
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
@@ -32,10 +32,24 @@ from chainshaper.flow.phase import Phase, measure_phase
 from chainshaper.linux.processes import descendants, find_applications, list_processes, run_users
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread, ThreadRole
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
+from chainshaper.planning.application_plan import (
+    ApplicationPlan,
+    combined,
+    open_until_done,
+    reach,
+    whole,
+    with_slots_moved,
+)
 from chainshaper.planning.offsets import chain_name
-from chainshaper.planning.overruns import Writer, check_publication
-from chainshaper.planning.plan import Plan, Server, ShapingNode, publisher_servers
+from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
+from chainshaper.planning.plan import (
+    Adaptation,
+    Plan,
+    Server,
+    ShapingNode,
+    publisher_servers,
+    revised,
+)
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -292,6 +306,47 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
             " server's threads, and servers of one priority run in the plan's order: choose"
             " another (--backend freezer)"
         )
+
+
+class Followed(NamedTuple):
+    """How far the slots of chains may be moved (ns), by their places; why those of others stay."""
+
+    reaches_ns: Mapping[int, tuple[int, int]]
+    notes: tuple[str, ...]
+
+
+def followed_chains(
+    plan: ApplicationPlan, back_end: str, max_latency_ns: int | None = None
+) -> tuple[ApplicationPlan, Followed]:
+    """The chains whose slots can follow their latencies, to no later end than ``max_latency_ns``.
+
+    That stands in the plan then. Raises InputError: no slots can, and why; or they end behind it as
+    planned.
+    """
+    chains, reaches, why_not = list(plan.chains), dict[int, tuple[int, int]](), list[str]()
+    for place, chain in enumerate(plan.chains):
+        rules = chain.adaptation or Adaptation()
+        if max_latency_ns is not None:
+            rules = rules.model_copy(update={"max_latency_ns": max_latency_ns})
+        try:
+            if (reason := why_not_followed(chain)) is not None:
+                raise InputError(reason)
+            chains[place] = revised(chain, adaptation=rules)
+            found = reach(plan, place, rules.max_latency_ns)
+            furthest = (with_slots_moved(plan, {place: by}) for by in found)
+            tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
+            if len(tables) > 1 and back_end not in ("freezer", "fifo"):
+                raise InputError(
+                    f"the back end {back_end} does not move slots of its servers with a cycle:"
+                    " choose freezer, or `shaping_thread: free`"
+                )
+        except InputError as error:
+            why_not.append(f"slots of {chain_name(chain)} cannot follow its latencies: {error}")
+        else:
+            reaches[place] = found
+    if not reaches:
+        raise InputError("; ".join(why_not))
+    return combined(chains), Followed(reaches, tuple(why_not))
 
 
 def server_table(plan: ApplicationPlan) -> ServerTable:

@@ -11,7 +11,7 @@ its slots played out over the hyper-period. A plan for one chain is the same wit
 """
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import combinations, product
 from typing import Annotated, Any, Literal, TypeAlias
@@ -20,19 +20,23 @@ from pydantic import Field, model_validator
 
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
-from chainshaper.planning.overruns import slots_without
+from chainshaper.planning.overruns import slots_without, with_output_moved
 from chainshaper.planning.plan import (
     Plan,
     Server,
     ShapingNode,
     Slot,
     Thread,
+    publish_slots,
     shaping_nodes,
     slot_text,
+    with_slots,
 )
 from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
 
+_GRID_NS = 1_000  # moved slots are found to microseconds
 MOST_SLOTS = 10_000
 """So many slots of all servers fit into a hyper-period at the most."""
 MOST_OPENED = 64
@@ -217,6 +221,46 @@ def combined(plans: Sequence[Plan]) -> ApplicationPlan:
     """
     with wrong_values_refused(ApplicationPlan):
         return ApplicationPlan(chains=tuple(plans))
+
+
+def with_slots_moved(plan: ApplicationPlan, moved_ns: Mapping[int, int]) -> ApplicationPlan:
+    """The plan with the slots of some chains' outputs moved, as :func:`.with_output_moved` does it.
+
+    Raises InputError: also where they would meet another chain's.
+    """
+    chains = list(plan.chains)
+    for place, by_ns in moved_ns.items():
+        own = with_output_moved(chains[place], by_ns)
+        slots = {server.name: server.slots for server in own.servers}  # others may share these
+        others = ({"servers": with_slots(one.servers, slots)} for one in chains)
+        chains = [one.model_copy(update=change) for one, change in zip(chains, others, strict=True)]
+        chains[place] = own
+    return combined(chains)
+
+
+def reach(plan: ApplicationPlan, place: int, latest_ns: int | None = None) -> tuple[int, int]:
+    """How far the slots of a chain's output may be moved, earlier (negative) and later (ns).
+
+    None ends behind ``latest_ns``. Raises InputError: not at all, and why.
+    """
+    slots, cycle_ns = publish_slots(plan.chains[place]), plan.chains[place].cycle_ns
+    latest = min(cycle_ns, cycle_ns if latest_ns is None else latest_ns)
+    reason = "they begin and end where they have to"
+    found = [0, 0]
+    for side, most in enumerate((-slots[0][0], latest - slots[-1][1])):
+        step = 1 << abs(most).bit_length()
+        while (step := step // 2) >= _GRID_NS:
+            further = found[side] + (step if side else -step)
+            if abs(further) > abs(most):
+                continue
+            try:
+                with_slots_moved(plan, {place: further})
+                found[side] = further
+            except InputError as error:
+                reason = str(error)
+    if found == [0, 0]:
+        raise InputError(reason)
+    return found[0], found[1]
 
 
 def _played_out(server: Server, chain: Plan, hyper_period_ns: int) -> Iterator[Slot]:

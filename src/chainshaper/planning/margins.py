@@ -24,16 +24,22 @@ one parametric bootstrap, because tables for known parameters do not hold for es
 simulations with four distributions the 95 % interval for a probability of 1e-5 had the true value
 in 97 to 100 of 100 samples of 5,000, in 93 to 98 of 100 samples of 1,500; where it missed it was
 too low. Where the density does not vanish at the end of the distribution, it errs on the high side.
+
+**On line** (:class:`Tail`) the same is estimated from the latencies as they come, so that slots can
+follow them. A move has to be certain: on stationary input it is the rare exception, however long
+that lasts.
 """
 
 import math
-from dataclasses import dataclass
+from collections import deque
+from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.plan import Margin
+from chainshaper.planning.plan import Adaptation, Margin
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError, OperationError
 
@@ -53,6 +59,17 @@ GOODNESS = 0.10  # the fit's own test must not come near rejection
 CONFIDENCE = 0.95
 BOOTSTRAPS = 999
 WIDEST_INTERVAL = 0.5  # of the latency itself; wider, the sample does not tell
+# On line: what slots are moved to is late in this part of the promised share, so that they need not
+# move again soon. Counts that chance makes rarer than this are none of chance: looked at once in a
+# while, and with every late output.
+AIM = 0.8
+DOUBT, DOUBT_AT_ONCE = 1e-6, 1e-9
+AT_ONCE = (8, 16, 32, 64, 128)  # so many cycles are looked at for a step
+LATEST = 64  # so many are compared with those before
+LOOKS = 80  # in a window
+FEWEST_BEYOND = 5  # with fewer in the sample, a latency is extrapolated
+SURELY = 3.0  # standard errors of what is extrapolated
+
 LEAST_LOG = np.log(1e-12)  # of a probability: a fitted end may stand at the longest excess itself
 
 _Latencies = NDArray[np.int64]
@@ -361,3 +378,182 @@ def _refuse_clusters(latencies: _Latencies, threshold: int) -> None:
             f" p = {chance:.2g}): executions are not independent, as when one delays the next."
             " Remove the cause, or give the margin yourself"
         )
+
+
+# On line ------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Tail:
+    """Where the slot of an output has to begin, from latencies as they come (ns).
+
+    All later than ``start_ns``, where it begins now, are to be the share ``promised`` at most. It
+    begins between ``earliest_ns`` and ``latest_ns``. ``usual_ns`` is the median as planned.
+
+    The window is what came since the last change, :attr:`.Adaptation.window` cycles at most:
+
+    * A **step** shows at once, in more late outputs than chance makes. What came before is
+      forgotten; the tail is taken to have grown as much as the median.
+    * Every now and then the window is looked at. If its latest cycles lie elsewhere than those
+      before, it begins with them. A **drift**, where thirds of it lie apart, is taken out: all
+      count for where they would be now. Then the share that is late by now is held against the
+      promise. Of a share so small that the window has hardly any beyond, the generalised Pareto
+      distribution says where it begins, with its standard error (Hosking and Wallis, 1987).
+    * Slots move earlier when that has been worth it for :attr:`.Adaptation.after` cycles on end;
+      for twice as many, each time that this was wrong and nothing has changed since. So however
+      the input is distributed, on a stationary one moves get rarer and rarer.
+    """
+
+    rules: Adaptation
+    promised: float
+    start_ns: int
+    usual_ns: float
+    latest_ns: int
+    earliest_ns: int = 0
+    seen: int = 0
+    _kept: _Floats = field(init=False)
+    _begin: int = 0
+    _end: int = 0
+    _lates: deque[int] = field(default_factory=lambda: deque(maxlen=AT_ONCE[-1]))
+    _worth_since: int | None = None
+    _earlier_at: int | None = None
+    _after: int = field(init=False)
+    _shape: tuple[float, float] = field(init=False)  # median, and latency to aim at
+
+    def __post_init__(self) -> None:
+        self._kept = np.zeros(2 * self.rules.window)
+        self._after, self._shape = self.rules.after, (self.usual_ns, float(self.start_ns))
+
+    def saw(self, latency_ns: int) -> int | None:
+        """The next output; where the slot is to begin from now on (None: where it does)."""
+        if self._end == self._kept.size:
+            kept = self.rules.window
+            self._kept[:kept] = self._kept[kept:]
+            self._begin, self._end = self._begin - kept, kept
+        self._kept[self._end] = latency_ns
+        self._end, self.seen = self._end + 1, self.seen + 1
+        self._begin = max(self._begin, self._end - self.rules.window)
+        if latency_ns > self.start_ns:
+            self._lates.append(self.seen)
+            for cycles in AT_ONCE:
+                most = _by_chance(cycles, min(0.5, self.rules.late * self.promised), DOUBT_AT_ONCE)
+                if len(self._lates) > most and self._lates[-most - 1] > self.seen - cycles:
+                    return self._step(cycles)
+        if self.seen % max(1, self.rules.window // LOOKS) == 0:
+            return self._look()
+        return None
+
+    def _step(self, cycles: int) -> int | None:
+        """Of the last ``cycles`` too many are late, to be chance, from the first late one on."""
+        first = next(one for one in self._lates if one > self.seen - cycles)
+        change = max(self._begin, self._end - 1 - (self.seen - first))
+        self._forget(change)
+        new = self._kept[change : self._end]
+        usual, aim = self._shape
+        error = 1.25 * (aim - usual) / 3 / math.sqrt(new.size)  # of a median, if it were normal
+        grown = (float(np.median(new)) + 2 * error) / usual
+        return self._move_to(max(aim * grown, float(np.median(new[new > self.start_ns]))))
+
+    def _forget(self, change: int) -> None:
+        """The window begins with a change; of what came before, the shape is remembered."""
+        before = self._kept[self._begin : change]
+        if before.size >= self.rules.window // 8:
+            aim = _beyond(before, AIM * self.promised)[0]
+            self._shape = float(np.median(before)), aim
+        self._begin, self._after, self._worth_since = change, self.rules.after, None
+
+    def _look(self) -> int | None:
+        window, size = self._kept[self._begin : self._end], self._end - self._begin
+        if size < self.rules.window // 8:
+            return None
+        now, drifts = _without_drift(window)
+        low, high = np.quantile(now[:-LATEST], (0.25, 0.75))
+        most = _by_chance(LATEST, 0.25, DOUBT_AT_ONCE)
+        latest = now[-LATEST:]
+        if max(np.count_nonzero(latest < low), np.count_nonzero(latest > high)) > most:
+            self._forget(self._end - LATEST)
+            return None
+        if drifts:
+            self._after = self.rules.after
+        late = int(np.count_nonzero(now > self.start_ns))
+        unlikely = _by_chance(size, self.promised, DOUBT)
+        aim, error = _beyond(now, AIM * self.promised)
+        if error:
+            if self.rules.window * AIM * self.promised >= FEWEST_BEYOND:
+                return None  # there will be enough
+            least, its = _beyond(now, self.rules.late * self.promised)
+            broken = late > unlikely or self.start_ns < least - SURELY * its
+            loose = self.start_ns > aim + SURELY * error
+        else:
+            broken = late > max(unlikely, self.rules.late * self.promised * size)
+            loose = late < _by_chance(size, AIM * self.promised, 1 - DOUBT)
+        if broken:
+            if self._earlier_at and self.seen - self._earlier_at < 2 * self.rules.window:
+                self._after *= 2  # that was wrong
+            return self._move_to(aim)
+        if not loose or self.start_ns - aim < self.rules.gain * self.start_ns:
+            self._worth_since = None
+        elif self._worth_since is None:
+            self._worth_since = self.seen
+        elif self.seen - self._worth_since >= self._after:
+            self._earlier_at = self.seen
+            return self._move_to(aim, earlier=True)
+        return None
+
+    def _move_to(self, start: float, *, earlier: bool = False) -> int | None:
+        """Begin there, as far as it may, to whole microseconds."""
+        self._worth_since = None
+        wanted = min(self.latest_ns, max(self.earliest_ns, math.ceil(start / 1_000) * 1_000))
+        if (wanted < self.start_ns) is not earlier or wanted == self.start_ns:
+            return None
+        self._lates.clear()
+        self.start_ns = wanted
+        return wanted
+
+
+@cache
+def _by_chance(trials: int, probability: float, doubt: float) -> int:
+    """The most of independent trials that are hit, but for this doubt."""
+    from scipy.special import bdtrc
+
+    return int(np.count_nonzero(bdtrc(np.arange(trials + 1), trials, probability) > doubt))
+
+
+def _without_drift(latencies: _Floats) -> tuple[_Floats, bool]:
+    """Latencies in their order as they would be now, if their thirds show a trend; whether so.
+
+    Medians of thirds are apart where they differ by four standard errors.
+    """
+    third, size = latencies.size // 3, latencies.size
+    first, middle, last = latencies[:third], latencies[third : size - third], latencies[-third:]
+    rise = float(np.median(last) - np.median(first))
+    spread = 1.4826 * float(np.median(np.abs(middle - np.median(middle))))
+    if abs(rise) <= 4 * 1.2533 * spread * math.sqrt(2 / third):
+        return latencies, False
+    return latencies + rise / (size - third) * np.arange(size - 1, -1, -1), True
+
+
+def _beyond(latencies: _Floats, share: float) -> tuple[float, float]:
+    """The latency beyond which a share of a sample lies, and, if extrapolated, its standard error.
+
+    The error is that of a generalised Pareto tail with both parameters estimated.
+    """
+    if (beyond := int(latencies.size * share)) >= FEWEST_BEYOND:
+        place = latencies.size - beyond - 1
+        return float(np.partition(latencies, place)[place]), 0.0
+    count = int(min(latencies.size ** (2 / 3), MOST_EXCESSES))
+    ordered = np.sort(latencies)[-count - 1 :]
+    threshold, excesses = ordered[0], (ordered[1:] - ordered[0])[np.newaxis, :]
+    if not excesses.any():
+        return float(threshold), 1.0
+    shape, scale = (float(each[0]) for each in _l_moment_fit(excesses))
+    shape = min(shape, 0.5)
+    logarithm = math.log(max(1.0, count / latencies.size / share))
+    by_scale = logarithm if abs(shape) < 1e-6 else math.expm1(shape * logarithm) / shape
+    by_shape = scale * logarithm**2 / 2
+    if abs(shape) >= 1e-6:
+        by_shape = scale * (math.exp(shape * logarithm) * logarithm - by_scale) / shape
+    one = 1 + shape
+    variance = 2 * (scale * by_scale) ** 2 * one + (one * by_shape) ** 2
+    variance -= 2 * scale * one * by_scale * by_shape
+    return float(threshold) + scale * by_scale, max(1.0, math.sqrt(max(0.0, variance) / count))

@@ -132,6 +132,38 @@ def _until(plan: Plan, end_ns: int) -> Iterator[Server]:
             yield server.model_copy(update={"slots": slots})
 
 
+def with_output_moved(plan: Plan, by_ns: int) -> Plan:
+    """The plan with the slots of its output moved by so much, and with them the ends of those that
+    run the chain until then.
+
+    Raises InputError: they would leave the cycle, end behind the longest latency that is allowed,
+    or meet others of their core and priority.
+    """
+    edges = {edge for slot in publish_slots(plan) for edge in slot}
+    slots = {
+        server.name: [
+            (start + by_ns * (start in edges), end + by_ns * (end in edges))
+            for start, end in server.slots
+        ]
+        for server in plan.servers
+        if not server.best_effort
+    }
+    return revised(plan, servers=with_slots(plan.servers, slots))
+
+
+def why_not_followed(plan: Plan) -> str | None:
+    """Why the slots of a plan cannot follow the latencies, None where they can."""
+    if plan.policy != "shaped":
+        return f"under {plan.policy} slots are where the policy has them"
+    if plan.modes is not None:
+        return "each mode has latencies and a slot of its own, and one promise is for all"
+    if plan.shaping_node is None:
+        return "no shaping node sees when outputs come (plan with --publication synchronous)"
+    if plan.further_shaping_nodes:
+        return "its other outputs are published in slots of the same servers"
+    return None
+
+
 def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, ...]:
     """Slots but for what is taken of them."""
     left = []

@@ -254,6 +254,22 @@ class Modes(Part):
         return self
 
 
+class Adaptation(Part):
+    """How slots follow the latencies of what runs (:class:`~chainshaper.planning.margins.Tail`).
+
+    They move later when ``late`` times the promised share of the last ``window`` cycles would have
+    been late in them; earlier where that takes at least the share ``gain`` off the latency, which
+    must have been so for ``after`` cycles on end. None ends behind ``max_latency_ns`` (None: behind
+    the cycle).
+    """
+
+    window: Annotated[int, Field(ge=500, le=1_000_000)] = 4_000
+    late: Annotated[float, Field(gt=1, le=10)] = 1.5
+    gain: Annotated[float, Field(gt=0, lt=1)] = 0.01
+    after: FromOne = 500
+    max_latency_ns: PositiveDuration | None = None
+
+
 class Prediction(Part):
     """What the plan promises: end-to-end latency, and the share of cycles per latency band.
 
@@ -296,7 +312,8 @@ class Plan(Part):
     ones are timed by their gates alone. ``equal_priorities`` says whether servers of one core and
     priority may overlap. ``shaping_node``
     serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
-    serve other sinks, or topics inside a chain (LET per callback).
+    serve other sinks, or topics inside a chain (LET per callback). Without an ``adaptation`` slots
+    that follow the latencies do so as it is by default.
     """
 
     format: Literal[1] = 1
@@ -317,12 +334,13 @@ class Plan(Part):
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()
     modes: Modes | None = None
+    adaptation: Adaptation | None = None
     predicted: Prediction
 
     @model_validator(mode="after")
     def _consistent(self) -> "Plan":
-        rules = (_cycle, _servers, _overlaps, _shaping_nodes, _modes, _publisher_threads, _entry)
-        for rule in rules:
+        first = (_cycle, _servers, _overlaps, _shaping_nodes, _modes)
+        for rule in (*first, _publisher_threads, _entry, _adaptation):
             for reason, *where in rule(self):
                 raise wrong_value(str(reason), *where)
         return self
@@ -591,6 +609,17 @@ def _entry(plan: Plan) -> _Wrong:
             f" for it, not {'a gated publisher' if gated else plan.policy}: write at-once",
             "into_open_slot",
         )
+
+
+def _adaptation(plan: Plan) -> _Wrong:
+    latest = None if plan.adaptation is None else plan.adaptation.max_latency_ns
+    for slot in publish_slots(plan)[-1:]:
+        if latest is not None and slot[1] > latest:
+            yield (
+                f"{format_duration(latest)}, but the slot {slot_text(slot)} ends behind it: write"
+                " more, or plan a shorter latency",
+                *("adaptation", "max_latency"),
+            )
 
 
 def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Slot]:

@@ -40,6 +40,8 @@ _SECTION_COMMENTS = {
     "servers": "a thread runs only in its server's slots; a smaller priority is better",
     "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
+    "adaptation": "how slots follow the latencies (apply --adapt): later when so many times the"
+    " promised share\n# of a window is late, earlier for this gain after so many cycles",
     "predicted": "for the slots as planned; not updated when they are edited",
 }
 

@@ -443,6 +443,8 @@ def servers_table(state: RunState) -> ResultTable:
         if state.drift_ns is not None:
             drift = f"{'-' if state.drift_ns < 0 else '+'}{format_duration(abs(state.drift_ns))}"
             table.caption += f"; the chain begins {drift} from where it did"
+        for move in {one.chain: one for one in state.moves}.values():
+            table.caption += f"; {move.text}"
     for server in state.servers:
         more = len(server.slots) - MOST_SLOTS  # of several chains, over the hyper-period
         slots = " ".join(map(slot_text, server.slots[:MOST_SLOTS]))

@@ -6,7 +6,7 @@ Shaping nodes and their standbys share a page of memory for each output
 
 import os
 import time
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +15,9 @@ from typing import Literal, TypeAlias
 from pydantic import TypeAdapter, ValidationError
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import STANDING_BY, Page, page_folders
+from chainshaper.gate.handover import MEASURED, MOVING, STANDING_BY, Page, page_folders
 from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import OperationError
 from chainshaper.values.yaml_file import FullName
 
 OutputState: TypeAlias = Literal["shaped", "bypassed", "silent", "no standby"]
@@ -42,6 +43,7 @@ class ShapedOutput:
     published: int  # by shaping nodes
     lost: dict[str, int]  # by reason
     late: int  # of both: behind the last slot that they were due in
+    moved_ns: int  # its slots follow the latencies, and are by so much not where the plan has them
     page: str
 
 
@@ -83,7 +85,64 @@ def output_text(output: ShapedOutput) -> str:
     lost = "".join(f", {count} {why}" for why, count in output.lost.items())
     if output.published or lost:
         text += f"; so far {output.published} messages published, {output.late} late{lost}"
+    if output.moved_ns:
+        text += f"; its slots {moved_text(output.moved_ns)}"
     return text
+
+
+def moved_text(moved_ns: int) -> str:
+    """``are moved by +2ms``."""
+    return f"are moved by {'-' if moved_ns < 0 else '+'}{format_duration(abs(moved_ns))}"
+
+
+class FollowedOutput:
+    """An output whose latencies are read, and whose slots are moved, until it is closed.
+
+    Raises OperationError: no shaping node of it runs, several do, or another run moves its slots.
+    """
+
+    def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
+        """``pids`` are processes that it may be of, where several have a gate for it."""
+        found = [one for one in find_outputs() if one.topic == topic and one.shaping_node]
+        found = [one for one in found if one.shaping_node in pids] or found
+        if len(found) != 1:
+            raise OperationError(
+                f"slots of {topic} cannot follow: {len(found) or 'no'} gates publish it now that"
+                " show their latencies; start the shaping node, one of this version"
+            )
+        folder, _, name = found[0].page.rpartition("/")
+        self._page = Page(folder, name, flags=os.O_RDWR)
+        if not self._page.lock(MOVING):
+            self._page.close()
+            raise OperationError(
+                f"another run has the slots of {topic} follow its latencies: end that first"
+            )
+        self._seen = self._page["measured"]
+
+    def latencies(self) -> list[int]:
+        """Those of the outputs that came since the last time, from origin to arrival (ns).
+
+        Raises OperationError: the gate's page is not there any more.
+        """
+        try:
+            self._page.look()
+        except (OSError, ValueError) as error:
+            raise OperationError(
+                f"{self._page.path}: its gate cannot be followed: {error}"
+            ) from error
+        new = self._page.latest("measured", MEASURED, self._seen)
+        self._seen = self._page["measured"]
+        return new
+
+    def move(self, by_ns: int, from_ns: int) -> None:
+        """Have slots be by so much not where the gate has them, in cycles from an instant on."""
+        self._page.put("moved_from_ns", 0)
+        self._page.put("moved_ns", by_ns)
+        self._page.put("moved_from_ns", from_ns)
+
+    def close(self) -> None:
+        """The slots go back to where the gate has them."""
+        self._page.close()
 
 
 def _looked_at(page: Page) -> list[ShapedOutput]:
@@ -109,6 +168,7 @@ def _looked_at(page: Page) -> list[ShapedOutput]:
             published=page["published"],
             lost={why: count for why, count in counts.items() if count},
             late=page["late"],
+            moved_ns=page["moved_ns"] if page["moved_from_ns"] and page.is_locked(MOVING) else 0,
             page=page.path,
         )
     ]
