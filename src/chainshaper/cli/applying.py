@@ -77,6 +77,8 @@ def apply(
         "--wait DURATION",
         "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
     ),
+    adapt: bool = opt.ADAPT,
+    max_latency: int | None = opt.MAX_LATENCY,
     user: list[str] | None = opt.USERS,
     dry_run: bool = opt.option(
         "--dry-run", "Show what would be done to which thread, and change nothing.", False
@@ -90,6 +92,7 @@ def apply(
     from chainshaper.reporting.overviews import servers_table
 
     planned = cs.load_application_plan(plan)
+    opt.refuse_bound_alone(max_latency, adapt)
     how: dict[str, Any] = {
         "recording": None if recording is None else cs.open_source(recording),
         "phase_ns": phase,
@@ -106,6 +109,8 @@ def apply(
             command_stdout=sys.stderr.fileno() if json else None,  # standard output is ours
             back_end=backend,
             wait_ns=wait,
+            adapt=adapt,
+            max_latency_ns=max_latency,
             plan_path=str(plan),
             stop=stop,
             watch=watch,

@@ -124,6 +124,15 @@ USERS: list[str] | None = option(
     "Whose processes are taken for nodes (may be repeated). Default: yours, also behind sudo, and"
     " root's.",
 )
+ADAPT: bool = option(
+    "--adapt",
+    "Slots follow the latencies: later when the plan's promise does not hold any more, earlier when"
+    " latency can be given back.",
+    False,
+)
+MAX_LATENCY: int | None = option(
+    "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
+)
 SOURCE: Source = option("--source", "Who records the events.", "lttng")
 NODE: NodeKind = option(
     "--node", "A script; a package for all types; or one generated for the type.", "python"
@@ -249,3 +258,9 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
         )
     with wrong_values_refused(Modes):
         return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")
+
+
+def refuse_bound_alone(max_latency_ns: int | None, adapt: bool) -> None:
+    """Refuse a bound for slots that stay where they are. Raises InputError."""
+    if max_latency_ns is not None and not adapt:
+        raise InputError("--max-latency bounds slots that follow the latencies: add --adapt")

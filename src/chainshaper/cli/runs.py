@@ -468,6 +468,8 @@ def shape(
     source: opt.Source = opt.SOURCE,
     node: opt.NodeKind = opt.NODE,
     backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
+    adapt: bool = opt.ADAPT,
+    max_latency: int | None = opt.MAX_LATENCY,
     *,
     request: "cs.PlanRequest",
     mode_profile: list[str] | None = opt.MODE_PROFILE,
@@ -478,13 +480,16 @@ def shape(
 
     The publisher's output topic is remapped, and the shaping node republishes it in its slots.
     Behind `--`, `ros2 launch` does the whole flow: record, choose a chain, profile, plan, splice,
-    apply, record again, compare. Every file in between stays. All options but --cycles and
-    --realtime are for this, and mean what they mean for `chainshaper plan` and `apply`.
+    apply, record again, compare. Every file in between stays. All options but --cycles, --realtime
+    and --adapt are for this, and mean what they mean for `chainshaper plan` and `apply`.
     """
+    opt.refuse_bound_alone(max_latency, adapt)
+    following: dict[str, Any] = {"adapt": adapt, "max_latency_ns": max_latency}
     if len(words) == 2 and words[0].endswith(opt.DESCRIPTIONS):
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
-        _shape_described(Path(words[0]), Path(words[1]), output, cycles, realtime)
+        how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, **following}
+        _shape_described(Path(words[0]), Path(words[1]), output, how)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
@@ -504,12 +509,11 @@ def shape(
         back_end=backend,
         request=request,
         users=user or (),
+        **following,
     )
 
 
-def _shape_described(
-    application: Path, plan: Path, output: Path, cycles: int, realtime: bool | None
-) -> None:
+def _shape_described(application: Path, plan: Path, output: Path, how: dict[str, Any]) -> None:
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
 
     described, planned = cs.load_application(application), cs.load_application_plan(plan)
@@ -519,10 +523,9 @@ def _shape_described(
             described,
             planned,
             output,
-            cycles=cycles,
-            realtime=realtime,
             command=sys.argv,
             progress=report,
+            **how,
         )
     for chain in planned.chains:
         about = f"{chain.chain.output}: " if len(planned.chains) > 1 else ""

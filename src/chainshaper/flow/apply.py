@@ -52,13 +52,12 @@ from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
-    from chainshaper.workload.live import StartedNodes
+    from chainshaper.workload.live import Enforcement, StartedNodes
 
 
 START_NS = 30_000_000_000  # for a command to start all nodes of the plan
@@ -357,11 +356,12 @@ class _Run:
         """Have the slots of chains follow the latencies, each within its reach."""
         cores = set(available_cores()) - {server.core for server in self.plan.servers}
         for place, reach_ns in reaches_ns.items():
-            chain = self.given.chains[place]
             pids = [one.thread.pid for one in self.found.threads]
-            output = FollowedOutput(chain.shaping_node.output, pids)  # type: ignore[union-attr]
-            move = partial(self.move_slots, place)
-            self.followers[place] = SlotFollower(chain, output, reach_ns, move, cores=cores)
+            self.followers[place] = SlotFollower(
+                self.given.chains[place],
+                *(pids, reach_ns, partial(self.move_slots, place)),
+                cores=cores,
+            )
 
     def move_slots(self, place: int, moved_ns: int) -> int:
         """Move a chain's slots in the servers, if any of theirs change; from when on the gate has
@@ -663,6 +663,39 @@ def threads_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None
             servers.release()
     if failure is not None:
         raise OperationError(f"the servers failed while the application ran: {failure}")
+
+
+@contextlib.contextmanager
+def slots_followed(
+    plan: ApplicationPlan,
+    reaches_ns: Mapping[int, tuple[int, int]],
+    enforcement: "Enforcement | None",
+    nodes: "StartedNodes",
+) -> Iterator[None]:
+    """Inside, slots of the live workload's gates follow its latencies, within their reach.
+
+    Beside what else is in force. Raises OperationError: one does not follow to the end; and what
+    ``enforcement`` raises.
+    """
+    anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
+
+    def from_when(chain: Plan, _: int) -> int:
+        since = time.monotonic_ns() + 2 * chain.cycle_ns
+        return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
+
+    with contextlib.ExitStack() as until:
+        if enforcement is not None:
+            until.enter_context(enforcement(nodes))
+        followers = []
+        for place, reach_ns in reaches_ns.items():
+            chain, pids = plan.chains[place], nodes.pids.values()
+            followers.append(SlotFollower(chain, pids, reach_ns, partial(from_when, chain)))
+        for follower in followers:
+            until.callback(follower.end)
+        yield
+    for follower in followers:
+        if follower.failure is not None:
+            raise follower.failure
 
 
 def _threads_of(wanted: Thread, nodes: "StartedNodes") -> list[int]:

@@ -139,14 +139,16 @@ MOVES = 20  # so many of the latest moves are shown
 class SlotFollower:
     """Has the slots of a chain's output follow its latencies, in a thread of its own.
 
-    ``reach_ns`` is how far they may be moved. ``put_in_force`` has servers move their slots by so
-    much, and says from when on the gate has to. It ends by itself where that, or the gate, fails.
+    ``pids`` are processes of which one may be the gate, ``reach_ns`` is how far slots may be moved.
+    ``put_in_force`` has servers move theirs by so much, and says from when on the gate has to.
+    Following ends by itself where that fails, or the gate does. Raises OperationError: see
+    :class:`.FollowedOutput`.
     """
 
     def __init__(
         self,
         chain: Plan,
-        output: FollowedOutput,
+        pids: Collection[int],
         reach_ns: tuple[int, int],
         put_in_force: Callable[[int], int],
         *,
@@ -154,7 +156,9 @@ class SlotFollower:
     ) -> None:
         self.moves: tuple[SlotMove, ...] = ()
         self.failure: OperationError | None = None
-        self._chain, self._output, self._put_in_force = chain, output, put_in_force
+        self._chain, self._put_in_force = chain, put_in_force
+        assert chain.shaping_node is not None  # noqa: S101 - else the chain cannot be followed
+        self._output = FollowedOutput(chain.shaping_node.output, pids)
         self._planned_ns = publish_slots(chain)[-1][0]
         earliest, latest = (self._planned_ns + by for by in reach_ns)
         promised = chain.margin.overrun_probability or OVERRUN_PROBABILITY

@@ -92,6 +92,8 @@ def shape_launch(
     source: Literal["lttng", "preload", "ebpf"] = "lttng",
     node: NodeKind = "python",
     back_end: str = "auto",
+    adapt: bool = False,
+    max_latency_ns: int | None = None,
     users: Collection[str | int] = (),
     stop: threading.Event | None = None,
     planned: Callable[[Plan | ApplicationPlan], None] = lambda _: None,
@@ -106,7 +108,8 @@ def shape_launch(
     (default: the last core, and others that are worth it). The application is launched three times,
     briefly, and for ``duration_ns`` before and after; more often, where chains are measured one by
     one. ``planned`` gets the plan before it is used, to say what is doubtful about it. ``stop``
-    ends the step that is under way, and with it everything. ``users`` are for :func:`.apply_plan`.
+    ends the step that is under way, and with it everything. ``adapt``, ``max_latency_ns`` and
+    ``users`` are for :func:`.apply_plan`.
 
     Raises:
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
@@ -188,7 +191,11 @@ def shape_launch(
         shaped = [*setup, *_sourced(splicing), *launch.with_file(file)]
     after = record(
         *("after", shaped, duration_ns),
-        scheduling=plan_in_force(plan, back_end, first, taken, applied := list[str]()),
+        scheduling=plan_in_force(
+            *(plan, back_end, first, taken, applied := list[str]()),
+            adapt=adapt,
+            max_latency_ns=max_latency_ns,
+        ),
         plan=plan,
         gate_logs=() if splicing is None else splicing.logs,
         chain=chains[0],
@@ -281,11 +288,12 @@ def plan_in_force(
     recording: Recording,
     users: frozenset[int],
     notes: list[str],
+    **how: Any,
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """The plan in force on what runs; what it gives says whether all servers have opened.
 
     A thread of its own does what `chainshaper apply` does, until the context ends; ``notes`` are
-    what it has to say then.
+    what it has to say then; ``how`` goes to :func:`.apply_plan`.
     """
     stop, states = threading.Event(), list[RunState]()
     with ThreadPoolExecutor(1, "apply") as beside:
@@ -298,6 +306,7 @@ def plan_in_force(
             users=users,
             stop=stop,
             watch=states.append,
+            **how,
         )
 
         def opened(_: Sequence[Process]) -> bool:

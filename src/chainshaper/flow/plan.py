@@ -572,6 +572,8 @@ def shape_application(
     cycles: int = 320,
     realtime: bool | None = None,
     enforcement: Enforcement | None = None,
+    adapt: bool = False,
+    max_latency_ns: int | None = None,
     command: Sequence[str] = (),
     progress: Progress = lambda *_: None,
 ) -> Recording:
@@ -579,9 +581,10 @@ def shape_application(
 
     ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without; the
     thread of an asynchronous publisher, and the stages of a pipeline, are gated unless
-    ``enforcement`` does so (:func:`chainshaper.flow.apply.threads_gated`).
+    ``enforcement`` does so (:func:`chainshaper.flow.apply.threads_gated`). With ``adapt`` slots
+    follow the latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
 
-    Raises InputError: the plan does not fit the application; and what
+    Raises InputError: the plan does not fit the application, or no slot can follow; and what
     :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates
     threads, and threads cannot be frozen here.
     """
@@ -590,6 +593,12 @@ def shape_application(
         from chainshaper.flow.apply import gated_threads, threads_gated
 
         enforcement = partial(threads_gated, joint) if gated_threads(joint) else None
+    if adapt:
+        from chainshaper.flow.apply import slots_followed
+        from chainshaper.flow.threads import followed_chains
+
+        joint, followed = followed_chains(joint, "fifo", max_latency_ns)
+        enforcement = partial(slots_followed, joint, followed.reaches_ns, enforcement)
     return run_application(
         splice_application(application, joint),
         output,
