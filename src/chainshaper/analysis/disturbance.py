@@ -135,7 +135,8 @@ def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
 
 
 def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
-    """Start and end of the last slot that is open to each output, from the slots' origin on.
+    """Start and end of the last slot that is open to each output, from the slots' origin on, where
+    it was moved to.
 
     Without a plan the latest place at which one in time was let go stands for the start.
     """
@@ -148,7 +149,7 @@ def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
         last = pl.when(pl.col("mode") == mode).then(slot).otherwise(last)
     delay = due.cycles * due.cycle_ns
     sides = (pl.Series([s + delay for s in side]) for side in zip(*due.slots, strict=True))
-    opens, closes = (pl.lit(side).gather(last) for side in sides)
+    opens, closes = (pl.lit(side).gather(last) + pl.col("moved_ns") for side in sides)
     return opens, closes
 
 

@@ -296,7 +296,7 @@ def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame
     A shaping node in ROS 2 does not know its callback's handle. A decision of its is there once for
     each subscription of its process; which one took the message, the source timestamp tells.
     """
-    decisions = events.table(tables, "gate_release", ["mode"])
+    decisions = events.table(tables, "gate_release", ["mode", "moved"])
     key = ["pid", "callback"]
     callbacks = objects.callbacks.with_columns(callback="handle")
     handles = callbacks.select(*key, "callback_id").unique()
@@ -325,8 +325,8 @@ def gated_hops(
 ) -> pl.DataFrame:
     """What gates decided about the messages of a chain: one row per hop whose callback is a gate.
 
-    ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode``
-    of `gate_release`, sorted; ``let_go`` is when it really did. Several messages may have the same
+    ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode,
+    moved_ns`` of `gate_release`, sorted; ``let_go`` is when it really did. Several messages may have the same
     source timestamp (writers stamp in microseconds, a simulated clock stands still): then the
     decision is meant whose ``arrival`` is nearest to the start of the callback.
     """
@@ -339,4 +339,5 @@ def gated_hops(
     return found.unique(["traversal", "hop"], keep="first", maintain_order=True).select(
         *("traversal", "hop", "arrival", "origin", "release", "let_go", "slot"),
         *("cycles_waited", "anchor", "overrun", "mode"),
+        moved_ns=pl.col("moved").fill_null(0),
     )

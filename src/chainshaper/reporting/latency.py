@@ -25,7 +25,13 @@ from chainshaper.reporting.tables import (
 )
 from chainshaper.values.durations import milliseconds
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
-from chainshaper.verify.overruns import dropped_text, next_cycles, overruns_text
+from chainshaper.verify.overruns import (
+    dropped_text,
+    moves_in,
+    moves_text,
+    next_cycles,
+    overruns_text,
+)
 from chainshaper.verify.predictions import FigureHeld, PredictionHeld
 
 LATE = ("came late", "maximum", "jitter (max − min)")
@@ -86,6 +92,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "overruns_by_policy": overruns,
         "overrun_outcomes": {name: asdict(one) for name, one in measurement.outcomes.items()},
         "into_open_slots": measurement.into_open_slots,
+        "moves": moves_in(analysis),
         "dropped": None if dropped is None else sum(dropped.values()),
         "dropped_by_reason": dropped,
         "stalls_watched": measurement.longest_stall_ns is not None,
@@ -233,6 +240,9 @@ def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
             ("real-time scheduling", YES_NO.get(info.realtime, ABSENT)),
         ):
             rows.setdefault(title, []).append(cell)
+    moves = [moves_in(one.analysis) for one in measurements]
+    if any(moves):
+        rows["slots followed latencies"] = [moves_text(own) if own else ABSENT for own in moves]
     return rows
 
 

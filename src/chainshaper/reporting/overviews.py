@@ -501,7 +501,9 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
         title = f"{one.chain}: {one.rate_hz:.2f} cycles a second"
         if one.promised_ns is not None:
             shares = ", ".join(map(percent, one.shares)) or "no output yet"
-            title += f"; the plan's last slot ends at {ms(one.promised_ns)} ms, in slots: {shares}"
+            moved = f", moved by {one.moved_ns / 1e6:+.3f} ms" if one.moved_ns else ""
+            title += f"; the plan's last slot ends at {ms(one.promised_ns)} ms{moved}"
+            title += f", in slots: {shares}"
         names = ("cycles", "min", "p50", "p99", "max", "jitter", "late", "incomplete")
         table = ResultTable(title, [*words("last [ms]"), *figures(*names)], one.problem)
         for span, own in one.spans.items():

@@ -36,7 +36,7 @@ from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, escape, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown
-from chainshaper.verify.overruns import next_cycles, overruns_text
+from chainshaper.verify.overruns import moves_in, moves_text, next_cycles, overruns_text
 
 __all__ = ["ENDINGS", "report_page", "write_report"]
 
@@ -209,7 +209,7 @@ def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str
         "comparison": of_chain.comparison_table(compared, names).html(),
         "predictions": _lines(map(_prediction, parts)),
         "hops": _lines(hops),
-        "overruns": _lines(map(_overruns, parts)),
+        "overruns": _lines(_overruns(part) + _moves(part) for part in parts),
         "incomplete": incomplete.html()
         if incomplete.rows
         else _paragraph("Every cycle that began is complete."),
@@ -287,6 +287,19 @@ def _callbacks(part: _Part) -> str:
     table = overviews.callback_table(callback_statistics(part.flow))
     title = f"Callbacks of {part.name} ({len(table.rows)}) [ms]"
     return _details(title, table.html(), unfolded=len(table.rows) <= LISTED)
+
+
+def _moves(part: _Part) -> str:
+    """Slots that followed the latencies, move by move."""
+    moves = moves_in(part.measurement.analysis)
+    if not moves:
+        return ""
+    begun = int(part.measurement.analysis.traversals["start"][0])
+    table = ResultTable("", figures("from the recording's second", "moved by [ms]"))
+    for move in moves:
+        table.add(f"{(move['from_ns'] - begun) / 1e9:.3f}", f"{move['moved_ns'] / 1e6:+.3f}")
+    title = f"{part.name}: slots followed the latencies, {moves_text(moves)}"
+    return _details(title, table.html(), unfolded=len(moves) <= LISTED)
 
 
 def _overruns(part: _Part) -> str:

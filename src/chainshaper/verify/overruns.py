@@ -14,7 +14,7 @@ Whatever the policy, an overrun is to be late by itself: the **next cycle** was 
 missed its slot too, or did not come, whatever the cause.
 """
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import polars as pl
@@ -40,6 +40,8 @@ _WITHOUT_NODE = {
     "bypass": "went around the shaping node, which was not there",
     "silence": "were not published, since the shaping node was not there",
 }
+
+_MOVES_SHOWN = 8
 
 
 def gate_releases(
@@ -160,6 +162,23 @@ def into_open_slots(
         return None
     table = decided.filter(pl.col("overrun").is_null())
     return int((table["release"] == table["arrival"]).sum())
+
+
+def moves_in(analysis: LatencyAnalysis) -> list[dict[str, int]]:
+    """From which cycle on (``from_ns``, its origin) the slots of a chain's output were moved, and by
+    how much from where the plan has them (``moved_ns``): slots that follow the latencies.
+    """
+    decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
+    moved = pl.col("moved_ns")
+    found = decided.sort("origin").filter(moved != moved.shift(1, fill_value=0))
+    return found.select(from_ns="origin", moved_ns=moved).to_dicts()
+
+
+def moves_text(moves: Sequence[Mapping[str, int]]) -> str:
+    """``moved 2 times, by +1.2 +0.8 ms``; of many the last."""
+    last = " ".join(f"{move['moved_ns'] / 1e6:+.3f}" for move in moves[-_MOVES_SHOWN:])
+    more = "last " if len(moves) > _MOVES_SHOWN else ""
+    return f"moved {len(moves)} {'time' if len(moves) == 1 else 'times'}, {more}by {last} ms"
 
 
 def dropped_in(

@@ -39,6 +39,7 @@ from chainshaper.sources.preload import (
     joined_tables,
 )
 from chainshaper.sources.system import processes_of
+from chainshaper.splicing.shaped_outputs import find_outputs
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import (
@@ -81,7 +82,7 @@ class ChainNow:
 
     ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of outputs that left in
     each of the plan's slots, over the hour (empty: without a plan); ``promised_ns`` is the end of
-    its last slot; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
+    its last slot, which is ``moved_ns`` behind the plan's; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
     and ``incomplete``. ``problem`` says why there is nothing to be seen.
     """
 
@@ -91,6 +92,7 @@ class ChainNow:
     hops: tuple[Hop, ...]
     shares: tuple[float, ...]
     promised_ns: int | None
+    moved_ns: int
     counted: Mapping[str, int]
     problem: str | None
 
@@ -273,14 +275,16 @@ class Watch:
                 for number, topic in zip(found.chain.callbacks, topics, strict=True)
             ]
         self._over_ns = over
+        moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
         return Seen(
             at_ns=now,
             processes=processes_of(tables, dict.fromkeys(self.processes, "")),
             lost=self.lost,
-            chains=tuple(self._now(one, over) for one in self.chains),
+            chains=tuple(self._now(one, over, moved) for one in self.chains),
         )
 
-    def _now(self, one: _Chain, over_ns: int) -> ChainNow:
+    def _now(self, one: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
+        moved_ns = moved.get(one.text.rpartition("..")[2], 0)
         within = one.begun > over_ns - SPANS["minute"]
         begun = one.begun[within]
         lasted = int(begun[-1] - begun[0]) if begun.size > 1 else 0
@@ -290,7 +294,8 @@ class Watch:
             rate_hz=(begun.size - 1) * SECOND / lasted if lasted else 0.0,
             hops=tuple(_hops(one)),
             shares=one.shares(),
-            promised_ns=one.slots[-1][1] if one.slots else None,
+            promised_ns=one.slots[-1][1] + moved_ns if one.slots else None,
+            moved_ns=moved_ns,
             counted=dict(one.counted),
             problem=one.problem,
         )
