@@ -7,6 +7,7 @@ import time
 from dataclasses import replace
 
 import pytest
+from gate_table import Case, walk
 from hypothesis import given
 from hypothesis import strategies as st
 from known import known
@@ -447,3 +448,25 @@ def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.Monke
     assert not shaper.switch(None, 1150 * MS)
     assert decided(shaper, serialized(1200 * MS), 1210 * MS).mode == "highway"
     assert not Shaper(ONE).switch("city", 5)
+
+
+@given(
+    overrun=st.sampled_from(["wait", "publish"]),
+    arrivals=st.lists(st.integers(0, 2_000), min_size=1, max_size=12).map(sorted),
+    ages=st.lists(st.integers(0, 150), min_size=12, max_size=12),
+    moves=st.lists(st.tuples(st.integers(0, 2_000), st.integers(-60, 39)), max_size=5).map(sorted),
+)
+def test_moves_lose_double_and_reorder_no_message(
+    overrun: str, arrivals: list[int], ages: list[int], moves: list[tuple[int, int]]
+) -> None:
+    gate = Gate(slots=((60, 61),), cycle_ns=100, overrun=overrun, depth=12)
+    stamped = tuple((at, at - age) for at, age in zip(arrivals, ages, strict=False))
+    outcomes = walk(Case(gate, stamped, moves=tuple(moves)), publishing_ns=1)
+    left = [outcome.left_ns for outcome in outcomes]
+    assert all(known(time) >= at for time, at in zip(left, arrivals, strict=True))
+    assert sorted(set(left), key=known) == left, "each once, in the order in which they came"
+    for outcome in outcomes:
+        release = outcome.release
+        if release.slot is not None:
+            start = release.start_ns(100) + 60 + release.moved_ns
+            assert start <= known(release.at_ns) < start + 1, "in the slot of its cycle"

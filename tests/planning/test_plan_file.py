@@ -24,7 +24,7 @@ from chainshaper.planning import (
     server_of,
 )
 from chainshaper.planning.application_plan import whole
-from chainshaper.planning.plan import ChainOfPlan, Evidence
+from chainshaper.planning.plan import Adaptation, ChainOfPlan, Evidence
 from chainshaper.values.errors import InputError, OperationError
 
 GOOD = """\
@@ -161,10 +161,23 @@ WRONG_MODES = [  # what is replaced, by what, the line in the modes, the key, an
 ]
 
 
-@pytest.mark.parametrize("case", [*WRONG_VALUES, *WRONG_MODES], ids=lambda case: case[1].strip())
+ADAPTED = GOOD + "adaptation: {window: 2000, late: 1.4, gain: 0.02, after: 9, max_latency: 70ms}\n"
+WRONG_ADAPTATIONS = [
+    ("window: 2000", "window: 7", 27, "adaptation.window", "equal to 500"),
+    ("late: 1.4", "late: 1", 27, "adaptation.late", "greater than 1"),
+    ("gain: 0.02", "gain: 2%", 27, "adaptation.gain", "not a number"),
+    ("after: 9", "after: 0", 27, "adaptation.after", "equal to 1"),
+    ("max_latency: 70ms", "max_latency: 64ms", 27, "adaptation.max_latency", "ends behind it"),
+    ("gain: 0.02", "gains: 0.02", 27, "adaptation.gains", "unknown key"),
+]
+
+
+@pytest.mark.parametrize(
+    "case", [*WRONG_VALUES, *WRONG_MODES, *WRONG_ADAPTATIONS], ids=lambda case: case[1].strip()
+)
 def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, str]) -> None:
     old, new, line, key, words = case
-    text = GOOD
+    text = ADAPTED if case in WRONG_ADAPTATIONS else GOOD
     if case in WRONG_MODES:
         text, line = WITH_MODES, line + WITH_MODES[: WITH_MODES.index("modes:")].count("\n")
     assert old in text
@@ -361,6 +374,9 @@ def plans(draw: st.DrawFn) -> Plan:
         servers=(chain, Server(name=name, core=0, priority=1, slots=slots, threads=(node.thread,))),
         shaping_node=node,
         modes=draw(optional(modes(len(slots)))),
+        adaptation=draw(
+            optional(st.builds(Adaptation, late=st.floats(1.1, 10), after=st.integers(1, 10**6)))
+        ),
         predicted=Prediction(mean_ns=1, max_ns=high, jitter_ns=0, shares=draw(SHARES)),
     )
 

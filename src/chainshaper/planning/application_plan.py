@@ -248,7 +248,7 @@ def reach(plan: ApplicationPlan, place: int, latest_ns: int | None = None) -> tu
     reason = "they begin and end where they have to"
     found = [0, 0]
     for side, most in enumerate((-slots[0][0], latest - slots[-1][1])):
-        step = 1 << abs(most).bit_length()
+        step = _GRID_NS << (abs(most) // _GRID_NS).bit_length()
         while (step := step // 2) >= _GRID_NS:
             further = found[side] + (step if side else -step)
             if abs(further) > abs(most):

@@ -165,8 +165,8 @@ def into_open_slots(
 
 
 def moves_in(analysis: LatencyAnalysis) -> list[dict[str, int]]:
-    """From which cycle on (``from_ns``, its origin) the slots of a chain's output were moved, and by
-    how much from where the plan has them (``moved_ns``): slots that follow the latencies.
+    """From which cycle on (``from_ns``, its origin) the slots of a chain's output were moved, and
+    by how much from where the plan has them (``moved_ns``): slots that follow the latencies.
     """
     decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
     moved = pl.col("moved_ns")

@@ -82,8 +82,9 @@ class ChainNow:
 
     ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of outputs that left in
     each of the plan's slots, over the hour (empty: without a plan); ``promised_ns`` is the end of
-    its last slot, which is ``moved_ns`` behind the plan's; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
-    and ``incomplete``. ``problem`` says why there is nothing to be seen.
+    its last slot, which is ``moved_ns`` behind the plan's; ``counted`` are cycles since the watch
+    began: ``complete``, of these ``late``, and ``incomplete``. ``problem`` says why there is
+    nothing to be seen.
     """
 
     chain: str

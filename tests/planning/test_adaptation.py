@@ -1,0 +1,235 @@
+"""Slots that follow the latencies: when the estimator has them move, and how far they may."""
+
+import json
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from processes import wait_for
+from small_chain import small_chain_plan
+
+from chainshaper.flow.drift import SlotFollower
+from chainshaper.flow.threads import followed_chains
+from chainshaper.gate import handover
+from chainshaper.gate.handover import Turn
+from chainshaper.planning.application_plan import combined, reach, whole, with_slots_moved
+from chainshaper.planning.margins import Tail
+from chainshaper.planning.plan import Adaptation, Modes, Plan, revised, with_slots
+from chainshaper.planning.shaping import let_per_chain
+from chainshaper.splicing import shaped_outputs
+from chainshaper.splicing.shaped_outputs import find_outputs, output_text
+from chainshaper.values.errors import InputError, OperationError
+
+MS = 1_000_000
+RULES = Adaptation()
+SHAPES = {
+    "normal": lambda random, n: 50 * MS * (1 + 0.04 * random.standard_normal(n)),
+    "long-tailed": lambda random, n: 40 * MS + random.exponential(2.5 * MS, n),
+    "bimodal": lambda random, n: (
+        np.where(random.random(n) < 0.1, 60, 48) * MS + random.normal(0, MS, n)
+    ),
+    "constant": lambda _, n: np.full(n, 50.0 * MS),
+    "with stalls": lambda random, n: (
+        50 * MS
+        + random.normal(0, MS, n)
+        + np.where(random.random(n) < 0.003, random.uniform(0, 30 * MS, n), 0)
+    ),
+}
+
+
+def drawn(shape: str, seed: int, count: int) -> Any:
+    return SHAPES[shape](np.random.default_rng(seed), count)
+
+
+def follow(
+    latencies: Any, start: float, promised: float = 0.01, **how: Any
+) -> list[tuple[int, int]]:
+    """The moves: behind which latency, and where to."""
+    how = {"latest_ns": 10**9, "rules": RULES, **how}
+    tail = Tail(how.pop("rules"), promised, round(start), float(np.median(latencies[:99])), **how)
+    return [(n, to) for n, one in enumerate(latencies) if (to := tail.saw(round(one))) is not None]
+
+
+def planned(shape: str, promised: float) -> float:
+    return float(np.quantile(drawn(shape, 1, 200_000), 1 - promised, method="higher"))
+
+
+@settings(max_examples=12, deadline=None)
+@given(
+    shape=st.sampled_from(sorted(SHAPES)),
+    seed=st.integers(0, 10**6),
+    promised=st.sampled_from([0.02, 0.01, 1e-4]),
+    off=st.sampled_from([0.9, 1.0, 1.0, 1.2]),
+)
+def test_nothing_oscillates_where_nothing_changes(
+    shape: str, seed: int, promised: float, off: float
+) -> None:
+    """Wherever slots were planned: they go where they belong, and then stay."""
+    start = planned(shape, promised) * off
+    starts = [start, *(to for _, to in follow(drawn(shape, seed, 10_000), start, promised))]
+    turns = [b > a for a, b in pairwise(starts)]
+    assert sum(a != b for a, b in pairwise(turns)) <= 1, starts
+    if off == 1.0:
+        assert len(turns) <= 1, "where they belong already"
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    blocks=st.lists(
+        st.tuples(st.integers(0, 200 * MS), st.integers(0, 30 * MS), st.integers(1, 700)),
+        min_size=1,
+        max_size=6,
+    ),
+    bound=st.integers(55 * MS, 90 * MS),
+    seed=st.integers(0, 99),
+)
+def test_no_input_moves_a_slot_beyond_its_bounds(
+    blocks: list[tuple[int, int, int]], bound: int, seed: int
+) -> None:
+    random = np.random.default_rng(seed)
+    latencies = np.concatenate([low + random.integers(0, width + 1, n) for low, width, n in blocks])
+    moves = follow(latencies, 52 * MS, latest_ns=bound, earliest_ns=20 * MS)
+    assert all(20 * MS <= to <= bound for _, to in moves)
+    assert all(a != b for (_, a), (_, b) in pairwise(moves)), "every move is one"
+
+
+@pytest.mark.parametrize("shape", ["normal", "long-tailed"])
+def test_a_step_is_followed_within_50_cycles_and_given_back(shape: str) -> None:
+    latencies = drawn(shape, 3, 20_000) * np.repeat([1, 1.2, 1], [6_000, 7_000, 7_000])
+    start = planned(shape, 0.01)
+    (first, up), *between, (last, down) = follow(latencies, start)
+    assert 6_000 < first < 6_050
+    assert 1.17 * start < up < 1.4 * start
+    assert last > 13_000 + RULES.after, "not before it was worth it for so long"
+    assert abs(down / start - 1) < 0.03
+    assert len(between) <= 4
+
+
+@pytest.mark.parametrize("direction", [1, -1])
+def test_a_drift_is_followed_in_steps_of_one_direction(direction: int) -> None:
+    """A twelfth within 5,000 cycles."""
+    scale = 1 + direction * np.arange(5_000) / 60_000
+    latencies, start = drawn("normal", 5, 5_000) * scale, planned("normal", 0.01)
+    starts = np.full(5_000, start)
+    moves = follow(latencies, start)
+    for n, to in moves:
+        starts[n + 1 :] = to
+    assert all((to > before) is (direction > 0) for (_, before), (_, to) in pairwise(moves))
+    assert np.mean(latencies > starts) < 0.02
+    assert starts.mean() < 1.02 * (start * scale).mean()
+    assert 2 <= len(moves) <= 15
+
+
+# Plans ------------------------------------------------------------------------------------------
+
+
+def small(**changes: Any) -> Plan:
+    """R_m is [0, 21 ms), R_m° [21, 22), the cycle 50 ms."""
+    return revised(small_chain_plan(10 * MS, 20 * MS), **changes)
+
+
+def test_the_chains_slot_and_the_outputs_move_together() -> None:
+    moved = with_slots_moved(whole(small()), {0: 3 * MS}).chains[0]
+    assert {one.name: one.slots for one in moved.servers} == {
+        "chain": ((0, 24 * MS),),
+        "output": ((24 * MS, 25 * MS),),
+    }
+    assert reach(whole(small()), 0) == (-20_999_000, 28 * MS), "the chain's slot is not empty"
+    assert reach(whole(small()), 0, 30 * MS)[1] == 8 * MS
+    bands = {"output": [(11 * MS, 12 * MS), (21 * MS, 22 * MS)]}
+    banded = revised(small(), servers=with_slots(small().servers, bands))
+    (first, last) = with_slots_moved(whole(banded), {0: -2 * MS}).chains[0].servers[1].slots
+    assert (first, last) == ((9 * MS, 10 * MS), (19 * MS, 20 * MS))
+
+
+def test_slots_do_not_move_into_another_chains() -> None:
+    """One whose chain has [30 ms, 40 ms) of the same core and priority."""
+    one, other = small(), small().model_copy(deep=True)
+    chain, _ = other.servers
+    chain = chain.model_copy(
+        update={"name": "other", "slots": ((30 * MS, 40 * MS),), "threads": ()}
+    )
+    bare = other.chain.model_copy(update={"spec": "/b..", "output": None, "publisher": None})
+    other = revised(other, chain=bare, servers=(chain,), shaping_node=None)
+    both = combined([one, other])
+    assert reach(both, 0)[1] == 9 * MS
+    with pytest.raises(InputError, match=r"meets \[0ms, 30\.001ms\)"):
+        with_slots_moved(both, {0: 9_001_000})
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        (let_per_chain(small()), "under let-per-chain slots are where the policy has them"),
+        (small(modes=Modes(topic="/m", default="a", bands={"a": 1})), "each mode has latencies"),
+        (small(shaping_node=None), "no shaping node sees when outputs come"),
+    ],
+)
+def test_what_cannot_follow_says_why(plan: Plan, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        followed_chains(whole(plan), "freezer")
+
+
+def test_only_slots_that_a_back_end_can_move_with_a_cycle_follow() -> None:
+    bound = whole(revised(small(), shaping_thread="in-slots"))
+    for back_end in ("scx", "litmus"):
+        assert followed_chains(whole(small()), back_end)[1].reaches_ns, "the gate alone moves"
+        with pytest.raises(InputError, match=f"{back_end} does not move .* choose freezer"):
+            followed_chains(bound, back_end)
+    plan, followed = followed_chains(bound, "freezer", 30 * MS)
+    assert followed.reaches_ns[0][1] == 8 * MS
+    assert plan.chains[0].adaptation == Adaptation(max_latency_ns=30 * MS)
+    with pytest.raises(InputError, match=r"ends behind it"):
+        followed_chains(bound, "freezer", 21 * MS)
+
+
+# With a gate ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    folder = tmp_path / "outputs"
+    for room in (handover, shaped_outputs):
+        monkeypatch.setattr(room, "page_folders", lambda: iter([str(folder)]))
+    return folder
+
+
+def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> None:
+    plan = small()
+    node = plan.shaping_node
+    assert node is not None
+    with pytest.raises(OperationError, match="no gates publish it now"):
+        SlotFollower(plan, (), (0, 8 * MS), lambda _: 0)
+    turn = Turn("gate", node.output)
+    assert turn.take(None)
+    asked: list[int] = []
+
+    def put_in_force(by_ns: int) -> int:
+        asked.append(by_ns)
+        return 1_000
+
+    follower = SlotFollower(plan, (), (0, 8 * MS), put_in_force)
+    with pytest.raises(OperationError, match="another run has the slots"):
+        SlotFollower(plan, (), (0, 8 * MS), put_in_force)
+    assert turn.moved() is None
+    for _ in range(20):
+        turn.count(None, None, late=True, latency_ns=25 * MS)
+    wait_for(lambda: turn.moved() is not None, "a move")
+    (move,) = follower.moves
+    assert turn.moved() == (move.moved_ns, 1_000)
+    assert asked == [move.moved_ns]
+    assert 4 * MS <= move.moved_ns <= 8 * MS
+    (output,) = find_outputs([str(pages)])
+    assert f"its slots are moved by +{move.moved_ns / MS:g}ms" in output_text(output)
+    assert json.loads(json.dumps(move.__dict__))["why"] == "its promise did not hold any more"
+    follower.end()
+    back = turn.moved()
+    assert back is not None
+    assert back[0] == 0
+    assert back[1] <= time.monotonic_ns()
