@@ -60,7 +60,7 @@ def planned(shape: str, promised: float) -> float:
     return float(np.quantile(drawn(shape, 1, 200_000), 1 - promised, method="higher"))
 
 
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=8, deadline=None)
 @given(
     shape=st.sampled_from(sorted(SHAPES)),
     seed=st.integers(0, 10**6),
@@ -70,11 +70,13 @@ def planned(shape: str, promised: float) -> float:
 def test_nothing_oscillates_where_nothing_changes(
     shape: str, seed: int, promised: float, off: float
 ) -> None:
-    """Wherever slots were planned: they go where they belong, and then stay."""
+    """Wherever slots were planned: they go where they belong, and then stay. Too far at most, in
+    one step from too early, and too far back, where a share is extrapolated.
+    """
     start = planned(shape, promised) * off
     starts = [start, *(to for _, to in follow(drawn(shape, seed, 10_000), start, promised))]
     turns = [b > a for a, b in pairwise(starts)]
-    assert sum(a != b for a, b in pairwise(turns)) <= 1, starts
+    assert sum(a != b for a, b in pairwise(turns)) <= (2 if promised < 0.001 else 1), starts
     if off == 1.0:
         assert len(turns) <= 1, "where they belong already"
 
@@ -113,17 +115,17 @@ def test_a_step_is_followed_within_50_cycles_and_given_back(shape: str) -> None:
 
 @pytest.mark.parametrize("direction", [1, -1])
 def test_a_drift_is_followed_in_steps_of_one_direction(direction: int) -> None:
-    """A twelfth within 5,000 cycles."""
-    scale = 1 + direction * np.arange(5_000) / 60_000
-    latencies, start = drawn("normal", 5, 5_000) * scale, planned("normal", 0.01)
-    starts = np.full(5_000, start)
+    """A fifth within 12,000 cycles."""
+    scale = 1 + direction * np.arange(12_000) / 60_000
+    latencies, start = drawn("normal", 5, 12_000) * scale, planned("normal", 0.01)
+    starts = np.full(12_000, start)
     moves = follow(latencies, start)
     for n, to in moves:
         starts[n + 1 :] = to
     assert all((to > before) is (direction > 0) for (_, before), (_, to) in pairwise(moves))
     assert np.mean(latencies > starts) < 0.02
     assert starts.mean() < 1.02 * (start * scale).mean()
-    assert 2 <= len(moves) <= 15
+    assert 5 <= len(moves) <= 25
 
 
 # Plans ------------------------------------------------------------------------------------------

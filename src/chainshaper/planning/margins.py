@@ -69,6 +69,7 @@ LATEST = 64  # so many are compared with those before
 LOOKS = 80  # in a window
 FEWEST_BEYOND = 5  # with fewer in the sample, a latency is extrapolated
 SURELY = 3.0  # standard errors of what is extrapolated
+REJECTED = 1.2  # A² of a tail that is none: p is some 0.01 (Choulakian and Stephens, 2001, table 2)
 
 LEAST_LOG = np.log(1e-12)  # of a probability: a fitted end may stand at the longest excess itself
 
@@ -399,9 +400,10 @@ class Tail:
       count for where they would be now. Then the share that is late by now is held against the
       promise. Of a share so small that the window has hardly any beyond, the generalised Pareto
       distribution says where it begins, with its standard error (Hosking and Wallis, 1987).
-    * Slots move earlier when that has been worth it for :attr:`.Adaptation.after` cycles on end;
-      for twice as many, each time that this was wrong and nothing has changed since. So however
-      the input is distributed, on a stationary one moves get rarer and rarer.
+    * Slots move earlier when far fewer than promised are late, or latencies fall, and that has been
+      worth it for :attr:`.Adaptation.after` cycles on end; for twice as many, each time that this
+      was wrong and nothing has changed since. So however the input is distributed, on a stationary
+      one moves get rarer and rarer.
     """
 
     rules: Adaptation
@@ -466,24 +468,25 @@ class Tail:
         window, size = self._kept[self._begin : self._end], self._end - self._begin
         if size < self.rules.window // 8:
             return None
-        now, drifts = _without_drift(window)
+        now, rise = _without_drift(window)
         low, high = np.quantile(now[:-LATEST], (0.25, 0.75))
         most = _by_chance(LATEST, 0.25, DOUBT_AT_ONCE)
         latest = now[-LATEST:]
         if max(np.count_nonzero(latest < low), np.count_nonzero(latest > high)) > most:
             self._forget(self._end - LATEST)
             return None
-        if drifts:
+        if rise:
             self._after = self.rules.after
         late = int(np.count_nonzero(now > self.start_ns))
         unlikely = _by_chance(size, self.promised, DOUBT)
         aim, error = _beyond(now, AIM * self.promised)
         if error:
-            if self.rules.window * AIM * self.promised >= FEWEST_BEYOND:
-                return None  # there will be enough
+            if size < self.rules.window:
+                return None  # there will be more
             least, its = _beyond(now, self.rules.late * self.promised)
             broken = late > unlikely or self.start_ns < least - SURELY * its
-            loose = self.start_ns > aim + SURELY * error
+            aim += SURELY * error if error < math.inf else 0.0
+            loose = error < math.inf and self.start_ns > aim
         else:
             broken = late > max(unlikely, self.rules.late * self.promised * size)
             loose = late < _by_chance(size, AIM * self.promised, 1 - DOUBT)
@@ -491,7 +494,7 @@ class Tail:
             if self._earlier_at and self.seen - self._earlier_at < 2 * self.rules.window:
                 self._after *= 2  # that was wrong
             return self._move_to(aim)
-        if not loose or self.start_ns - aim < self.rules.gain * self.start_ns:
+        if not (loose or (rise < 0 and not error)) or self.start_ns - aim < self.rules.gain * self.start_ns:
             self._worth_since = None
         elif self._worth_since is None:
             self._worth_since = self.seen
@@ -519,8 +522,9 @@ def _by_chance(trials: int, probability: float, doubt: float) -> int:
     return int(np.count_nonzero(bdtrc(np.arange(trials + 1), trials, probability) > doubt))
 
 
-def _without_drift(latencies: _Floats) -> tuple[_Floats, bool]:
-    """Latencies in their order as they would be now, if their thirds show a trend; whether so.
+def _without_drift(latencies: _Floats) -> tuple[_Floats, float]:
+    """Latencies in their order as they would be now, and by how much they rise from their first
+    third to the last; 0, where these do not show a trend.
 
     Medians of thirds are apart where they differ by four standard errors.
     """
@@ -529,14 +533,15 @@ def _without_drift(latencies: _Floats) -> tuple[_Floats, bool]:
     rise = float(np.median(last) - np.median(first))
     spread = 1.4826 * float(np.median(np.abs(middle - np.median(middle))))
     if abs(rise) <= 4 * 1.2533 * spread * math.sqrt(2 / third):
-        return latencies, False
-    return latencies + rise / (size - third) * np.arange(size - 1, -1, -1), True
+        return latencies, 0.0
+    return latencies + rise / (size - third) * np.arange(size - 1, -1, -1), rise
 
 
 def _beyond(latencies: _Floats, share: float) -> tuple[float, float]:
     """The latency beyond which a share of a sample lies, and, if extrapolated, its standard error.
 
-    The error is that of a generalised Pareto tail with both parameters estimated.
+    The error is that of a generalised Pareto tail with both parameters estimated. Where the longest
+    latencies do not look like one, the longest stands for it, with any error.
     """
     if (beyond := int(latencies.size * share)) >= FEWEST_BEYOND:
         place = latencies.size - beyond - 1
@@ -544,10 +549,10 @@ def _beyond(latencies: _Floats, share: float) -> tuple[float, float]:
     count = int(min(latencies.size ** (2 / 3), MOST_EXCESSES))
     ordered = np.sort(latencies)[-count - 1 :]
     threshold, excesses = ordered[0], (ordered[1:] - ordered[0])[np.newaxis, :]
-    if not excesses.any():
-        return float(threshold), 1.0
-    shape, scale = (float(each[0]) for each in _l_moment_fit(excesses))
-    shape = min(shape, 0.5)
+    fit = _l_moment_fit(excesses) if excesses.any() else None
+    if fit is None or _anderson_darling(excesses, *fit)[0] > REJECTED:
+        return float(ordered[-1]), math.inf
+    shape, scale = min(float(fit[0][0]), 0.5), float(fit[1][0])
     logarithm = math.log(max(1.0, count / latencies.size / share))
     by_scale = logarithm if abs(shape) < 1e-6 else math.expm1(shape * logarithm) / shape
     by_shape = scale * logarithm**2 / 2
