@@ -44,13 +44,14 @@ def normal(random: np.random.Generator, count: int) -> Floats:
 
 def callbacks(random: np.random.Generator, count: int) -> Floats:
     """Five callbacks of 10 ms, each of gamma distributed times that vary by 6 %."""
-    return random.gamma(280, 10 / 280 * MS, (5, count)).sum(axis=0)
+    total: Floats = random.gamma(280, 10 / 280 * MS, (5, count)).sum(axis=0)
+    return total
 
 
 def bimodal(random: np.random.Generator, count: int) -> Floats:
     """A tenth of the cycles takes 60 ms, the others 48 ms, and 1 ms more or less."""
     usual = np.where(random.random(count) < 0.1, 60.0, 48.0)
-    return (usual + random.standard_normal(count)) * MS
+    return np.asarray((usual + random.standard_normal(count)) * MS)
 
 
 def long_tailed(random: np.random.Generator, count: int) -> Floats:
@@ -68,7 +69,7 @@ def step(cycle: npt.NDArray[np.int64], count: int) -> Floats:
 
 def drift(cycle: npt.NDArray[np.int64], _: int) -> Floats:
     place = cycle / (20 * PER_MINUTE) % 2
-    return 1 + 0.2 * np.minimum(place, 2 - place)
+    return np.asarray(1 + 0.2 * np.minimum(place, 2 - place), dtype=np.float64)
 
 
 def outside_steps(scale: Floats) -> npt.NDArray[np.bool_]:
@@ -158,7 +159,8 @@ def work(message: bytes) -> bytes:
 def live_scale(cycle: npt.NDArray[np.int64], change: str, count: int) -> Floats:
     if change == "step":
         return np.where(cycle < count // 3, 1.0, 1.2)
-    return 1 + cycle * (CYCLE_MS / 60_000 / 100) * (change == "drift")
+    a_cycle = CYCLE_MS / 60_000 / 100 if change == "drift" else 0.0
+    return np.asarray(1 + cycle * a_cycle, dtype=np.float64)
 
 
 def application() -> Application:

@@ -173,6 +173,32 @@ def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(tmp_path: 
         assert inside_its_slots(spinner, since[2], end, (5, 12), anchor=MS) > 0.99
 
 
+def test_slots_move_at_the_end_of_a_cycle_and_lets_nothing_slip_between(tmp_path: Path) -> None:
+    first, later = (
+        tuple(server(name, slot) for name, slot in zip("ab", slots, strict=True))
+        for slots in (((2, 7), (7, 9)), ((2, 12), (12, 14)))
+    )
+    with (
+        stamping(tmp_path, 30) as one,
+        stamping(tmp_path, 30) as two,
+        freezer(tmp_path, *first) as back_end,
+    ):
+        back_end.assign(one.tid, "a")
+        back_end.assign(two.tid, "b")
+        back_end.arm(0)
+        begin = begun(back_end)
+        with ahead_of_others(one.tid, two.tid):
+            time.sleep(0.4)
+            back_end.change(ServerTable(CYCLE, later), 0)
+            moved = begun(back_end)
+            time.sleep(0.4)
+            end = time.monotonic_ns()
+        back_end.release()
+        assert (moved - begin) % CYCLE == 0
+        assert inside_its_slots(one, begin, moved, (2, 7)) > 0.99
+        assert inside_its_slots(two, moved, end, (12, 14)) > 0.95
+
+
 def stands_still(tid: int) -> bool:
     ran = cpu_ns(tid)
     time.sleep(0.1)

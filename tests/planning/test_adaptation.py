@@ -2,7 +2,7 @@
 
 import json
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -28,7 +28,7 @@ from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
 RULES = Adaptation()
-SHAPES = {
+SHAPES: dict[str, Callable[[Any, int], Any]] = {
     "normal": lambda random, n: 50 * MS * (1 + 0.04 * random.standard_normal(n)),
     "long-tailed": lambda random, n: 40 * MS + random.exponential(2.5 * MS, n),
     "bimodal": lambda random, n: (
@@ -195,7 +195,7 @@ def test_only_slots_that_a_back_end_can_move_with_a_cycle_follow() -> None:
 
 
 @pytest.fixture
-def pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     folder = tmp_path / "outputs"
     for room in (handover, shaped_outputs):
         monkeypatch.setattr(room, "page_folders", lambda: iter([str(folder)]))

@@ -494,7 +494,10 @@ class Tail:
             if self._earlier_at and self.seen - self._earlier_at < 2 * self.rules.window:
                 self._after *= 2  # that was wrong
             return self._move_to(aim)
-        if not (loose or (rise < 0 and not error)) or self.start_ns - aim < self.rules.gain * self.start_ns:
+        if (
+            not (loose or (rise < 0 and not error))
+            or self.start_ns - aim < self.rules.gain * self.start_ns
+        ):
             self._worth_since = None
         elif self._worth_since is None:
             self._worth_since = self.seen
