@@ -64,7 +64,7 @@ def steady(cycle: npt.NDArray[np.int64], _: int) -> Floats:
 
 
 def step(cycle: npt.NDArray[np.int64], count: int) -> Floats:
-    return 1 + 0.2 * (cycle // (count // 10) % 2)
+    return np.asarray(1 + 0.2 * (cycle // (count // 10) % 2), dtype=np.float64)
 
 
 def drift(cycle: npt.NDArray[np.int64], _: int) -> Floats:
