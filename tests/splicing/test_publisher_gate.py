@@ -142,8 +142,9 @@ def test_it_does_what_the_table_of_all_gates_says(run: Callable[..., Run]) -> No
     """All cases at once, one that the machine disturbed again; in real time, so without those that
     need it to the microsecond.
     """
-    left = {f"/t{number}": case for number, case in enumerate(filter(in_real_time, cases()))}
-    assert len(left) > len(cases()) * 0.8
+    unmoved = [case for case in cases() if not case.moves]  # its slots follow nothing
+    left = {f"/t{number}": case for number, case in enumerate(filter(in_real_time, unmoved))}
+    assert len(left) > len(unmoved) * 0.8
     wrong: dict[str, Any] = {}
     for _ in range(6):
         for half in (0, 1):
