@@ -136,11 +136,6 @@ def small(**changes: Any) -> Plan:
     return revised(small_chain_plan(10 * MS, 20 * MS), **changes)
 
 
-def in_process() -> Plan:
-    node = small().shaping_node
-    return small(shaping_node=node and node.model_copy(update={"in_process": True}))
-
-
 def test_the_chains_slot_and_the_outputs_move_together() -> None:
     moved = with_slots_moved(whole(small()), {0: 3 * MS}).chains[0]
     assert {one.name: one.slots for one in moved.servers} == {
@@ -175,7 +170,6 @@ def test_slots_do_not_move_into_another_chains() -> None:
     [
         (let_per_chain(small()), "under let-per-chain slots are where the policy has them"),
         (small(modes=Modes(topic="/m", default="a", bands={"a": 1})), "each mode has latencies"),
-        (in_process(), "a gate in the publisher's process does not show latencies"),
         (small(shaping_node=None), "no shaping node sees when outputs come"),
     ],
 )

@@ -6,7 +6,9 @@
 import os
 import shutil
 import subprocess
+import threading
 import time
+import uuid
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,8 +18,10 @@ import pytest
 from gate_table import Case, cases, walk
 
 from chainshaper.gate.decision import Gate, gate_parameters
+from chainshaper.gate.handover import page_folders
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.sources.gate_log import read_gate_log
+from chainshaper.splicing.shaped_outputs import FollowedOutput, ShapedOutput, find_outputs
 from chainshaper.splicing.shaping_process import gate_library, set_phase, settings_text
 from chainshaper.values.errors import OperationError
 
@@ -68,6 +72,7 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
         The process lives for half a second behind the last.
         """
         start, logs = time.monotonic_ns() + 300 * MS, {}
+        domain = str(uuid.uuid4().int % 10**9)  # so that pages of other runs are not ours
         blocks, makes = [], ["publisher /other /nobody 10"]
         for topic, gate in gates.items():
             logs[topic] = tmp_path / f"{topic[1:]}.csv"
@@ -76,7 +81,7 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
             about = {"output": topic, "input": f"{topic}_tmp", "node": node, "log": logs[topic]}
             about |= {"thread": gate_thread_name(node), "publisher": "/node5"}
             about |= {"changes": logs[topic].with_suffix(".changes"), "depth": gate.depth}
-            values = gate_parameters(gate, f"/modes{topic}")
+            values = gate_parameters(gate, f"/modes{topic}") | {"handover": node}
             values["phase_ns"] = (start + gate.phase_ns) % gate.cycle_ns
             blocks.append(settings_text(about | values))
             makes.append(f"publisher {topic} node5 {gate.depth}")
@@ -95,12 +100,18 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
                 "LD_PRELOAD": str(gate_library()),
                 "LD_LIBRARY_PATH": str(program.parent),
                 "CHAINSHAPER_GATES": str(tmp_path / "gates"),
+                "ROS_DOMAIN_ID": domain,
                 **env,
             },
         ) as process:
-            meanwhile(tmp_path / "gates")
+            beside = threading.Thread(target=meanwhile, args=(tmp_path / "gates",))
+            beside.start()
             out, err = process.communicate("\n".join([*makes, *ordered]) + "\n", timeout=30)
+            beside.join()
         assert process.returncode == 0, err
+        for folder in page_folders():
+            for page in Path(folder).glob(f"*.{domain}.v*"):
+                page.unlink()
         rows = {
             topic: read_gate_log(log).sort("row").to_dicts() if log.exists() else []
             for topic, log in logs.items()
@@ -142,7 +153,7 @@ def test_it_does_what_the_table_of_all_gates_says(run: Callable[..., Run]) -> No
     """All cases at once, one that the machine disturbed again; in real time, so without those that
     need it to the microsecond.
     """
-    unmoved = [case for case in cases() if not case.moves]  # its slots follow nothing
+    unmoved = [case for case in cases() if not case.moves]  # these have a test of their own
     left = {f"/t{number}": case for number, case in enumerate(filter(in_real_time, unmoved))}
     assert len(left) > len(unmoved) * 0.8
     wrong: dict[str, Any] = {}
@@ -261,3 +272,31 @@ def test_cycles_begin_elsewhere_from_the_next_one_on(run: Callable[..., Run]) ->
     assert origins == sorted(origins)
     with pytest.raises(OperationError, match="has no gate of other"):
         set_phase(Path(os.devnull), "other", 0)
+
+
+def test_its_output_is_shown_and_its_slots_move_while_they_are_followed(
+    run: Callable[..., Run],
+) -> None:
+    times = [n * 100 * MS + 20 * MS for n in range(12)]
+    seen, latencies = list[ShapedOutput](), list[int]()
+
+    def follow(_: Path) -> None:
+        time.sleep(0.7)
+        seen.extend(one for one in find_outputs() if one.topic == "/t5")
+        followed = FollowedOutput("/t5")
+        followed.move(10 * MS, time.monotonic_ns() + 100 * MS)
+        time.sleep(0.4)
+        latencies.extend(followed.latencies())
+        followed.close()
+
+    done = run({"/t5": SLOT}, [at(ns, stamp=ns - 20 * MS) for ns in times], follow)
+    assert [one.state for one in seen] == ["in process"]
+    assert 0 < seen[0].published < 6
+    assert all(latency >= 20 * MS for latency in latencies)
+    moved = [row["moved"] for row in done.logs["/t5"]]
+    assert {*moved} == {0, 10 * MS}
+    assert [row["release"] - row["origin"] - row["moved"] for row in done.logs["/t5"]] == [
+        60 * MS
+    ] * 12
+    assert moved[-1] == 0, "who had them follow has ended"
+    assert done.written() == [*range(12)]

@@ -159,10 +159,6 @@ def why_not_followed(plan: Plan) -> str | None:
         return "each mode has latencies and a slot of its own, and one promise is for all"
     if plan.shaping_node is None:
         return "no shaping node sees when outputs come (plan with --publication synchronous)"
-    if plan.shaping_node.in_process:
-        return (
-            "a gate in the publisher's process does not show latencies (--publication synchronous)"
-        )
     if plan.further_shaping_nodes:
         return "its other outputs are published in slots of the same servers"
     return None

@@ -20,7 +20,7 @@ from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 from chainshaper.values.yaml_file import FullName
 
-OutputState: TypeAlias = Literal["shaped", "bypassed", "silent", "no standby"]
+OutputState: TypeAlias = Literal["shaped", "in process", "bypassed", "silent", "no standby"]
 _TOPIC: TypeAdapter[str] = TypeAdapter(FullName)
 
 
@@ -29,7 +29,7 @@ class ShapedOutput:
     """An output with a shaping node, as it is now; it counts since the machine has booted.
 
     ``state`` is ``bypassed`` or ``silent`` while no shaping node is in force, and ``no standby``
-    when one is, but nothing would stand in for it.
+    when one is, but nothing would stand in for it: a gate ``in process`` ends with its publisher.
     """
 
     topic: str
@@ -78,6 +78,7 @@ def output_text(output: ShapedOutput) -> str:
     gone = f"for {format_duration(since_ns // 1_000_000 * 1_000_000)}, {output.messages} messages"
     text = {
         "shaped": shaped,
+        "in process": f"{shaped}, which publishes it",
         "no standby": f"{shaped}, but has no standby: it falls silent when that ends",
         "bypassed": f"{output.topic} is bypassed {gone} go around its shaping node",
         "silent": f"{output.topic} is silent {gone} were not published",
@@ -151,7 +152,8 @@ def _looked_at(page: Page) -> list[ShapedOutput]:
     if not holder and not standby:
         return []
     since = page["bypassing_since_ns"] if standby else 0
-    state: OutputState = "shaped" if standby else "no standby"
+    alone: OutputState = "in process" if page["in_process"] else "no standby"
+    state: OutputState = "shaped" if standby else alone
     if since or not holder:
         state = "silent" if page["silent"] else "bypassed"
     counts = {why: page[why.replace(" ", "_").lower()] for why in (*DROPPED, "lost by DDS")}

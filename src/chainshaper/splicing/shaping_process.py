@@ -100,10 +100,8 @@ def write_shaping_process(
         message_type=message_type,
     )
     beside, files_beside = _process("python", "standby", standby, folder, remappings=remappings)
-    # The files may be moved before they are used; the log stays where it is.
-    place = hashlib.sha256(str((log or folder).absolute()).encode()).hexdigest()
     parameters = shaping_parameters(plan, node, log)
-    parameters["handover"] = f"{node.name}.{place[:8]}"
+    parameters["handover"] = _page_name(node, log or folder)
     of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
         "shaping_node": node.name,
         "fallback": plan.fallback,
@@ -116,6 +114,11 @@ def write_shaping_process(
     files |= {f"{node.name}.yaml": _yaml(parameters), f"{standby}.yaml": _yaml(of_standby)}
     _write(into or folder, {**files, **files_beside})
     return replace(process, standby=beside)
+
+
+def _page_name(node: ShapingNode, place: Path) -> str:
+    """Of the page of an output: the files may be moved before they are used, the log may not."""
+    return f"{node.name}.{hashlib.sha256(str(place.absolute()).encode()).hexdigest()[:8]}"
 
 
 def write_throttler(
@@ -299,7 +302,8 @@ def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> s
         "thread": gate_thread_name(node.name),
         "changes": log.with_suffix(".changes").absolute(),
     }
-    return settings_text(values | shaping_parameters(plan, node, log))
+    values |= shaping_parameters(plan, node, log) | {"handover": _page_name(node, log)}
+    return settings_text(values)
 
 
 def settings_text(values: Mapping[str, Any]) -> str:

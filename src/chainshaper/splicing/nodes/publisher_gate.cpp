@@ -16,7 +16,6 @@
 #include <dlfcn.h>
 #include <pthread.h>
 #include <semaphore.h>
-#include <sys/stat.h>
 
 #include <atomic>
 #include <fstream>
@@ -25,6 +24,7 @@
 #include <thread>
 
 #include "chainshaper_shaping/gate_log.hpp"
+#include "chainshaper_shaping/handover.hpp"
 
 #define EXPORTED extern "C" __attribute__((visibility("default")))
 
@@ -311,7 +311,11 @@ public:
         type_support_(type_support),
         shaper_(
             gate_of(settings_.parameters, depth), settings_.parameters.spin_ns,
-            [](std::int64_t) {}, [this] { look(); }) {
+            [](std::int64_t) {}, [this] { look(); },
+            [this](const Release & release, std::int64_t phase_ns) {
+              if (turn_) turn_->hold(release.at_ns, phase_ns, release.mode);
+            }) {
+    show();
     const auto & parameters = settings_.parameters;
     if (!parameters.log.empty() && !log_.open_file(parameters.log, parameters.log_bytes))
       say("no log is written to %s: %s", parameters.log.c_str(), std::strerror(errno));
@@ -369,6 +373,31 @@ public:
   const RmwPublisher * const publisher;
 
 private:
+  // A page shows what becomes of the output; no standby looks at it. Cycles begin where they did for
+  // the process before this one, in its mode.
+  void show() {
+    const auto & name = settings_.parameters.handover;
+    if (name.empty()) return;
+    try {
+      turn_.emplace(name, settings_.output, page_folders(), true);
+    } catch (const std::runtime_error & error) {
+      say("%s is not among the outputs that are shown: %s", settings_.output.c_str(), error.what());
+      return;
+    }
+    const auto & gate = shaper_.queue.gate;
+    if (const auto phase = turn_->phase_ns())
+      shaper_.set_phase(*phase, monotonic_ns() - gate.cycle_ns);  // from now on
+    if (const auto mode = turn_->mode(); gate.modes && mode && *mode < gate.modes->names.size())
+      shaper_.announce(gate.modes->names[*mode], 0);
+  }
+
+  void note(const Outcome<Message> & outcome, Maybe published_ns = {}, Maybe stalled_ns = {}) {
+    log_.write(shaper_.queue.gate, outcome, published_ns, stalled_ns);
+    if (turn_)
+      turn_->count(outcome.dropped, {}, outcome.release.overrun.has_value(),
+                   outcome.waiting.arrival_ns - outcome.release.origin_ns);
+  }
+
   // Of CLOCK_REALTIME, and each once: it tells a message from the others.
   std::int64_t next_stamp() {
     std::int64_t before = stamp_.load();
@@ -385,7 +414,7 @@ private:
         if (shaper_.queue.waiting.empty())
           while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
         look();
-        for (const auto & gone : shaper_.overflowed) log_.write(shaper_.queue.gate, gone);
+        for (const auto & gone : shaper_.overflowed) note(gone);
         shaper_.overflowed.clear();
         if (!shaper_.queue.waiting.empty()) serve();
       }
@@ -425,6 +454,8 @@ private:
       newest = before;
     }
     if (oldest != nullptr) read_changes();
+    if (const auto moved = turn_ ? turn_->moved() : std::nullopt)
+      shaper_.move_slots(moved->first, moved->second);
     while (oldest != nullptr) {
       Message message(oldest);
       oldest = oldest->next;
@@ -461,6 +492,8 @@ private:
     const auto & oldest = shaper_.queue.waiting.front();
     EMIT(rmw_take, &rmw_subscription_, oldest.message.get(), oldest.message->stamp, true);
     EMIT(callback_start, &callback_, false);
+    const auto key = oldest.message->stamp;
+    if (turn_) turn_->take(key);
     const auto outcome = shaper_.hold();
     Maybe published_ns;
     Maybe stalled_ns;
@@ -470,11 +503,12 @@ private:
     }
     EMIT(callback_end, &callback_);
     if (!outcome) return;
+    if (turn_) turn_->done(key);
     if (published_ns) {
       stalled_ns = shaper_.time_lost(*outcome);
       shaper_.rest(*published_ns, settings_.parameters.pause_ns);
     }
-    log_.write(shaper_.queue.gate, *outcome, published_ns, stalled_ns);
+    note(*outcome, published_ns, stalled_ns);
   }
 
   void publish(const Serialized & message) {
@@ -501,6 +535,7 @@ private:
   bool failed_{false};
   std::pair<ino_t, long> changes_{};  // NOLINT(runtime/int)
   sem_t more_{};
+  std::optional<Turn> turn_;
   Shaper<Message> shaper_;
   GateLog log_;
   std::optional<ModeTopic> modes_;

@@ -168,9 +168,11 @@ inline std::unique_ptr<Page> open_page(const std::string & name, const std::stri
 // Whose turn it is to publish a message; messages are named by their source timestamps.
 class Turn {
 public:
-  Turn(std::string name, std::string topic, std::vector<std::string> folders = page_folders())
+  Turn(std::string name, std::string topic, std::vector<std::string> folders = page_folders(),
+       bool in_process = false)
       : name_(std::move(name)), topic_(std::move(topic)), folders_(std::move(folders)) {
     page_ = open_page(name_, topic_, folders_);
+    page_->set(Field::in_process, in_process ? 1 : 0);
     const auto now = monotonic_ns();
     if (now - page_->get(Field::started_ns) > schema::at_once_ns)
       page_->set(Field::failed_starts, 0);
