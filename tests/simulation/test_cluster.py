@@ -16,8 +16,8 @@ from processes import wait_for
 from quick_chain import quick_chain
 
 from chainshaper import sweep
-from chainshaper.flow import sweep as sweeping
 from chainshaper.flow.sweep import rows_beside
+from chainshaper.linux import computing
 from chainshaper.values.errors import InputError, OperationError
 
 distributed = pytest.importorskip("distributed", reason="Dask's `distributed` is not installed")
@@ -114,7 +114,7 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
     start: Start, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Dask's worker ends when it cannot load what it is sent: here it has no chainshaper."""
-    monkeypatch.setattr(sweeping, "WITHOUT_WORKERS_S", 1)
+    monkeypatch.setattr(computing, "WITHOUT_WORKERS_S", 1)
     (tmp_path / "other" / "chainshaper").mkdir(parents=True)
     (tmp_path / "other" / "chainshaper" / "__init__.py").touch()
     ended = worker(start, scheduler, path=tmp_path / "other")
@@ -129,7 +129,7 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
 def test_where_no_scheduler_answers_the_address_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweeping, "CONNECT_S", 1)
+    monkeypatch.setattr(computing, "CONNECT_S", 1)
     with socket.socket() as reserved:
         reserved.bind(("127.0.0.1", 0))  # nothing listens there
         address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
