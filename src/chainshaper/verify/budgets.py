@@ -12,9 +12,7 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 ``starts`` is the topic or period that starts a callback, as `chainshaper callbacks` shows it.
 """
 
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
@@ -27,6 +25,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.latency import PERCENTILES, LatencyAnalysis, callback_statistics
+from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
 from chainshaper.values.durations import format_duration
@@ -44,6 +43,7 @@ __all__ = [
     "junit_report",
     "load_budget",
     "markdown_report",
+    "named_callbacks",
     "propose_budget",
     "save_budget",
 ]
@@ -202,7 +202,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             response_ns=limit(_most(row["response_ns"])),
             execution_ns=limit(_most(row["execution_ns"])),
         )
-        for row in _callbacks(flow).to_dicts()
+        for row in named_callbacks(flow).to_dicts()
     )
     return Budget(chains=tuple(of_chains), callbacks=callbacks)
 
@@ -233,7 +233,7 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         found += hops
     rows = {
         (row["node"], trigger_text(row["topic"], row["period_ns"])): row
-        for row in _callbacks(flow).to_dicts()
+        for row in named_callbacks(flow).to_dicts()
     }
     for callback in budget.callbacks:
         row = rows.get((callback.node, callback.starts), {})
@@ -251,27 +251,24 @@ def check_budgets(
     paths: Sequence[Path],
     budget: Budget,
     progress: Callable[[float, str], None] = lambda *_: None,
+    scheduler: str | None = None,
 ) -> list[list[Judged]]:
-    """Recordings and traces against a budget, in their order, as many at a time as there are cores.
+    """Recordings and traces against a budget, in their order, as many at a time as there are cores,
+    or as the cluster of a Dask ``scheduler`` computes.
 
     What cannot be read breaks the budget as well, with the reason: the others are judged all the
-    same.
+    same. Raises: as :func:`~chainshaper.linux.computing.engine`.
     """
-    if len(paths) < 2:
-        return [_checked(path, budget) for path in paths]
-    workers = min(len(paths), len(os.sched_getaffinity(0)))
-    found: dict[int, list[Judged]] = {}
-    with ThreadPoolExecutor(workers) as pool:  # decoding and analysis run without Python's lock
-        running = {pool.submit(_checked, path, budget): n for n, path in enumerate(paths)}
-        for done in as_completed(running):
-            found[running[done]] = done.result()
-            progress(len(found) / len(paths), f"{len(found)} of {len(paths)} recordings")
-    return [found[number] for number in range(len(paths))]
+    return computed(
+        _checked, paths, budget, scheduler=scheduler, purpose="a check", progress=progress
+    )
 
 
-def _checked(path: Path, budget: Budget) -> list[Judged]:
+def _checked(
+    path: Path, budget: Budget, progress: Callable[[float, str], None] | None = None
+) -> list[Judged]:
     try:
-        return check_budget(open_source(path), budget, str(path))
+        return check_budget(open_source(path, progress=progress), budget, str(path))
     except ChainshaperError as error:
         return [Judged(str(path), str(path), "its events", 0, None, because=str(error))]
 
@@ -335,7 +332,7 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
 
 
-def _callbacks(flow: DataFlow) -> pl.DataFrame:
+def named_callbacks(flow: DataFlow) -> pl.DataFrame:
     """Callbacks that ran and are named alike in every run, without those that every node has."""
     return (
         callback_statistics(flow)
