@@ -15,7 +15,7 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 from xml.etree import ElementTree
 
 import polars as pl
@@ -38,6 +38,7 @@ from chainshaper.verify.measure import chain_of, hop_breakdown, measure_latency
 __all__ = [
     "Budget",
     "Judged",
+    "Verdict",
     "check_budget",
     "check_budgets",
     "junit_report",
@@ -349,9 +350,24 @@ def _most(times: dict[str, float] | None) -> float | None:
     return None if times is None else times["max"]
 
 
-def junit_report(judged: Sequence[Judged]) -> str:
-    """JUnit XML: a suite for each recording, a test case for each limit."""
-    root = ElementTree.Element("testsuites", name="chainshaper budget")
+class Verdict(Protocol):
+    """A limit, or a callback beside a baseline: what reports have of it."""
+
+    @property
+    def recording(self) -> str: ...
+    @property
+    def where(self) -> str: ...
+    @property
+    def what(self) -> str: ...
+    @property
+    def met(self) -> bool: ...
+    @property
+    def text(self) -> str: ...
+
+
+def junit_report(judged: Sequence[Verdict]) -> str:
+    """JUnit XML: a suite for each recording, a test case for each limit or callback."""
+    root = ElementTree.Element("testsuites", name="chainshaper check")
     for recording in dict.fromkeys(one.recording for one in judged):
         own = [one for one in judged if one.recording == recording]
         broken = sum(not one.met for one in own)
@@ -366,22 +382,22 @@ def junit_report(judged: Sequence[Judged]) -> str:
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def markdown_report(judged: Sequence[Judged]) -> str:
-    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met."""
+def markdown_report(
+    judged: Sequence[Verdict], words: tuple[str, str, str] = ("limits", "broken", "met")
+) -> str:
+    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met.
+
+    ``words`` are for what is judged, and for both verdicts.
+    """
+    noun, bad, good = words
     broken = [one for one in judged if not one.met]
-    met = len(judged) - len(broken)
     lines = [
-        f"**{len(broken)} of {len(judged)} limits are broken**"
+        f"**{len(broken)} of {len(judged)} {noun} are {bad}**"
         if broken
-        else f"**All {met} limits are met**"
+        else f"**All {len(judged)} {noun} are {good}**"
     ]
     if broken:
-        lines += ["", "| recording | limit |", "|---|---|"]
-        lines += [
-            f"| {cell} |"
-            for one in broken
-            for cell in [
-                " | ".join(shown(t).replace("|", "\\|") for t in (one.recording, one.text))
-            ]
-        ]
+        lines += ["", f"| recording | {noun.removesuffix('s')} |", "|---|---|"]
+        cells = ((shown(t).replace("|", "\\|") for t in (o.recording, o.text)) for o in broken)
+        lines += [f"| {' | '.join(own)} |" for own in cells]
     return "\n".join(lines) + "\n"

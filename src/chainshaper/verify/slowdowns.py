@@ -41,7 +41,7 @@ from chainshaper.values.application import trigger_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.budgets import named_callbacks
-from chainshaper.verify.measure import chain_of, measure_latency
+from chainshaper.verify.measure import measure_latency
 
 __all__ = ["Compared", "Sample", "find_slowdowns", "sample_of", "slowdowns_in"]
 
@@ -50,7 +50,7 @@ LEAST = log1p(0.005)
 """Less is no slowdown: another build of the same program differs by as much."""
 COMMON = log1p(0.1)
 PRIOR = 8
-RUN_SHARE, RUN_LEAST, RUN_MOST = 0.2, 0.0015, 0.01
+RUN_SHARE, RUN_LEAST, RUN_MOST = 0.2, 0.001, 0.01
 """Standard deviation from run to run: this share of that of ratios of instances, and limits."""
 WINDOW, ALIKE, SHIFT = 32, 0.8, 64
 BLOCKS, FEWEST = 20, 40
@@ -133,14 +133,19 @@ def slowdowns_in(
 ) -> tuple[list[Compared], list[str]]:
     """:func:`find_slowdowns` in recordings and traces, which are read in parallel.
 
-    Raises: as :func:`find_slowdowns` and :func:`~chainshaper.linux.computing.engine`. InputError: a
-    recording cannot be read, or lacks one of the ``chains`` (none: those that recordings name).
+    ``chains`` are those to speak of; without, those that recordings name. Raises: as
+    :func:`find_slowdowns` and :func:`~chainshaper.linux.computing.engine`. InputError: a recording
+    cannot be read.
     """
     every, purpose = [*paths, *before], "a comparison"
     samples = computed(
         _read, every, tuple(chains), scheduler=scheduler, purpose=purpose, progress=progress
     )
-    return find_slowdowns(samples[: len(paths)], samples[len(paths) :])
+    compared, notes = find_slowdowns(samples[: len(paths)], samples[len(paths) :])
+    missing = {
+        (chain, one.recording) for chain in chains for one in samples if chain not in one.chains
+    }
+    return compared, [*notes, *(f"{chain} is not in {name}" for chain, name in sorted(missing))]
 
 
 def _read(
@@ -152,7 +157,7 @@ def _read(
 
 
 def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None = None) -> Sample:
-    """What counts of a recording. Raises InputError: it does not have one of the ``chains``."""
+    """What counts of a recording, and of the ``chains`` that it has (none: its own)."""
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     names = {
         row["callback_id"]: (row["node"], trigger_text(row["topic"], row["period_ns"]))
@@ -175,17 +180,13 @@ def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None
         names[number]: Taken(*(own[time].to_numpy() for time in Taken._fields))
         for (number,), own in calm.group_by("callback_id", maintain_order=True)
     }
-    wanted = list(chains)
-    if not wanted:
-        with contextlib.suppress(InputError):  # it names none, or one that is not in it
-            wanted = [chain_of(recording, None)]
     found = {}
-    for chain in wanted:
-        with contextlib.suppress(*([] if chains else [InputError])):
+    for chain in chains or (None,):
+        with contextlib.suppress(InputError):  # it names none, or the chain is not in it
             analysis = measure_latency(recording, chain, flow=flow).analysis
             median = analysis.undisturbed.percentiles_ns.get("50", np.nan)
             on_the_way = frozenset(names[n] for n in analysis.chain.callbacks if n in names)
-            found[chain] = (float(median), on_the_way)
+            found[analysis.chain.spec] = (float(median), on_the_way)
     return Sample(name or str(recording.path), callbacks, found)
 
 
