@@ -237,13 +237,14 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         for row in named_callbacks(flow).to_dicts()
     }
     for callback in budget.callbacks:
-        row = rows.get((callback.node, callback.starts), {})
+        row = rows.get((callback.node, callback.starts))
+        lacks = "no such callback" if row is None else "no such time"
         where = f"{callback.node} ({callback.starts})"
         for what in ("response", "execution"):
             limit = getattr(callback, f"{what}_ns")
             if limit is not None:
-                most = _most(row.get(f"{what}_ns"))
-                why = None if most is not None else "the recording has no such time"
+                most = _most((row or {}).get(f"{what}_ns"))
+                why = None if most is not None else f"the recording has {lacks}"
                 found.append(Judged(name, where, what, limit, most, because=why))
     return found
 

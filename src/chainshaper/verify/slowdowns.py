@@ -52,7 +52,7 @@ COMMON = log1p(0.1)
 PRIOR = 8
 RUN_SHARE, RUN_LEAST, RUN_MOST = 0.2, 0.001, 0.01
 """Standard deviation from run to run: this share of that of ratios of instances, and limits."""
-WINDOW, ALIKE, SHIFT = 32, 0.8, 64
+WINDOW, ALIKE, SHIFT = 32, 0.8, 128
 BLOCKS, FEWEST = 20, 40
 
 Times: TypeAlias = npt.NDArray[np.float64]
