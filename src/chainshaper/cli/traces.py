@@ -208,23 +208,27 @@ def check(
     --baseline all recordings together are compared with those of before, callback by callback.
     """
     from chainshaper.values.files import new_file, write_whole
-    from chainshaper.verify import budgets, slowdowns
+    from chainshaper.verify import budgets
 
     if budget is None and not baseline:
         raise InputError("say what to check against: --budget FILE, or --baseline REC")
     limits = budgets.Budget() if budget is None else budgets.load_budget(budget)
     for wanted in filter(None, (junit, markdown)):
         new_file(wanted)
-    found, compared, notes = list[list[budgets.Judged]](), list[slowdowns.Compared](), list[str]()
+    found: list[list[Judged]] = []
+    compared: list[Compared] = []
+    notes: list[str] = []
     paths, before = _matching(recordings), _matching(baseline or [])
     with out.late_progress("check") as report:
         if budget is not None:
             found = budgets.check_budgets(paths, limits, report, scheduler)
         if before:
+            from chainshaper.verify.slowdowns import slowdowns_in
+
             chains = chain or [one.chain for one in limits.chains]
-            compared, notes = slowdowns.slowdowns_in(paths, before, chains, report, scheduler)
+            compared, notes = slowdowns_in(paths, before, chains, report, scheduler)
     judged = [one for own in found for one in own]
-    every: list[budgets.Judged | slowdowns.Compared] = [*judged, *compared]
+    every: list[Judged | Compared] = [*judged, *compared]
     if junit is not None:
         write_whole(junit, [budgets.junit_report(every).encode()])
     if markdown is not None:
