@@ -10,11 +10,12 @@ which other instances of the chain had its core. So a recording in which instanc
 core tells the same as one in which nothing overlapped, where an instance's times sum up to its
 latency; and what took long together stays together, as L̄ has it.
 
-**Stages.** On the axis of the chain's latency stage j begins when all executions of j − 1 were over:
-s_1 = 0 and s_{j+1} ≥ s_j + W_j, with W_j the longest time that its callbacks took together, in one
-instance. As in eq. 1, its slot is [s_j, s_j + W_j + ε); it repeats every cycle, so it is a cycle
-long at most, and modulo CT two slots of one core do not overlap: a stage may wait for its turn. The
-ε of a stage lies beside the next one, which may be late by it: one ε serves the whole chain.
+**Stages.** On the axis of the chain's latency stage j begins when all executions of j − 1 were
+over: s_1 = 0 and s_{j+1} ≥ s_j + W_j, with W_j the longest time that its callbacks took together,
+in one instance. As in eq. 1, its slot is [s_j, s_j + W_j + ε); it repeats every cycle, so it is a
+cycle long at most, and modulo CT two slots of one core do not overlap: a stage may wait for its
+turn. The ε of a stage lies beside the next one, which may be late by it: one ε serves the whole
+chain.
 
 **Search.** The shortest cut is that with the earliest end; of several, with the fewest stages, then
 the fewest cores. Once cut, cores and turns are chosen, the starts obey difference constraints

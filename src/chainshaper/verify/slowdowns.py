@@ -21,7 +21,7 @@ callbacks together (Bonferroni). ``benchmarks/slowdowns.py`` shows how often tha
 """
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from math import expm1, log1p
 from pathlib import Path
@@ -54,6 +54,7 @@ RUN_SHARE, RUN_LEAST, RUN_MOST = 0.2, 0.001, 0.01
 """Standard deviation from run to run: this share of that of ratios of instances, and limits."""
 WINDOW, ALIKE, SHIFT = 32, 0.8, 128
 BLOCKS, FEWEST = 20, 40
+SEVERAL, MUCH = 3, 0.03
 
 Times: TypeAlias = npt.NDArray[np.float64]
 Places: TypeAlias = npt.NDArray[np.intp]
@@ -244,7 +245,24 @@ def find_slowdowns(
                 chains=_chains(samples, before, name),
             )
         )
-    return sorted(compared, key=lambda one: one.p), notes
+    compared.sort(key=lambda one: one.p)
+    return compared, [*notes, *_doubts(compared, min(len(samples), len(before)))]
+
+
+def _doubts(compared: Sequence[Compared], fewest: int) -> Iterator[str]:
+    """What speaks against the verdicts, by how many recordings a side has."""
+    if fewest < SEVERAL and not all(one.met for one in compared):
+        yield (
+            "now and then a process runs slower from its start to its end, by chance: see whether"
+            f" {SEVERAL} recordings of each side say the same"
+        )
+    worst = max(compared, key=lambda one: one.resolution)
+    if worst.resolution > MUCH:
+        least = min(one.resolution for one in compared)
+        yield (
+            f"slowdowns from {least:.1%} on, at {worst.where} from {worst.resolution:.1%} on, are"
+            " found in most comparisons: more recordings of each side, or longer ones, find less"
+        )
 
 
 def _chains(samples: Sequence[Sample], before: Sequence[Sample], name: Name) -> dict[str, float]:
