@@ -1,4 +1,4 @@
-"""Slowdowns: callbacks that take longer than in recordings of before, told apart from noise.
+"""Slowdowns: callbacks that take longer than in recordings of before, by more than noise.
 
 What is compared is CPU time where all recordings have it, else the time from start to end, without
 instances that met a stall of the machine. Each recording is set against the first one of before:
@@ -49,8 +49,8 @@ LEVEL = 1 / 200
 LEAST = log1p(0.005)
 """Less is no slowdown: another build of the same program differs by as much."""
 COMMON = log1p(0.1)
-PRIOR = 8
-RUN_SHARE, RUN_LEAST, RUN_MOST = 0.2, 0.001, 0.01
+PRIOR = 12
+RUN_SHARE, RUN_LEAST, RUN_MOST = 0.15, 0.001, 0.01
 """Standard deviation from run to run: this share of that of ratios of instances, and limits."""
 WINDOW, ALIKE, SHIFT = 32, 0.8, 128
 BLOCKS, FEWEST = 20, 40
