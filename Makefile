@@ -40,6 +40,7 @@ benchmark: .venv/.ready-dev
 	.venv/bin/python benchmarks/sweep.py
 	.venv/bin/python benchmarks/ctf_decode.py
 	.venv/bin/python benchmarks/trace_to_latency.py
+	.venv/bin/python benchmarks/fleet.py
 	.venv/bin/python benchmarks/enforcement/enter_exit.py
 
 # The paper's tables and figures, ours beside them, in experiments/RESULTS.md. An hour on a quiet

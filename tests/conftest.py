@@ -33,6 +33,7 @@ TIMELESS |= {"enforcement/test_dispatcher", "workload/test_event_log"}
 TIMELESS |= {"flow/test_drift", "gate/test_throttling", "verify/test_several_chains"}
 TIMELESS |= {"enforcement/test_node_threads", "flow/test_profiles", "linux/test_processes"}
 TIMELESS |= {
+    "verify/test_slowdowns",
     "verify/test_budgets",
     "verify/test_predictions",
     "verify/test_watch",

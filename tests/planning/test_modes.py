@@ -20,7 +20,7 @@ from chainshaper.planning import (
     plan_warnings,
     publish_slots,
 )
-from chainshaper.planning.modes import place_modes
+from chainshaper.planning.request import place_modes
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.workload.description import load_application
 

@@ -14,11 +14,10 @@ from chainshaper.planning import CallbackTimes, Plan, PlanRequest, Profile, plan
 from chainshaper.planning.application_plan import open_until_done as joint_until_done
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.overruns import cycles_until_output, open_until_done, plan_warnings
-from chainshaper.planning.pipeline import in_cycle
+from chainshaper.planning.pipeline import Longest, Stage, in_cycle, opened_early, shortest_cut
 from chainshaper.planning.plan import publish_slots, revised
 from chainshaper.planning.plan_file import dump_plan, load_plan
 from chainshaper.planning.request import cores_for
-from chainshaper.planning.stages import Longest, Stage, opened_early, shortest_cut
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

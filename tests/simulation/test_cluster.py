@@ -15,10 +15,12 @@ import pytest
 from processes import wait_for
 from quick_chain import quick_chain
 
-from chainshaper import sweep
-from chainshaper.flow import sweep as sweeping
+from chainshaper import open_recording, simulate, sweep
 from chainshaper.flow.sweep import rows_beside
+from chainshaper.linux import computing
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.verify.budgets import check_budgets, propose_budget
+from chainshaper.verify.slowdowns import slowdowns_in
 
 distributed = pytest.importorskip("distributed", reason="Dask's `distributed` is not installed")
 
@@ -86,6 +88,24 @@ def test_the_rows_are_the_same_although_a_worker_is_killed(
     assert on_cluster.equals(swept(tmp_path / "here.parquet", workers=1))
 
 
+def test_a_fleet_is_checked_as_here(start: Start, scheduler: str, tmp_path: Path) -> None:
+    """Against a budget and a baseline, a file that cannot be read included."""
+    application = quick_chain(*[{"uniform": ["1ms", "6ms"]}] * 2)
+    paths = [simulate(application, tmp_path / f"r{n}", cycles=60).path for n in range(3)]
+    budget = propose_budget(open_recording(paths[0]))
+    every = [*paths, tmp_path / "gone"]
+    one = worker(start, scheduler)
+    try:
+        assert check_budgets(every, budget, scheduler=scheduler) == check_budgets(every, budget)
+        assert slowdowns_in(paths[:2], paths[2:], scheduler=scheduler) == slowdowns_in(
+            paths[:2], paths[2:]
+        )
+        with pytest.raises(InputError, match="gone: no such folder"):
+            slowdowns_in(every, paths, scheduler=scheduler)
+    finally:
+        _end(one)
+
+
 def _end(*processes: "subprocess.Popen[bytes]") -> None:
     for process in processes:
         process.kill()
@@ -114,7 +134,7 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
     start: Start, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Dask's worker ends when it cannot load what it is sent: here it has no chainshaper."""
-    monkeypatch.setattr(sweeping, "WITHOUT_WORKERS_S", 1)
+    monkeypatch.setattr(computing, "WITHOUT_WORKERS_S", 1)
     (tmp_path / "other" / "chainshaper").mkdir(parents=True)
     (tmp_path / "other" / "chainshaper" / "__init__.py").touch()
     ended = worker(start, scheduler, path=tmp_path / "other")
@@ -129,7 +149,7 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
 def test_where_no_scheduler_answers_the_address_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sweeping, "CONNECT_S", 1)
+    monkeypatch.setattr(computing, "CONNECT_S", 1)
     with socket.socket() as reserved:
         reserved.bind(("127.0.0.1", 0))  # nothing listens there
         address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"

@@ -107,6 +107,10 @@ CHAIN: str | None = option(
 PLAN_IN_FORCE: Path | None = option(
     "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
 )
+SCHEDULER: str | None = option(
+    "--scheduler ADDRESS",
+    "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
+)
 TRACE: list[Path] = argument(
     "TRACE...",
     "An LTTng trace's folder (several of one trace: kernel and user space), or a recording's.",

@@ -179,10 +179,7 @@ def sweep(
     workers: int | None = opt.option(
         "--workers", "Threads that compute. Default: one per core.", min=1
     ),
-    scheduler: str | None = opt.option(
-        "--scheduler ADDRESS",
-        "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
-    ),
+    scheduler: str | None = opt.SCHEDULER,
     draw: Path | None = opt.option(
         "--draw FILE.png", "Draw average and jitter over the first axis."
     ),

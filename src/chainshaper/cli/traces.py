@@ -11,6 +11,8 @@ from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
     from chainshaper.reporting.tables import ResultTable
+    from chainshaper.verify.budgets import Judged
+    from chainshaper.verify.slowdowns import Compared
 
 
 def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
@@ -172,39 +174,100 @@ def budget(
     out.show_line(save_budget(proposed, output))
 
 
+def _matching(recordings: list[Path]) -> list[Path]:
+    """Folders, and those that a pattern in quotes means, which the shell left to us."""
+    found: list[Path] = []
+    for one in recordings:
+        own = [one]
+        if not one.exists() and any(letter in str(one) for letter in "*?["):
+            own = sorted(Path(one.anchor or ".").glob(str(one.relative_to(one.anchor))))
+        if not own:
+            raise InputError(f"{one}: no folder has such a name; see that the pattern is right")
+        found += own
+    return found
+
+
 def check(
     recordings: list[Path] = opt.argument("REC...", "Recordings' or traces' folders.", ...),
-    budget: Path = opt.option("--budget FILE", "What they have to keep to.", ...),
+    budget: Path | None = opt.option("--budget FILE", "What they have to keep to."),
+    baseline: list[Path] | None = opt.option(
+        "--baseline REC", "Recordings of before (may be repeated): is a callback slower now?"
+    ),
+    chain: list[str] | None = opt.option(
+        "--chain FIRST..LAST",
+        "A chain beside the baseline (may be repeated). Default: the one that recordings name.",
+    ),
     junit: Path | None = opt.option("--junit FILE", "Also write JUnit XML, for a CI system."),
     markdown: Path | None = opt.option("--markdown FILE", "Also write Markdown, for a review."),
+    scheduler: str | None = opt.SCHEDULER,
     json: bool = opt.JSON,
 ) -> None:
-    """Check recordings against a budget; exit code 1 if a limit is broken.
+    """Check recordings against a budget, or those of before; exit code 1 if they are worse.
 
-    Limits are of all cycles. Where only disturbed cycles break one, that is said.
+    A budget's limits are of all cycles. Where only disturbed cycles break one, that is said. With
+    --baseline all recordings together are compared with those of before, callback by callback.
     """
-    from chainshaper.reporting.overviews import broken_table, fleet_table
     from chainshaper.values.files import new_file, write_whole
     from chainshaper.verify import budgets
 
-    limits = budgets.load_budget(budget)
+    if budget is None and not baseline:
+        raise InputError("say what to check against: --budget FILE, or --baseline REC")
+    limits = budgets.Budget() if budget is None else budgets.load_budget(budget)
     for wanted in filter(None, (junit, markdown)):
         new_file(wanted)
+    found: list[list[Judged]] = []
+    compared: list[Compared] = []
+    notes: list[str] = []
+    paths, before = _matching(recordings), _matching(baseline or [])
     with out.late_progress("check") as report:
-        found = budgets.check_budgets(recordings, limits, report)
+        if budget is not None:
+            found = budgets.check_budgets(paths, limits, report, scheduler)
+        if before:
+            from chainshaper.verify.slowdowns import slowdowns_in
+
+            chains = chain or [one.chain for one in limits.chains]
+            compared, notes = slowdowns_in(paths, before, chains, report, scheduler)
     judged = [one for own in found for one in own]
-    for file, write in ((junit, budgets.junit_report), (markdown, budgets.markdown_report)):
-        if file is not None:
-            write_whole(file, [write(judged).encode()])
-    broken = [one for one in judged if not one.met]
+    every: list[Judged | Compared] = [*judged, *compared]
+    if junit is not None:
+        write_whole(junit, [budgets.junit_report(every).encode()])
+    if markdown is not None:
+        words = ("callbacks", "slower than before", "no slower than before")
+        parts = [budgets.markdown_report(judged)] if judged else []
+        parts += [budgets.markdown_report(compared, words)] if compared else []
+        write_whole(markdown, ["\n".join(parts).encode()])
+    out.notes(notes)
     if json:
-        out.print_json([{**asdict(one), "met": one.met} for one in judged])
-    elif broken:
+        out.print_json([{**asdict(one), "met": one.met, "text": one.text} for one in every])
+    verdicts = [
+        _limits_shown(found, str(budget), json) if budget is not None else None,
+        _callbacks_shown(compared, json) if compared else None,
+    ]
+    if any(verdicts):
+        raise OperationError("; ".join(filter(None, verdicts)))
+
+
+def _limits_shown(found: "list[list[Judged]]", budget: str, json: bool) -> str | None:
+    """What breaks of a budget; the number in words, if any."""
+    from chainshaper.reporting.overviews import broken_table, fleet_table
+
+    judged = [one for own in found for one in own]
+    broken = [one for one in judged if not one.met]
+    if broken and not json:
         out.show(*([fleet_table(found)] if len(found) > FEW else []), broken_table(broken))
-    if broken:
-        raise OperationError(f"{len(broken)} of {len(judged)} limits of {budget} are broken")
-    if not json:
+    elif not json:
         out.show_line(f"all {len(judged)} limits of {budget} are met")
+    return f"{len(broken)} of {len(judged)} limits of {budget} are broken" if broken else None
+
+
+def _callbacks_shown(compared: "list[Compared]", json: bool) -> str | None:
+    """Callbacks that are slower; the number in words, if any."""
+    slower = [one for one in compared if not one.met]
+    for one in [] if json else slower:
+        out.show_line(one.text)
+    if not (slower or json):
+        out.show_line(f"none of {len(compared)} callbacks is slower than before")
+    return f"{len(slower)} of {len(compared)} callbacks are slower than before" if slower else None
 
 
 def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":

@@ -14,12 +14,8 @@ A point is what a careful person would do by hand: simulate the application with
 of all others (the profile), plan, splice, simulate again. The run that is planned from and the run
 that is judged draw their execution times with different seeds, so a margin is tried against
 latencies that the plan has not seen, and all points of one seed are judged by the same ones.
-
-Threads suffice to compute, because the compiled engine runs without the interpreter's lock; and
-they open no port and start no process that other users of the machine could reach.
 """
 
-import asyncio
 import dataclasses
 import difflib
 import fcntl
@@ -32,14 +28,11 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from itertools import product
 from math import prod
 from pathlib import Path
-from queue import SimpleQueue
-from threading import Event
 from typing import IO, Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -50,13 +43,14 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from chainshaper.analysis import latency_statistics
 from chainshaper.analysis.latency import PERCENTILES
 from chainshaper.flow.plan import profile_chains
+from chainshaper.linux.computing import engine
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain, publish_slots
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.arrays import build_system
 from chainshaper.values.durations import format_duration, parse_duration
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError, extra_library
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.workload.description import (
@@ -558,15 +552,6 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
 
 # Who computes ----------------------------------------------------------------------------------
 
-CONNECT_S = 10
-WITHOUT_WORKERS_S = 60
-LOOK_S = 0.5
-ASKED_OF_CLUSTER = 10_000
-"""So many points at a time are with a cluster: more than its workers compute at once."""
-SAME = ("chainshaper", "numpy", "distributed")
-"""Packages whose versions rows depend on: NumPy's generators may draw differently."""
-_ADDRESS = re.compile(r"((tcp|tls|ws|wss|ucx)://)?[^/]+:\d+")
-
 
 @dataclass(frozen=True)
 class Group:
@@ -574,16 +559,6 @@ class Group:
 
     profiled: bool
     points: tuple[tuple[int, Values], ...]
-
-
-@dataclass(frozen=True)
-class _Engine:
-    """Who computes: ``submit`` (a function and its arguments, futures among them), the next future
-    that is ``finished``, and how many may be ``under_way``."""
-
-    submit: Callable[..., Any]
-    finished: Callable[[], Any]
-    under_way: int
 
 
 def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
@@ -607,120 +582,31 @@ def rows_of(
     by others; a row does not depend on who computes it. Points that differ in nothing measured
     share a profile; those whose profile is there come first, so that few are in memory at a time.
 
-    Raises InputError: that is no address. PlatformError: `distributed` is not installed.
-    OperationError: no scheduler is there, or it is gone; there are no workers, or one has other
-    versions of what rows depend on; or a point killed one worker after another.
+    Raises: as :func:`~chainshaper.linux.computing.engine`.
     """
     coming = iter(groups_of(grid, points))
     ready: deque[tuple[int, Values, Any]] = deque()
     pending: dict[Any, Group | int] = {}
-    with _threads(workers) if scheduler is None else _cluster(scheduler) as engine:
+    with engine(workers, scheduler, "a sweep", "; finished rows stay") as computing:
         while True:
-            while len(pending) < engine.under_way:
+            while len(pending) < computing.under_way:
                 if ready:
                     number, values, profile = ready.popleft()
-                    pending[engine.submit(row_at, grid, values, profile)] = number
+                    pending[computing.submit(row_at, grid, values, profile)] = number
                 elif (group := next(coming, None)) is None:
                     break
                 elif group.profiled:
-                    pending[engine.submit(profile_at, grid, group.points[0][1])] = group
+                    pending[computing.submit(profile_at, grid, group.points[0][1])] = group
                 else:
                     ready.extend((number, values, None) for number, values in group.points)
             if not pending:
                 return
-            future = engine.finished()
+            future = computing.finished()
             result, of = future.result(), pending.pop(future)
             if isinstance(of, Group):
                 ready.extend((number, values, future) for number, values in of.points)
             else:
                 yield of, result
-
-
-@contextmanager
-def _threads(workers: int) -> Iterator[_Engine]:
-    """Threads of this process, which leave their points unfinished when the sweep ends early."""
-    ending, done = Event(), SimpleQueue["Future[Any]"]()
-
-    def go_on(*_: object) -> None:
-        if ending.is_set():
-            raise CancelledError
-
-    def submit(function: Callable[..., Any], *arguments: Any) -> "Future[Any]":
-        known = [one.result() if isinstance(one, Future) else one for one in arguments]
-        future = pool.submit(function, *known, progress=go_on)
-        future.add_done_callback(done.put)
-        return future
-
-    pool = ThreadPoolExecutor(workers, "sweep")
-    try:
-        yield _Engine(submit, done.get, 2 * workers)
-    finally:
-        ending.set()
-        pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _cluster(address: str) -> Iterator[_Engine]:
-    """A Dask cluster. All of Dask's many errors leave the sweep where it is, and the user with the
-    same things to look at.
-    """
-    distributed, here = extra_library("distributed", "a sweep on a Dask cluster"), _versions()
-    if not _ADDRESS.fullmatch(address):
-        raise InputError(f"{address!r} is no scheduler's address: write one like tcp://HOST:8786")
-    try:
-        connected = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, asyncio.TimeoutError) as error:  # from Python 3.11 on they are one
-        raise OperationError(
-            f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`,"
-            " and give the address that it prints, such as --scheduler tcp://HOST:8786"
-        ) from error
-    with connected as client:
-        completed = distributed.as_completed(loop=client.loop)
-
-        def submit(function: Callable[..., Any], *arguments: Any) -> Any:
-            future = client.submit(_same_versions, here, function, *arguments, pure=False)
-            completed.add(future)
-            return future
-
-        def finished() -> Any:
-            """The next result. Workers may come and go, but one has to be there now and then."""
-            seen = looked = time.monotonic()
-            while not completed.has_ready():
-                time.sleep(0.02)
-                if time.monotonic() - looked > LOOK_S:
-                    looked = time.monotonic()
-                    seen = looked if client.nthreads() else seen
-                    if looked - seen > WITHOUT_WORKERS_S:
-                        raise TimeoutError(f"it has had no workers for {WITHOUT_WORKERS_S} s")
-            return next(completed)
-
-        try:
-            yield _Engine(submit, finished, ASKED_OF_CLUSTER)
-        except ChainshaperError:
-            raise
-        except Exception as error:
-            raise OperationError(
-                f"the Dask cluster at {address} failed ({type(error).__name__}: {error}); finished"
-                " rows stay. See that its workers run, that chainshaper is installed on each,"
-                " and that they have memory; then the same command goes on"
-            ) from error
-
-
-def _versions() -> dict[str, str]:
-    return {name: importlib.metadata.version(name) for name in SAME}
-
-
-def _same_versions(client: dict[str, str], function: Callable[..., Any], *arguments: Any) -> Any:
-    """On a worker, which may have come later than the rest: rows must not depend on who it is."""
-    own = _versions()
-    different = [f"{n} {own[n]}, not {client[n]}" for n in SAME if own[n] != client[n]]
-    if different:
-        worker = importlib.import_module("distributed").get_worker().address
-        raise OperationError(
-            f"the Dask worker at {worker} has {' and '.join(different)}: install the same versions"
-            " there as here"
-        )
-    return function(*arguments)
 
 
 # Where finished rows stand ---------------------------------------------------------------------

@@ -10,7 +10,7 @@ makes that one later than was measured, and its slot too early. Such chains are 
 """
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, permutations
@@ -18,7 +18,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from chainshaper.planning.bands import BandChoice, choose_bands, with_bands, with_long_slot
+from chainshaper.planning.bands import (
+    BandChoice,
+    choose_bands,
+    with_bands,
+    with_long_slot,
+    with_publish_slots,
+)
 from chainshaper.planning.cores import Work, assign_cores
 from chainshaper.planning.margins import (
     EPSILON_NS,
@@ -30,7 +36,6 @@ from chainshaper.planning.margins import (
     derive_margin,
     late_share,
 )
-from chainshaper.planning.modes import place_modes, with_modes
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import pipelined, stage_cores
 from chainshaper.planning.plan import (
@@ -42,6 +47,8 @@ from chainshaper.planning.plan import (
     Margin,
     Modes,
     Plan,
+    Prediction,
+    Slot,
     revised,
 )
 from chainshaper.planning.profile import Profile, with_interference
@@ -264,6 +271,58 @@ def _slot_ns(profile: Profile, request: PlanRequest) -> int:
         longest = SENDS_PER_SLOT * (profile.longest_send_ns or 0)
     grid = max(1, request.grid_ns)
     return max(SHORTEST_SLOT_NS, -(-longest // grid) * grid)
+
+
+def place_modes(
+    starts_ns: Mapping[str, int], length_ns: int, given: Mapping[str, int] | None = None
+) -> tuple[dict[str, int], tuple[Slot, ...]]:
+    """The band of each mode, and the slots: each behind the one before, when all outputs of its
+    modes may leave (with L̄ and ε of the cycles that began in a mode, from L̄ + ε on: eq. 1 for
+    each mode by itself). Unless bands are ``given``, slots that would overlap are one.
+
+    Raises InputError: of the bands given, one is no mode's.
+    """
+    first, band, bands = 0, 0, dict(given or {})
+    for mode in () if given else sorted(starts_ns, key=starts_ns.__getitem__):
+        if not band or starts_ns[mode] >= first + length_ns:
+            first, band = starts_ns[mode], band + 1
+        bands[mode] = band
+    slots: list[Slot] = []
+    for band in range(1, max(bands.values()) + 1):
+        if band not in bands.values():
+            raise InputError(
+                f"no mode has the band {band}, so no latencies say where its slot is: number the"
+                " modes' bands from 1 on, or leave out the numbers"
+            )
+        own = (start for mode, start in starts_ns.items() if bands[mode] == band)
+        start = max(*own, slots[-1][1] if slots else 0)
+        slots.append((start, start + length_ns))
+    return bands, tuple(slots)
+
+
+def with_modes(
+    plan: Plan, modes: Modes, slots: tuple[Slot, ...], measured: Mapping[str, Evidence]
+) -> Plan:
+    """A shaped plan with slots for modes of which each was measured.
+
+    The prediction of the whole is for modes in force as often as they were measured.
+    """
+    ends, cycles = [end for _, end in slots], [0] * len(slots)
+    alone = {}
+    for mode, own in measured.items():
+        start, end = slots[(place := modes.bands[mode] - 1)]
+        cycles[place] += own.samples
+        alone[mode] = Prediction(mean_ns=end, max_ns=end, jitter_ns=end - start, shares=(1.0,))
+    shares = tuple(own / sum(cycles) for own in cycles)
+    predicted = Prediction(
+        mean_ns=round(sum(share * end for share, end in zip(shares, ends, strict=True))),
+        max_ns=ends[-1],
+        jitter_ns=ends[-1] - slots[0][0],
+        shares=shares,
+        modes=alone,
+    )
+    evidence = plan.evidence.model_copy(update={"modes": dict(measured)})
+    return with_publish_slots(plan, slots, evidence=evidence, predicted=predicted, modes=modes)
 
 
 def _together(

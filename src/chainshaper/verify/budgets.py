@@ -12,12 +12,10 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 ``starts`` is the topic or period that starts a callback, as `chainshaper callbacks` shows it.
 """
 
-import os
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Protocol
 from xml.etree import ElementTree
 
 import polars as pl
@@ -27,6 +25,7 @@ from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.latency import PERCENTILES, LatencyAnalysis, callback_statistics
+from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
 from chainshaper.values.durations import format_duration
@@ -39,11 +38,13 @@ from chainshaper.verify.measure import chain_of, hop_breakdown, measure_latency
 __all__ = [
     "Budget",
     "Judged",
+    "Verdict",
     "check_budget",
     "check_budgets",
     "junit_report",
     "load_budget",
     "markdown_report",
+    "named_callbacks",
     "propose_budget",
     "save_budget",
 ]
@@ -202,7 +203,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             response_ns=limit(_most(row["response_ns"])),
             execution_ns=limit(_most(row["execution_ns"])),
         )
-        for row in _callbacks(flow).to_dicts()
+        for row in named_callbacks(flow).to_dicts()
     )
     return Budget(chains=tuple(of_chains), callbacks=callbacks)
 
@@ -233,16 +234,17 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         found += hops
     rows = {
         (row["node"], trigger_text(row["topic"], row["period_ns"])): row
-        for row in _callbacks(flow).to_dicts()
+        for row in named_callbacks(flow).to_dicts()
     }
     for callback in budget.callbacks:
-        row = rows.get((callback.node, callback.starts), {})
+        row = rows.get((callback.node, callback.starts))
+        lacks = "no such callback" if row is None else "no such time"
         where = f"{callback.node} ({callback.starts})"
         for what in ("response", "execution"):
             limit = getattr(callback, f"{what}_ns")
             if limit is not None:
-                most = _most(row.get(f"{what}_ns"))
-                why = None if most is not None else "the recording has no such time"
+                most = _most((row or {}).get(f"{what}_ns"))
+                why = None if most is not None else f"the recording has {lacks}"
                 found.append(Judged(name, where, what, limit, most, because=why))
     return found
 
@@ -251,27 +253,24 @@ def check_budgets(
     paths: Sequence[Path],
     budget: Budget,
     progress: Callable[[float, str], None] = lambda *_: None,
+    scheduler: str | None = None,
 ) -> list[list[Judged]]:
-    """Recordings and traces against a budget, in their order, as many at a time as there are cores.
+    """Recordings and traces against a budget, in their order, as many at a time as there are cores,
+    or as the cluster of a Dask ``scheduler`` computes.
 
     What cannot be read breaks the budget as well, with the reason: the others are judged all the
-    same.
+    same. Raises: as :func:`~chainshaper.linux.computing.engine`.
     """
-    if len(paths) < 2:
-        return [_checked(path, budget) for path in paths]
-    workers = min(len(paths), len(os.sched_getaffinity(0)))
-    found: dict[int, list[Judged]] = {}
-    with ThreadPoolExecutor(workers) as pool:  # decoding and analysis run without Python's lock
-        running = {pool.submit(_checked, path, budget): n for n, path in enumerate(paths)}
-        for done in as_completed(running):
-            found[running[done]] = done.result()
-            progress(len(found) / len(paths), f"{len(found)} of {len(paths)} recordings")
-    return [found[number] for number in range(len(paths))]
+    return computed(
+        _checked, paths, budget, scheduler=scheduler, purpose="a check", progress=progress
+    )
 
 
-def _checked(path: Path, budget: Budget) -> list[Judged]:
+def _checked(
+    path: Path, budget: Budget, progress: Callable[[float, str], None] | None = None
+) -> list[Judged]:
     try:
-        return check_budget(open_source(path), budget, str(path))
+        return check_budget(open_source(path, progress=progress), budget, str(path))
     except ChainshaperError as error:
         return [Judged(str(path), str(path), "its events", 0, None, because=str(error))]
 
@@ -335,7 +334,7 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
 
 
-def _callbacks(flow: DataFlow) -> pl.DataFrame:
+def named_callbacks(flow: DataFlow) -> pl.DataFrame:
     """Callbacks that ran and are named alike in every run, without those that every node has."""
     return (
         callback_statistics(flow)
@@ -352,9 +351,24 @@ def _most(times: dict[str, float] | None) -> float | None:
     return None if times is None else times["max"]
 
 
-def junit_report(judged: Sequence[Judged]) -> str:
-    """JUnit XML: a suite for each recording, a test case for each limit."""
-    root = ElementTree.Element("testsuites", name="chainshaper budget")
+class Verdict(Protocol):
+    """A limit, or a callback beside a baseline: what reports have of it."""
+
+    @property
+    def recording(self) -> str: ...
+    @property
+    def where(self) -> str: ...
+    @property
+    def what(self) -> str: ...
+    @property
+    def met(self) -> bool: ...
+    @property
+    def text(self) -> str: ...
+
+
+def junit_report(judged: Sequence[Verdict]) -> str:
+    """JUnit XML: a suite for each recording, a test case for each limit or callback."""
+    root = ElementTree.Element("testsuites", name="chainshaper check")
     for recording in dict.fromkeys(one.recording for one in judged):
         own = [one for one in judged if one.recording == recording]
         broken = sum(not one.met for one in own)
@@ -369,22 +383,22 @@ def junit_report(judged: Sequence[Judged]) -> str:
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
 
-def markdown_report(judged: Sequence[Judged]) -> str:
-    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met."""
+def markdown_report(
+    judged: Sequence[Verdict], words: tuple[str, str, str] = ("limits", "broken", "met")
+) -> str:
+    """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met.
+
+    ``words`` are for what is judged, and for both verdicts.
+    """
+    noun, bad, good = words
     broken = [one for one in judged if not one.met]
-    met = len(judged) - len(broken)
     lines = [
-        f"**{len(broken)} of {len(judged)} limits are broken**"
+        f"**{len(broken)} of {len(judged)} {noun} are {bad}**"
         if broken
-        else f"**All {met} limits are met**"
+        else f"**All {len(judged)} {noun} are {good}**"
     ]
     if broken:
-        lines += ["", "| recording | limit |", "|---|---|"]
-        lines += [
-            f"| {cell} |"
-            for one in broken
-            for cell in [
-                " | ".join(shown(t).replace("|", "\\|") for t in (one.recording, one.text))
-            ]
-        ]
+        lines += ["", f"| recording | {noun.removesuffix('s')} |", "|---|---|"]
+        cells = ((shown(t).replace("|", "\\|") for t in (o.recording, o.text)) for o in broken)
+        lines += [f"| {' | '.join(own)} |" for own in cells]
     return "\n".join(lines) + "\n"
