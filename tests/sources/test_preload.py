@@ -13,9 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import called, json_of
+from lttng_node import required_node
 from processes import wait_for
 from traced_program import Traced, assert_same, built, of_process, traced
 
+import chainshaper as cs
+from chainshaper.flow import record
+from chainshaper.sources import preload
 from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary
 from chainshaper.sources.preload import (
     SOURCE,
@@ -24,6 +28,7 @@ from chainshaper.sources.preload import (
     TracedProcess,
     build_library,
     event_names,
+    preloading,
 )
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -124,7 +129,7 @@ for n in range(4000):
 for rival in rivals: os.kill(rival, 9)
 for before, after in rows: print(before, after)
 """
-"""Sleeps, moves between cores, rivals on the same core, a fork: clock readings around each event."""
+"""Sleeps, moves between cores, rivals on the same core, a fork: what it read around events."""
 
 
 @pytest.mark.parametrize("tunables", ["", "glibc.pthread.rseq=0"])
@@ -343,11 +348,9 @@ def test_memory_of_others_is_refused(tmp_path: Path) -> None:
 
 def test_the_command_records_and_the_chain_is_measured(tmp_path: Path) -> None:
     program, recording = built(), tmp_path / "recording"
-    made = called(
-        *("record", "--source", "preload", "-o", recording, "--"),
-        *program.command("chain", str(CYCLES)),
-    )
+    made = called("record", "-o", recording, "--", *program.command("chain", str(CYCLES)))
     assert made.code == 0, made.err
+    assert not (recording / "trace").exists(), "the tables have all of it"
     measured = json_of("latency", recording, "--chain", "/ebpf1../ebpf2", "--json")
     assert measured["count"] >= CYCLES - 1
     callbacks = json_of("callbacks", recording, "--json")
@@ -355,10 +358,60 @@ def test_the_command_records_and_the_chain_is_measured(tmp_path: Path) -> None:
     assert json_of("info", recording, "--json")["source"] == "preload"
 
 
+def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> None:
+    """Objects of before are known, events of before are not: the run lasts longer than its part."""
+    environment = {**os.environ, "LD_PRELOAD": str(build_library(tmp_path))}
+    words = built().command("chain", "40")
+    with (
+        subprocess.Popen(words, env=environment, stdout=subprocess.PIPE) as process,
+        subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as other,
+    ):
+        time.sleep(0.7)
+        begun = time.monotonic_ns()
+        attach = ("--duration", "500ms", "--pid", str(process.pid))
+        made = called("record", "--source", "preload", "-o", tmp_path / "rec", *attach)
+        assert (made.code, process.poll()) == (0, None), made.err
+        printed = process.communicate()[0]
+        other.kill()
+    assert printed.count(b"instance") == 80
+    tables = cs.open_recording(tmp_path / "rec").events
+    started = tables["callback_start"]
+    assert set(started["pid"]) == {process.pid}
+    assert (started["time"] >= begun).all()
+    assert 10 <= started.height < 70
+    assert (tables["rcl_node_init"]["time"] < begun).all()
+    assert json_of("latency", tmp_path / "rec", "--chain", "/ebpf1../ebpf2", "--json")["count"] >= 5
+
+
+def test_without_a_library_lttng_records_and_says_why(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a compiler nor what it has built before; then without LTTng as well."""
+    required_node()
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(preload, "SOURCE", tmp_path / "preload.c")
+    (tmp_path / "preload.c").write_text("no C")
+    with pytest.raises(OperationError) as caught:
+        cs.record_command(tmp_path / "rec", ["true"])
+    said = str(caught.value)
+    assert "no process with LTTng trace points was seen" in said
+    assert "LTTng recorded: " in said
+    assert "cannot compile" in said
+    monkeypatch.setattr(
+        record.shutil, "which", lambda name, **_: None if name in ("cc", "lttng") else name
+    )
+    with pytest.raises(PlatformError, match="needs a C compiler, and there is none: install one"):
+        cs.record_command(tmp_path / "rec", ["true"])
+    assert not (tmp_path / "rec").exists()
+
+
 def test_wrong_use_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     attached = called("record", "--source", "preload", "-o", tmp_path / "r", "--pid", "1")
-    assert attached.code == 2
+    assert attached.code == 1
+    assert "no process of these users runs with the library in front" in attached.err
     assert "attach with `--source ebpf`" in attached.err
+    with pytest.raises(PlatformError, match="a space or a colon in it, so LD_PRELOAD cannot"):
+        preloading(Path("/my home/library.so"))
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(PlatformError, match="needs a C compiler, and there is none"):
         build_library(tmp_path)

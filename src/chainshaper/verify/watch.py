@@ -11,7 +11,6 @@ hour, and only as three numbers each.
 """
 
 import contextlib
-import re
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -27,16 +26,17 @@ from numpy.typing import NDArray
 from chainshaper.analysis import analyse_latency, data_flow
 from chainshaper.analysis.latency import LatencyStatistics, latency_statistics
 from chainshaper.gate.decision import clock_offset
-from chainshaper.linux.threads import innermost_id, read_proc
 from chainshaper.planning import ApplicationPlan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import (
+    NO_PROCESS,
     TracedProcess,
     creation_tables,
     event_tables,
     info_of,
     joined_tables,
+    memories,
 )
 from chainshaper.sources.system import processes_of
 from chainshaper.splicing.shaped_outputs import find_outputs
@@ -59,11 +59,6 @@ RECORDER_NS = 10 * SECOND
 
 _SEARCH_NS, _FIRST_SEARCH_NS = 5 * SECOND, SECOND  # between two looks for new processes
 _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave before their slot
-_NO_PROCESS = (
-    "no process of these users runs with the library in front: set what `chainshaper watch "
-    "--environment` prints before the application is started"
-)
-_MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
 
 
 @dataclass(frozen=True)
@@ -265,7 +260,7 @@ class Watch:
             try:
                 found = analyse_latency(flow, one.text, due=self.due)
             except InputError as error:
-                one.problem = str(error) if self.processes else _NO_PROCESS
+                one.problem = str(error) if self.processes else NO_PROCESS
                 continue
             one.problem = None
             new = found.traversals.filter(pl.col("start").is_between(self._over_ns, over, "right"))
@@ -360,24 +355,6 @@ def _hops(one: _Chain) -> Iterator[Hop]:
     for number, communication, computation, count in sums.iter_rows():
         node, topic = one.names[number]
         yield Hop(node, topic, communication / count, computation / count)
-
-
-def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
-    """Processes of some users that have the library in front, but for those that are ``known``."""
-    for process in Path("/proc").iterdir():
-        if not process.name.isdigit() or int(process.name) in known:
-            continue
-        with contextlib.suppress(OSError):  # it has ended, or may not be looked into
-            if process.stat().st_uid not in users:
-                continue
-            own = innermost_id(read_proc(f"{process}/status"))
-            for descriptor in (process / "fd").iterdir():
-                if _MEMORY.match(str(descriptor.readlink())):
-                    with contextlib.suppress(InputError), descriptor.open("rb") as file:
-                        memory = TracedProcess(file.fileno())
-                        if memory.pid == own:  # else it is one that reads it, as we do
-                            yield int(process.name), memory
-                            break
 
 
 @contextlib.contextmanager
