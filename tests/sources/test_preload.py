@@ -2,11 +2,14 @@
 
 import ctypes
 import os
+import platform
 import re
+import shutil
 import signal
 import subprocess
 import sys
 import time
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +18,7 @@ import pytest
 from command_line import called, json_of
 from lttng_node import required_node
 from processes import wait_for
-from traced_program import Traced, assert_same, built, of_process, traced
+from traced_program import Traced, assert_same, build, built, of_process, traced
 
 import chainshaper as cs
 from chainshaper.flow import record
@@ -34,6 +37,7 @@ from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 RING, RINGS = 1 << 14, 64
+ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 CYCLES, PERIOD_NS = 20, 50_000_000
 
 CALLER = """
@@ -80,6 +84,69 @@ def test_every_argument_of_every_function_arrives_as_it_was_passed(
         own = of_process(run.tables, int(rows[0][1]))
         assert_same(own, rows, version)
         assert own["rcl_take"].item(0, "tid") != int(rows[0][1])
+
+
+def test_every_argument_arrives_on_arm64(tmp_path: Path) -> None:
+    program = build(tmp_path / "prefix", compiler="aarch64-linux-gnu-gcc")
+    if shutil.which("qemu-aarch64") is None:
+        pytest.skip("qemu-aarch64 is not installed (package qemu-user)")
+    library = tmp_path / "library.so"
+    words = ["aarch64-linux-gnu-gcc", *preload._OPTIONS, "-o", str(library), str(preload.SOURCE)]
+    subprocess.run([*words, *preload._LIBRARIES], check=True)
+    emulated = ["qemu-aarch64", "-L", "/usr/aarch64-linux-gnu", "-E", f"LD_PRELOAD={library}"]
+
+    def run() -> list[list[str]]:
+        environment = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
+        done = subprocess.run(
+            [*emulated, *program.command("every")], env=environment, capture_output=True, text=True, check=False
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        return [line.split("\t") for line in done.stdout.splitlines()]
+
+    (tmp_path / "trace").mkdir()
+    run_there = traced(tracer_of(tmp_path / "trace"), run)
+    assert run_there.info.lost == {"lost_events": 0}
+    assert_same(run_there.tables, run_there.printed, "8.2.3")
+
+
+def test_a_wheel_brings_the_library_that_works_for_its_machine(tmp_path: Path) -> None:
+    """Installed beside nothing else; and of another machine, by its compiler."""
+    pytest.importorskip("hatchling")
+    root, files = Path(__file__).parents[2], "chainshaper/sources/preload/libchainshaper_trace.so"
+    for compiler in ("cc", "aarch64-linux-gnu-gcc", "no-compiler"):
+        folder = tmp_path / compiler
+        words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
+        if compiler != "no-compiler" and shutil.which(compiler) is None:
+            pytest.skip(f"no {compiler} to build the library with")
+        environment = {**os.environ, "CC": compiler}
+        subprocess.run(words, check=True, cwd=root, env=environment, capture_output=True)
+        (wheel,) = folder.iterdir()
+        names = zipfile.ZipFile(wheel).namelist()
+        tag = wheel.stem.split("-")[-1]
+        if compiler == "no-compiler":
+            assert (tag, files in names) == ("any", False)
+        else:
+            machine = platform.machine() if compiler == "cc" else "aarch64"
+            assert re.fullmatch(rf"manylinux_2_\d+_{machine}", tag), tag
+            (content,) = (zipfile.ZipFile(wheel).read(one) for one in names if one == files)
+            assert int.from_bytes(content[18:20], "little") == ELF_MACHINES[machine]
+    (wheel,) = (tmp_path / "cc").iterdir()
+    site = tmp_path / "site"
+    words = ["-m", "pip", "install", "--no-deps", "--no-index", "--target", str(site), str(wheel)]
+    subprocess.run([sys.executable, *words], check=True, capture_output=True)
+    program = "from chainshaper.sources.preload import *\nprint(preloading(installed_library()))"
+    found = subprocess.check_output(
+        [sys.executable, "-c", program],
+        env={**os.environ, "PYTHONPATH": str(site), "PATH": "", "HOME": str(tmp_path)},
+        text=True,
+    )
+    assert found.strip() == str(site / files)
+    shown = subprocess.check_output(
+        [sys.executable, "-c", CALLER + "take(1)\nprint(open('/proc/self/maps').read())"],
+        env={**os.environ, "LD_PRELOAD": found.strip()},
+        text=True,
+    )
+    assert "memfd:chainshaper-trace" in shown
 
 
 def test_execution_times_are_the_threads_own_cpu_time(

@@ -97,8 +97,8 @@ static inline uint64_t now(clockid_t clock) {
 // then it has used what has passed. The kernel says so: it resets the thread's pointer to a
 // restartable sequence (rseq(2)) when it takes the core away outside of that sequence, and ours is
 // empty. The clock itself is read again after SURELY_USED, so that interrupts and stolen time, which
-// it leaves out, add up to no more. Linux 6.19 does not reset the pointer of a thread that waits in
-// the kernel: one try in each process finds that out, and the clock is read each time.
+// it leaves out, add up to no more. A kernel need not reset the pointer of a thread that waits in a
+// system call: one try in each process finds that out, and the clock is read each time.
 #define SURELY_USED 200000u  // ns
 #if defined(__x86_64__)
 #define SIGNATURE 0x53053053u
