@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 
 from chainshaper.analysis import analyse_latency, data_flow
 from chainshaper.analysis.latency import LatencyStatistics, latency_statistics
+from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.gate.decision import clock_offset
 from chainshaper.planning import ApplicationPlan
 from chainshaper.planning.plan_file import plan_values
@@ -40,6 +41,7 @@ from chainshaper.sources.preload import (
 )
 from chainshaper.sources.system import processes_of
 from chainshaper.splicing.shaped_outputs import find_outputs
+from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import (
@@ -216,6 +218,8 @@ class Watch:
         self.processes: dict[int, TracedProcess] = {}
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
         self._recent: dict[int, deque[NDArray[Any]]] = {}
+        self._known: list[tuple[Any, ...]] = []
+        self._resolved = resolve_objects({})
         self._clock_offset_ns = clock_offset()
         self._searched_ns = 0
         self._lost_with_ended = 0
@@ -254,8 +258,9 @@ class Watch:
         self.read()
         now = time.monotonic_ns()
         over = now - self.longest_ns
-        tables = self._tables(now - 2 * self.longest_ns - (over - self._over_ns))
-        flow = data_flow(tables, self._clock_offset_ns)
+        since = now - 2 * self.longest_ns - (over - self._over_ns)
+        tables = self._tables(since)
+        flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
         for one in self.chains:
             try:
                 found = analyse_latency(flow, one.text, due=self.due)
@@ -278,6 +283,22 @@ class Watch:
             lost=self.lost,
             chains=tuple(self._now(one, over, moved) for one in self.chains),
         )
+
+    def _objects(self, tables: EventTables, since_ns: int) -> Objects:
+        """Who exists: as at the last look where nothing was created, and the same ran, since then.
+
+        That is half of a look, and what is created stays; which callbacks ran, and which
+        subscriptions took, makes known those that say so only thereby (Python's).
+        """
+        what_ran = [("callback_start", "callback"), ("rmw_take", "rmw_subscription_handle")]
+        known = [tuple(sorted((pid, one[0]) for pid, one in self._created.items()))]
+        for name, column in what_ran:
+            rows = events.table(tables, name).select("pid", column).unique()
+            known.append(tuple(sorted(rows.iter_rows())))
+        created = (tables[one]["time"][-1] for one in events.CREATION & tables.keys())
+        if known != self._known or max(created, default=0) >= since_ns:
+            self._known, self._resolved = known, resolve_objects(tables)
+        return self._resolved
 
     def _now(self, one: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
         moved_ns = moved.get(one.text.rpartition("..")[2], 0)
