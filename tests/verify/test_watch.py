@@ -137,8 +137,7 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
     counted = watch.look().chains[0].spans["hour"].count
     assert counted > 15
     watch._searched_ns = 0
-    for recent in watch._recent.values():
-        recent.clear()  # as twelve seconds later
+    watch._latest = dict.fromkeys(watch._latest, 0)  # as twelve seconds later
     watch.read()
     assert not watch.processes
 
@@ -217,7 +216,7 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         assert objects[-1]["chains"][0]["spans"]["hour"]["count"] > 5
         assert objects[-1]["processes"] == {str(process.pid): "/first, /second"}
         shown = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        time.sleep(3)
+        time.sleep(6)
         shown.send_signal(signal.SIGINT)
         text, _ = shown.communicate(timeout=20)
     assert re.search(rf"{CHAIN}: \d\d\.\d\d cycles a second", text)

@@ -23,7 +23,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.analysis import analyse_latency, data_flow
+from chainshaper.analysis import data_flow, find_chain, graph_of, traverse
+from chainshaper.analysis.disturbance import with_punctuality
 from chainshaper.analysis.latency import LatencyStatistics, latency_statistics
 from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.gate.decision import clock_offset
@@ -217,7 +218,10 @@ class Watch:
         self.chains = [_Chain(text, self._slots(text)) for text in chains]
         self.processes: dict[int, TracedProcess] = {}
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
-        self._recent: dict[int, deque[NDArray[Any]]] = {}
+        self._fresh: list[tuple[int, NDArray[Any]]] = []  # of a process, not yet in a table
+        self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # and their last instant
+        self._latest: dict[int, int] = {}  # a process's last event
+        self._tabled_ns = 0
         self._known: list[tuple[Any, ...]] = []
         self._resolved = resolve_objects({})
         self._clock_offset_ns = clock_offset()
@@ -236,22 +240,22 @@ class Watch:
             self._searched_ns = now
             self._search()
         for pid, process in self.processes.items():
-            recent = self._recent[pid]
-            recent.extend(process.new_records())
-            while recent and recent[0]["time"][-1] < now - RECORDER_NS - self.longest_ns:
-                recent.popleft()
+            for part in process.new_records():
+                self._fresh.append((pid, part))
+                self._latest[pid] = max(self._latest[pid], int(part["time"][-1]))
+        if now - self._tabled_ns > SECOND:
+            self._take_fresh(now)
 
     def _search(self) -> None:
         """Follow processes that have a memory, and leave those that have ended and are silent."""
         for pid, memory in memories(self.users, self.processes):
-            self.processes[pid] = memory
-            self._recent[pid] = deque()
+            self.processes[pid], self._latest[pid] = memory, 0
         for pid in [one for one in self.processes if not Path(f"/proc/{one}").exists()]:
-            if not self._recent[pid]:
+            if self._latest[pid] < self._searched_ns - RECORDER_NS - self.longest_ns:
                 process = self.processes.pop(pid)
                 self._lost_with_ended += process.lost + process.dropped
                 self._created.pop(pid, None)
-                del self._recent[pid]
+                del self._latest[pid]
 
     def look(self) -> Seen:
         """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
@@ -261,20 +265,23 @@ class Watch:
         since = now - 2 * self.longest_ns - (over - self._over_ns)
         tables = self._tables(since)
         flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
+        graph = graph_of(flow)
+        nodes = {one.id: one.node or "" for one in graph.callbacks}
         for one in self.chains:
             try:
-                found = analyse_latency(flow, one.text, due=self.due)
+                chain = find_chain(graph, one.text)
             except InputError as error:
                 one.problem = str(error) if self.processes else NO_PROCESS
                 continue
             one.problem = None
-            new = found.traversals.filter(pl.col("start").is_between(self._over_ns, over, "right"))
+            found = traverse(flow, chain, graph)
+            due = next((d for d in self.due if d.output in {None, chain.topics[-1]}), None)
+            judged, _ = with_punctuality(flow, found, due)
+            new = judged.filter(pl.col("start").is_between(self._over_ns, over, "right"))
             one.take_over(new, found.hops, now)
-            topics, nodes = found.chain.topics, {c.id: c.node for c in found.graph.callbacks}
-            one.names = [
-                (nodes[number] or "", topic)
-                for number, topic in zip(found.chain.callbacks, topics, strict=True)
-            ]
+            one.names = list(
+                zip(map(nodes.__getitem__, chain.callbacks), chain.topics, strict=True)
+            )
         self._over_ns = over
         moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
         return Seen(
@@ -325,22 +332,29 @@ class Watch:
 
     def _tables(self, since_ns: int) -> EventTables:
         """All that was created, and what happened since an instant."""
-        parts: list[dict[str, pl.DataFrame]] = []
+        self._take_fresh(time.monotonic_ns())
+        created = (tables for _, tables, _ in self._created.values())
+        recent = (tables for last, tables in self._recent if last >= since_ns)
+        return joined_tables([*created, *recent])
+
+    def _take_fresh(self, now_ns: int) -> None:
+        """Make tables of what was read since the last time, and drop those that are too old."""
         by_library: dict[TracingLibrary, list[tuple[NDArray[Any], int]]] = {}
         for pid, process in self.processes.items():
             asked = int(process.header["objects"][0])
             if pid not in self._created or self._created[pid][0] != asked:
                 self._created[pid] = (asked, *creation_tables(process))
-            _, created, library = self._created[pid]
-            parts.append(created)
-            recent = (part for part in self._recent[pid] if part["time"][-1] >= since_ns)
-            by_library.setdefault(library, []).extend((part, process.pid) for part in recent)
+        for pid, part in self._fresh:
+            own = by_library.setdefault(self._created[pid][2], [])
+            own.append((part, self.processes[pid].pid))
         for library, own in by_library.items():
-            if own:
-                records = np.concatenate([part for part, _ in own])
-                pids = np.repeat([pid for _, pid in own], [part.size for part, _ in own])
-                parts.append(event_tables(records, pids.astype(np.int32), library))
-        return joined_tables(parts)
+            records = np.concatenate([part for part, _ in own])
+            pids = np.repeat([pid for _, pid in own], [part.size for part, _ in own])
+            tables = event_tables(records, pids.astype(np.int32), library)
+            self._recent.append((int(records["time"].max()), tables))
+        self._fresh, self._tabled_ns = [], now_ns
+        while self._recent and self._recent[0][0] < now_ns - RECORDER_NS - self.longest_ns:
+            self._recent.popleft()
 
     def save(self, output: str | Path) -> Recording:
         """Write the last ten seconds as a recording: the flight recorder.

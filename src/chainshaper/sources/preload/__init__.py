@@ -205,9 +205,10 @@ def joined_tables(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.D
     for tables in parts:
         for name, table in tables.items():
             found.setdefault(name, []).append(table)
+    joined = {name: pl.concat(own, how="diagonal") for name, own in found.items()}
     return {
-        name: pl.concat(own, how="diagonal").sort("time", maintain_order=True)
-        for name, own in found.items()
+        name: one if one["time"].is_sorted() else one.sort("time", maintain_order=True)
+        for name, one in joined.items()
     }
 
 
