@@ -97,9 +97,8 @@ def test_every_argument_arrives_on_arm64(tmp_path: Path) -> None:
 
     def run() -> list[list[str]]:
         environment = {name: value for name, value in os.environ.items() if name != "LD_PRELOAD"}
-        done = subprocess.run(
-            [*emulated, *program.command("every")], env=environment, capture_output=True, text=True, check=False
-        )  # fmt: skip
+        words = [*emulated, *program.command("every")]
+        done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stderr
         return [line.split("\t") for line in done.stdout.splitlines()]
 

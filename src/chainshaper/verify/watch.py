@@ -61,6 +61,7 @@ RECORDER_NS = 10 * SECOND
 """So much of the past the flight recorder has."""
 
 _SEARCH_NS, _FIRST_SEARCH_NS = 5 * SECOND, SECOND  # between two looks for new processes
+_STEP_NS = 1_000_000  # of CLOCK_REALTIME: more than reading its offset can be off
 _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave before their slot
 
 
@@ -81,8 +82,9 @@ class ChainNow:
     ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of outputs that left in
     each of the plan's slots, over the hour (empty: without a plan); ``promised_ns`` is the end of
     its last slot, which is ``moved_ns`` behind the plan's; ``counted`` are cycles since the watch
-    began: ``complete``, of these ``late``, and ``incomplete``. ``problem`` says why there is
-    nothing to be seen.
+    began: ``complete``, of these ``late``, ``incomplete``, and ``unclear``, whose messages no event
+    before Iron tells apart while CLOCK_REALTIME is set. ``problem`` says why there is nothing to be
+    seen.
     """
 
     chain: str
@@ -149,7 +151,9 @@ class _Chain:
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
-    counted: Counter[str] = field(default_factory=lambda: Counter(complete=0, late=0, incomplete=0))
+    counted: Counter[str] = field(
+        default_factory=lambda: Counter(complete=0, late=0, incomplete=0, unclear=0)
+    )
     problem: str | None = None
 
     def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
@@ -222,6 +226,7 @@ class Watch:
         self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # and their last instant
         self._latest: dict[int, int] = {}  # a process's last event
         self._tabled_ns = 0
+        self._stepped_ns = 0  # until then it is not clear which message a cycle had
         self._known: list[tuple[Any, ...]] = []
         self._resolved = resolve_objects({})
         self._clock_offset_ns = clock_offset()
@@ -236,20 +241,22 @@ class Watch:
     def read(self) -> None:
         """Take what is new in all memories, and look for new processes now and then."""
         now = time.monotonic_ns()
-        if now - self._searched_ns > (_SEARCH_NS if self.processes else _FIRST_SEARCH_NS):
+        searches = now - self._searched_ns > (_SEARCH_NS if self.processes else _FIRST_SEARCH_NS)
+        if searches:
             self._searched_ns = now
-            self._search()
+            for pid, memory in memories(self.users, self.processes):
+                self.processes[pid], self._latest[pid] = memory, 0
         for pid, process in self.processes.items():
             for part in process.new_records():
                 self._fresh.append((pid, part))
                 self._latest[pid] = max(self._latest[pid], int(part["time"][-1]))
         if now - self._tabled_ns > SECOND:
             self._take_fresh(now)
+        if searches:
+            self._leave_ended()
 
-    def _search(self) -> None:
-        """Follow processes that have a memory, and leave those that have ended and are silent."""
-        for pid, memory in memories(self.users, self.processes):
-            self.processes[pid], self._latest[pid] = memory, 0
+    def _leave_ended(self) -> None:
+        """Leave processes that have ended, once their last events are too old to be asked for."""
         for pid in [one for one in self.processes if not Path(f"/proc/{one}").exists()]:
             if self._latest[pid] < self._searched_ns - RECORDER_NS - self.longest_ns:
                 process = self.processes.pop(pid)
@@ -260,11 +267,17 @@ class Watch:
     def look(self) -> Seen:
         """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
         self.read()
-        now = time.monotonic_ns()
+        now, offset = time.monotonic_ns(), clock_offset()
+        if abs(offset - self._clock_offset_ns) > _STEP_NS:
+            self._stepped_ns = now
+        self._clock_offset_ns = offset
         over = now - self.longest_ns
         since = now - 2 * self.longest_ns - (over - self._over_ns)
         tables = self._tables(since)
         flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
+        # Where publications carry no stamp, the clock's offset says which one was taken.
+        stampless = flow.publications["source_timestamp"].null_count() > 0
+        clear_ns = self._stepped_ns if stampless else 0
         graph = graph_of(flow)
         nodes = {one.id: one.node or "" for one in graph.callbacks}
         for one in self.chains:
@@ -278,7 +291,8 @@ class Watch:
             due = next((d for d in self.due if d.output in {None, chain.topics[-1]}), None)
             judged, _ = with_punctuality(flow, found, due)
             new = judged.filter(pl.col("start").is_between(self._over_ns, over, "right"))
-            one.take_over(new, found.hops, now)
+            one.take_over(clear := new.filter(pl.col("start") > clear_ns), found.hops, now)
+            one.counted["unclear"] += new.height - clear.height
             one.names = list(
                 zip(map(nodes.__getitem__, chain.callbacks), chain.topics, strict=True)
             )
