@@ -3,10 +3,11 @@
     python benchmarks/tracing_cost.py [--events 200000] [--seconds 10]
 
 A program calls three trace points of libtracetools, in blocks of a hundred: the sourced ROS 2's, or
-one that does nothing. `preload_switched` is what the library takes where the thread has lost its
-core since the last callback event (it reads the CPU clock each time then). Each tracer records such a run; runs take turns, five of each. The table has
-the CPU time of a call in ns, median and 90th percentile over blocks, and what no tracer takes. The
-second table is the CPU time of a process that records 20,000 events a second with the library.
+one that does nothing. Each tracer records such a run; runs take turns, five of each.
+`preload_switched` is the library where a thread has lost its core before each event: it reads the
+CPU clock then. The table has the CPU time of a call in ns, median and 90th percentile over blocks,
+and what no tracer takes. The second table is the CPU time of a process that records 20,000 events a
+second with the library.
 """
 
 import argparse

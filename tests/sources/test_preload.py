@@ -21,7 +21,6 @@ from processes import wait_for
 from traced_program import Traced, assert_same, build, built, of_process, traced
 
 import chainshaper as cs
-from chainshaper.flow import record
 from chainshaper.sources import preload
 from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary
 from chainshaper.sources.preload import (
@@ -464,7 +463,7 @@ def test_without_a_library_lttng_records_and_says_why(
     assert "LTTng recorded: " in said
     assert "cannot compile" in said
     monkeypatch.setattr(
-        record.shutil, "which", lambda name, **_: None if name in ("cc", "lttng") else name
+        shutil, "which", lambda name, **_: None if name in ("cc", "lttng") else name
     )
     with pytest.raises(PlatformError, match="needs a C compiler, and there is none: install one"):
         cs.record_command(tmp_path / "rec", ["true"])

@@ -29,6 +29,7 @@ from traced_program import built
 
 from chainshaper import plan_recording
 from chainshaper.analysis import analyse_latency
+from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library, event_names
@@ -232,7 +233,7 @@ def test_a_clock_that_is_set_spoils_no_figure(
     (tmp_path / "clock.c").write_text(REALTIME_STEPS)
     words = ["gcc", "-shared", "-fPIC", "-o", str(tmp_path / "clock.so"), str(tmp_path / "clock.c")]
     subprocess.run(words, check=True)
-    at, real = time.monotonic_ns() + 2 * SECOND, watch_module.clock_offset
+    at, real = time.monotonic_ns() + 2 * SECOND, decision.clock_offset
     shifted = lambda: real() - (60_000_000 if time.monotonic_ns() > at else 0)  # noqa: E731
     monkeypatch.setattr(watch_module, "clock_offset", shifted)
     program = built("-DHUMBLE", version=version) if version == "4.1.1" else built()
