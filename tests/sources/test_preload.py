@@ -465,7 +465,9 @@ def test_without_a_library_lttng_records_and_says_why(
     monkeypatch.setattr(
         shutil, "which", lambda name, **_: None if name in ("cc", "lttng") else name
     )
-    with pytest.raises(PlatformError, match="needs a C compiler, and there is none: install one"):
+    with pytest.raises(
+        PlatformError, match=r"needs a compiler \(cc\), and there is none: install one"
+    ):
         cs.record_command(tmp_path / "rec", ["true"])
     assert not (tmp_path / "rec").exists()
 
@@ -478,7 +480,7 @@ def test_wrong_use_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     with pytest.raises(PlatformError, match="a space or a colon in it, so LD_PRELOAD cannot"):
         preloading(Path("/my home/library.so"))
     monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(PlatformError, match="needs a C compiler, and there is none"):
+    with pytest.raises(PlatformError, match=r"needs a compiler \(cc\), and there is none"):
         build_library(tmp_path)
 
 
