@@ -3,9 +3,11 @@
     python benchmarks/tracing_cost.py [--events 200000] [--seconds 10]
 
 A program calls three trace points of libtracetools, in blocks of a hundred: the sourced ROS 2's, or
-one that does nothing. Each tracer records such a run; runs take turns, five of each. The table has
-the CPU time of a call in ns, median and 90th percentile over blocks, and what no tracer takes. The
-second table is the CPU time of a process that records 20,000 events a second with the library.
+one that does nothing. Each tracer records such a run; runs take turns, five of each.
+`preload_switched` is the library where a thread has lost its core before each event: it reads the
+CPU clock then. The table has the CPU time of a call in ns, median and 90th percentile over blocks,
+and what no tracer takes. The second table is the CPU time of a process that records 20,000 events a
+second with the library.
 """
 
 import argparse
@@ -34,6 +36,7 @@ from traced_program import built
 RUNS = 5
 CALLS = ("rcl_publish", "rmw_take", "callback_start")
 RATE = 20_000
+SWITCHED = "preload_switched"
 
 PROGRAM = r"""
 #include <stdbool.h>
@@ -118,6 +121,7 @@ def main() -> None:
         tracers: dict[str, Callable[[Path], Tracer] | None] = {
             "none": None,
             "preload": lambda folder: PreloadTracer(folder, [program], ()),
+            SWITCHED: lambda folder: PreloadTracer(folder, [program], ()),
             "lttng": lambda folder: LttngSession(folder, [program], ()),
             "ebpf": lambda folder: EbpfTracer(folder, [program], ()),
         }
@@ -127,7 +131,10 @@ def main() -> None:
                 folder = Path(scratch) / f"{name}_{turn}"
                 folder.mkdir()
                 try:
-                    said, _ = run_under(make, [program, str(given.events), "0"], folder)
+                    command = [program, str(given.events), "0"]
+                    if name == SWITCHED:
+                        command = ["env", "GLIBC_TUNABLES=glibc.pthread.rseq=0", *command]
+                    said, _ = run_under(make, command, folder)
                 except ChainshaperError as error:
                     console.print(f"without {name}: {error}")
                     del tracers[name]

@@ -134,7 +134,7 @@ def missing_for_live() -> str:
 
 
 def missing_for_ros() -> str:
-    needed = [one for one in ("ros2", "colcon", "lttng") if shutil.which(one) is None]
+    needed = [one for one in ("ros2", "colcon") if shutil.which(one) is None]
     if needed or "AMENT_PREFIX_PATH" not in os.environ:
         return f"runs on ROS 2 need it sourced, and {', '.join(needed) or 'AMENT_PREFIX_PATH'}"
     return ""

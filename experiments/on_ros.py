@@ -4,7 +4,7 @@ An application becomes a colcon package (`chainshaper generate`), which is built
 `ros2 launch`, over one middleware after the other. `chainshaper shape … -- ros2 launch …` measures
 it under the paper's profiling condition, plans, splices and proves. Then the application as it was
 profiled and as it was shaped take turns, in blocks, as live runs do: each block draws execution
-times of its own, which the command's plan has not seen. LTTng records everything.
+times of its own, which the command's plan has not seen. `chainshaper record` records everything.
 
     table = [Shaping("1-band", "chain", application, {"1 band": None}, unshaped={"FIFO": None})]
     runs += ros_runs("table_9", table, options)

@@ -14,7 +14,10 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["chain_command", "required_node"]
+__all__ = ["LTTNG", "chain_command", "required_node"]
+
+LTTNG = ("--source", "lttng")
+"""The program emits its events to LTTng itself: no library in front of libtracetools sees them."""
 
 EVENTS = """
 callback_end: callback: uint64

@@ -111,16 +111,16 @@ def built(*flags: str, version: str = "8.2.3") -> Program:
     return build(folder / "prefix", *flags, version=version)
 
 
-def build(prefix: Path, *flags: str, version: str = "8.2.3") -> Program:
+def build(prefix: Path, *flags: str, version: str = "8.2.3", compiler: str = "gcc") -> Program:
     """Compile library and program; ``version`` is what the library's package says."""
-    if shutil.which("gcc") is None:
-        pytest.skip("no gcc to build the traced program with")
+    if shutil.which(compiler) is None:
+        pytest.skip(f"no {compiler} to build the traced program with")
     program = Program(prefix)
     program.tracetools.parent.mkdir(parents=True)
     package = prefix / "share/tracetools/package.xml"
     package.parent.mkdir(parents=True)
     package.write_text(_PACKAGE.format(version))
-    gcc = ["gcc", "-O1", *flags]
+    gcc = [compiler, "-O1", *flags]
     library = [str(_SOURCES / "tracetools.c"), "-shared", "-fPIC", "-o", str(program.tracetools)]
     subprocess.run([*gcc, *library], check=True)
     if "-DDISABLED" not in flags:

@@ -67,6 +67,7 @@ if TYPE_CHECKING:
     from chainshaper.reporting.figures import draw_latency as draw_latency
     from chainshaper.reporting.graph_drawing import write_picture as write_picture
     from chainshaper.reporting.page import write_report as write_report
+    from chainshaper.reporting.perfetto import export_mcap as export_mcap
     from chainshaper.reporting.perfetto import export_perfetto as export_perfetto
     from chainshaper.simulation import simulate as simulate
     from chainshaper.simulation import simulate_latencies as simulate_latencies

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from command_line import called, json_of, refused
-from lttng_node import chain_command, required_node
+from lttng_node import LTTNG, chain_command, required_node
 from processes import wait_for
 
 from chainshaper import InputError, OperationError, PlanRequest, PlatformError, open_recording
@@ -164,7 +164,7 @@ def test_a_core_that_is_not_there_is_refused() -> None:
 def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     command = chain_command(node, 100_000)
-    assert called("record", "-o", first, "--duration", "1s", "--", *command).code == 0
+    assert called("record", *LTTNG, "-o", first, "--duration", "1s", "--", *command).code == 0
     assert chain_nodes(open_recording(first), "/x../y") == ("/source", "/relay")
     _, cores = profiled_cores(open_recording(first), ["/x../y"], PlanRequest())
     assert cores == {"/source": available_cores()[-1], "/relay": available_cores()[-1]}
@@ -172,7 +172,7 @@ def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Pat
         chain_nodes(open_recording(first), "/x../nowhere")
     chain: tuple[str | Path, ...] = ("--chain", "/x../y", "--like", first)
     arguments = ("-o", second, *chain, "--duration", "2s", "--", *command)
-    assert called("profile", *arguments).code == 0
+    assert called("profile", *LTTNG, *arguments).code == 0
     recording = open_recording(second)
     executors = [thread for thread in recording.info.threads if thread.role == "executor"]
     assert {thread.policy for thread in executors} == {"SCHED_FIFO"}

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from command_line import Running, called, chainshaper, json_of, refused
-from lttng_node import chain_command, required_node
+from lttng_node import LTTNG, chain_command, required_node
 from processes import wait_for
 from ros2 import ros2_environment
 
@@ -42,7 +42,7 @@ def recorded(node: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def json_of_recording(*arguments: str | Path) -> Mapping[str, object]:
-    finished = called("record", "--json", *arguments)
+    finished = called("record", "--json", *LTTNG, *arguments)
     assert finished.code == 0, finished
     found: Mapping[str, object] = json.loads(finished.out)
     return found
@@ -111,7 +111,7 @@ def test_ctrl_c_ends_the_application_and_the_recording_is_whole(
     path, sent = tmp_path / "rec", tmp_path / "sent"
     (shell, option, pipe) = chain_command(node, 100_000)
     pipe = pipe.replace("|", f"| tee {sent} |")
-    running = Running.start("record", "-o", path, "--", shell, option, pipe)
+    running = Running.start("record", *LTTNG, "-o", path, "--", shell, option, pipe)
     wait_for(lambda: sent.exists() and sent.stat().st_size > 100, "the chain's first messages")
     running.process.send_signal(number)
     finished = running.end()  # waits for the end of all its descendants
@@ -141,7 +141,7 @@ def test_an_application_that_fails_is_reported_and_what_was_recorded_is_kept(
     node: Path, tmp_path: Path, end: str, words: str
 ) -> None:
     path = tmp_path / "rec"
-    finished = called("record", "-o", path, "--", "sh", "-c", f"{node} flood 10 0; {end}")
+    finished = called("record", *LTTNG, "-o", path, "--", "sh", "-c", f"{node} flood 10 0; {end}")
     assert finished.code == 1
     assert f"error: the command {words}; what was recorded until then is in {path}" in finished.err
     recording = open_recording(path)
@@ -150,7 +150,7 @@ def test_an_application_that_fails_is_reported_and_what_was_recorded_is_kept(
 
 
 def test_an_application_that_is_not_traced_leaves_no_recording(node: Path, tmp_path: Path) -> None:
-    said = refused(1, "record", "-o", tmp_path / "rec", "--", "sh", "-c", "exit 4")
+    said = refused(1, "record", *LTTNG, "-o", tmp_path / "rec", "--", "sh", "-c", "exit 4")
     assert "no process with LTTng trace points was seen" in said
     assert "; the command ended with code 4 after" in said
     assert files_in(tmp_path) == []
@@ -159,7 +159,7 @@ def test_an_application_that_is_not_traced_leaves_no_recording(node: Path, tmp_p
 def test_lost_events_are_named_wherever_figures_are(node: Path, tmp_path: Path) -> None:
     path = tmp_path / "rec"
     command = ("--buffer", "1", "--", node, "flood", "300000", "0")
-    finished = called("record", "-o", path, *command)
+    finished = called("record", *LTTNG, "-o", path, *command)
     assert finished.code == 0
     lost = json.loads((path / "recording.json").read_text())["lost"]["discarded_events"]
     assert lost > 0
@@ -184,7 +184,7 @@ def test_an_ordinary_user_records_with_a_daemon_of_their_own(
         monkeypatch.setenv("HOME", readable)
         nobody = ("setpriv", "--reuid=65534", "--regid=65534", "--clear-groups")
         arguments = ("-o", folder / "rec", "--", program, "flood", "20", "0")
-        run = chainshaper("record", *arguments, prefix=nobody)
+        run = chainshaper("record", *LTTNG, *arguments, prefix=nobody)
         assert run.code == 0, run
         assert open_recording(folder / "rec").events["callback_start"].height == 20
         assert "root or the group `tracing`" in run.err  # for sched_switch
@@ -206,7 +206,7 @@ def test_what_is_wrong_is_said_before_anything_starts(
         assert words in refused(2, "record", *arguments)
     (tmp_path / "true").symlink_to("/bin/true")
     monkeypatch.setenv("PATH", str(tmp_path))
-    said = refused(3, "record", "-o", path, *program)
+    said = refused(3, "record", *LTTNG, "-o", path, *program)
     assert "install LTTng" in said
     assert "--source ebpf" in said
     assert files_in(tmp_path) == ["mine", "true"]
@@ -254,7 +254,9 @@ def test_a_trace_that_cannot_be_read_is_kept_and_named(
 
 
 def test_a_full_disk_is_named(node: Path, full_disk: Path) -> None:
-    said = refused(1, "record", "-o", full_disk / "rec", "--", node, "flood", "100000", "1000")
+    said = refused(
+        1, "record", *LTTNG, "-o", full_disk / "rec", "--", node, "flood", "100000", "1000"
+    )
     assert f"the disk of {full_disk} is full" in said
     assert "rec" not in files_in(full_disk)
 

@@ -1,11 +1,13 @@
 """The trace for Perfetto holds what the recording holds, read by Perfetto's own schema."""
 
 import importlib
+import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import polars as pl
 import pytest
 from command_line import called, refused
 from hypothesis import given
@@ -224,6 +226,36 @@ def test_the_command_writes_it_and_never_over_another(tmp_path: Path) -> None:
     assert "ends in .pftrace or .perfetto-trace" in wrong
     absent = refused(2, "export", "--perfetto", known.path, "-o", tmp_path / "no" / "t.pftrace")
     assert "no such folder to write t.pftrace into" in absent
+
+
+def test_mcap_has_every_callback_and_every_cycle(tmp_path: Path) -> None:
+    """Read with the format's own reader, for which log times are those of a bag."""
+    reader = pytest.importorskip("mcap.reader")
+    recording, file = known_run(tmp_path / "known", untaken=(1,)), tmp_path / "known.mcap"
+    written = called("export", "--mcap", recording.path, "-o", file)
+    assert (written.code, written.out) == (0, f"{file}\n"), written.err
+    with file.open("rb") as stream:
+        found = [
+            (channel.topic, message.log_time, message.publish_time, json.loads(message.data))
+            for _, channel, message in reader.make_reader(stream).iter_messages()
+        ]
+    cycles = [one for one in found if one[0] == "/chainshaper/latency"]
+    traversals = measure_latency(recording).analysis.traversals
+    offset = recording.info.clock_offset_ns
+    assert [(when, one.get("latency_ms"), one.get("incomplete")) for *_, when, one in cycles] == [
+        (start + offset, latency and latency / 1e6, reason)
+        for start, latency, reason in traversals.sort(pl.max_horizontal("start", "end"))
+        .select("start", "latency_ns", "reason")
+        .iter_rows()
+    ]
+    instances = data_flow(recording.events, offset).instances.drop_nulls("end")
+    assert len(found) - len(cycles) == instances.height
+    assert sorted(message["response_ms"] for *_, message in found if "response_ms" in message) == [
+        response / 1e6 for response in sorted(instances["end"] - instances["start"])
+    ]
+    assert "add --perfetto or --mcap" in refused(2, "export", recording.path, "-o", file)
+    wrong = refused(2, "export", "--mcap", recording.path, "-o", tmp_path / "trace.json")
+    assert "ends in .mcap" in wrong
 
 
 def test_a_recording_without_a_chain_is_exported_without_one(tmp_path: Path) -> None:

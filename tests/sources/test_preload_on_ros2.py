@@ -51,7 +51,9 @@ def test_events_are_those_of_lttng_one_by_one(
     for name, value in tracer.start().items():
         monkeypatch.setenv(name, value)
     try:
-        done = record_command(tmp_path / "lttng", launch, duration_ns=SECONDS * 1_000_000_000)
+        done = record_command(
+            tmp_path / "lttng", launch, source="lttng", duration_ns=SECONDS * 1_000_000_000
+        )
     finally:
         tracer.remove()
     ours, info = tracer.recording()
@@ -116,7 +118,7 @@ def test_what_is_watched_is_what_lttng_records(
     thread = Thread(target=follow)
     thread.start()
     try:
-        record_command(tmp_path / "lttng", launch, duration_ns=SECONDS * SECOND)
+        record_command(tmp_path / "lttng", launch, source="lttng", duration_ns=SECONDS * SECOND)
     finally:
         over.set()
         thread.join()

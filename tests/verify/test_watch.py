@@ -29,10 +29,12 @@ from traced_program import built
 
 from chainshaper import plan_recording
 from chainshaper.analysis import analyse_latency
+from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
-from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library
+from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library, event_names
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.verify import watch as watch_module
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.watch import SECOND, Seen, Watch, exporting
 
@@ -137,8 +139,7 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
     counted = watch.look().chains[0].spans["hour"].count
     assert counted > 15
     watch._searched_ns = 0
-    for recent in watch._recent.values():
-        recent.clear()  # as twelve seconds later
+    watch._latest = dict.fromkeys(watch._latest, 0)  # as twelve seconds later
     watch.read()
     assert not watch.processes
 
@@ -163,6 +164,98 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
     counted = too_late.spans["hour"].count - in_time.spans["hour"].count
     assert counted > 10
     assert too_late.spans["hour"].late == in_time.spans["hour"].late + counted
+
+
+def test_a_node_that_dies_in_a_callback_leaves_a_cycle_that_is_incomplete(tmp_path: Path) -> None:
+    watch = own_watch()
+    with running(tmp_path, 1000) as process:
+        seen = watched(watch, 1.0)[-1].chains[0]
+        (memory,) = (one for pid, one in watch.processes.items() if pid == process.pid)
+        start = event_names().index("callback_start") + 3  # numbers begin with 3
+        while not any(part["event"][-1] == start for part in memory.new_records()):
+            pass
+        process.kill()
+        process.wait()
+        # What this loop has read is no part of what is watched: a watch that begins now has it.
+        late = own_watch()
+        late.processes, late._latest = {process.pid: memory}, {process.pid: 0}
+        memory._read[:] = 0
+        late._over_ns -= 3 * SECOND  # what began before the watch is none of its cycles
+        time.sleep(2 * LONGEST_NS / SECOND)
+        after = late.look().chains[0]
+    assert seen.counted["incomplete"] == 0
+    assert after.counted["incomplete"] == 1
+    assert after.counted["complete"] > 10
+    assert late.lost == 0
+
+
+def test_a_full_disk_stops_neither_the_watch_nor_loses_what_it_has(
+    tmp_path: Path, full_disk: Path
+) -> None:
+    with running(tmp_path, 200):
+        watch = own_watch()
+        watched(watch, 1.0)
+        with pytest.raises(OperationError, match=r"cannot be written: .*No space left"):
+            watch.save(full_disk / "flight")
+        assert [one.name for one in full_disk.iterdir()] == ["filling"]
+        counted = watched(watch, 0.5)[-1].chains[0].counted["complete"]
+        recording = watch.save(tmp_path / "flight")
+    assert measure_latency(recording, CHAIN).analysis.statistics.count >= counted
+
+
+REALTIME_STEPS = """
+#define _GNU_SOURCE
+#include <stdlib.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
+int clock_gettime(clockid_t clock, struct timespec *time) {
+    static long long at;
+    if (!at) at = atoll(getenv("STEP_AT"));
+    if (clock == CLOCK_REALTIME) {
+        syscall(SYS_clock_gettime, CLOCK_MONOTONIC, time);
+        int is_set = time->tv_sec * 1000000000LL + time->tv_nsec > at;
+        syscall(SYS_clock_gettime, clock, time);
+        if (is_set && (time->tv_nsec -= 60000000) < 0) time->tv_sec--, time->tv_nsec += 1000000000;
+        return 0;
+    }
+    return (int)syscall(SYS_clock_gettime, clock, time);
+}
+"""
+"""CLOCK_REALTIME as the application sees it: set back by 60 ms, a cycle and more, at an instant."""
+
+
+@pytest.mark.parametrize("version", ["4.1.1", "8.2.3"])
+def test_a_clock_that_is_set_spoils_no_figure(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, version: str
+) -> None:
+    """Only Humble's publications have no stamp: its cycles around the step are counted apart."""
+    (tmp_path / "clock.c").write_text(REALTIME_STEPS)
+    words = ["gcc", "-shared", "-fPIC", "-o", str(tmp_path / "clock.so"), str(tmp_path / "clock.c")]
+    subprocess.run(words, check=True)
+    at, real = time.monotonic_ns() + 2 * SECOND, decision.clock_offset
+    shifted = lambda: real() - (60_000_000 if time.monotonic_ns() > at else 0)  # noqa: E731
+    monkeypatch.setattr(watch_module, "clock_offset", shifted)
+    program = built("-DHUMBLE", version=version) if version == "4.1.1" else built()
+    watch, libraries = own_watch(), f"{build_library(tmp_path)}:{tmp_path / 'clock.so'}"
+    variables = {**os.environ, "LD_PRELOAD": libraries, "STEP_AT": str(at)}
+    process = subprocess.Popen(
+        program.command("chain", "80"), env=variables, stdout=subprocess.PIPE, text=True
+    )
+    counted = watched(watch, 4.5)[-1].chains[0].counted
+    printed = [line.split("\t") for line in process.communicate()[0].splitlines()]
+    starts = [int(row[2]) for row in printed if row[0] == "instance"][::2]
+    outputs = [int(row[2]) for row in printed if row[:2] == ["publication", "/ebpf2"]]
+    (chain,) = watch.chains
+    first = np.searchsorted(starts, chain.begun) - 1  # the program reads the clock before the event
+    expected = np.array(outputs)[first] - np.array(starts)[first]
+    whole = chain.latency >= 0
+    assert (np.abs(chain.latency - expected)[whole] < PERIOD_NS // 2).all(), "of its own cycle"
+    assert first[-1] - first[0] + 1 == first.size + counted["unclear"], "none is passed over"
+    assert first.size > 30
+    assert counted["incomplete"] <= 1
+    assert (counted["unclear"] > 0) == (version == "4.1.1")
+    assert counted["unclear"] < 20
 
 
 def test_memory_does_not_grow(tmp_path: Path) -> None:
@@ -217,7 +310,7 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         assert objects[-1]["chains"][0]["spans"]["hour"]["count"] > 5
         assert objects[-1]["processes"] == {str(process.pid): "/first, /second"}
         shown = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
-        time.sleep(3)
+        time.sleep(6)
         shown.send_signal(signal.SIGINT)
         text, _ = shown.communicate(timeout=20)
     assert re.search(rf"{CHAIN}: \d\d\.\d\d cycles a second", text)

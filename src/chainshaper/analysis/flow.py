@@ -54,12 +54,15 @@ class DataFlow:
     notes: tuple[str, ...]
 
 
-def data_flow(tables: events.EventTables, clock_offset_ns: int = 0) -> DataFlow:
+def data_flow(
+    tables: events.EventTables, clock_offset_ns: int = 0, objects: Objects | None = None
+) -> DataFlow:
     """Resolve a recording's events.
 
     ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
+    ``objects`` are the tables' own, where they have been resolved already.
     """
-    objects = resolve_objects(tables)
+    objects = objects or resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
         running = beside.submit(callback_instances, tables, objects.callbacks)
         taken = takes(tables, objects)

@@ -141,7 +141,8 @@ def _keys(
 
 def _as_array(column: pl.Series) -> npt.NDArray[Any]:
     """A column of integers as an array, nulls as 0; a copy only where there are any."""
-    values: npt.NDArray[Any] = column.fill_null(0).rechunk().to_numpy()
+    known = column.fill_null(0) if column.null_count() else column
+    values: npt.NDArray[Any] = known.rechunk().to_numpy()
     return values
 
 

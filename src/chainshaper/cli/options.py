@@ -137,7 +137,9 @@ ADAPT: bool = option(
 MAX_LATENCY: int | None = option(
     "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
 )
-SOURCE: Source = option("--source", "Who records the events.", "lttng")
+SOURCE: Source | None = option(
+    "--source", "Who records the events. Default: preload, or lttng where that cannot be had."
+)
 NODE: NodeKind = option(
     "--node", "A script; a package for all types; or one generated for the type.", "python"
 )

@@ -161,11 +161,11 @@ def generate(
 def record(
     output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
-    source: opt.Source = opt.SOURCE,
+    source: opt.Source | None = opt.SOURCE,
     duration: int | None = DURATION,
     pid: list[int] | None = opt.option(
         "--pid",
-        "Attach to this process and what it has started (ebpf; may be repeated). "
+        "Attach to this process and what it has started (ebpf, preload; may be repeated). "
         "Default, without a COMMAND: everything of the users that looks like ROS 2.",
     ),
     user: list[str] | None = opt.USERS,
@@ -184,10 +184,10 @@ def record(
     """
     if command and pid:
         raise InputError("a COMMAND is started, --pid attaches to what runs: give one of them")
-    if not command and source == "lttng":
+    if not command and source not in ("ebpf", "preload"):
         raise InputError(
             "no command given: `chainshaper record -o REC -- ros2 launch …`; to attach to what "
-            "runs already, add `--source ebpf`"
+            "runs already, add `--source ebpf`, or `--source preload` if it has the library"
         )
     _record_and_show(
         *(output, command or [], json, buffer),
@@ -380,7 +380,7 @@ def profile(
         min=0,
     ),
     request: "cs.PlanRequest",
-    source: opt.Source = opt.SOURCE,
+    source: opt.Source | None = opt.SOURCE,
     duration: int | None = DURATION,
     buffer: int | None = BUFFER,
     json: bool = opt.JSON,
@@ -465,7 +465,7 @@ def shape(
     duration: int | None = opt.option(
         "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
-    source: opt.Source = opt.SOURCE,
+    source: opt.Source | None = opt.SOURCE,
     node: opt.NodeKind = opt.NODE,
     backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     adapt: bool = opt.ADAPT,

@@ -351,6 +351,7 @@ def export(
         "--output -o FILE", "File to write, such as trace.pftrace; must not exist.", ...
     ),
     perfetto: bool = opt.option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
+    mcap: bool = opt.option("--mcap", "Times of callbacks and cycles, for Foxglove.", False),
     chain: str | None = opt.CHAIN,
     plan: Path | None = opt.PLAN_IN_FORCE,
 ) -> None:
@@ -358,18 +359,19 @@ def export(
 
     The chain's traversals are a track of their own where a chain is named or recorded.
     """
-    if not perfetto:
-        raise InputError("the format is missing: add --perfetto")
+    if perfetto == mcap:
+        raise InputError("the format is missing: add --perfetto or --mcap")
     from chainshaper.reporting.perfetto import ENDINGS
     from chainshaper.values.files import new_file
 
-    new_file(output, ENDINGS)
+    new_file(output, (".mcap",) if mcap else ENDINGS)
     in_force = opt.plan_in_force(plan)
     with out.opened("export", trace) as (recording, report):
         report(0.5, "analysing")
         named = chain or recording.info.chain
         measured = None if named is None else cs.measure_latency(recording, named, in_force)
         report(0.7, "writing")
-        written = cs.export_perfetto(measured or recording, output)
+        write = cs.export_mcap if mcap else cs.export_perfetto
+        written = write(measured or recording, output)
     out.show_line(written.absolute())
     out.notes((*recording.info.notes, out.lost_events(recording)))

@@ -89,7 +89,7 @@ def shape_launch(
     period_ns: int | None = None,
     mode_recordings: Mapping[str, str | Path] | None = None,
     duration_ns: int = 60_000_000_000,
-    source: Literal["lttng", "preload", "ebpf"] = "lttng",
+    source: Literal["lttng", "preload", "ebpf"] | None = None,
     node: NodeKind = "python",
     back_end: str = "auto",
     adapt: bool = False,

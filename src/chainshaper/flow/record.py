@@ -44,7 +44,12 @@ from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
 from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.errors import (
+    ChainshaperError,
+    InputError,
+    OperationError,
+    PlatformError,
+)
 from chainshaper.values.files import open_to_all
 from chainshaper.values.recording import (
     EndpointInfo,
@@ -116,7 +121,7 @@ def record_command(
     output: str | Path,
     command: Sequence[str] = (),
     *,
-    source: str = "lttng",
+    source: str | None = None,
     duration_ns: int | None = None,
     pids: Sequence[int] = (),
     users: Collection[str | int] = (),
@@ -133,12 +138,13 @@ def record_command(
     """Record an application until it ends, ``duration_ns`` are over, or ``stop`` is set.
 
     ``command`` is started, and ended with the recording; it prints to ``command_stdout``. Without
-    one, eBPF attaches to ``pids`` and their descendants, or to all that ``users`` run (names or
-    numbers; default: who launched us, and root). ``buffer`` is the size of LTTng's buffer of a core
-    in bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in force;
-    ``gate_logs`` are where its shaping nodes note what they do. ``watch_stalls`` has a sleeper on
-    every core notice when the machine stands still (2 % of it). ``progress`` gets the share that is
-    done, as far as that is known, and what is being done.
+    one, `ebpf` and `preload` attach to ``pids`` and their descendants, or to all that ``users`` run
+    (names or numbers; default: who launched us, and root). Without ``source`` it is `preload`, or
+    `lttng` where the library cannot be had; a note says why then. ``buffer`` is the size of LTTng's
+    buffer of a core in bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in
+    force; ``gate_logs`` are where its shaping nodes note what they do. ``watch_stalls`` has a
+    sleeper on every core notice when the machine stands still (2 % of it). ``progress`` gets the
+    share that is done, as far as that is known, and what is being done.
 
     Raises:
         InputError: ``output`` exists, there is no such command or process, or no such source.
@@ -155,9 +161,13 @@ def record_command(
     except OSError as error:
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
+        source, because = (source, ()) if source else _usual_source(command, buffer)
         tracer = _tracer(source, folder, command, pids, buffer, users=taken)
         stop = stop or threading.Event()
         run = _Run(tracer, folder, duration_ns, stop, progress, taken, pids, gate_logs)
+        run.notes = because
+        for note in because:
+            progress(0.0, note)
         _trace(run, command, command_stdout, scheduling, watch_stalls=watch_stalls)
         progress(1.0, "reading the events")
         try:
@@ -170,6 +180,24 @@ def record_command(
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return Recorded(recording, run.exit_code)
+
+
+def _usual_source(command: Sequence[str], buffer: int | None) -> tuple[str, tuple[str, ...]]:
+    """Who records where that was not said, and why it is not the library in front of ROS 2.
+
+    Raises PlatformError: neither the library nor LTTng is there.
+    """
+    from chainshaper.sources.preload import installed_library
+
+    if buffer is not None or not command:  # both are LTTng's to answer
+        return "lttng", ()
+    try:
+        installed_library()
+    except PlatformError as error:
+        if shutil.which("lttng") is None:
+            raise
+        return "lttng", (f"LTTng recorded: {error}.",)
+    return "preload", ()
 
 
 def _tracer(

@@ -518,6 +518,8 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
                 hops.add(hop.node, hop.topic, ms(hop.communication_ns), ms(hop.computation_ns))
             tables.append(hops)
     lost = f"; {seen.lost} events lost" if seen.lost else ""
+    if unclear := sum(one.counted["unclear"] for one in seen.chains):
+        lost += f"; {unclear} cycles unclear: the clock was set"
     tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
     return tables
 

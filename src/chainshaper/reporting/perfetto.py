@@ -1,9 +1,9 @@
-"""A recording as a trace that ui.perfetto.dev opens.
+"""A recording as a trace that ui.perfetto.dev opens, or as MCAP, which Foxglove plots.
 
-What is in it: the threads of every process with their callbacks; each publication as an instant,
-with an arrow to the callback that took the message; what asynchronous publishers' threads sent;
-and, as rows of their own, the traversals of the chain with their hops, what the gate retained,
-the slots of the servers, and stalls of the machine. Times are ns of the recording's event clock.
+What is in the former: the threads of every process with their callbacks; each publication as an
+instant, with an arrow to the callback that took the message; what asynchronous publishers'
+threads sent; and, as rows of their own, the traversals of the chain with their hops, what the gate
+retained, the slots of the servers, and stalls of the machine. Times are ns of the event clock.
 
 A trace is a sequence of packets in protobuf's encoding; each packet describes a track, or an event
 of one. Slices of one track must nest: a track whose slices overlap otherwise is written as
@@ -11,6 +11,8 @@ several of one name, which the viewer shows as one. Numbers of fields and enumer
 `protos/perfetto/trace/` (perfetto.dev, "Advanced Guide to Programmatic Trace Generation").
 """
 
+import io
+import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -23,12 +25,14 @@ import polars as pl
 from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values import events
-from chainshaper.values.errors import shown
+from chainshaper.values.application import trigger_text
+from chainshaper.values.errors import extra_library, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement
 
-__all__ = ["ENDINGS", "Slice", "Track", "Value", "encode_trace", "export_perfetto"]
+__all__ = ["ENDINGS", "Slice", "Track", "Value", "encode_trace", "export_mcap"]
+__all__ += ["export_perfetto"]
 
 ENDINGS = (".pftrace", ".perfetto-trace")
 
@@ -103,6 +107,55 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
         where = "all cores" if core is None else f"core {core}"
         tracks.append(Track("Stalls of the machine", where, stalls))
     return write_whole(path, encode_trace(tracks, recording.info.clock_offset_ns))
+
+
+def export_mcap(source: Recording | Measurement, path: str | Path) -> Path:
+    """Write times of callbacks, and of a measurement's chain, as messages for Foxglove.
+
+    A topic for each node, ``/chainshaper/<node>``, has its callback instances as they end, and
+    ``/chainshaper/latency`` the chain's cycles; times are ms, log times CLOCK_REALTIME, as those of
+    a bag of the same run. Messages are JSON, with a schema.
+
+    Raises InputError: the path exists already, or does not end in `.mcap`. PlatformError: the
+    package mcap is not installed. OperationError: it cannot be written; nothing is left behind.
+    """
+    path = new_file(path, (".mcap",))
+    writing = extra_library("mcap.writer", "writing MCAP", "mcap")
+    recording = source.recording if isinstance(source, Measurement) else source
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    about = {one.id: one for one in graph_of(flow).callbacks}
+    rows: list[tuple[int, int, str, dict[str, Value | float]]] = []
+    took = flow.instances.drop_nulls("end").select("callback_id", "start", "end", "execution_ns")
+    for number, start, end, used in took.iter_rows():
+        one = about[number]
+        values: dict[str, Value | float] = {"callback": trigger_text(one.topic, one.period_ns)}
+        values |= {"response_ms": (end - start) / 1e6, "execution_ms": used and used / 1e6}
+        rows.append((end, start, one.node or "/unknown", values))
+    if isinstance(source, Measurement):
+        cycles = source.analysis.traversals.select("start", "end", "latency_ns", "late", "reason")
+        for start, end, latency, late, reason in cycles.iter_rows():
+            values = {"latency_ms": latency and latency / 1e6, "late": late, "incomplete": reason}
+            rows.append((end or start, start, "/latency", values))
+    file, offset = io.BytesIO(), recording.info.clock_offset_ns
+    writer, channels = writing.Writer(file), dict[str, int]()
+    writer.start()
+    kinds = {name: {"type": kind} for name, kind in _JSON_TYPES.items()}
+    schema = json.dumps({"type": "object", "properties": kinds}).encode()
+    number = writer.register_schema("chainshaper", "jsonschema", schema)
+    for end, start, topic, values in sorted(rows, key=lambda row: row[0]):
+        if topic not in channels:
+            channels[topic] = writer.register_channel(f"/chainshaper{topic}", "json", number)
+        data = json.dumps({name: one for name, one in values.items() if one is not None})
+        writer.add_message(channels[topic], end + offset, data.encode(), start + offset)
+    writer.finish()
+    return write_whole(path, [file.getvalue()])
+
+
+_JSON_TYPES = {
+    **dict.fromkeys(("latency_ms", "response_ms", "execution_ms"), "number"),
+    **dict.fromkeys(("callback", "incomplete"), "string"),
+    "late": "boolean",
+}
 
 
 def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> list[Track]:

@@ -211,8 +211,10 @@ def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.Dat
 
     So code asks for the columns it can use, whatever a distribution or tracer did not record.
     """
-    frame, known = tables.get(name, empty(name)), column_types(name)
+    frame, known = tables[name] if name in tables else empty(name), column_types(name)
     missing = [column for column in columns if column not in frame.columns]
+    if not missing:
+        return frame
     return frame.with_columns(pl.lit(None, dtype=known[column]).alias(column) for column in missing)
 
 

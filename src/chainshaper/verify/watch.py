@@ -11,7 +11,6 @@ hour, and only as three numbers each.
 """
 
 import contextlib
-import re
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -24,22 +23,26 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.analysis import analyse_latency, data_flow
+from chainshaper.analysis import data_flow, find_chain, graph_of, traverse
+from chainshaper.analysis.disturbance import with_punctuality
 from chainshaper.analysis.latency import LatencyStatistics, latency_statistics
+from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.gate.decision import clock_offset
-from chainshaper.linux.threads import innermost_id, read_proc
 from chainshaper.planning import ApplicationPlan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import (
+    NO_PROCESS,
     TracedProcess,
     creation_tables,
     event_tables,
     info_of,
     joined_tables,
+    memories,
 )
 from chainshaper.sources.system import processes_of
 from chainshaper.splicing.shaped_outputs import find_outputs
+from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import (
@@ -58,12 +61,8 @@ RECORDER_NS = 10 * SECOND
 """So much of the past the flight recorder has."""
 
 _SEARCH_NS, _FIRST_SEARCH_NS = 5 * SECOND, SECOND  # between two looks for new processes
+_STEP_NS = 1_000_000  # of CLOCK_REALTIME: more than reading its offset can be off
 _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave before their slot
-_NO_PROCESS = (
-    "no process of these users runs with the library in front: set what `chainshaper watch "
-    "--environment` prints before the application is started"
-)
-_MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
 
 
 @dataclass(frozen=True)
@@ -83,8 +82,9 @@ class ChainNow:
     ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of outputs that left in
     each of the plan's slots, over the hour (empty: without a plan); ``promised_ns`` is the end of
     its last slot, which is ``moved_ns`` behind the plan's; ``counted`` are cycles since the watch
-    began: ``complete``, of these ``late``, and ``incomplete``. ``problem`` says why there is
-    nothing to be seen.
+    began: ``complete``, of these ``late``, ``incomplete``, and ``unclear``, whose messages no event
+    before Iron tells apart while CLOCK_REALTIME is set. ``problem`` says why there is nothing to be
+    seen.
     """
 
     chain: str
@@ -151,7 +151,9 @@ class _Chain:
     place: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
-    counted: Counter[str] = field(default_factory=lambda: Counter(complete=0, late=0, incomplete=0))
+    counted: Counter[str] = field(
+        default_factory=lambda: Counter(complete=0, late=0, incomplete=0, unclear=0)
+    )
     problem: str | None = None
 
     def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
@@ -220,7 +222,13 @@ class Watch:
         self.chains = [_Chain(text, self._slots(text)) for text in chains]
         self.processes: dict[int, TracedProcess] = {}
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
-        self._recent: dict[int, deque[NDArray[Any]]] = {}
+        self._fresh: list[tuple[int, NDArray[Any]]] = []  # of a process, not yet in a table
+        self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # and their last instant
+        self._latest: dict[int, int] = {}  # a process's last event
+        self._tabled_ns = 0
+        self._stepped_ns = 0  # until then it is not clear which message a cycle had
+        self._known: list[tuple[Any, ...]] = []
+        self._resolved = resolve_objects({})
         self._clock_offset_ns = clock_offset()
         self._searched_ns = 0
         self._lost_with_ended = 0
@@ -233,48 +241,61 @@ class Watch:
     def read(self) -> None:
         """Take what is new in all memories, and look for new processes now and then."""
         now = time.monotonic_ns()
-        if now - self._searched_ns > (_SEARCH_NS if self.processes else _FIRST_SEARCH_NS):
+        searches = now - self._searched_ns > (_SEARCH_NS if self.processes else _FIRST_SEARCH_NS)
+        if searches:
             self._searched_ns = now
-            self._search()
+            for pid, memory in memories(self.users, self.processes):
+                self.processes[pid], self._latest[pid] = memory, 0
         for pid, process in self.processes.items():
-            recent = self._recent[pid]
-            recent.extend(process.new_records())
-            while recent and recent[0]["time"][-1] < now - RECORDER_NS - self.longest_ns:
-                recent.popleft()
+            for part in process.new_records():
+                self._fresh.append((pid, part))
+                self._latest[pid] = max(self._latest[pid], int(part["time"][-1]))
+        if now - self._tabled_ns > SECOND:
+            self._take_fresh(now)
+        if searches:
+            self._leave_ended()
 
-    def _search(self) -> None:
-        """Follow processes that have a memory, and leave those that have ended and are silent."""
-        for pid, memory in memories(self.users, self.processes):
-            self.processes[pid] = memory
-            self._recent[pid] = deque()
+    def _leave_ended(self) -> None:
+        """Leave processes that have ended, once their last events are too old to be asked for."""
         for pid in [one for one in self.processes if not Path(f"/proc/{one}").exists()]:
-            if not self._recent[pid]:
+            if self._latest[pid] < self._searched_ns - RECORDER_NS - self.longest_ns:
                 process = self.processes.pop(pid)
                 self._lost_with_ended += process.lost + process.dropped
                 self._created.pop(pid, None)
-                del self._recent[pid]
+                del self._latest[pid]
 
     def look(self) -> Seen:
         """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
         self.read()
-        now = time.monotonic_ns()
+        now, offset = time.monotonic_ns(), clock_offset()
+        if abs(offset - self._clock_offset_ns) > _STEP_NS:
+            self._stepped_ns = now
+        self._clock_offset_ns = offset
         over = now - self.longest_ns
-        tables = self._tables(now - 2 * self.longest_ns - (over - self._over_ns))
-        flow = data_flow(tables, self._clock_offset_ns)
+        since = now - 2 * self.longest_ns - (over - self._over_ns)
+        tables = self._tables(since)
+        flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
+        # Where publications carry no stamp, the clock's offset says which one was taken.
+        stampless = flow.publications["source_timestamp"].null_count() > 0
+        clear_ns = self._stepped_ns if stampless else 0
+        graph = graph_of(flow)
+        nodes = {one.id: one.node or "" for one in graph.callbacks}
         for one in self.chains:
             try:
-                found = analyse_latency(flow, one.text, due=self.due)
+                chain = find_chain(graph, one.text)
             except InputError as error:
-                one.problem = str(error) if self.processes else _NO_PROCESS
+                one.problem = str(error) if self.processes else NO_PROCESS
                 continue
             one.problem = None
-            new = found.traversals.filter(pl.col("start").is_between(self._over_ns, over, "right"))
-            one.take_over(new, found.hops, now)
-            topics, nodes = found.chain.topics, {c.id: c.node for c in found.graph.callbacks}
-            one.names = [
-                (nodes[number] or "", topic)
-                for number, topic in zip(found.chain.callbacks, topics, strict=True)
-            ]
+            found = traverse(flow, chain, graph)
+            due = next((d for d in self.due if d.output in {None, chain.topics[-1]}), None)
+            judged, _ = with_punctuality(flow, found, due)
+            new = judged.filter(pl.col("start").is_between(self._over_ns, over, "right"))
+            one.take_over(clear := new.filter(pl.col("start") > clear_ns), found.hops, now)
+            one.counted["unclear"] += new.height - clear.height
+            one.names = list(
+                zip(map(nodes.__getitem__, chain.callbacks), chain.topics, strict=True)
+            )
         self._over_ns = over
         moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
         return Seen(
@@ -283,6 +304,22 @@ class Watch:
             lost=self.lost,
             chains=tuple(self._now(one, over, moved) for one in self.chains),
         )
+
+    def _objects(self, tables: EventTables, since_ns: int) -> Objects:
+        """Who exists: as at the last look where nothing was created, and the same ran, since then.
+
+        That is half of a look, and what is created stays; which callbacks ran, and which
+        subscriptions took, makes known those that say so only thereby (Python's).
+        """
+        what_ran = [("callback_start", "callback"), ("rmw_take", "rmw_subscription_handle")]
+        known = [tuple(sorted((pid, one[0]) for pid, one in self._created.items()))]
+        for name, column in what_ran:
+            rows = events.table(tables, name).select("pid", column).unique()
+            known.append(tuple(sorted(rows.iter_rows())))
+        created = (tables[one]["time"][-1] for one in events.CREATION & tables.keys())
+        if known != self._known or max(created, default=0) >= since_ns:
+            self._known, self._resolved = known, resolve_objects(tables)
+        return self._resolved
 
     def _now(self, one: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
         moved_ns = moved.get(one.text.rpartition("..")[2], 0)
@@ -309,22 +346,29 @@ class Watch:
 
     def _tables(self, since_ns: int) -> EventTables:
         """All that was created, and what happened since an instant."""
-        parts: list[dict[str, pl.DataFrame]] = []
+        self._take_fresh(time.monotonic_ns())
+        created = (tables for _, tables, _ in self._created.values())
+        recent = (tables for last, tables in self._recent if last >= since_ns)
+        return joined_tables([*created, *recent])
+
+    def _take_fresh(self, now_ns: int) -> None:
+        """Make tables of what was read since the last time, and drop those that are too old."""
         by_library: dict[TracingLibrary, list[tuple[NDArray[Any], int]]] = {}
         for pid, process in self.processes.items():
             asked = int(process.header["objects"][0])
             if pid not in self._created or self._created[pid][0] != asked:
                 self._created[pid] = (asked, *creation_tables(process))
-            _, created, library = self._created[pid]
-            parts.append(created)
-            recent = (part for part in self._recent[pid] if part["time"][-1] >= since_ns)
-            by_library.setdefault(library, []).extend((part, process.pid) for part in recent)
+        for pid, part in self._fresh:
+            own = by_library.setdefault(self._created[pid][2], [])
+            own.append((part, self.processes[pid].pid))
         for library, own in by_library.items():
-            if own:
-                records = np.concatenate([part for part, _ in own])
-                pids = np.repeat([pid for _, pid in own], [part.size for part, _ in own])
-                parts.append(event_tables(records, pids.astype(np.int32), library))
-        return joined_tables(parts)
+            records = np.concatenate([part for part, _ in own])
+            pids = np.repeat([pid for _, pid in own], [part.size for part, _ in own])
+            tables = event_tables(records, pids.astype(np.int32), library)
+            self._recent.append((int(records["time"].max()), tables))
+        self._fresh, self._tabled_ns = [], now_ns
+        while self._recent and self._recent[0][0] < now_ns - RECORDER_NS - self.longest_ns:
+            self._recent.popleft()
 
     def save(self, output: str | Path) -> Recording:
         """Write the last ten seconds as a recording: the flight recorder.
@@ -360,24 +404,6 @@ def _hops(one: _Chain) -> Iterator[Hop]:
     for number, communication, computation, count in sums.iter_rows():
         node, topic = one.names[number]
         yield Hop(node, topic, communication / count, computation / count)
-
-
-def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
-    """Processes of some users that have the library in front, but for those that are ``known``."""
-    for process in Path("/proc").iterdir():
-        if not process.name.isdigit() or int(process.name) in known:
-            continue
-        with contextlib.suppress(OSError):  # it has ended, or may not be looked into
-            if process.stat().st_uid not in users:
-                continue
-            own = innermost_id(read_proc(f"{process}/status"))
-            for descriptor in (process / "fd").iterdir():
-                if _MEMORY.match(str(descriptor.readlink())):
-                    with contextlib.suppress(InputError), descriptor.open("rb") as file:
-                        memory = TracedProcess(file.fileno())
-                        if memory.pid == own:  # else it is one that reads it, as we do
-                            yield int(process.name), memory
-                            break
 
 
 @contextlib.contextmanager

@@ -1,8 +1,9 @@
 """Tracing by a library that `LD_PRELOAD` puts in front of ROS 2: no root, no daemon, no module.
 
 `preload.c` is that library. It sends us the memory of its process with the process's first event,
-over a socket whose name is in no file system. A thread reads all memories ten times a second: a
-process that was killed in between has lost nothing, since its memory is ours as well.
+over a socket whose name is in no file system; that of a process that runs already is in `/proc`. A
+thread reads all memories ten times a second: a process that was killed in between has lost nothing,
+since its memory is ours as well.
 
 Nothing is locked: who writes never waits for who reads. So a reader copies what is new in a ring,
 then looks again how much has been written: what may have been overwritten meanwhile is thrown away
@@ -23,6 +24,7 @@ import struct
 import subprocess
 import tempfile
 import threading
+import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -34,7 +36,8 @@ from numpy.typing import NDArray
 
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import tool_environment
-from chainshaper.linux.processes import run_users
+from chainshaper.linux.processes import descendants, run_users
+from chainshaper.linux.threads import innermost_id, parents, read_proc
 from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary, version_of
 from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
 from chainshaper.values import events
@@ -55,6 +58,7 @@ __all__ = [
     "info_of",
     "installed_library",
     "joined_tables",
+    "memories",
     "preloading",
 ]
 
@@ -201,9 +205,10 @@ def joined_tables(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.D
     for tables in parts:
         for name, table in tables.items():
             found.setdefault(name, []).append(table)
+    joined = {name: pl.concat(own, how="diagonal") for name, own in found.items()}
     return {
-        name: pl.concat(own, how="diagonal").sort("time", maintain_order=True)
-        for name, own in found.items()
+        name: one if one["time"].is_sorted() else one.sort("time", maintain_order=True)
+        for name, one in joined.items()
     }
 
 
@@ -279,6 +284,7 @@ def _table(name: str, records: NDArray[Any], columns: Mapping[str, Any]) -> pl.D
 VARIABLE = "CHAINSHAPER_TRACE"
 _FILE = "libchainshaper_trace.so"
 _BETWEEN_LOOKS_S = 0.1
+_BETWEEN_SEARCHES_NS = 1_000_000_000
 _OPTIONS = ("-O2", "-std=gnu11", "-shared", "-fPIC", "-ftls-model=initial-exec")
 _LIBRARIES = ("-ldl", "-lpthread")
 _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
@@ -320,10 +326,12 @@ def compile_library(
 
 
 def installed_library() -> Path:
-    """The library in the user's cache, built at the first use: for what runs longer than we do.
+    """The library that came with the package, or is in the user's cache, built at the first use.
 
     Raises PlatformError: as :func:`build_library`, or others may write to the cache.
     """
+    if (shipped := SOURCE.with_name(_FILE)).exists():
+        return shipped
     return in_cache(_FILE, [SOURCE.read_text()], build_library)
 
 
@@ -358,13 +366,49 @@ def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -
 
 
 def preloading(library: Path) -> str:
-    """`LD_PRELOAD` with the library in front of those that it names already."""
+    """`LD_PRELOAD` with the library in front of those that it names already.
+
+    Raises PlatformError: its path has a character that separates libraries there.
+    """
+    if re.search(r"[\s:]", str(library)):
+        raise PlatformError(
+            f"{str(library)!r} has a space or a colon in it, so LD_PRELOAD cannot name it: name "
+            "another cache in $XDG_CACHE_HOME"
+        )
     before = os.environ.get("LD_PRELOAD", "").split(":")
     return ":".join([str(library), *(one for one in before if one and one != str(library))])
 
 
+NO_PROCESS = (
+    "no process of these users runs with the library in front: set what `chainshaper watch "
+    "--environment` prints before the application is started"
+)
+_MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
+
+
+def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
+    """Processes of some users that have the library in front, but for those that are ``known``."""
+    for process in Path("/proc").iterdir():
+        if not process.name.isdigit() or int(process.name) in known:
+            continue
+        with suppress(OSError):  # it has ended, or may not be looked into
+            if process.stat().st_uid not in users:
+                continue
+            own = innermost_id(read_proc(f"{process}/status"))
+            for descriptor in (process / "fd").iterdir():
+                if _MEMORY.match(str(descriptor.readlink())):
+                    with suppress(InputError), descriptor.open("rb") as file:
+                        memory = TracedProcess(file.fileno())
+                        if memory.pid == own:  # else it is one that reads it, as we do
+                            yield int(process.name), memory
+                            break
+
+
 class PreloadTracer:
-    """Records with the library in front: a :class:`~chainshaper.sources.Tracer`."""
+    """Records with the library in front: a :class:`~chainshaper.sources.Tracer`.
+
+    Without a command it follows ``pids`` and their descendants, or all of the users' that have it.
+    """
 
     def __init__(
         self,
@@ -373,12 +417,7 @@ class PreloadTracer:
         pids: Sequence[int],
         users: Collection[int] | None = None,
     ) -> None:
-        if pids or not command:
-            raise InputError(
-                "the library is loaded as a process starts: give the COMMAND that starts the "
-                "application behind `--`, or attach with `--source ebpf`"
-            )
-        self._folder = folder
+        self._folder, self._pids, self._attaches = folder, pids, not command
         self._users = {os.geteuid(), *(run_users() if users is None else users)}
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self._reader = threading.Thread(target=self._read_until_over, daemon=True)
@@ -387,15 +426,26 @@ class PreloadTracer:
         self._clock_offset_ns = 0
         self._processes: list[TracedProcess] = []
         self._names: dict[int, str] = {}
+        self._found: set[int] = set()  # attached to, by the ids that they have here
+        self._searched_ns = 0
 
     def start(self) -> Mapping[str, str]:
-        """Compile the library, and wait for the processes that have it."""
-        library = build_library(self._folder)
+        """Wait for the processes that have the library, or take those that run with it."""
+        self._clock_offset_ns = clock_offset()
+        if self._attaches:
+            self._search()
+            if not self._processes:
+                raise OperationError(f"{NO_PROCESS}, or attach with `--source ebpf`")
+            for process in self._processes:  # what happened until now is none of this recording
+                process.new_records()
+                process.lost = 0
+            self._reader.start()
+            return {}
+        library = installed_library()
         name = f"chainshaper-{os.getpid()}-{secrets.token_hex(8)}"
         self._socket.bind(f"\0{name}")
         self._socket.listen(128)
         self._socket.settimeout(_BETWEEN_LOOKS_S)
-        self._clock_offset_ns = clock_offset()
         self._reader.start()
         return {"LD_PRELOAD": preloading(library), VARIABLE: name}
 
@@ -420,13 +470,15 @@ class PreloadTracer:
             raise OperationError(
                 "no process has loaded the tracing library: is tracing compiled into this ROS 2 "
                 "(`ros2 run tracetools status`), and do the nodes run here, not in a container, "
-                "and without more rights than you (LD_PRELOAD is ignored then)?"
+                "and without more rights than you (LD_PRELOAD is ignored then)? LTTng can record "
+                "what loads it: `--source lttng`"
             )
         parts: list[dict[str, pl.DataFrame]] = []
         versions: list[str | None] = []
         for place, process in enumerate(self._processes):
             file = self._file(place)
             records = np.fromfile(file, RECORD) if file.exists() else np.empty(0, RECORD)
+            file.unlink(missing_ok=True)  # the tables have all of it
             created, library = creation_tables(process)
             pids = np.full(records.size, process.pid, np.int32)
             versions.append(library.version)
@@ -447,7 +499,10 @@ class PreloadTracer:
     def _read_until_over(self) -> None:
         try:
             while not self._over.is_set():
-                self._welcome()
+                if not self._attaches:
+                    self._welcome()
+                elif not self._over.wait(_BETWEEN_LOOKS_S):
+                    self._search()
                 self._read_all()
             self._read_all()
         except OSError as error:
@@ -460,6 +515,17 @@ class PreloadTracer:
                 peer, _ = self._socket.accept()
                 with peer:
                     self._take_memory(peer)
+
+    def _search(self) -> None:
+        """Processes with the library that are new, once a second."""
+        if time.monotonic_ns() - self._searched_ns < _BETWEEN_SEARCHES_NS:
+            return
+        self._searched_ns = time.monotonic_ns()
+        family = descendants(parents(), *self._pids)
+        for pid, process in memories(self._users, self._found):
+            if not self._pids or pid in family:
+                self._found.add(pid)
+                self._processes.append(process)
 
     def _take_memory(self, peer: socket.socket) -> None:
         """The memory of one process, which runs as one of the users that are recorded."""

@@ -75,16 +75,79 @@ static _Atomic(struct memory *) memory;
 static _Atomic int state;  // 0: none yet, 1: being made, 2: there, 3: cannot be had
 static int descriptor = -1;
 static pthread_key_t at_end;
+struct rseq_area {  // struct rseq of <linux/rseq.h>, which older headers have not
+  uint32_t cpu_id_start, cpu_id;
+  volatile uint64_t section;
+};
 static __thread struct {
   struct ring *ring;
   struct record *records;
   uint32_t tid;
+  struct rseq_area *rseq;             // NULL: a switch cannot be noticed
+  uint64_t used, used_at, last_used;  // CPU time as read, when that was, and as last written
 } own;
 
 static inline uint64_t now(clockid_t clock) {
   struct timespec time;
   clock_gettime(clock, &time);
   return (uint64_t)time.tv_sec * 1000000000u + (uint64_t)time.tv_nsec;
+}
+
+// CPU time of the thread, without a system call while it has been on its core since the last one:
+// then it has used what has passed. The kernel says so: it resets the thread's pointer to a
+// restartable sequence (rseq(2)) when it takes the core away outside of that sequence, and ours is
+// empty. The clock itself is read again after SURELY_USED, so that interrupts and stolen time, which
+// it leaves out, add up to no more. A kernel need not reset the pointer of a thread that waits in a
+// system call: one try in each process finds that out, and the clock is read each time.
+#define SURELY_USED 200000u  // ns
+#if defined(__x86_64__)
+#define SIGNATURE 0x53053053u
+#define THREAD_POINTER(to) __asm__("mov %%fs:0, %0" : "=r"(to))
+#elif defined(__aarch64__)
+#define SIGNATURE 0xd428bc00u
+#define THREAD_POINTER(to) (to = __builtin_thread_pointer())
+#else
+#define SIGNATURE 0u
+#define THREAD_POINTER(to) (to = NULL)
+#endif
+static const uint32_t nowhere[2] = {SIGNATURE};  // the kernel looks for it before an abort's address
+static struct {
+  uint32_t version, flags;
+  uint64_t start, size, abort;
+} no_section __attribute__((aligned(32)));
+static ptrdiff_t rseq_offset;  // from the thread's pointer; 0: without
+
+static struct rseq_area *rseq_of_thread(void) {
+  char *thread;
+  THREAD_POINTER(thread);
+  struct rseq_area *found = (struct rseq_area *)(void *)(thread + rseq_offset);
+  return thread && rseq_offset && (int32_t)found->cpu_id >= 0 ? found : NULL;
+}
+
+static void find_rseq(void) {
+  const ptrdiff_t *offset = dlsym(RTLD_DEFAULT, "__rseq_offset");  // glibc 2.35 and later
+  const unsigned *size = dlsym(RTLD_DEFAULT, "__rseq_size");
+  no_section.start = (uintptr_t)nowhere;
+  no_section.abort = (uintptr_t)&nowhere[1];
+  rseq_offset = offset && size && *size ? *offset : 0;
+  struct rseq_area *rseq = rseq_of_thread();
+  for (int try = 0; rseq && try < 3; try++) {
+    rseq->section = (uintptr_t)&no_section;
+    nanosleep(&(struct timespec){0, 1}, NULL);
+    if (rseq->section) rseq_offset = 0;
+  }
+}
+
+static uint64_t thread_time(uint64_t time) {
+  uint64_t used = own.used + (time - own.used_at);
+  bool stayed = own.rseq && own.rseq->section == (uintptr_t)&no_section;
+  if (!stayed || time - own.used_at >= SURELY_USED) {
+    if (own.rseq) own.rseq->section = (uintptr_t)&no_section;
+    used = own.used = now(CLOCK_THREAD_CPUTIME_ID);
+    own.used_at = now(CLOCK_MONOTONIC);
+  }
+  if (used > own.last_used) own.last_used = used;
+  return own.last_used;
 }
 
 static void stamp(struct record *record, uint64_t time) {
@@ -149,8 +212,8 @@ static void in_child(void) {
   descriptor = -1;
   memory = NULL;
   state = 0;
-  own.ring = NULL;
-  own.tid = 0;
+  pthread_setspecific(at_end, NULL);
+  memset(&own, 0, sizeof own);
 }
 
 static bool is_ready(void) {
@@ -160,6 +223,7 @@ static bool is_ready(void) {
     static bool once;
     if (!once && (pthread_key_create(&at_end, give_back) || pthread_atfork(NULL, NULL, in_child)))
       state = 3;
+    if (!once) find_rseq();
     once = true;
     if (state == 1) state = make_memory() ? 2 : 3;
     if (state == 2) {
@@ -183,6 +247,7 @@ static bool has_ring(void) {
   if (own.ring) return true;
   if (!is_ready()) return false;
   own.tid = (uint32_t)syscall(SYS_gettid);
+  own.rseq = rseq_of_thread();
   struct memory *all = memory;
   for (unsigned number = 0; number < RINGS; number++) {
     uint32_t none = 0;
@@ -197,15 +262,18 @@ static bool has_ring(void) {
 }
 
 static inline __attribute__((always_inline)) void write_record(uint16_t event, unsigned count,
-                                                               const uint64_t *values) {
+                                                               const uint64_t *values,
+                                                               bool timed) {
   if (__builtin_expect(!own.ring, 0) && !has_ring()) return;
   uint64_t number = atomic_load_explicit(&own.ring->written, memory_order_relaxed);
   struct record *record = &own.records[number & (RING_RECORDS - 1)];
   // Who sees any of this record sees the count of those before, and that its room is taken again.
   atomic_thread_fence(memory_order_release);
-  stamp(record, now(CLOCK_MONOTONIC));
+  uint64_t time = now(CLOCK_MONOTONIC);
+  stamp(record, time);
   atomic_store_explicit(&record->event, event, memory_order_relaxed);
   for (unsigned place = 0; place < count; place++) record->values[place] = values[place];
+  if (timed) record->values[2] = thread_time(time);
   atomic_store_explicit(&own.ring->written, number + 1, memory_order_release);
 }
 
@@ -334,10 +402,9 @@ typedef bool (*question)(void);
   bool ros_trace_enabled_##name(void) { return true; }
 
 #define EVENT(name, count) \
-  HOOK(name, write_record(number_##name, count, ((uint64_t[6]){a, b, c, d, e})))
+  HOOK(name, write_record(number_##name, count, ((uint64_t[6]){a, b, c, d, e}), false))
 #define TIMED(name, count) \
-  HOOK(name, write_record(number_##name, 3, \
-                          ((uint64_t[6]){a, b, now(CLOCK_THREAD_CPUTIME_ID)})))
+  HOOK(name, write_record(number_##name, count, ((uint64_t[6]){a, b, c, d, e}), true))
 #define CREATION(name, texts, gid) \
   HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
 ALL_EVENTS
