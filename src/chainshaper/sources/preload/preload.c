@@ -178,6 +178,13 @@ static void send_memory(const char *name) {
   close(peer);
 }
 
+// The function behind ours. What Python's nodes load is in no scope of ours: rcl needs all of it.
+static void *next_one(const char *name) {
+  void *found = dlsym(RTLD_NEXT, name);
+  void *rcl = found ? NULL : dlopen("librcl.so", RTLD_LAZY | RTLD_NOLOAD);
+  return rcl ? dlsym(rcl, name) : found;
+}
+
 static void append(uint16_t event, const uint64_t *values, const void *const *texts,
                    const unsigned *places, unsigned count);
 
@@ -228,7 +235,7 @@ static bool is_ready(void) {
     if (state == 1) state = make_memory() ? 2 : 3;
     if (state == 2) {
       Dl_info behind;
-      void *function = dlsym(RTLD_NEXT, "ros_trace_callback_start");
+      void *function = next_one("ros_trace_callback_start");
       own.tid = (uint32_t)syscall(SYS_gettid);
       if (function && dladdr(function, &behind) && behind.dli_fname) {
         const void *path = behind.dli_fname;
@@ -388,15 +395,15 @@ typedef bool (*question)(void);
     static _Atomic bool looked; \
     write; \
     if (!looked) { \
-      behind = (function)dlsym(RTLD_NEXT, "ros_trace_" #name); \
+      behind = (function)next_one("ros_trace_" #name); \
       looked = true; \
     } \
     if (behind) behind(a, b, c, d, e); \
   } \
   void ros_trace_do_##name(ARGUMENTS) { \
     write; \
-    function behind = (function)dlsym(RTLD_NEXT, "ros_trace_do_" #name); \
-    question enabled = (question)dlsym(RTLD_NEXT, "ros_trace_enabled_" #name); \
+    function behind = (function)next_one("ros_trace_do_" #name); \
+    question enabled = (question)next_one("ros_trace_enabled_" #name); \
     if (behind && enabled && enabled()) behind(a, b, c, d, e); \
   } \
   bool ros_trace_enabled_##name(void) { return true; }
