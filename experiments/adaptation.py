@@ -33,7 +33,7 @@ from chainshaper.planning.plan import Adaptation
 from chainshaper.workload.description import Application
 
 MS, PROMISED, PER_MINUTE, AFTER_STEP, DELAY = 1_000_000, 0.01, 600, 50, 2
-CYCLE_MS, WORK_MS, SPREAD = 20, 7.0, 0.03
+CYCLE_MS, WORK_MS, SPREAD = 20, 10.0, 0.03
 Floats = npt.NDArray[np.float64]
 
 

@@ -1,7 +1,9 @@
 """Slots that follow a timer: an hour of a timer that is some ppm off, as a drift watch sees it."""
 
 import random
+import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -9,13 +11,18 @@ from typing import Any
 
 import pytest
 from applied_plans import one_server_plan
+from small_chain import small_chain_plan
 
 from chainshaper.enforcement.back_ends import Choice
+from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.undoing import SlotMove
 from chainshaper.flow import apply as applying
 from chainshaper.flow import threads
 from chainshaper.flow.apply import _Run
 from chainshaper.flow.drift import TimerTrack
-from chainshaper.planning.application_plan import whole
+from chainshaper.planning.application_plan import open_until_done, whole
+from chainshaper.planning.plan import revised
+from chainshaper.reporting.overviews import servers_table
 from chainshaper.values.errors import OperationError
 
 MS, S = 1_000_000, 1_000_000_000
@@ -144,3 +151,44 @@ def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
     monkeypatch.setattr(applying, "DriftWatch", lambda *given, **_: watched.append(given[-1]))
     run.drift_watches()
     assert watched == [slots]
+
+
+@pytest.mark.parametrize("thread", ["free", "in-slots"])
+def test_servers_and_gate_move_with_the_same_cycle(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, thread: str
+) -> None:
+    """Cycles of 50 ms begin at 7 ms; R_m [0, 21 ms) is open to their end, R_m° [21, 22) is not."""
+    plan = whole(revised(small_chain_plan(10 * MS, 20 * MS), shaping_thread=thread))
+    here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None)
+    run = _Run(plan, open_until_done(plan), Choice("freezer", ""), here, (), frozenset(), Event())
+    run.found, run.servers = here, object.__new__(Freezer)
+    changed: list[Any] = []
+    in_force = 10**15 // (50 * MS) * 50 * MS + 7 * MS
+    monkeypatch.setattr(Freezer, "change", lambda _, table, anchor: changed.append((table, anchor)))
+    monkeypatch.setattr(Freezer, "in_force_from", lambda _: in_force)
+    run.begin_state((), "")
+    run.find_anchor(5 * MS, lambda *_: None)  # the timer expires 2 ms before its slot
+    run.state = replace(run.state, anchor_ns=7 * MS)
+    from_ns = run.move_slots(0, 3 * MS)
+    assert from_ns % (50 * MS) == (7 - 25) * MS % (50 * MS), "half a cycle before one begins"
+    if thread == "free":
+        assert not changed, "only the gate moves"
+        assert from_ns > time.monotonic_ns() + 50 * MS, "announced"
+    else:
+        ((table, anchor),) = changed
+        assert anchor == 7 * MS
+        assert {s.name: s.slots for s in table.servers}["output"] == ((19 * MS, 50 * MS),)
+        assert from_ns == in_force - 25 * MS, "with the first cycle that the servers have so"
+    move = SlotMove(from_ns, "/t1..", 3 * MS, 24 * MS, "its promise did not hold any more")
+    follower: Any = SimpleNamespace(moves=(move,), failure=OperationError("gone"), end=lambda: None)
+    run.followers[0] = follower
+    run.show_moves()
+    assert run.state.moves == (move,)
+    slots = {one.name: one.slots for one in run.state.servers}
+    assert slots["chain"] == ((0, 50 * MS),)
+    assert (
+        slots["output"] == ((19 * MS, 50 * MS),) if thread == "in-slots" else ((24 * MS, 25 * MS),)
+    )
+    assert run.state.notes[-1] == "slots are as planned, and do not follow any more: gone"
+    assert not run.followers
+    assert "begins at 24ms now: its promise did not hold" in str(servers_table(run.state).caption)

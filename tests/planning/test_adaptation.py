@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from known import known
 from processes import wait_for
 from small_chain import small_chain_plan
 
@@ -219,10 +220,11 @@ def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> N
     follower = SlotFollower(plan, (), (0, 8 * MS), put_in_force)
     with pytest.raises(OperationError, match="another run has the slots"):
         SlotFollower(plan, (), (0, 8 * MS), put_in_force)
-    assert turn.moved() is None
+    by, _ = known(turn.moved())
+    assert by == 0
     for _ in range(20):
         turn.count(None, None, late=True, latency_ns=25 * MS)
-    wait_for(lambda: turn.moved() is not None, "a move")
+    wait_for(lambda: known(turn.moved())[0] != 0, "a move")
     (move,) = follower.moves
     assert turn.moved() == (move.moved_ns, 1_000)
     assert asked == [move.moved_ns]
@@ -235,3 +237,6 @@ def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> N
     assert back is not None
     assert back[0] == 0
     assert back[1] <= time.monotonic_ns()
+    again = SlotFollower(plan, (), (0, 8 * MS), put_in_force)
+    assert known(turn.moved())[0] == 0, "not where the run before had them"
+    again.end()

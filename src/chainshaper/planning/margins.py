@@ -397,7 +397,7 @@ class Tail:
       forgotten; the tail is taken to have grown as much as the median.
     * Every now and then the window is looked at. If its latest cycles lie elsewhere than those
       before, it begins with them. A **drift**, where thirds of it lie apart, is taken out: all
-      count for where they would be now. Then the share that is late by now is held against the
+      count for where they would be now. Then the share that is late by now is compared with the
       promise. Of a share so small that the window has hardly any beyond, the generalised Pareto
       distribution says where it begins, with its standard error (Hosking and Wallis, 1987).
     * Slots move earlier when far fewer than promised are late, or latencies fall, and that has been
@@ -413,7 +413,7 @@ class Tail:
     latest_ns: int
     earliest_ns: int = 0
     seen: int = 0
-    _kept: _Floats = field(init=False)
+    _latencies: _Floats = field(init=False)
     _begin: int = 0
     _end: int = 0
     _lates: deque[int] = field(default_factory=lambda: deque(maxlen=AT_ONCE[-1]))
@@ -423,16 +423,16 @@ class Tail:
     _shape: tuple[float, float] = field(init=False)  # median, and latency to aim at
 
     def __post_init__(self) -> None:
-        self._kept = np.zeros(2 * self.rules.window)
+        self._latencies = np.zeros(2 * self.rules.window)
         self._after, self._shape = self.rules.after, (self.usual_ns, float(self.start_ns))
 
     def saw(self, latency_ns: int) -> int | None:
         """The next output; where the slot is to begin from now on (None: where it does)."""
-        if self._end == self._kept.size:
-            kept = self.rules.window
-            self._kept[:kept] = self._kept[kept:]
-            self._begin, self._end = self._begin - kept, kept
-        self._kept[self._end] = latency_ns
+        if self._end == self._latencies.size:
+            window = self.rules.window
+            self._latencies[:window] = self._latencies[window:]
+            self._begin, self._end = self._begin - window, window
+        self._latencies[self._end] = latency_ns
         self._end, self.seen = self._end + 1, self.seen + 1
         self._begin = max(self._begin, self._end - self.rules.window)
         if latency_ns > self.start_ns:
@@ -450,7 +450,7 @@ class Tail:
         first = next(one for one in self._lates if one > self.seen - cycles)
         change = max(self._begin, self._end - 1 - (self.seen - first))
         self._forget(change)
-        new = self._kept[change : self._end]
+        new = self._latencies[change : self._end]
         usual, aim = self._shape
         error = 1.25 * (aim - usual) / 3 / math.sqrt(new.size)  # of a median, if it were normal
         grown = (float(np.median(new)) + 2 * error) / usual
@@ -458,14 +458,14 @@ class Tail:
 
     def _forget(self, change: int) -> None:
         """The window begins with a change; of what came before, the shape is remembered."""
-        before = self._kept[self._begin : change]
+        before = self._latencies[self._begin : change]
         if before.size >= self.rules.window // 8:
             aim = _beyond(before, AIM * self.promised)[0]
             self._shape = float(np.median(before)), aim
         self._begin, self._after, self._worth_since = change, self.rules.after, None
 
     def _look(self) -> int | None:
-        window, size = self._kept[self._begin : self._end], self._end - self._begin
+        window, size = self._latencies[self._begin : self._end], self._end - self._begin
         if size < self.rules.window // 8:
             return None
         now, rise = _without_drift(window)

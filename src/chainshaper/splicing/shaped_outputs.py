@@ -113,12 +113,15 @@ class FollowedOutput:
             )
         folder, _, name = found[0].page.rpartition("/")
         self._page = Page(folder, name, flags=os.O_RDWR)
+        if not self._page.is_locked(MOVING):  # by how much a run before moved them is over
+            self._page.put("moved_from_ns", 0)
         if not self._page.lock(MOVING):
             self._page.close()
             raise OperationError(
                 f"another run has the slots of {topic} follow its latencies: end that first"
             )
         self._seen = self._page["measured"]
+        self.move(0, time.monotonic_ns())
 
     def latencies(self) -> list[int]:
         """Those of the outputs that came since the last time, from origin to arrival (ns).
