@@ -118,6 +118,12 @@ TRACE: list[Path] = argument(
 )
 APPLICATION: Path = argument("APP.yaml", "The application's description.", ...)
 RECORDING_OUTPUT: Path = option("--output -o REC", "Folder to write; must not exist.", ...)
+SINCE: int = option(
+    "--skip --from DURATION",
+    "Leave out what the recording begins with, such as 2s of start-up.",
+    0,
+)
+UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
 SEED: int | None = option("--seed", "Instead of the description's.", min=0)
 REALTIME: bool | None = option(

@@ -465,6 +465,8 @@ def shape(
     duration: int | None = opt.option(
         "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
+    since: int = opt.SINCE,
+    until: int | None = opt.UNTIL,
     source: opt.Source = opt.SOURCE,
     node: opt.NodeKind = opt.NODE,
     backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
@@ -503,6 +505,8 @@ def shape(
         throttled=throttled_inputs(throttle or []),
         period_ns=period,
         mode_recordings=opt.mode_profiles(mode_profile, request),
+        since_ns=since,
+        until_ns=until,
         duration_ns=duration or SHAPING_DURATION_NS,
         source=source,
         node=node,

@@ -77,6 +77,9 @@ class Wishes:
     epsilon_ns: Annotated[int | None, Option(
         "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"
         " that all cycles but 1 % stay below.", MARGIN)] = None
+    percentile: Annotated[float | None, Option(
+        "Plan from latencies up to this percentile, such as 99.5; longer ones will be late."
+        " Default: all.", MARGIN, "P")] = None
     overrun_probability: Annotated[float | None, Option(
         "Share of all cycles that may be late, such as 0.01; below 0.001 it is derived from"
         " the tail of the latencies.", MARGIN, "P")] = None
