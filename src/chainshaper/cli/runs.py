@@ -15,7 +15,7 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
-from chainshaper.cli.traces import comparison_tables
+from chainshaper.cli.traces import comparison_tables, judge
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
 if TYPE_CHECKING:
@@ -83,6 +83,7 @@ def demo(
     if out.present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
         out.notes(result.notes)
         out.show_line(folder.absolute())
+        judge([result.comparison], strict=False, json=json)
 
 
 def run(
@@ -476,6 +477,7 @@ def shape(
     request: "cs.PlanRequest",
     mode_profile: list[str] | None = opt.MODE_PROFILE,
     user: list[str] | None = opt.USERS,
+    strict: bool = opt.STRICT,
     json: bool = opt.JSON,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
@@ -491,7 +493,8 @@ def shape(
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, **following}
-        _shape_described(Path(words[0]), Path(words[1]), output, how)
+        recording = _shape_described(Path(words[0]), Path(words[1]), output, how)
+        judge(cs.compare_chains([recording], least=1), strict=strict, json=False)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
@@ -499,7 +502,7 @@ def shape(
             "APP.yaml plan.yaml -o REC`"
         )
     _shape_launched(
-        *(words, output, json),
+        *(words, output, json, strict),
         chain=chain,
         sinks=sink or (),
         throttled=throttled_inputs(throttle or []),
@@ -517,7 +520,9 @@ def shape(
     )
 
 
-def _shape_described(application: Path, plan: Path, output: Path, how: dict[str, Any]) -> None:
+def _shape_described(
+    application: Path, plan: Path, output: Path, how: dict[str, Any]
+) -> "cs.Recording":
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
 
     described, planned = cs.load_application(application), cs.load_application_plan(plan)
@@ -539,9 +544,10 @@ def _shape_described(application: Path, plan: Path, output: Path, how: dict[str,
         out.notes([dropped_text(dropped)])
     out.notes(recording.info.notes)
     out.show_line(recording.path)
+    return recording
 
 
-def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) -> None:
+def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, **how: Any) -> None:
     """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
     from chainshaper.reporting.latency import comparison_json
 
@@ -564,6 +570,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
     if out.present(json, values, *tables):
         out.notes(shaped.notes)
         out.show_line(shaped.folder)
+    judge(shaped.comparisons, strict=strict, json=json)
 
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:

@@ -10,6 +10,8 @@ from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from chainshaper.reporting.tables import ResultTable
     from chainshaper.verify.budgets import Judged
     from chainshaper.verify.slowdowns import Compared
@@ -284,6 +286,29 @@ def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
     return tables
 
 
+def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -> None:
+    """Say whether promises of plans were kept.
+
+    Raises OperationError, InputError: not all were, or there was none, and ``strict`` asks for it.
+    """
+    from chainshaper.reporting.latency import verdict
+
+    several = len(comparisons) > 1
+    found = [
+        (kept, f"{one.chain}: {text}" if several else text)
+        for one in comparisons
+        for measured in one.measurements
+        if measured.plan is not None
+        for kept, text in [verdict(measured)]
+    ]
+    for _, text in found if not json else ():
+        out.show_line(text)
+    if strict and not found:
+        raise InputError("--strict judges a plan's promise: name the plan in force with --plan")
+    if strict and not all(kept for kept, _ in found):
+        raise OperationError("the plan's promise is not kept (--strict)")
+
+
 def compare(
     recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
     chain: str | None = opt.CHAIN,
@@ -291,12 +316,14 @@ def compare(
         "--figures DIR", "Draw latency.png and distribution.png into this folder."
     ),
     plan: Path | None = opt.PLAN_IN_FORCE,
+    strict: bool = opt.STRICT,
     json: bool = opt.JSON,
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
-    Where a plan was in force, its prediction stands beside the measurement, band by band. Without
-    --chain, all chains of the plan in force in the last recording are shown.
+    Where a plan was in force, its prediction stands beside the measurement, band by band, and the
+    last line says whether its promise was kept. Without --chain, all chains of
+    the plan in force in the last recording are shown.
     """
     from chainshaper.reporting.latency import comparisons_json
 
@@ -308,6 +335,7 @@ def compare(
             raise InputError("--figures draws one chain: name it with --chain")
         draw_comparison(comparisons[0].measurements, figures)
     out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
+    judge(comparisons, strict=strict, json=json)
 
 
 def report(

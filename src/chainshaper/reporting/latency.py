@@ -8,7 +8,8 @@ from typing import Any
 import polars as pl
 
 from chainshaper.analysis import REASONS, LatencyAnalysis, LatencyStatistics
-from chainshaper.planning import publish_slots
+from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning.overruns import expected
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
@@ -210,14 +211,39 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
     ]
     planned = [m.plan for m in measurements if m.plan is not None]
     if planned:
-        predicted = planned[-1].predicted
         remarks.append(
-            f"planned: slots {slots_ms(*publish_slots(planned[-1]))}, "
-            f"predicted maximum {milliseconds(predicted.max_ns)}, "
-            f"jitter at most {milliseconds(predicted.jitter_ns)}"
+            f"planned: slots {slots_ms(*publish_slots(planned[-1]))}; {expected_text(planned[-1])}"
         )
     table.caption = "\n".join(remarks) or None
     return table
+
+
+def expected_text(plan: Plan) -> str:
+    """What a plan's outputs will look like, in ms."""
+    seen, predicted = expected(plan), plan.predicted
+    if seen is None:
+        figures = map(milliseconds, (predicted.mean_ns, predicted.max_ns, predicted.jitter_ns))
+        return "expected average {}, maximum {}, jitter {} at most".format(*figures)
+    places = ", ".join(map(milliseconds, seen.leave_ns))
+    average = f", average {milliseconds(seen.mean_ns)}" if len(seen.leave_ns) > 1 else ""
+    return f"outputs leave at {places}{average}; expected jitter {milliseconds(seen.jitter_ns, 1)}"
+
+
+def verdict(one: Measurement) -> tuple[bool | None, str]:
+    """Whether a recording has what its plan promised (None: nothing to judge), in a sentence."""
+    held, statistics, name = one.held, one.analysis.statistics, one.recording.path.name
+    if held is None or one.plan is None:
+        return None, f"{name}: no plan was in force, so nothing was promised"
+    left_out = statistics.disturbed
+    aside = f"; without {left_out} of {statistics.count} cycles, disturbed by the machine"
+    aside = aside if left_out else ""
+    if held.broken:
+        return False, f"{name}: promise broken: {'; '.join(held.broken)}{aside}"
+    if held.mean.measured_ns is None:
+        return None, f"{name}: no undisturbed cycle to judge the promise by{aside}"
+    late = "" if held.late_of_all is None else f", {held.late_of_all} of {held.cycles} outputs late"
+    jitter = f"jitter {ms(held.jitter.measured_ns)} ms"
+    return True, f"{name}: promise kept: {jitter}{late} ({expected_text(one.plan)}){aside}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
@@ -282,8 +308,7 @@ def prediction_table(held: PredictionHeld) -> ResultTable:
         ("jitter (max − min)", held.jitter),
     ):
         verdict = {True: "as predicted", False: "differs", None: ABSENT}[figure.holds]
-        predicted = " … ".join(dict.fromkeys(map(milliseconds, (figure.from_ns, figure.to_ns))))
-        table.add(title, predicted, ms(figure.measured_ns), verdict, "", "", "")
+        table.add(title, figure.range_text, ms(figure.measured_ns), verdict, "", "", "")
     table.line()
     for number, band in enumerate(held.bands, start=1):
         name = band.mode or f"band {number}"
@@ -329,6 +354,8 @@ def prediction_json(held: PredictionHeld) -> dict[str, Any]:
         "late": held.late,
         "late_of_all": held.late_of_all,
         "counted_from": held.counted_from,
+        "kept": None if held.mean.measured_ns is None and not held.broken else not held.broken,
+        "broken": list(held.broken),
     }
 
 

@@ -16,6 +16,7 @@ from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
 from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
+from chainshaper.reporting.latency import expected_text
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
@@ -377,14 +378,8 @@ def plan_table(plan: Plan) -> ResultTable:
         )
         where = str(server.core), str(server.priority)
         table.add(server.name, *where, slots_ms(*server.slots), ", ".join(threads))
-    predicted = plan.predicted
     offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
-    table.caption = (
-        f"cycle {milliseconds(plan.cycle_ns)}{offset}; "
-        f"predicted average {milliseconds(predicted.mean_ns)}, "
-        f"maximum {milliseconds(predicted.max_ns)}, jitter at most "
-        f"{milliseconds(predicted.jitter_ns)}"
-    )
+    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_text(plan)}"
     return table
 
 

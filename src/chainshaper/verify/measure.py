@@ -229,7 +229,7 @@ def compare_chains(
     opened = [_opened(recording) for recording in recordings]
     joint = _plan_of(opened[-1], plan)
     chains = [] if joint is None or chain is not None else [one.chain.spec for one in joint.chains]
-    chains = chains if len(chains) > 1 else [chain]
+    chains = chains if len(chains) > 1 else [chain or next(iter(chains), None)]
     columns = []
     for number, recording in enumerate(opened, start=1):
         progress((number - 1) / len(opened), f"analysing {recording.path}")
