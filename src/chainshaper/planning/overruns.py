@@ -32,6 +32,7 @@ from chainshaper.planning.plan import (
 from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
 
+IDLE_BAND = 0.02  # of the cycles: a band that has less does next to nothing for the average
 NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
 GATE_NS = 100_000
 """How far apart a gate's outputs of one slot are: p0.5–p99.5 of 0.02–0.1 ms measured, on idle and
@@ -322,7 +323,13 @@ def plan_warnings(*plans: Plan) -> list[str]:
     """What a person must know before relying on a plan; one sentence each, none if all is well. Of
     several chains, each with its chain.
     """
-    about = (_about_stages, _about_late_outputs, _about_evidence, publication_warnings)
+    about = (
+        _about_stages,
+        _about_bands,
+        _about_late_outputs,
+        _about_evidence,
+        publication_warnings,
+    )
     names = [f"{plan.chain.spec or plan.chain.output}: " if plans[1:] else "" for plan in plans]
     return [
         f"{name}{warning}"
@@ -353,6 +360,18 @@ def _about_stages(plan: Plan) -> Iterator[str]:
                 f"{one.name} and {two.name} have core {one.core} at the same time: that is right"
                 " only where their callbacks wait (for a device, a sleep) rather than compute."
             )
+
+
+def _about_bands(plan: Plan) -> Iterator[str]:
+    """Bands that hardly any cycle takes, such as those that are close for closeness' sake."""
+    shares = plan.predicted.shares
+    idle = [number for number, share in enumerate(shares, start=1) if share < IDLE_BAND]
+    if idle and len(shares) > 1 and plan.modes is None:
+        yield (
+            f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(map(str, idle))} of"
+            f" {len(shares)}, which hardly lower the average: limit it (--mean-at-most) or a band's"
+            " share (--max-share), or plan fewer bands."
+        )
 
 
 def _leaves_at(plan: Plan) -> int:
