@@ -12,9 +12,9 @@ import numpy as np
 import polars as pl
 import pytest
 from command_line import called, chainshaper, message_of, refused
-from small_chain import small_chain_text
+from small_chain import small_chain_plan, small_chain_text
 
-from chainshaper.planning import Plan, save_plan
+from chainshaper.planning import Plan, save_plan, server_per_chain
 from chainshaper.values.recording import Recording
 
 MISSING_CORE = small_chain_text(executor_core=1023)
@@ -88,6 +88,10 @@ def test_a_mistake_in_the_application(
     [
         (("50ms", "15ms"), "15ms"),  # shorter than the longest latency
         (("50ms", "60ms"), "plan again from a recording of this application"),
+        (
+            ("node: /second", "node: /secnod"),
+            "the plan names /secnod, which 'small chain' does not",
+        ),
         ((r" core: \d+", " core: 1023"), "core 1023, which node chainshaper_t3 asks for"),
     ],
 )
@@ -98,6 +102,13 @@ def test_a_mistake_in_the_plan(
     (folder / "plan.yaml").write_text(re.sub(*change, text))
     code = 3 if "core" in message else 2
     assert message in refused(code, *words("shape APP PLAN -o OUT"))
+
+
+def test_servers_without_shaping_go_to_apply(words: Words, folder: Path) -> None:
+    file = folder / "servers.yaml"
+    save_plan(server_per_chain(small_chain_plan(8_000_000, 12_000_000)), file)
+    message = refused(2, *words(f"shape APP {file} -o OUT"))
+    assert "put server-per-chain in force with `chainshaper apply plan.yaml`" in message
 
 
 def test_a_missing_core_is_the_platforms_fault(folder: Path, words: Words) -> None:

@@ -516,11 +516,16 @@ def _longest_calm(flow: DataFlow, lasted: pl.DataFrame) -> int:
 
 
 def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
-    """Whether a node's process has a publisher's thread; None where DDS threads have no names."""
+    """Whether a node's process has a publisher's thread; None where DDS threads have no names.
+
+    Cyclone DDS has none: there the thread that publishes also sends.
+    """
     threads = recording.info.threads
     pids = {thread.pid for thread in threads if thread.node == node}
     roles = {thread.role for thread in threads if thread.pid in pids}
-    return "publisher" in roles if "dds" in roles else None
+    if "dds" not in roles:
+        return False if recording.info.rmw == "rmw_cyclonedds_cpp" else None
+    return "publisher" in roles
 
 
 def _goes_without_dds(flow: DataFlow, node: str, topic: str) -> bool:
