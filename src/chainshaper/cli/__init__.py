@@ -47,10 +47,20 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
         sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
     _catch_aborts()
     try:
+        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # as chainshaper.__main__ has it
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.exit(_run(arguments, name))
     except ChainshaperError as error:
         say(f"error: {error}")  # the last line of a failed command
         sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except PermissionError as error:
+        say(
+            f"error: {error.filename}: permission denied: name a place that you may read and write,"
+            " or change its permissions"
+        )
+        sys.exit(2)
     except BaseException as error:  # a panic of Polars is no Exception
         message = _exhausted(error)
         if message is None:
