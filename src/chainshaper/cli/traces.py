@@ -209,6 +209,7 @@ def check(
     A budget's limits are of all cycles. Where only disturbed cycles break one, that is said. With
     --baseline all recordings together are compared with those of before, callback by callback.
     """
+    from chainshaper.reporting.latency import JSON_FORMAT
     from chainshaper.values.files import new_file, write_whole
     from chainshaper.verify import budgets
 
@@ -240,7 +241,8 @@ def check(
         write_whole(markdown, ["\n".join(parts).encode()])
     out.notes(notes)
     if json:
-        out.print_json([{**asdict(one), "met": one.met, "text": one.text} for one in every])
+        rows = [{**asdict(one), "met": one.met, "text": one.text} for one in every]
+        out.print_json({"format": JSON_FORMAT, "limits": rows})
     verdicts = [
         _limits_shown(found, str(budget), json) if budget is not None else None,
         _callbacks_shown(compared, json) if compared else None,

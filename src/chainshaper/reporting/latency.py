@@ -38,6 +38,9 @@ from chainshaper.verify.predictions import FigureHeld, PredictionHeld
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows that say what happened to cycles that are called disturbed."""
 
+JSON_FORMAT = 1
+"""Of the objects that `latency`, `compare`, `check` print; another if a key changes its meaning."""
+
 CONVENTION = (
     "at_start: every output leaves as its slot starts, as a gate does it; at_end: at its slot's"
     " end, eq. 5's convention; from, to: with room for what two samples may differ by, the bounds"
@@ -80,6 +83,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
     overruns, dropped = measurement.overruns, measurement.dropped
     calm, received = analysis.subscriber_undisturbed, analysis.subscriber
     result = {
+        "format": JSON_FORMAT,
         "chain": analysis.chain.spec,
         **asdict(analysis.statistics),
         "max_all_ns": analysis.statistics.max_ns,
@@ -123,13 +127,13 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         if measurement.held is not None:
             entry["prediction"] = prediction_json(measurement.held)
         entries.append(entry)
-    return {"chain": comparison.chain, "recordings": entries}
+    return {"format": JSON_FORMAT, "chain": comparison.chain, "recordings": entries}
 
 
 def comparisons_json(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """A comparison as plain data; of several chains an object whose ``chains`` has them."""
     several = [comparison_json(one) for one in comparisons]
-    return several[0] if len(several) == 1 else {"chains": several}
+    return several[0] if len(several) == 1 else {"format": JSON_FORMAT, "chains": several}
 
 
 def latency_table(measurement: Measurement) -> ResultTable:
