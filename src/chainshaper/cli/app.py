@@ -36,6 +36,11 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 class _PlainCommand(TyperCommand):
     """A command whose help has a section for each panel."""
 
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        return [
+            piece.strip("{}").replace("}...", "...") for piece in super().collect_usage_pieces(ctx)
+        ]
+
     def format_options(self, ctx: Any, formatter: Any) -> None:
         panels: dict[str, list[tuple[str, str]]] = {}
         for parameter in self.get_params(ctx):

@@ -90,7 +90,11 @@ def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
 
 
 def argument(metavar: str, help_text: str, default: Any = None) -> Any:
-    """An argument as a parameter's default; ``...`` where it must be given."""
+    """An argument as a parameter's default; ``...`` where it must be given.
+
+    Click adds what says that it may be left out, or repeated.
+    """
+    metavar = metavar.strip("[]").rstrip(".…")
     return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
 
 
@@ -144,7 +148,7 @@ ADAPT: bool = option(
 MAX_LATENCY: int | None = option(
     "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
 )
-SOURCE: Source = option("--source", "Who records the events.", "lttng")
+SOURCE: Source = option("--source", "Tracer.", "lttng")
 NODE: NodeKind = option(
     "--node", "A script; a package for all types; or one generated for the type.", "python"
 )

@@ -241,7 +241,7 @@ def sweep(
 def splice(
     plan: Path | None = opt.argument("plan.yaml", "The plan; none with --throttle."),
     launch: list[str] | None = opt.argument(
-        "LAUNCH... [NAME:=VALUE...]",
+        "LAUNCH...",
         "The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, behind --, "
         "a `ros2 run …`.",
     ),

@@ -283,8 +283,12 @@ def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
 
     tables = [overview_table(comparisons)] if len(comparisons) > 1 else []
     for comparison in comparisons:
-        predictions = [one.held for one in comparison.measurements if one.held is not None]
-        tables += [comparison_table(comparison), *map(prediction_table, predictions)]
+        predictions = [
+            prediction_table(one.held, one.recording.path.name)
+            for one in comparison.measurements
+            if one.held is not None
+        ]
+        tables += [comparison_table(comparison), *predictions]
     return tables
 
 

@@ -16,6 +16,7 @@ from chainshaper.reporting.tables import (
     Column,
     ResultTable,
     count,
+    counted,
     counts,
     figures,
     min_mean_max,
@@ -160,7 +161,7 @@ def latency_table(measurement: Measurement) -> ResultTable:
 def doubts_text(measurement: Measurement) -> str:
     """What a measurement leaves in doubt: disturbed, incomplete, late and lost, in one line."""
     analysis = measurement.analysis
-    parts = [f"{analysis.statistics.disturbed} cycles disturbed by the machine"]
+    parts = [f"{counted(analysis.statistics.disturbed, 'cycle')} disturbed by the machine"]
     if measurement.longest_stall_ns is None:
         parts = ["stalls of the machine not watched"]
     if analysis.incomplete:
@@ -204,7 +205,9 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
     ):
         if watched:
             columns = [getattr(one, undisturbed) for one in analyses]
-            add(f"at {place}, undisturbed cycles [ms]", columns, every | calm)
+            left_out = [one.statistics.disturbed for one in analyses]
+            without = f" (without {' / '.join(map(str, left_out))} disturbed)" * any(left_out)
+            add(f"at {place}, undisturbed cycles{without} [ms]", columns, every | calm)
         columns = [getattr(one, field) for one in analyses]
         add(f"at {place}, all complete cycles [ms]", columns, titles - brief if watched else every)
     table.group("cycles")
@@ -262,7 +265,7 @@ def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
             ("incomplete", counts(one.analysis.incomplete)),
             ("too late for their slot", counts(one.overruns, "not gated")),
             ("next cycle hit", next_cycles(one.outcomes) if one.outcomes else ABSENT),
-            ("came when it was open", count(one.into_open_slots, "not gated")),
+            ("arrived during their slot", count(one.into_open_slots, "not gated")),
             ("messages lost at the gate", counts(one.dropped, "not gated")),
             ("begun without publishing", str(one.analysis.silent)),
             ("longest stall of the machine [ms]", ms(one.longest_stall_ns)),
@@ -300,12 +303,13 @@ def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ())
     return table
 
 
-def prediction_table(held: PredictionHeld) -> ResultTable:
-    """Predicted beside measured: the whole, then band by band."""
+def prediction_table(held: PredictionHeld, name: str = "") -> ResultTable:
+    """Predicted beside measured: the whole, then band by band; of a recording with a ``name``."""
     whence = ", from the start of the cycle" if held.counted_from == "cycle" else ""
     columns = [*words(""), *figures("predicted", "measured"), *words("verdict")]
     columns += figures("jitter", "share predicted", "measured")
-    table = ResultTable(f"Prediction and measurement{whence} [ms]", columns)
+    title = f"Prediction and measurement{f' of {name}' if name else ''}{whence} [ms]"
+    table = ResultTable(title, columns)
     for title, figure in (
         ("average", held.mean),
         ("maximum", held.max),

@@ -23,6 +23,7 @@ from chainshaper.reporting.tables import (
     Column,
     ResultTable,
     count,
+    counted,
     figures,
     listed,
     min_mean_max,
@@ -167,7 +168,7 @@ def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
 
 def count_text(found: ChainEnumeration) -> str:
     """How many chains there are, and how many of them are listed."""
-    number = f"{found.count:,} chains" if found.exact else f"at least {found.count:,} chains"
+    number = f"{'' if found.exact else 'at least '}{counted(found.count, 'chain')}"
     return number if found.complete else f"{number}, {len(found.chains)} of them listed"
 
 
@@ -436,8 +437,7 @@ def servers_table(state: RunState) -> ResultTable:
     if state.anchor_ns is not None:
         table.caption = f"cycles of {format_duration(state.cycle_ns)}"
         if state.drift_ns is not None:
-            drift = f"{'-' if state.drift_ns < 0 else '+'}{format_duration(abs(state.drift_ns))}"
-            table.caption += f"; the chain begins {drift} from where it did"
+            table.caption += f"; the chain's start has drifted by {state.drift_ns / 1e6:+.3f} ms"
         for move in {one.chain: one for one in state.moves}.values():
             table.caption += f"; {move.text}"
     for server in state.servers:
