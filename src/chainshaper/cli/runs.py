@@ -86,6 +86,22 @@ def demo(
         judge([result.comparison], strict=False, json=json)
 
 
+def init(
+    output: Path = opt.option(
+        "--output -o app.yaml", "File to write; must not exist.", Path("app.yaml")
+    ),
+) -> None:
+    """Write the description of an application to start from: the paper's synthetic chain.
+
+    Edit its nodes, callbacks and execution times; `chainshaper run` and `simulate` take it.
+    """
+    from chainshaper.flow.demo import synthetic_chain
+    from chainshaper.values.files import new_file, write_whole
+
+    write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])
+    out.show_line(output)
+
+
 def run(
     application: Path = opt.APPLICATION,
     output: Path = opt.RECORDING_OUTPUT,
@@ -97,12 +113,14 @@ def run(
     Every node is a process of its own, scheduled as the description says (SCHED_FIFO where it is
     permitted). The recording is a folder of Parquet tables.
     """
+    from chainshaper.workload.live import WARM_UP_CYCLES
+
     described = cs.load_application(application)
     with out.progress(f"running {described.name}") as report:
         recording = cs.run_application(
             described, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
         )
-    out.notes(recording.info.notes)
+    out.notes((f"skipped {WARM_UP_CYCLES} warm-up cycles", *recording.info.notes))
     out.show_line(recording.path)
 
 

@@ -89,7 +89,7 @@ def simulate(
         processes={process.pid: process.node for process in system.processes},
         threads=system.threads,
         realtime=True,
-        notes=(f"simulated; skipped {live.WARM_UP_CYCLES} warm-up cycles",),
+        notes=("simulated",),
         chain=application.chain,
         application=application_as_written(application),
         plan=None if joint is None else plan_values(joint),

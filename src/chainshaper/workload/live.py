@@ -424,7 +424,6 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
 def _notes(
     realtime: bool, permitted: bool, memory_locked: bool, clock_moved_ns: int
 ) -> Iterator[str]:
-    yield f"skipped {WARM_UP_CYCLES} warm-up cycles"
     if not realtime:
         reason = "SCHED_FIFO was declined" if permitted else "the process may not use SCHED_FIFO"
         yield (
