@@ -22,7 +22,7 @@ _MODULES = (
     ("runs", "demo init run simulate generate"),
     ("plans", "sweep"),
     ("runs", "record profile watch"),
-    ("traces", "info graph callbacks chains latency convert"),
+    ("traces", "info describe graph callbacks chains latency convert"),
     ("plans", "plan offsets splice"),
     ("runs", "shape"),
     ("traces", "compare budget check report export"),

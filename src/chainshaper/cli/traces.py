@@ -28,6 +28,24 @@ def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
         out.notes(contents["notes"])
 
 
+def describe(
+    trace: list[Path] = opt.TRACE,
+    output: Path = opt.option("--output -o app.yaml", "File to write; must not exist.", ...),
+    chain: str | None = opt.CHAIN,
+) -> None:
+    """Write the description of an application from a recording, with its execution times.
+
+    `chainshaper simulate` and `run` take it; edit it as you like.
+    """
+    from chainshaper.flow.exploration import application_file
+    from chainshaper.values.files import new_file, write_whole
+
+    new_file(output, opt.DESCRIPTIONS)
+    with out.opened("describe", trace) as (recording, _):
+        text = application_file(recording, chain)
+    out.show_line(write_whole(output, [text.encode()]))
+
+
 def graph(
     trace: list[Path] = opt.TRACE,
     output: Path | None = opt.option(

@@ -249,7 +249,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     before: dict[int, list[_Key]] = {}  # of the chain's callbacks
     of_chain: dict[int, _Key] = {}
     for number, topic in zip(chain.callbacks, chain.topics, strict=True):
-        members = _inputs(graph, graph.callbacks[number], topic) if along else (number,)
+        members = inputs_of(graph, graph.callbacks[number], topic) if along else (number,)
         before[number] = along[-1:]
         along.append((members, topic))
         of_chain.update(dict.fromkeys(members, along[-1]))
@@ -257,7 +257,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
 
     def writers_of(topic: str | None) -> list[_Key]:
         return [
-            of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
+            of_chain.get(writer.id) or (inputs_of(graph, writer, topic), topic)
             for writer in graph.callbacks
             if topic is not None and topic in writer.publishes and writer.node not in outside
         ]
@@ -306,7 +306,7 @@ def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> fr
             for callback in graph.callbacks
             for topic in ahead.intersection(callback.publishes)
         ]
-        inputs = [number for one, topic in writers for number in _inputs(graph, one, topic)]
+        inputs = [number for one, topic in writers for number in inputs_of(graph, one, topic)]
         read = {graph.callbacks[number].topic for number in inputs}
         ahead = {topic for topic in read if topic is not None} - found
     return frozenset(found - {chain.topics[-1]})
@@ -326,7 +326,7 @@ def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
     return found
 
 
-def _inputs(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[int, ...]:
+def inputs_of(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[int, ...]:
     """The callback and, where it is an input of a synchronising one, the other inputs."""
     if not goes_on_elsewhere(graph, callback, topic):
         return (callback.id,)
