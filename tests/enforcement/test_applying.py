@@ -117,8 +117,11 @@ def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_pa
     assert ended.code == 1
     assert "ended with code 1 before all nodes" in ended.err
     shaped = plan_shaping(
-        *(np.array([8, 12]) * 1_000_000, 50_000_000),
-        **{"output": "/out", "publisher": "/origin", "nodes": ("/origin",)},
+        np.array([8, 12]) * 1_000_000,
+        50_000_000,
+        output="/out",
+        publisher="/origin",
+        nodes=("/origin",),
     )
     save_plan(shaped, tmp_path / "shaped.yaml")
     command = ("timeout", "3", *node_command("origin", tmp_path / "windows"))

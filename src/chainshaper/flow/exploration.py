@@ -131,7 +131,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
         if not taken.size or len(began) < 2:  # it hardly ran
             continue
         read = [graph.callbacks[number].topic for number in members]
-        period = one.period_ns or int(began.diff().median() or 0)  # type: ignore[arg-type]
+        period = one.period_ns or int(began.diff().median() or 0)
         trigger: dict[str, Any] = {"timer": format_duration(round(period, -3))}
         if set(read) <= published:
             trigger = {"synchronises": read} if len(read) > 1 else {"subscription": read[0]}
@@ -142,7 +142,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
     cores = available_cores()
     values = {
         "name": recording.path.name,
-        "chain": chain or heaviest.spec,
+        "chain": chain or recording.info.chain or heaviest.spec,
         "scheduling": {
             "executors": {"core": cores[-1], "priority": 80},
             "dds": {"core": cores[0], "priority": 90},

@@ -35,11 +35,11 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
     InputError: the plan shapes nothing, or does not fit the application.
     """
     joint = whole(plan)
-    _refuse_strange_nodes(application, joint)
     check_periods(application, joint)
     application = _placed(application, joint)
     for chain in joint.chains:
         application = _with_chain(_at_offset(application, joint, chain), joint, chain)
+    _refuse_strange_nodes(application, joint)
     return application
 
 

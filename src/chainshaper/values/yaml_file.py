@@ -149,7 +149,7 @@ def read_model(
     except ValidationError as error:
         own = {name.removesuffix("_ns") for name in meant.model_fields}
         for kind, keys in KINDS.items():
-            if keys <= values.keys() and not keys <= own:
+            if keys <= values.keys() and not keys <= own and meant is model:
                 raise InputError(f"{path}: is {kind}; wanted is a file {made_by}") from error
         raise plain.problems(error, meant) from error
 

@@ -183,7 +183,7 @@ def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
 def _most_late(plan: Plan, cycles: int) -> int:
     """How many of so many outputs may be late, by the plan's margin, as far as chance goes."""
     share = plan.margin.overrun_probability or 0.0
-    return math.floor(cycles * share + STANDARD_ERRORS * (cycles * share) ** 0.5)
+    return math.floor(cycles * share + STANDARD_ERRORS * math.sqrt(cycles * share))
 
 
 def _figures(

@@ -149,7 +149,7 @@ def run_application(
     tables |= meter_tables(seen, tables.get("machine_stall"))
     notes = list(_notes(realtime, permitted, memory_locked, clock_offset() - offset))
     if ended_ns is not None:
-        tables = events.happened(tables, 0, timing.stop_ns)
+        tables = dict(events.happened(tables, 0, timing.stop_ns))
         notes.append(f"interrupted: {timing.cycles} of {cycles} cycles were recorded")
     together = in_force_throughout(governed)
     in_force = None if plan is None else InForceInfo(since_ns=timing.record_from_ns)
