@@ -91,7 +91,7 @@ def test_paths_that_are_no_files(tmp_path: Path) -> None:
     missing = _refusal(tmp_path / "missing.yaml")
     assert missing.startswith(f"{tmp_path / 'missing.yaml'}: cannot be read (No such file")
     assert "chainshaper init" in missing, "where to find a description to begin with"
-    assert f"{tmp_path}: cannot be read (Is a directory)" in _refusal(tmp_path)
+    assert f"{tmp_path}: is a folder; wanted is a file" in _refusal(tmp_path)
 
 
 def test_the_right_one_is_read(tmp_path: Path) -> None:
