@@ -96,12 +96,12 @@ def test_whole_cycles_until_an_interruption_are_recorded_and_marked(
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="setpriv is not installed")
-@pytest.mark.parametrize("command", ["latency {}/x", "simulate {0}/../application.yaml -o {0}/x"])
+@pytest.mark.parametrize("command", ["latency {}/x", "simulate {1} -o {0}/x"])
 def test_a_folder_that_may_not_be_searched_is_named(command: str, application_file: Path) -> None:
     closed = application_file.parent / "closed"
     closed.mkdir(mode=0)
     prefix = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
-    finished = chainshaper(*command.format(closed).split(), prefix=prefix)
+    finished = chainshaper(*command.format(closed, application_file).split(), prefix=prefix)
     closed.chmod(0o700)
     assert "closed/x" in message_of(finished, 2)
     assert "permission denied" in finished.err
