@@ -40,7 +40,7 @@ setup(
     ],
     zip_safe=False,
     entry_points={
-        "console_scripts": ["chainshaper = chainshaper.cli:main"],
+        "console_scripts": ["chainshaper = chainshaper.__main__:main"],
         "ros2cli.command": ["chain = chainshaper.cli.ros2_chain:ChainCommand"],
     },
 )

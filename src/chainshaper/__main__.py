@@ -2,7 +2,11 @@
 
 import contextlib
 import os
+import signal
 import sys
+
+if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends us at once
 
 with contextlib.suppress(OSError):  # that folder may be gone
     if sys.path[:1] == [os.getcwd()]:  # noqa: PTH109 - as `-m` has put it there

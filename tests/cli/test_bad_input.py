@@ -1,6 +1,7 @@
 """What people do by mistake: one message with the place and the remedy, and the right exit code."""
 
 import errno
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -12,9 +13,10 @@ import numpy as np
 import polars as pl
 import pytest
 from command_line import called, chainshaper, message_of, refused
-from small_chain import small_chain_text
+from reference_traces import DATA
+from small_chain import small_chain_plan, small_chain_text
 
-from chainshaper.planning import Plan, save_plan
+from chainshaper.planning import Plan, save_plan, server_per_chain
 from chainshaper.values.recording import Recording
 
 MISSING_CORE = small_chain_text(executor_core=1023)
@@ -88,6 +90,10 @@ def test_a_mistake_in_the_application(
     [
         (("50ms", "15ms"), "15ms"),  # shorter than the longest latency
         (("50ms", "60ms"), "plan again from a recording of this application"),
+        (
+            ("node: /second", "node: /secnod"),
+            "the plan names /secnod, which 'small chain' does not",
+        ),
         ((r" core: \d+", " core: 1023"), "core 1023, which node chainshaper_t3 asks for"),
     ],
 )
@@ -98,6 +104,13 @@ def test_a_mistake_in_the_plan(
     (folder / "plan.yaml").write_text(re.sub(*change, text))
     code = 3 if "core" in message else 2
     assert message in refused(code, *words("shape APP PLAN -o OUT"))
+
+
+def test_servers_without_shaping_go_to_apply(words: Words, folder: Path) -> None:
+    file = folder / "servers.yaml"
+    save_plan(server_per_chain(small_chain_plan(8_000_000, 12_000_000)), file)
+    message = refused(2, *words(f"shape APP {file} -o OUT"))
+    assert "put server-per-chain in force with `chainshaper apply plan.yaml`" in message
 
 
 def test_a_missing_core_is_the_platforms_fault(folder: Path, words: Words) -> None:
@@ -143,9 +156,13 @@ def test_without_the_privilege_it_runs_with_what_it_may(
         ("plan OUT", "a recording is made with `chainshaper run"),
         ("compare REC DIR", ": a folder without"),
         # An application as the plan, a plan as the application, a recording as either.
-        ("shape APP APP -o OUT", "nodes: unknown key"),
-        ("run PLAN -o OUT", "scheduling: is missing"),
-        ("run REC -o OUT", "Is a directory"),
+        (
+            "shape APP APP -o OUT",
+            "is the description of an application; wanted is a file written by",
+        ),
+        ("run PLAN -o OUT", "is a plan; wanted is a file "),
+        ("shape PLAN APP -o OUT", "is a plan; wanted is a file "),
+        ("run REC -o OUT", "is the folder of a recording; wanted is a file "),
         ("plan --latencies TABLE --period 1s", "one duration a line"),
         # Options that do not go together.
         ("plan", "give either a recording or --latencies"),
@@ -170,6 +187,24 @@ def test_what_does_not_go_is_refused_and_nothing_written(
     before = {path: path.read_bytes() for path in folder.iterdir()}
     assert message in refused(2, *words(command))
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
+
+
+def test_with_json_an_error_is_json_too(words: Words) -> None:
+    failed = called(*words("latency REC --chain /t1../t9 --json"))
+    assert (failed.code, failed.out) == (2, "")
+    error = json.loads(failed.err.splitlines()[-1])
+    assert (error["format"], error["exit_code"]) == (1, 2)
+    assert "/t9" in error["error"]
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the reference traces are not here")
+def test_without_a_chain_those_of_the_trace_are_proposed() -> None:
+    message = refused(2, "latency", DATA / "jazzy_avp_cyclonedds" / "trace")
+    proposed = [spec.split("..") for spec in re.findall(r"--chain (\S+)", message)]
+    assert {(topics[0], topics[-1]) for topics in proposed} == {
+        ("/lidar_front/points_raw", "/localization/ndt_pose"),
+        ("/lidar_rear/points_raw", "/localization/ndt_pose"),
+    }
 
 
 @pytest.mark.parametrize(

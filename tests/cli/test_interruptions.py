@@ -1,7 +1,9 @@
 """Whatever ends a run: nothing is left of it, and no recording that looks whole."""
 
 import os
+import shutil
 import signal
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,6 +12,7 @@ from command_line import Running, chainshaper, message_of
 from processes import wait_for
 from small_chain import NODES
 
+from chainshaper import measure_latency
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.values.recording import Recording
 
@@ -74,6 +77,34 @@ def test_interrupted_it_ends_in_order(
         assert "Traceback" not in finished.err
         assert finished.out == ""
     _assert_nothing_was_written(application_file)
+
+
+def test_whole_cycles_until_an_interruption_are_recorded_and_marked(
+    run: Running, application_file: Path
+) -> None:
+    time.sleep(3)
+    run.process.send_signal(signal.SIGINT)
+    finished = run.end()
+    assert finished.code == 1
+    assert "error: interrupted: " in finished.err
+    assert finished.err.endswith(f"they are in {_recording(application_file)}\n")
+    recorded = measure_latency(_recording(application_file))
+    (note,) = (one for one in recorded.analysis.notes if one.startswith("interrupted: "))
+    cycles = int(note.split()[1])
+    assert 5 < cycles < 60
+    assert abs(recorded.analysis.statistics.count - cycles) <= 1, "whole ones"
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="setpriv is not installed")
+@pytest.mark.parametrize("command", ["latency {}/x", "simulate {1} -o {0}/x"])
+def test_a_folder_that_may_not_be_searched_is_named(command: str, application_file: Path) -> None:
+    closed = application_file.parent / "closed"
+    closed.mkdir(mode=0)
+    prefix = ("setpriv", "--bounding-set=-dac_override,-dac_read_search")
+    finished = chainshaper(*command.format(closed, application_file).split(), prefix=prefix)
+    closed.chmod(0o700)
+    assert "closed/x" in message_of(finished, 2)
+    assert "permission denied" in finished.err
 
 
 def test_killed_it_leaves_no_orphans(run: Running, application_file: Path) -> None:

@@ -107,6 +107,15 @@ def test_each_band_has_its_share_and_jitter(common: Words) -> None:
     assert "Predicted latency bands" not in called(*common).out
 
 
+def test_bands_that_hardly_any_cycle_takes_are_named(common: Words) -> None:
+    """Nothing but close to each other, all bands stand behind the longest latency but one."""
+    close = json_of(*common, "--bands", "3", "--minimise", "gap")
+    assert [band["share"] for band in close["predicted_bands"]][2] == 0
+    assert any("less than 2% of the cycles: 3 of 3" in one for one in close["warnings"])
+    bound = json_of(*common, "--bands", "3", "--minimise", "gap", "--max-share", "50%")
+    assert not any("less than 2%" in one for one in bound["warnings"])
+
+
 def test_auto_shows_the_curve_and_says_why_it_stops(common: Words, file: Path) -> None:
     curve = file.with_name("curve.png")
     _triangular(file)

@@ -1,5 +1,6 @@
 """What verbs print when all is well: for people on stdout, for scripts as JSON."""
 
+import io
 import json
 import os
 import time
@@ -7,12 +8,14 @@ from pathlib import Path
 
 import pytest
 from command_line import called, chainshaper, json_of
+from rich.console import Console
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
 from chainshaper import load_plan, measure_latency, open_recording
 from chainshaper.cli import output
 from chainshaper.cli.app import VERBS
 from chainshaper.planning import Plan, save_plan
+from chainshaper.reporting.tables import ResultTable, figures, words
 from chainshaper.values.recording import Recording
 
 STATISTICS = {
@@ -199,3 +202,49 @@ def test_what_takes_longer_says_what_it_does(
         report(0.5, "decoding events")
     said += capsys.readouterr().err
     assert said == "latency: opening the trace\nlatency: decoding events\n"
+
+
+def test_a_promise_is_judged_in_one_line_and_an_exit_code(tmp_path: Path) -> None:
+    application = Path(__file__).parents[2] / "examples" / "synthetic_chain.yaml"
+    before, after, plan = tmp_path / "before", tmp_path / "after", tmp_path / "plan.yaml"
+    assert called("simulate", application, "-o", before).code == 0
+    printed = called("plan", before, "-o", plan).out
+    assert "outputs leave at" in printed
+    assert "expected jitter 0.1" in printed
+    assert called("simulate", application, plan, "-o", after).code == 0
+    kept = called("compare", before, after, "--strict")
+    assert kept.code == 0
+    assert kept.out.splitlines()[-1].startswith("after: promise kept: jitter 0.000 ms, 0 of 320")
+    broken = called("compare", after, before, "--plan", plan, "--strict")
+    assert broken.code == 1
+    assert "before: promise broken: average" in broken.out.splitlines()[-1]
+    assert broken.err == "error: the plan's promise is not kept (--strict)\n"
+    assert "name the plan in force" in called("compare", before, before, "--strict").err
+    assert json_of("compare", before, after)["recordings"][1]["prediction"]["kept"] is True
+    assert json_of("plan", before)["expected"]["jitter_ns"] == 100_000
+
+
+def test_an_application_is_described_from_scratch_and_from_a_recording(tmp_path: Path) -> None:
+    first, again, copy = tmp_path / "first", tmp_path / "again", tmp_path / "copy.yaml"
+    assert called("init", "-o", tmp_path / "app.yaml").code == 0
+    assert called("simulate", tmp_path / "app.yaml", "-o", first).code == 0
+    assert called("describe", first, "-o", copy).code == 0
+    assert called("simulate", copy, "-o", again).code == 0
+    one, two = json_of("latency", first), json_of("latency", again)
+    assert one["chain"] == two["chain"]
+    assert two["mean_ns"] == pytest.approx(one["mean_ns"], rel=0.1)
+    assert called("--version").out.startswith("chainshaper 0.")
+
+
+def test_names_stay_whole_in_a_narrow_terminal() -> None:
+    table = ResultTable("Callbacks", [*words("node", "callback"), *figures("response\nmin", "max")])
+    names = "/a_node_with_a_long_name", "subscription /and/a/long_topic"
+    table.add(*names, "1.000", "20.000")
+    shown = {}
+    for width in (40, 100):
+        with io.StringIO() as text:
+            Console(file=text, width=width).print(table)
+            shown[width] = text.getvalue()
+    assert "  ".join(names).replace("  ", " ") in " ".join(shown[40].split())
+    assert shown[40].splitlines()[-1].split() == ["1.000", "20.000"]
+    assert f"{names[0]} │ {names[1]}" in shown[100]

@@ -52,7 +52,7 @@ from chainshaper import __file__ as package_file
 from chainshaper.linux import cgroups
 from chainshaper.linux.runs import journals_folder
 from chainshaper.linux.threads import list_threads, parents
-from chainshaper.planning import Plan, save_plan
+from chainshaper.planning import Plan, plan_shaping, save_plan
 
 pytestmark = [needs_fifo, needs_cgroups]
 FIFO = ("--backend", "fifo")
@@ -116,6 +116,18 @@ def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_pa
     ended = chainshaper("apply", path, *FIFO, "--", "false")
     assert ended.code == 1
     assert "ended with code 1 before all nodes" in ended.err
+    shaped = plan_shaping(
+        np.array([8, 12]) * 1_000_000,
+        50_000_000,
+        output="/out",
+        publisher="/origin",
+        nodes=("/origin",),
+    )
+    save_plan(shaped, tmp_path / "shaped.yaml")
+    command = ("timeout", "3", *node_command("origin", tmp_path / "windows"))
+    without = chainshaper("apply", tmp_path / "shaped.yaml", *FIFO, "--", *command)
+    assert without.code == 1
+    assert "shaping node /chainshaper_out is not running, all other nodes are" in without.err
     absent = chainshaper("apply", path, *FIFO)
     assert absent.code == 1
     assert "/origin" in absent.err

@@ -13,6 +13,8 @@ from story import OFFSET, Callback, Publisher, Story
 
 from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.planning import Plan, PlanRequest, Profile, band_choice, plan_chain, plan_warnings
+from chainshaper.planning.margins import late_share
+from chainshaper.planning.profile import deciding_cycles
 from chainshaper.planning.request import on_cores
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
@@ -344,3 +346,53 @@ def test_what_passes_without_dds_is_not_planned_for_a_gate_before_dds() -> None:
     assert plan_chain(profile).shaping_node is not None
     with pytest.raises(InputError, match=r"get its messages inside the process of /ndt.*synchr"):
         plan_chain(profile, PlanRequest(publication="in-process"))
+
+
+def _outliers(*places: int, watched: bool = False) -> Profile:
+    latencies = np.full(400, 30 * MS) + np.arange(400) * 1000
+    latencies[[*places]] = 130 * MS
+    return Profile(latencies, 100 * MS, longest_stall_ns=0 if watched else None)
+
+
+@pytest.mark.parametrize(
+    ("profile", "said"),
+    [
+        (_outliers(0), r"1 of 400 cycles decides .* at 0.0 s: 130.0 ms;.* 30.4 ms.* --skip 1s"),
+        (_outliers(0, 12), r"2 of 400 cycles decide .*start-up .*--skip 2s"),
+        (_outliers(398), "the application was ending: leave it out with --to 39.8s"),
+        (_outliers(5, 200), r"a stall of the machine \(not watched\): .* --percentile 99.5"),
+        (_outliers(200, watched=True), "the application's own: .* --percentile 99.7"),
+    ],
+)
+def test_few_cycles_that_decide_are_named_and_how_to_leave_them_out(
+    profile: Profile, said: str
+) -> None:
+    with pytest.raises(OperationError, match=said):
+        plan_chain(profile)
+    plan = plan_chain(profile, PlanRequest(percentile=99.5))
+    assert plan.servers[0].slots[0][1] < 32 * MS
+    assert plan.evidence.max_of_all_ns == 130 * MS, "what is late stays known"
+    assert late_share(profile.every, 32 * MS) == plan.margin.overrun_probability
+
+
+def test_many_long_cycles_are_no_outliers() -> None:
+    assert deciding_cycles(_outliers(*range(0, 400, 10))) is None
+    assert deciding_cycles(_outliers()) is None
+    few = Profile(np.array([10, 100]) * MS, 200 * MS)
+    assert deciding_cycles(few) is None
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="the reference traces are not here")
+def test_a_real_trace_with_a_start_up_is_planned_without_it() -> None:
+    trace, chain = (
+        DATA / "jazzy_avp_cyclonedds" / "trace",
+        "/lidar_front/points_raw../localization/ndt_pose",
+    )
+    (whole,) = profile_chains(trace, [chain])
+    with pytest.raises(OperationError, match=r"100.2 ms of it .* /point_cloud_fusion; .*--skip 1s"):
+        plan_chain(whole)
+    (part,) = profile_chains(trace, [chain], since_ns=1000 * MS, until_ns=11_000 * MS)
+    assert 95 <= len(part.latencies_ns) <= 100
+    assert set(part.latencies_ns) <= set(whole.latencies_ns)
+    assert 1000 * MS <= part.starts.min() <= part.starts.max() < 11_000 * MS
+    assert plan_chain(part).evidence.max_latency_ns < 43 * MS

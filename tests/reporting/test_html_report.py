@@ -200,7 +200,7 @@ def test_incomplete_cycles_and_overruns_have_numbers_and_reasons(tmp_path: Path)
         ("incomplete", "2 (2 lost)"),
         ("too late for their slot", "1 (1 publish)"),
         ("next cycle hit", "0 of 1"),
-        ("came when it was open", "0"),
+        ("arrived during their slot", "0"),
     ):
         assert [title, cell] in page.rows["figures"]
 

@@ -196,7 +196,7 @@ def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Pa
     assert measured.into_open_slots == (behind > 0).sum()
     assert measured.overruns == {}
     shown = called("compare", recording.path, recording.path).out
-    assert re.search(rf"came when it was open +│ +{measured.into_open_slots} │", shown)
+    assert re.search(rf"arrived during their slot +│ +{measured.into_open_slots} │", shown)
     assert json_of("latency", recording.path)["into_open_slots"] == measured.into_open_slots
     # Or it waits for the next slot, which is none of this cycle: only one instant of it is used.
     strict = revised(plan, into_open_slot="next-slot")

@@ -14,8 +14,16 @@ from small_chain import small_chain
 
 from chainshaper import compare_recordings, measure_latency, plan_recording, simulate
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
-from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain, publish_slots
-from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning import (
+    Margin,
+    Modes,
+    Plan,
+    PlanRequest,
+    Profile,
+    plan_chain,
+    publish_slots,
+)
+from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected
 from chainshaper.planning.plan import revised
 from chainshaper.reporting.latency import late_text, prediction_json, prediction_table
 from chainshaper.values.recording import Recording
@@ -79,9 +87,27 @@ def test_what_differs_is_said_to_differ(like: LatencyAnalysis) -> None:
     assert held.bands[0].inside == 1
     assert held.bands[0].jitter_ns == 12 * MS
     assert held.late == 1
+    late = "1 of 3 outputs late, none expected"
+    sure = revised(plan, margin=Margin(epsilon_ns=MS))
+    broken = hold_prediction(sure, _measured([85 * MS, 97 * MS, 203 * MS], like)).broken
+    assert [text.partition(" ms, not")[0] for text in broken] == [
+        *("average 128.333", "maximum 203.000", "jitter 118.000", late)
+    ]
+    assert late not in held.broken, "six latencies promise little"
     nothing = hold_prediction(plan, _measured([], like))
     assert (nothing.mean.holds, nothing.bands[0].share) == (None, None)
     assert prediction_json(nothing)["bands"][0]["jitter_ns"] is None
+    assert prediction_json(nothing)["kept"] is None
+
+
+def test_a_wide_slot_promises_no_wide_jitter(like: LatencyAnalysis) -> None:
+    plan = plan_chain(PROFILE, PlanRequest(publish_slot_ns=10 * MS))
+    assert plan.predicted.jitter_ns == 10 * MS, "the bound of eq. 5"
+    seen = expected(plan)
+    assert seen == ((85 * MS,), 85 * MS, 85 * MS + GATE_NS, GATE_NS)
+    for apart, kept in ((MS, True), (4 * MS, False)):
+        held = hold_prediction(plan, _measured([85 * MS, 85 * MS + apart], like))
+        assert (held.jitter.holds, held.max.holds) == (kept, kept)
 
 
 def test_let_publishes_a_cycle_later(like: LatencyAnalysis) -> None:
@@ -216,7 +242,7 @@ def test_of_a_gated_publisher_too_the_place_is_judged_and_no_average_is_as_predi
     assert publish_slots(plan) == ((58_500_000, 68_500_000),)
     too_soon = [56_800_000] * 20
     early = hold_prediction(plan, _measured(too_soon, like))
-    assert (early.mean.from_ns, early.mean.to_ns) == (58_500_000, 68_500_000)
+    assert (early.mean.from_ns, early.mean.to_ns) == (58_500_000, 59_600_000)
     assert (early.mean.measured_ns, early.mean.holds) == (56_800_000, False)
     places = hold_prediction(plan, _measured(too_soon, like, places=[58_600_000] * 20))
     assert (places.mean.measured_ns, places.mean.holds) == (58_600_000, True)

@@ -198,7 +198,7 @@ def test_the_command(tmp_path: Path) -> None:
     (suite,) = ElementTree.parse(junit).getroot()  # noqa: S314 - ours
     assert (suite.get("tests"), suite.get("failures")) == ("4", "1")
     assert line in markdown.read_text()
-    rows = json.loads(called("check", after, "--baseline", before, "--json").out)
+    rows = json.loads(called("check", after, "--baseline", before, "--json").out)["limits"]
     assert [row["node"] for row in rows if not row["met"]] == ["/second"]
     equal = called("check", str(tmp_path / "bef*" / "rec*"), "--baseline", before)
     assert equal.code == 0, equal.err

@@ -90,8 +90,8 @@ def test_files_that_are_no_descriptions(content: bytes, said: str, tmp_path: Pat
 def test_paths_that_are_no_files(tmp_path: Path) -> None:
     missing = _refusal(tmp_path / "missing.yaml")
     assert missing.startswith(f"{tmp_path / 'missing.yaml'}: cannot be read (No such file")
-    assert "synthetic_chain.yaml" in missing, "where to find a description to begin with"
-    assert f"{tmp_path}: cannot be read (Is a directory)" in _refusal(tmp_path)
+    assert "chainshaper init" in missing, "where to find a description to begin with"
+    assert f"{tmp_path}: is a folder; wanted is a file" in _refusal(tmp_path)
 
 
 def test_the_right_one_is_read(tmp_path: Path) -> None:

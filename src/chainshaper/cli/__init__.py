@@ -7,13 +7,14 @@ wrong use or bad input, 3 the platform cannot do it.
 import ctypes
 import errno
 import io
+import json
 import os
 import resource
 import signal
 import sys
 import textwrap
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 __all__ = ["main"]
 
@@ -46,17 +47,34 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
     if isinstance(sys.stdout, io.TextIOWrapper):
         sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
     _catch_aborts()
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    own = words[: words.index("--")] if "--" in words else words  # behind it is a COMMAND
+
+    def fail(message: str, code: int) -> NoReturn:
+        """End with the last line of a failed command: for people, or for a script."""
+        as_json = json.dumps({"format": 1, "error": message, "exit_code": code})
+        say(as_json if "--json" in own else f"error: {message}")
+        sys.exit(code)
+
     try:
+        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # as chainshaper.__main__ has it
+            signal.signal(signal.SIGINT, signal.default_int_handler)
         sys.exit(_run(arguments, name))
     except ChainshaperError as error:
-        say(f"error: {error}")  # the last line of a failed command
-        sys.exit(error.exit_code)
+        fail(str(error), error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    except PermissionError as error:
+        fail(
+            f"{error.filename}: permission denied: name a place that you may read and write, or"
+            " change its permissions",
+            2,
+        )
     except BaseException as error:  # a panic of Polars is no Exception
         message = _exhausted(error)
         if message is None:
             raise
-        say(f"error: {message}")
-        sys.exit(1)
+        fail(message, 1)
 
 
 def _run(arguments: list[str] | None, name: str) -> Any:

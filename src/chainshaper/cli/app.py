@@ -5,6 +5,7 @@ Help is written without Rich, which takes longer to import than most verbs take 
 """
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import Any
 
 import typer
@@ -18,10 +19,10 @@ USAGE_ERROR: Any = typer.BadParameter.__base__
 """What Typer raises where a command line is wrong; the name of its module changes."""
 
 _MODULES = (
-    ("runs", "demo run simulate generate"),
+    ("runs", "demo init run simulate generate"),
     ("plans", "sweep"),
     ("runs", "record profile watch"),
-    ("traces", "info graph callbacks chains latency convert"),
+    ("traces", "info describe graph callbacks chains latency convert"),
     ("plans", "plan offsets splice"),
     ("runs", "shape"),
     ("traces", "compare budget check report export"),
@@ -35,6 +36,11 @@ _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 class _PlainCommand(TyperCommand):
     """A command whose help has a section for each panel."""
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        return [
+            piece.strip("{}").replace("}...", "...") for piece in super().collect_usage_pieces(ctx)
+        ]
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         panels: dict[str, list[tuple[str, str]]] = {}
@@ -64,11 +70,30 @@ class _Verb(TyperCommand):
         return get_command(alone).make_context(*values, **more)
 
 
+_root = typer.Typer(rich_markup_mode=None, context_settings=_SETTINGS)
+
+
+def _show_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"chainshaper {version('chainshaper')}")
+        raise typer.Exit
+
+
+@_root.callback()
+def _options(
+    version: bool = typer.Option(
+        False, "--version", help="Show the version and exit.", callback=_show_version, is_eager=True
+    ),
+) -> None:
+    """Options without a verb: Typer adds those that install shell completion."""
+
+
 app = TyperGroup(
     name="chainshaper",
     help="Constant end-to-end latency for ROS 2 computation chains, without touching their code.",
     commands={verb: _Verb(verb) for verb in VERBS},
     no_args_is_help=True,
+    params=[*get_command(_root).params],
     rich_markup_mode=None,
     context_settings=_SETTINGS,
 )

@@ -90,7 +90,11 @@ def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
 
 
 def argument(metavar: str, help_text: str, default: Any = None) -> Any:
-    """An argument as a parameter's default; ``...`` where it must be given."""
+    """An argument as a parameter's default; ``...`` where it must be given.
+
+    Click adds what says that it may be left out, or repeated.
+    """
+    metavar = metavar.strip("[]").rstrip(".…")
     return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
 
 
@@ -104,6 +108,7 @@ CHAIN: str | None = option(
     "--chain FIRST..LAST",
     "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
 )
+STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is kept.", False)
 PLAN_IN_FORCE: Path | None = option(
     "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
 )
@@ -118,6 +123,12 @@ TRACE: list[Path] = argument(
 )
 APPLICATION: Path = argument("APP.yaml", "The application's description.", ...)
 RECORDING_OUTPUT: Path = option("--output -o REC", "Folder to write; must not exist.", ...)
+SINCE: int = option(
+    "--skip --from DURATION",
+    "Leave out what the recording begins with, such as 2s of start-up.",
+    0,
+)
+UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
 SEED: int | None = option("--seed", "Instead of the description's.", min=0)
 REALTIME: bool | None = option(
@@ -138,7 +149,7 @@ MAX_LATENCY: int | None = option(
     "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
 )
 SOURCE: Source | None = option(
-    "--source", "Who records the events. Default: preload, or lttng where that cannot be had."
+    "--source", "Tracer. Default: preload, or lttng where that cannot be had."
 )
 NODE: NodeKind = option(
     "--node", "A script; a package for all types; or one generated for the type.", "python"

@@ -32,6 +32,8 @@ def plan(
         "--period DURATION", "Period, with --latencies or a chain that no timer starts."
     ),
     *,
+    since: int = opt.SINCE,
+    until: int | None = opt.UNTIL,
     request: "cs.PlanRequest",
     curve: Path | None = opt.option(
         "--curve FILE.png",
@@ -54,6 +56,7 @@ def plan(
         plan_warnings,
         publish_slots,
     )
+    from chainshaper.planning.profile import deciding_cycles
     from chainshaper.planning.request import on_cores
     from chainshaper.reporting.figures import draw_curve
     from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
@@ -63,20 +66,23 @@ def plan(
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     wanted: list[str | None] = [*chain] if chain else [None]
-    modes = {"modes": request.modes, "mode_recordings": opt.mode_profiles(mode_profile, request)}
-    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], **modes)
+    how: dict[str, Any] = {"modes": request.modes, "since_ns": since, "until_ns": until}
+    how["mode_recordings"] = opt.mode_profiles(mode_profile, request)
+    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], how)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
+    outliers = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
     if len(planned) > 1:
         if sinks or curve is not None:
             raise InputError("--sink and --curve go with one chain: plan chains one by one")
         joint, remarks = plan_application(planned, request)
+        remarks += outliers
         _print_several(joint.chains, remarks, output, json)
         return
     made = cs.plan_chain(planned[0], request, sinks)
     choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
     if output is not None:
         cs.save_plan(made, output)
-    warnings = [*on_cores(profiles, request)[1], *plan_warnings(made)]
+    warnings = [*on_cores(profiles, request)[1], *outliers, *plan_warnings(made)]
     values: dict[str, Any] = {**plan_json(made), "warnings": warnings}
     tables = [plan_table(made)]
     if len(publish_slots(made)) > 1 or made.modes is not None:
@@ -97,17 +103,20 @@ def _profiles(
     latencies: Path | None,
     period: int | None,
     chains: Sequence[str | None],
-    **modes: Any,
+    how: dict[str, Any],
 ) -> "tuple[cs.Profile, ...]":
     from chainshaper.planning import read_latencies
 
     if recording is not None:
-        return cs.profile_chains(recording, chains, period_ns=period, **modes)
+        return cs.profile_chains(recording, chains, period_ns=period, **how)
     if latencies is None or period is None:
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
-    return (cs.Profile(read_latencies(latencies), period, spec=chains[0]),)
+    first, last = (
+        None if at is None else -(-at // period) for at in (how["since_ns"], how["until_ns"])
+    )
+    return (cs.Profile(read_latencies(latencies)[first:last], period, spec=chains[0]),)
 
 
 def offsets(
@@ -232,7 +241,7 @@ def sweep(
 def splice(
     plan: Path | None = opt.argument("plan.yaml", "The plan; none with --throttle."),
     launch: list[str] | None = opt.argument(
-        "LAUNCH... [NAME:=VALUE...]",
+        "LAUNCH...",
         "The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, behind --, "
         "a `ros2 run …`.",
     ),

@@ -15,7 +15,7 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
-from chainshaper.cli.traces import comparison_tables
+from chainshaper.cli.traces import comparison_tables, judge
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 
 if TYPE_CHECKING:
@@ -83,6 +83,23 @@ def demo(
     if out.present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
         out.notes(result.notes)
         out.show_line(folder.absolute())
+        judge([result.comparison], strict=False, json=json)
+
+
+def init(
+    output: Path = opt.option(
+        "--output -o app.yaml", "File to write; must not exist.", Path("app.yaml")
+    ),
+) -> None:
+    """Write the description of an application to start from: the paper's synthetic chain.
+
+    Edit its nodes, callbacks and execution times; `chainshaper run` and `simulate` take it.
+    """
+    from chainshaper.flow.demo import synthetic_chain
+    from chainshaper.values.files import new_file, write_whole
+
+    write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])
+    out.show_line(output)
 
 
 def run(
@@ -96,12 +113,14 @@ def run(
     Every node is a process of its own, scheduled as the description says (SCHED_FIFO where it is
     permitted). The recording is a folder of Parquet tables.
     """
+    from chainshaper.workload.live import WARM_UP_CYCLES
+
     described = cs.load_application(application)
     with out.progress(f"running {described.name}") as report:
         recording = cs.run_application(
             described, output, cycles=cycles, realtime=realtime, command=sys.argv, progress=report
         )
-    out.notes(recording.info.notes)
+    out.notes((f"skipped {WARM_UP_CYCLES} warm-up cycles", *recording.info.notes))
     out.show_line(recording.path)
 
 
@@ -465,6 +484,8 @@ def shape(
     duration: int | None = opt.option(
         "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
+    since: int = opt.SINCE,
+    until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,
     node: opt.NodeKind = opt.NODE,
     backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
@@ -474,6 +495,7 @@ def shape(
     request: "cs.PlanRequest",
     mode_profile: list[str] | None = opt.MODE_PROFILE,
     user: list[str] | None = opt.USERS,
+    strict: bool = opt.STRICT,
     json: bool = opt.JSON,
 ) -> None:
     """Run an application with its output shaped as planned, and record it.
@@ -489,7 +511,8 @@ def shape(
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, **following}
-        _shape_described(Path(words[0]), Path(words[1]), output, how)
+        recording = _shape_described(Path(words[0]), Path(words[1]), output, how)
+        judge(cs.compare_chains([recording], least=1), strict=strict, json=False)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
@@ -497,12 +520,14 @@ def shape(
             "APP.yaml plan.yaml -o REC`"
         )
     _shape_launched(
-        *(words, output, json),
+        *(words, output, json, strict),
         chain=chain,
         sinks=sink or (),
         throttled=throttled_inputs(throttle or []),
         period_ns=period,
         mode_recordings=opt.mode_profiles(mode_profile, request),
+        since_ns=since,
+        until_ns=until,
         duration_ns=duration or SHAPING_DURATION_NS,
         source=source,
         node=node,
@@ -513,7 +538,9 @@ def shape(
     )
 
 
-def _shape_described(application: Path, plan: Path, output: Path, how: dict[str, Any]) -> None:
+def _shape_described(
+    application: Path, plan: Path, output: Path, how: dict[str, Any]
+) -> "cs.Recording":
     from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
 
     described, planned = cs.load_application(application), cs.load_application_plan(plan)
@@ -535,9 +562,10 @@ def _shape_described(application: Path, plan: Path, output: Path, how: dict[str,
         out.notes([dropped_text(dropped)])
     out.notes(recording.info.notes)
     out.show_line(recording.path)
+    return recording
 
 
-def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) -> None:
+def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, **how: Any) -> None:
     """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
     from chainshaper.reporting.latency import comparison_json
 
@@ -560,6 +588,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, **how: Any) ->
     if out.present(json, values, *tables):
         out.notes(shaped.notes)
         out.show_line(shaped.folder)
+    judge(shaped.comparisons, strict=strict, json=json)
 
 
 def _ask(graph: "ApplicationGraph", found: "ChainEnumeration") -> str:

@@ -10,6 +10,8 @@ from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from chainshaper.reporting.tables import ResultTable
     from chainshaper.verify.budgets import Judged
     from chainshaper.verify.slowdowns import Compared
@@ -24,6 +26,24 @@ def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     if out.present(json, contents, *contents_table(recording)):
         out.show_line(out.lost_events(recording))
         out.notes(contents["notes"])
+
+
+def describe(
+    trace: list[Path] = opt.TRACE,
+    output: Path = opt.option("--output -o app.yaml", "File to write; must not exist.", ...),
+    chain: str | None = opt.CHAIN,
+) -> None:
+    """Write the description of an application from a recording, with its execution times.
+
+    `chainshaper simulate` and `run` take it; edit it as you like.
+    """
+    from chainshaper.flow.exploration import application_file
+    from chainshaper.values.files import new_file, write_whole
+
+    new_file(output, opt.DESCRIPTIONS)
+    with out.opened("describe", trace) as (recording, _):
+        text = application_file(recording, chain)
+    out.show_line(write_whole(output, [text.encode()]))
 
 
 def graph(
@@ -207,6 +227,7 @@ def check(
     A budget's limits are of all cycles. Where only disturbed cycles break one, that is said. With
     --baseline all recordings together are compared with those of before, callback by callback.
     """
+    from chainshaper.reporting.latency import JSON_FORMAT
     from chainshaper.values.files import new_file, write_whole
     from chainshaper.verify import budgets
 
@@ -238,7 +259,8 @@ def check(
         write_whole(markdown, ["\n".join(parts).encode()])
     out.notes(notes)
     if json:
-        out.print_json([{**asdict(one), "met": one.met, "text": one.text} for one in every])
+        rows = [{**asdict(one), "met": one.met, "text": one.text} for one in every]
+        out.print_json({"format": JSON_FORMAT, "limits": rows})
     verdicts = [
         _limits_shown(found, str(budget), json) if budget is not None else None,
         _callbacks_shown(compared, json) if compared else None,
@@ -279,9 +301,36 @@ def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
 
     tables = [overview_table(comparisons)] if len(comparisons) > 1 else []
     for comparison in comparisons:
-        predictions = [one.held for one in comparison.measurements if one.held is not None]
-        tables += [comparison_table(comparison), *map(prediction_table, predictions)]
+        predictions = [
+            prediction_table(one.held, one.recording.path.name)
+            for one in comparison.measurements
+            if one.held is not None
+        ]
+        tables += [comparison_table(comparison), *predictions]
     return tables
+
+
+def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -> None:
+    """Say whether promises of plans were kept.
+
+    Raises OperationError, InputError: not all were, or there was none, and ``strict`` asks for it.
+    """
+    from chainshaper.reporting.latency import verdict
+
+    several = len(comparisons) > 1
+    found = [
+        (kept, f"{one.chain}: {text}" if several else text)
+        for one in comparisons
+        for measured in one.measurements
+        if measured.plan is not None
+        for kept, text in [verdict(measured)]
+    ]
+    for _, text in found if not json else ():
+        out.show_line(text)
+    if strict and not found:
+        raise InputError("--strict judges a plan's promise: name the plan in force with --plan")
+    if strict and not all(kept for kept, _ in found):
+        raise OperationError("the plan's promise is not kept (--strict)")
 
 
 def compare(
@@ -291,12 +340,14 @@ def compare(
         "--figures DIR", "Draw latency.png and distribution.png into this folder."
     ),
     plan: Path | None = opt.PLAN_IN_FORCE,
+    strict: bool = opt.STRICT,
     json: bool = opt.JSON,
 ) -> None:
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
-    Where a plan was in force, its prediction stands beside the measurement, band by band. Without
-    --chain, all chains of the plan in force in the last recording are shown.
+    Where a plan was in force, its prediction stands beside the measurement, band by band, and the
+    last line says whether its promise was kept. Without --chain, all chains of
+    the plan in force in the last recording are shown.
     """
     from chainshaper.reporting.latency import comparisons_json
 
@@ -308,6 +359,7 @@ def compare(
             raise InputError("--figures draws one chain: name it with --chain")
         draw_comparison(comparisons[0].measurements, figures)
     out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
+    judge(comparisons, strict=strict, json=json)
 
 
 def report(

@@ -64,6 +64,7 @@ START_NS = 30_000_000_000  # for a command to start all nodes of the plan
 PHASE_BOUND_NS = 250_000  # nodes get the beginning of cycles again when it has moved by more
 _LOOK_S = 1.0
 _SETTLING_LOOKS = 3  # nodes that have just started go on to start threads for a while
+GATE_START_NS = 10_000_000_000  # a shaping node appears so long after all others, or never
 _FLEETING = 3  # so many threads that a look finds, and the next does not, are worth a note
 _NOTHING = ServerCounters()
 
@@ -160,6 +161,15 @@ def apply_plan(
     return Applied(run.state, run.command.returncode if run.command else None)
 
 
+def _without_gates(missing: Collection[str]) -> str:
+    return (
+        f"the plan's shaping node {', '.join(sorted(missing))} is not running, all other nodes are:"
+        " start the application with it (`chainshaper splice plan.yaml LAUNCH... -o DIR`; of a"
+        " described application, `chainshaper shape APP.yaml plan.yaml -o REC`), or plan without"
+        " one (--policy server-per-chain)"
+    )
+
+
 def _go_on(stop: threading.Event) -> None:
     if stop.is_set():
         raise OperationError("the run was asked to end before the plan was in force")
@@ -208,7 +218,7 @@ class _Run:
 
     def await_nodes(self, wait_ns: int, progress: Callable[[float, str], None]) -> None:
         """Look until all nodes of the plan run; where there is time, a little for late threads."""
-        begun, looks, before = time.monotonic_ns(), 0, None
+        begun, looks, before, others_ns = time.monotonic_ns(), 0, None, 0
         while True:
             self.go_on()
             self.found = self.find()
@@ -217,11 +227,16 @@ class _Run:
                 allocation.server_members(self.plan, self.found)
                 looks += 1
             except OperationError:
-                looks = 0
+                looks, missing = 0, self.missing()
+                gates = {node.thread.node for node in self.given.shaping_nodes}
+                others_ns = waited if missing - gates else others_ns
+                over = self.command_ended or waited >= min(wait_ns, others_ns + GATE_START_NS)
+                if over and missing and missing <= gates:
+                    raise OperationError(_without_gates(missing)) from None
                 if self.command_ended and self.command is not None:
                     raise OperationError(
                         f"the command ended with code {self.command.returncode} before all nodes "
-                        "of the plan were running"
+                        f"of the plan were running: {', '.join(sorted(missing)) or 'all'} were not"
                     ) from None
                 if waited >= wait_ns:
                     raise
@@ -231,6 +246,11 @@ class _Run:
             before = self.found
             progress(min(1.0, waited / wait_ns), "finding the nodes")
             self.stop.wait(min(_LOOK_S, (wait_ns - waited) / 1e9))
+
+    def missing(self) -> set[str]:
+        """The nodes of servers that are not running."""
+        running = {node for one in self.found.threads for node in one.nodes}
+        return {one.node for server in self.given.servers for one in server.threads} - running
 
     def schedule(self) -> None:
         """Give threads their priorities and cores, as far as the back end leaves that to us."""

@@ -88,6 +88,8 @@ def shape_launch(
     request: PlanRequest | None = None,
     period_ns: int | None = None,
     mode_recordings: Mapping[str, str | Path] | None = None,
+    since_ns: int = 0,
+    until_ns: int | None = None,
     duration_ns: int = 60_000_000_000,
     source: Literal["lttng", "preload", "ebpf"] | None = None,
     node: NodeKind = "python",
@@ -104,12 +106,12 @@ def shape_launch(
     ``chain`` is the one to shape, or several; without it, ``choose`` is asked. ``sinks`` are chains
     to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that get them
     by way of a throttler, ``period_ns`` is that of chains that no timer starts, and
-    ``mode_recordings`` are for :func:`.profile_chains`. ``request.cores`` are where executors run
-    (default: the last core, and others that are worth it). The application is launched three times,
-    briefly, and for ``duration_ns`` before and after; more often, where chains are measured one by
-    one. ``planned`` gets the plan before it is used, to say what is doubtful about it. ``stop``
-    ends the step that is under way, and with it everything. ``adapt``, ``max_latency_ns`` and
-    ``users`` are for :func:`.apply_plan`.
+    ``mode_recordings``, ``since_ns`` and ``until_ns`` are for :func:`.profile_chains`.
+    ``request.cores`` are where executors run (default: the last core, and others that are worth
+    it). The application is launched three times, briefly, and for ``duration_ns`` before and after;
+    more often, where chains are measured one by one. ``planned`` gets the plan before it is used,
+    to say what is doubtful about it. ``stop`` ends the step that is under way, and with it
+    everything. ``adapt``, ``max_latency_ns`` and ``users`` are for :func:`.apply_plan`.
 
     Raises:
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
@@ -119,7 +121,8 @@ def shape_launch(
     """
     launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
-    known: Any = {"modes": request.modes, "mode_recordings": mode_recordings or {}}
+    known: Any = {"modes": request.modes, "since_ns": since_ns, "until_ns": until_ns}
+    known["mode_recordings"] = mode_recordings or {}
     _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
     if node != "python":
         check_build_tools()
@@ -159,8 +162,7 @@ def shape_launch(
     seen, core_of = profiled_cores(first, wanted, request, period_ns)
     _refuse_at_first_look(seen, len(chains), request)
     permitted = may_use_fifo()  # else it is measured under ordinary scheduling
-    found = [] if permitted else [NOT_PERMITTED]
-    measured: dict[int, tuple[Recording, Profile]] = {}
+    found, measured = ([] if permitted else [NOT_PERMITTED]), dict[int, tuple[Recording, Profile]]()
     for number, places in enumerate(undelayed(seen, core_of), start=1):
         own = [wanted[place] for place in places]
         cores = {node: core_of[node] for node in chain_nodes(first, *own)}

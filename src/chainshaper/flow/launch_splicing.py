@@ -22,6 +22,7 @@ from chainshaper.planning.application_plan import ApplicationPlan, combined, who
 from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
+from chainshaper.splicing.application import nothing_to_splice
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (
     GATES,
@@ -118,11 +119,8 @@ def splice_launch_files(
     joint = whole(plan)
     if fallback is not None:
         joint = combined([revised(chain, fallback=fallback) for chain in joint.chains])
-    if any(chain.shaping_node is None for chain in joint.chains):
-        raise InputError(
-            "the plan has no `shaping_node`, so there is nothing to splice: plan again with"
-            " `chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
-        )
+    if without := [chain for chain in joint.chains if chain.shaping_node is None]:
+        raise nothing_to_splice(without[0])
     folder = usable(Path(output))
     publishers = _endpoints(recording, "publisher")
     every = [(chain, node) for chain in joint.chains for node in shaping_nodes(chain)]

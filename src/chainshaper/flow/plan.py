@@ -52,6 +52,8 @@ def profile_chains(
     period_ns: int | None = None,
     modes: Modes | None = None,
     mode_recordings: Mapping[str, str | Path] = MappingProxyType({}),
+    since_ns: int = 0,
+    until_ns: int | None = None,
 ) -> tuple[Profile, ...]:
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
@@ -60,18 +62,27 @@ def profile_chains(
     did not disturb: a stall is not part of the chain's latency, but its output is late
     nevertheless. Only where fewer than two were undisturbed, they are over all. Of ``modes``, each
     has a profile of its own: of its recording or file of latencies in ``mode_recordings``, or of
-    the cycles that began in it, where the description of what ran says when that was.
+    the cycles that began in it, where the description of what ran says when that was. What happened
+    before ``since_ns`` of the recording, or from ``until_ns`` on, is left out.
 
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
     """
     if not isinstance(recording, Recording):
         recording = open_source(recording)
+    starts = events.table(recording.events, "callback_start")["time"]
+    begun = int(starts.min() or 0)  # type: ignore[arg-type]
+    if since_ns or until_ns is not None:
+        until = None if until_ns is None else begun + until_ns
+        within = events.happened(recording.events, begun + since_ns, until)
+        recording = replace(recording, events=within)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
     stages = [graph_stages(one.graph, one.chain) for one in analyses]
     planned = {number for own in stages for stage in own for number in stage.members}
-    profile_of = partial(_profile_of, recording, flow, period_ns=period_ns, planned=planned)
+    profile_of = partial(
+        _profile_of, recording, flow, begun_ns=begun, period_ns=period_ns, planned=planned
+    )
     profiles = [profile_of(one, stages=own) for one, own in zip(analyses, stages, strict=True)]
     if modes is None:
         return tuple(profiles)
@@ -84,7 +95,10 @@ def profile_chains(
                 bare, period = read_latencies(Path(place)), profiles[number].period_ns
                 apart[mode] = Profile(bare, period, recording=str(place))
             else:
-                (apart[mode],) = profile_chains(place, chains[number:][:1], period_ns=period_ns)
+                only = chains[number:][:1]
+                (apart[mode],) = profile_chains(
+                    place, only, period_ns=period_ns, since_ns=since_ns, until_ns=until_ns
+                )
         in_force = _modes_in_force(recording, flow, analysis.traversals["start"], modes)
         for mode in modes.bands.keys() - apart if apart or in_force.count() else ():
             own = replace(analysis, traversals=analysis.traversals.filter(in_force == mode))
@@ -103,6 +117,7 @@ def _profile_of(
     analysis: LatencyAnalysis,
     *,
     stages: list["_Stage"],
+    begun_ns: int,
     period_ns: int | None,
     planned: Collection[int],
 ) -> Profile:
@@ -129,6 +144,7 @@ def _profile_of(
     return Profile(
         latencies_ns=measured["latency_ns"].to_numpy().astype(np.int64),
         every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
+        starts_ns=measured["start"].to_numpy() - begun_ns,
         period_ns=period,
         spec=chain.spec,
         nodes=tuple(graph.callbacks[number].node for number in chain.callbacks),
@@ -233,7 +249,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     before: dict[int, list[_Key]] = {}  # of the chain's callbacks
     of_chain: dict[int, _Key] = {}
     for number, topic in zip(chain.callbacks, chain.topics, strict=True):
-        members = _inputs(graph, graph.callbacks[number], topic) if along else (number,)
+        members = inputs_of(graph, graph.callbacks[number], topic) if along else (number,)
         before[number] = along[-1:]
         along.append((members, topic))
         of_chain.update(dict.fromkeys(members, along[-1]))
@@ -241,7 +257,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
 
     def writers_of(topic: str | None) -> list[_Key]:
         return [
-            of_chain.get(writer.id) or (_inputs(graph, writer, topic), topic)
+            of_chain.get(writer.id) or (inputs_of(graph, writer, topic), topic)
             for writer in graph.callbacks
             if topic is not None and topic in writer.publishes and writer.node not in outside
         ]
@@ -290,7 +306,7 @@ def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> fr
             for callback in graph.callbacks
             for topic in ahead.intersection(callback.publishes)
         ]
-        inputs = [number for one, topic in writers for number in _inputs(graph, one, topic)]
+        inputs = [number for one, topic in writers for number in inputs_of(graph, one, topic)]
         read = {graph.callbacks[number].topic for number in inputs}
         ahead = {topic for topic in read if topic is not None} - found
     return frozenset(found - {chain.topics[-1]})
@@ -310,7 +326,7 @@ def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
     return found
 
 
-def _inputs(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[int, ...]:
+def inputs_of(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[int, ...]:
     """The callback and, where it is an input of a synchronising one, the other inputs."""
     if not goes_on_elsewhere(graph, callback, topic):
         return (callback.id,)
@@ -500,11 +516,16 @@ def _longest_calm(flow: DataFlow, lasted: pl.DataFrame) -> int:
 
 
 def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
-    """Whether a node's process has a publisher's thread; None where DDS threads have no names."""
+    """Whether a node's process has a publisher's thread; None where DDS threads have no names.
+
+    Cyclone DDS has none: there the thread that publishes also sends.
+    """
     threads = recording.info.threads
     pids = {thread.pid for thread in threads if thread.node == node}
     roles = {thread.role for thread in threads if thread.pid in pids}
-    return "publisher" in roles if "dds" in roles else None
+    if "dds" not in roles:
+        return False if recording.info.rmw == "rmw_cyclonedds_cpp" else None
+    return "publisher" in roles
 
 
 def _goes_without_dds(flow: DataFlow, node: str, topic: str) -> bool:

@@ -245,8 +245,7 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
     latencies = check_latencies(latencies_ns)
     if not 0 < probability < MOST_PROBABLE:
         raise InputError(
-            f"an overrun probability of {probability} is none of the tail: give one above 0 and"
-            f" below {MOST_PROBABLE}"
+            f"an overrun probability of {probability} must be between 0 and {MOST_PROBABLE}"
         )
     fewest = round(FEWEST_EXCESSES**1.5)
     if latencies.size <= fewest:

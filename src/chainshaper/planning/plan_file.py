@@ -14,6 +14,7 @@ import yaml
 from pydantic import model_validator
 
 from chainshaper.planning.application_plan import ApplicationPlan, whole
+from chainshaper.planning.overruns import expected
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import new_file, write_whole
@@ -181,10 +182,13 @@ def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
 
 def plan_json(plan: Plan) -> dict[str, Any]:
     """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``, with the
-    ends of the publish slots (``bands_ns``) and :func:`band_predictions`.
+    ends of the publish slots (``bands_ns``), :func:`band_predictions`, and what will be seen
+    (``expected``: :class:`~chainshaper.planning.overruns.Expected`).
     """
+    seen = expected(plan)
     return {
         **plan.model_dump(mode="json"),
+        "expected": None if seen is None else {**seen._asdict(), "leave_ns": list(seen.leave_ns)},
         "bands_ns": [end for _, end in publish_slots(plan)],
         "predicted_bands": [band._asdict() for band in band_predictions(plan)],
     }

@@ -17,6 +17,7 @@ in one cycle than in another:
 * the shaping nodes of all other chains, which spin before a slot and publish.
 """
 
+import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
@@ -28,10 +29,15 @@ from numpy.typing import NDArray
 from chainshaper.planning.margins import check_latencies
 from chainshaper.planning.plan import SHORTEST_SLOT_NS
 from chainshaper.planning.shaping import CallbackTimes
+from chainshaper.values.durations import format_duration
+from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Wishes
 
 _Stage: TypeAlias = tuple[str, str | None]
 """A callback of a graph, by its node and what it publishes."""
+START_UP_NS = 3_000_000_000  # in so long an application starts, or ends
+APART = 1.3  # so many times as long as others is no part of their tail
+FEWEST = 20  # cycles, to tell one from the others
 _ADDED_UP = ("shaped", "one-long-slot", "server-per-chain")
 
 
@@ -40,7 +46,8 @@ class Profile:
     """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
 
     ``latencies_ns`` are those of undisturbed cycles (where ``all_disturbed``, of all),
-    ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time.
+    ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time;
+    ``starts_ns`` is when each of the former began in the recording (None: a period apart).
     ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
     publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
     also on branches that the chain waits for, ``cores`` that of any node that has one core; where a
@@ -62,6 +69,7 @@ class Profile:
     latencies_ns: NDArray[np.int64]
     period_ns: int
     every_latency_ns: NDArray[np.int64] | None = None
+    starts_ns: NDArray[np.int64] | None = None
     spec: str | None = None
     nodes: tuple[str, ...] = ()
     topics: tuple[str, ...] = ()
@@ -107,6 +115,77 @@ class Profile:
     def longest_ns(self) -> int:
         """The longest of the latencies that are planned from."""
         return int(check_latencies(self.latencies_ns).max())
+
+    @property
+    def starts(self) -> NDArray[np.int64]:
+        """When each cycle began, from the beginning of the recording."""
+        given = self.starts_ns
+        return np.arange(len(self.latencies_ns)) * self.period_ns if given is None else given
+
+    def chosen(self, these: NDArray[np.bool_]) -> "Profile":
+        """The profile with the longest latency of these cycles; the others stay in ``every``."""
+        steps = self.steps_ns[these] if len(self.steps_ns) == len(these) else self.steps_ns
+        latencies, starts = self.latencies_ns[these], self.starts[these]
+        every = self.every
+        return replace(
+            self, latencies_ns=latencies, starts_ns=starts, steps_ns=steps, every_latency_ns=every
+        )
+
+
+def up_to(profile: Profile, percentile: float) -> Profile:
+    """The profile up to a percentile of its latencies: what takes longer is taken to be late.
+
+    Raises InputError: no percentile.
+    """
+    if not 0 < percentile <= 100:
+        raise InputError(f"--percentile {percentile:g}: write more than 0, at most 100")
+    latencies = profile.latencies_ns
+    fit = max(min(2, latencies.size), math.ceil(percentile / 100 * latencies.size - 1e-6))
+    of_modes = {mode: up_to(one, percentile) for mode, one in profile.of_modes.items()}
+    return replace(profile.chosen(latencies <= np.sort(latencies)[fit - 1]), of_modes=of_modes)
+
+
+def deciding_cycles(profile: Profile) -> str | None:
+    """Which few cycles decide the longest latency, the likely cause, and what leaves them out.
+
+    They are 1 % of all at most, and all of them :data:`APART` times as long as the next longest
+    (None: there are none such).
+    """
+    latencies, starts = profile.latencies_ns, profile.starts
+    order = np.argsort(latencies, kind="stable")[::-1]
+    most = max(1, latencies.size // 100)
+    if latencies.size < FEWEST or latencies[order[most]] == 0:
+        return None
+    apart = latencies[order[:most]] / latencies[order[1 : most + 1]]
+    number = 1 + int(np.argmax(apart))
+    if apart[number - 1] < APART:
+        return None
+    few, next_longest = order[:number], int(latencies[order[number]])
+    first, last = int(starts[few].min()), int(starts[few].max())
+    where = ""
+    if len(profile.steps_ns) == latencies.size and profile.nodes:
+        longer = profile.steps_ns[few[0]] - np.median(profile.steps_ns, axis=0)
+        worst = int(np.argmax(longer))
+        where = f", {_brief(longer[worst])} of it more than usual at {profile.nodes[worst]}"
+    if last < START_UP_NS:
+        cause = "it is the start-up (first instances, discovery)"
+        remedy = f"--skip {format_duration((last // 1_000_000_000 + 1) * 1_000_000_000)}"
+    elif first > int(starts.max()) - START_UP_NS:
+        cause, remedy = "the application was ending", f"--to {format_duration(first)}"
+    else:
+        watched = profile.longest_stall_ns is not None
+        cause = "the application's own" if watched else "a stall of the machine (not watched)"
+        remedy = f"--percentile {math.floor(1000 * (1 - number / latencies.size)) / 10:g}"
+    cycles = ", ".join(f"{start / 1e9:.1f} s" for start in starts[few[:3]])
+    return (
+        f"{number} of {latencies.size} cycles decide{'s' * (number == 1)} the longest latency, at"
+        f" {cycles}{', …' * (number > 3)}: {_brief(int(latencies[few[0]]))}{where}; the next"
+        f" longest takes {_brief(next_longest)}. Likely {cause}: leave it out with {remedy}"
+    )
+
+
+def _brief(nanoseconds: float) -> str:
+    return f"{nanoseconds / 1e6:.1f} ms"
 
 
 class Rival(NamedTuple):

@@ -51,7 +51,7 @@ from chainshaper.planning.plan import (
     Slot,
     revised,
 )
-from chainshaper.planning.profile import Profile, with_interference
+from chainshaper.planning.profile import Profile, deciding_cycles, up_to, with_interference
 from chainshaper.planning.shaping import (
     evidence_of,
     let_per_callback,
@@ -101,7 +101,19 @@ def plan_chain(
     has. OperationError: no such plan exists; the message names what prevents it. PlatformError: a
     library that only this request needs is not installed.
     """
+    try:
+        return _plan_chain(profile, request, sinks)
+    except OperationError as error:
+        remark = next(filter(None, map(deciding_cycles, (profile, *sinks))), None)
+        if remark is None or request.percentile is not None:
+            raise
+        raise OperationError(f"{str(error).rstrip('.')}. {remark}") from error
+
+
+def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]) -> Plan:
     refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
+    if request.percentile is not None:
+        profile, *sinks = (up_to(one, request.percentile) for one in (profile, *sinks))
     if request.policy == "pipelined":
         profile = _apart(profile)
     else:
@@ -427,7 +439,8 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
             f" measure {cycles_needed(probability)} or more"
         )
     stalls = 0
-    if request.policy not in OWN_SLOTS or request.policy == "pipelined":
+    shown_late = request.percentile is not None  # what takes longer has been left out
+    if not shown_late and (request.policy not in OWN_SLOTS or request.policy == "pipelined"):
         share = probability or OVERRUN_PROBABILITY  # a stall belongs to no single callback
         latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
         stalls = max(0, covered_latency(covered, share, latest) - longest)

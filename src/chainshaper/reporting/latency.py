@@ -8,13 +8,15 @@ from typing import Any
 import polars as pl
 
 from chainshaper.analysis import REASONS, LatencyAnalysis, LatencyStatistics
-from chainshaper.planning import publish_slots
+from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning.overruns import expected
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
     Column,
     ResultTable,
     count,
+    counted,
     counts,
     figures,
     min_mean_max,
@@ -36,6 +38,9 @@ from chainshaper.verify.predictions import FigureHeld, PredictionHeld
 
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows that say what happened to cycles that are called disturbed."""
+
+JSON_FORMAT = 1
+"""Of the objects that `latency`, `compare`, `check` print; another if a key changes its meaning."""
 
 CONVENTION = (
     "at_start: every output leaves as its slot starts, as a gate does it; at_end: at its slot's"
@@ -79,6 +84,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
     overruns, dropped = measurement.overruns, measurement.dropped
     calm, received = analysis.subscriber_undisturbed, analysis.subscriber
     result = {
+        "format": JSON_FORMAT,
         "chain": analysis.chain.spec,
         **asdict(analysis.statistics),
         "max_all_ns": analysis.statistics.max_ns,
@@ -122,13 +128,13 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         if measurement.held is not None:
             entry["prediction"] = prediction_json(measurement.held)
         entries.append(entry)
-    return {"chain": comparison.chain, "recordings": entries}
+    return {"format": JSON_FORMAT, "chain": comparison.chain, "recordings": entries}
 
 
 def comparisons_json(comparisons: Sequence[Comparison]) -> dict[str, Any]:
     """A comparison as plain data; of several chains an object whose ``chains`` has them."""
     several = [comparison_json(one) for one in comparisons]
-    return several[0] if len(several) == 1 else {"chains": several}
+    return several[0] if len(several) == 1 else {"format": JSON_FORMAT, "chains": several}
 
 
 def latency_table(measurement: Measurement) -> ResultTable:
@@ -155,7 +161,7 @@ def latency_table(measurement: Measurement) -> ResultTable:
 def doubts_text(measurement: Measurement) -> str:
     """What a measurement leaves in doubt: disturbed, incomplete, late and lost, in one line."""
     analysis = measurement.analysis
-    parts = [f"{analysis.statistics.disturbed} cycles disturbed by the machine"]
+    parts = [f"{counted(analysis.statistics.disturbed, 'cycle')} disturbed by the machine"]
     if measurement.longest_stall_ns is None:
         parts = ["stalls of the machine not watched"]
     if analysis.incomplete:
@@ -199,7 +205,9 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
     ):
         if watched:
             columns = [getattr(one, undisturbed) for one in analyses]
-            add(f"at {place}, undisturbed cycles [ms]", columns, every | calm)
+            left_out = [one.statistics.disturbed for one in analyses]
+            without = f" (without {' / '.join(map(str, left_out))} disturbed)" * any(left_out)
+            add(f"at {place}, undisturbed cycles{without} [ms]", columns, every | calm)
         columns = [getattr(one, field) for one in analyses]
         add(f"at {place}, all complete cycles [ms]", columns, titles - brief if watched else every)
     table.group("cycles")
@@ -210,14 +218,39 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
     ]
     planned = [m.plan for m in measurements if m.plan is not None]
     if planned:
-        predicted = planned[-1].predicted
         remarks.append(
-            f"planned: slots {slots_ms(*publish_slots(planned[-1]))}, "
-            f"predicted maximum {milliseconds(predicted.max_ns)}, "
-            f"jitter at most {milliseconds(predicted.jitter_ns)}"
+            f"planned: slots {slots_ms(*publish_slots(planned[-1]))}; {expected_text(planned[-1])}"
         )
     table.caption = "\n".join(remarks) or None
     return table
+
+
+def expected_text(plan: Plan) -> str:
+    """What a plan's outputs will look like, in ms."""
+    seen, predicted = expected(plan), plan.predicted
+    if seen is None:
+        figures = map(milliseconds, (predicted.mean_ns, predicted.max_ns, predicted.jitter_ns))
+        return "expected average {}, maximum {}, jitter {} at most".format(*figures)
+    places = ", ".join(map(milliseconds, seen.leave_ns))
+    average = f", average {milliseconds(seen.mean_ns)}" if len(seen.leave_ns) > 1 else ""
+    return f"outputs leave at {places}{average}; expected jitter {milliseconds(seen.jitter_ns, 1)}"
+
+
+def verdict(one: Measurement) -> tuple[bool | None, str]:
+    """Whether a recording has what its plan promised (None: nothing to judge), in a sentence."""
+    held, statistics, name = one.held, one.analysis.statistics, one.recording.path.name
+    if held is None or one.plan is None:
+        return None, f"{name}: no plan was in force, so nothing was promised"
+    left_out = statistics.disturbed
+    aside = f"; without {left_out} of {statistics.count} cycles, disturbed by the machine"
+    aside = aside if left_out else ""
+    if held.broken:
+        return False, f"{name}: promise broken: {'; '.join(held.broken)}{aside}"
+    if held.mean.measured_ns is None:
+        return None, f"{name}: no undisturbed cycle to judge the promise by{aside}"
+    late = "" if held.late_of_all is None else f", {held.late_of_all} of {held.cycles} outputs late"
+    jitter = f"jitter {ms(held.jitter.measured_ns)} ms"
+    return True, f"{name}: promise kept: {jitter}{late} ({expected_text(one.plan)}){aside}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
@@ -232,7 +265,7 @@ def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
             ("incomplete", counts(one.analysis.incomplete)),
             ("too late for their slot", counts(one.overruns, "not gated")),
             ("next cycle hit", next_cycles(one.outcomes) if one.outcomes else ABSENT),
-            ("came when it was open", count(one.into_open_slots, "not gated")),
+            ("arrived during their slot", count(one.into_open_slots, "not gated")),
             ("messages lost at the gate", counts(one.dropped, "not gated")),
             ("begun without publishing", str(one.analysis.silent)),
             ("longest stall of the machine [ms]", ms(one.longest_stall_ns)),
@@ -270,20 +303,20 @@ def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ())
     return table
 
 
-def prediction_table(held: PredictionHeld) -> ResultTable:
-    """Predicted beside measured: the whole, then band by band."""
+def prediction_table(held: PredictionHeld, name: str = "") -> ResultTable:
+    """Predicted beside measured: the whole, then band by band; of a recording with a ``name``."""
     whence = ", from the start of the cycle" if held.counted_from == "cycle" else ""
     columns = [*words(""), *figures("predicted", "measured"), *words("verdict")]
     columns += figures("jitter", "share predicted", "measured")
-    table = ResultTable(f"Prediction and measurement{whence} [ms]", columns)
+    title = f"Prediction and measurement{f' of {name}' if name else ''}{whence} [ms]"
+    table = ResultTable(title, columns)
     for title, figure in (
         ("average", held.mean),
         ("maximum", held.max),
         ("jitter (max − min)", held.jitter),
     ):
         verdict = {True: "as predicted", False: "differs", None: ABSENT}[figure.holds]
-        predicted = " … ".join(dict.fromkeys(map(milliseconds, (figure.from_ns, figure.to_ns))))
-        table.add(title, predicted, ms(figure.measured_ns), verdict, "", "", "")
+        table.add(title, figure.range_text, ms(figure.measured_ns), verdict, "", "", "")
     table.line()
     for number, band in enumerate(held.bands, start=1):
         name = band.mode or f"band {number}"
@@ -329,6 +362,8 @@ def prediction_json(held: PredictionHeld) -> dict[str, Any]:
         "late": held.late,
         "late_of_all": held.late_of_all,
         "counted_from": held.counted_from,
+        "kept": None if held.mean.measured_ns is None and not held.broken else not held.broken,
+        "broken": list(held.broken),
     }
 
 

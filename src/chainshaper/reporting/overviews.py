@@ -16,12 +16,14 @@ from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
 from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
+from chainshaper.reporting.latency import expected_text
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
     Column,
     ResultTable,
     count,
+    counted,
     figures,
     listed,
     min_mean_max,
@@ -166,7 +168,7 @@ def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
 
 def count_text(found: ChainEnumeration) -> str:
     """How many chains there are, and how many of them are listed."""
-    number = f"{found.count:,} chains" if found.exact else f"at least {found.count:,} chains"
+    number = f"{'' if found.exact else 'at least '}{counted(found.count, 'chain')}"
     return number if found.complete else f"{number}, {len(found.chains)} of them listed"
 
 
@@ -377,14 +379,8 @@ def plan_table(plan: Plan) -> ResultTable:
         )
         where = str(server.core), str(server.priority)
         table.add(server.name, *where, slots_ms(*server.slots), ", ".join(threads))
-    predicted = plan.predicted
     offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
-    table.caption = (
-        f"cycle {milliseconds(plan.cycle_ns)}{offset}; "
-        f"predicted average {milliseconds(predicted.mean_ns)}, "
-        f"maximum {milliseconds(predicted.max_ns)}, jitter at most "
-        f"{milliseconds(predicted.jitter_ns)}"
-    )
+    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_text(plan)}"
     return table
 
 
@@ -441,8 +437,7 @@ def servers_table(state: RunState) -> ResultTable:
     if state.anchor_ns is not None:
         table.caption = f"cycles of {format_duration(state.cycle_ns)}"
         if state.drift_ns is not None:
-            drift = f"{'-' if state.drift_ns < 0 else '+'}{format_duration(abs(state.drift_ns))}"
-            table.caption += f"; the chain begins {drift} from where it did"
+            table.caption += f"; the chain's start has drifted by {state.drift_ns / 1e6:+.3f} ms"
         for move in {one.chain: one for one in state.moves}.values():
             table.caption += f"; {move.text}"
     for server in state.servers:

@@ -4,10 +4,13 @@ Texts of others (names in traces) stay literal in both: Rich takes brackets for 
 control characters on, so on the terminal every text is a `Text`; in HTML every text is escaped.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
+from rich.cells import cell_len
+from rich.console import Console, ConsoleOptions, RenderResult
+from rich.measure import Measurement
 from rich.table import Table as RichTable
 from rich.text import Text
 
@@ -73,8 +76,42 @@ class ResultTable:
         """A line between the rows before and behind it, on the terminal."""
         self.rows.append(_Row(()))
 
-    def __rich__(self) -> RichTable:
-        """The table for the terminal, without details."""
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        """The table for the terminal, without details; where it would break names, in lines."""
+        table = self._table()
+        least = Measurement.get(console, options.update(max_width=9999), table).minimum
+        fits = least <= options.max_width
+        yield from (
+            [table] if fits or all(column.words for column in self.columns) else self._lines()
+        )
+
+    def _lines(self) -> Iterator[Text]:
+        """Each row in two lines: its words, then its figures under each other."""
+        used = [number for number, column in enumerate(self.columns) if not column.detail]
+        names = [number for number in used if self.columns[number].words]
+        heads = {n: self.columns[n].title.split("\n") for n in used if n not in names}
+        rows = [row for row in self.rows if row.cells and not row.detail]
+        if any(column.footer for column in self.columns):
+            rows.append(_Row(tuple(column.footer for column in self.columns)))
+        cells = [row.cells for row in rows if not row.title]
+        width = {n: max(map(cell_len, [*heads[n], *(str(row[n]) for row in cells)])) for n in heads}
+
+        def line(values: Mapping[int, str], style: str = "") -> Text:
+            return plain("    " + "  ".join(values[n].rjust(width[n]) for n in heads), style)  # type: ignore[no-any-return]
+
+        yield plain(self.title, "table.title")
+        depth = max(map(len, heads.values()))
+        for number in range(depth):
+            yield line({n: ([""] * (depth - len(h)) + h)[number] for n, h in heads.items()}, "bold")
+        for row in rows:
+            text = row.cells[0] if row.title else "  ".join(str(row.cells[n]) for n in names)
+            yield plain(str(text), "bold" if row.title else "")
+            if not row.title:
+                yield line({n: str(row.cells[n]) for n in heads})
+        if self.caption:
+            yield plain(self.caption, "table.caption")
+
+    def _table(self) -> RichTable:
         used = [number for number, column in enumerate(self.columns) if not column.detail]
         table = RichTable(
             title=plain(self.title, "table.title"),
@@ -142,6 +179,11 @@ def ms(nanoseconds: float | None) -> str:
 def count(number: int | None, absent: str = ABSENT) -> str:
     """A number, where it is known."""
     return absent if number is None else str(number)
+
+
+def counted(number: int, what: str) -> str:
+    """``1 cycle``, ``2 cycles``."""
+    return f"{number:,} {what}{'' if number == 1 else 's'}"
 
 
 def counts(by_kind: Mapping[str, int] | None, absent: str = ABSENT) -> str:

@@ -89,7 +89,7 @@ def simulate(
         processes={process.pid: process.node for process in system.processes},
         threads=system.threads,
         realtime=True,
-        notes=(f"simulated; the first {live.WARM_UP_CYCLES} cycles were not recorded",),
+        notes=("simulated",),
         chain=application.chain,
         application=application_as_written(application),
         plan=None if joint is None else plan_values(joint),

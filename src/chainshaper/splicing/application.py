@@ -39,7 +39,19 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
     application = _placed(application, joint)
     for chain in joint.chains:
         application = _with_chain(_at_offset(application, joint, chain), joint, chain)
+    _refuse_strange_nodes(application, joint)
     return application
+
+
+def _refuse_strange_nodes(application: Application, joint: ApplicationPlan) -> None:
+    own = {"/" + name.strip("/") for name in application.nodes}
+    planned = {thread.node for server in joint.servers for thread in server.threads}
+    if strange := planned - own - {node.thread.node for node in joint.shaping_nodes}:
+        raise InputError(
+            f"the plan names {', '.join(sorted(strange))}, which {application.name!r} does not have"
+            f" (its nodes: {', '.join(sorted(own))}): correct the plan, or plan from a recording of"
+            " this application"
+        )
 
 
 def check_periods(application: Application, joint: ApplicationPlan) -> None:
@@ -90,10 +102,7 @@ def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) ->
         changed = described.model_copy(update={"lifespan_ns": shortest})
         return application.model_copy(update={"topics": {**application.topics, topic: changed}})
     if shaping is None:
-        raise InputError(
-            "the plan has no `shaping_node`, so there is nothing to splice: plan again with "
-            "`chainshaper plan REC --chain FIRST..LAST -o plan.yaml`"
-        )
+        raise nothing_to_splice(plan)
     if plan.modes is not None and plan.modes.topic not in application.announced():
         raise InputError(
             f"the plan's modes are named on {plan.modes.topic}, but no callback of the application "
@@ -102,6 +111,14 @@ def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) ->
     for node in (shaping, *plan.further_shaping_nodes):
         application = _spliced(application, joint, plan, node)
     return application
+
+
+def nothing_to_splice(plan: Plan) -> InputError:
+    """The error for a plan without a shaping node."""
+    return InputError(
+        f"the plan has no `shaping_node`, so there is nothing to splice: put {plan.policy} in force"
+        " with `chainshaper apply plan.yaml`, or plan with --policy shaped"
+    )
 
 
 def _placed(application: Application, joint: ApplicationPlan) -> Application:

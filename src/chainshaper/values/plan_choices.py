@@ -66,7 +66,7 @@ class Wishes:
     with ``one-long-slot``. ``cores`` None: executors are planned for the cores that they ran on.
     """
 
-    policy: Annotated[Policy, Option("How it is scheduled.")] = "shaped"
+    policy: Annotated[Policy, Option("Scheduling policy.")] = "shaped"
     publication: Annotated[Publication, Option(
         "By a shaping node; by the asynchronous publisher's own thread; or in-process: by a gate"
         " that is loaded into the publisher's process, without another node.")] = "synchronous"
@@ -77,6 +77,9 @@ class Wishes:
     epsilon_ns: Annotated[int | None, Option(
         "A given margin behind the longest undisturbed latency. Default: 1ms behind the latency"
         " that all cycles but 1 % stay below.", MARGIN)] = None
+    percentile: Annotated[float | None, Option(
+        "Plan from latencies up to this percentile, such as 99.5; longer ones will be late."
+        " Default: all.", MARGIN, "P")] = None
     overrun_probability: Annotated[float | None, Option(
         "Share of all cycles that may be late, such as 0.01; below 0.001 it is derived from"
         " the tail of the latencies.", MARGIN, "P")] = None
@@ -85,13 +88,13 @@ class Wishes:
     )] = False
     bands: Annotated[int | Literal["auto"], Option(
         "Number of bands; auto: as many as are worth it.", BANDS, "N|auto")] = 1
-    solver: Annotated[Solver, Option("What places bands.", BANDS)] = "exact"
+    solver: Annotated[Solver, Option("Band solver.", BANDS)] = "exact"
     grid_ns: Annotated[int, Option("Slots end at multiples of this.", BANDS)] = 1_000
     max_gap_ns: Annotated[int | None, Option(
         "Longest distance of neighbouring bands (LV).", BANDS)] = None
     max_share: Annotated[float | None, Option(
         "Most cycles in one band: 0.4 or 40%.", BANDS, "SHARE")] = None
-    minimise: Annotated[Goal, Option("What to make small.", BANDS)] = "mean"
+    minimise: Annotated[Goal, Option("Objective.", BANDS)] = "mean"
     mean_at_most_ns: Annotated[int | None, Option(
         "The average that --minimise may cost.", BANDS)] = None
     least_gain: Annotated[float, Option(

@@ -112,6 +112,14 @@ def wrong_value(reason: str, *where: str | int) -> PydanticCustomError:
     return PydanticCustomError("wrong_value", "{reason}", {"reason": reason, "where": where})
 
 
+KINDS = {
+    "a plan": {"servers", "predicted"},
+    "a plan of several chains": {"format", "chains"},
+    "the description of an application": {"nodes", "scheduling"},
+}
+"""What other files are, by keys that only they have."""
+
+
 def read_model(
     path: str | Path,
     model: type[Model],
@@ -139,6 +147,10 @@ def read_model(
     try:
         return meant.model_validate(values, context=AS_YAML)
     except ValidationError as error:
+        own = {name.removesuffix("_ns") for name in meant.model_fields}
+        for kind, keys in KINDS.items():
+            if keys <= values.keys() and not keys <= own and meant is model:
+                raise InputError(f"{path}: is {kind}; wanted is a file {made_by}") from error
         raise plain.problems(error, meant) from error
 
 
@@ -151,6 +163,9 @@ def read_text(path: Path, made_by: str) -> str:
     try:
         with path.open("rb") as file:
             content = file.read(LARGEST_FILE + 1)
+    except IsADirectoryError as error:
+        kind = "the folder of a recording" if (path / "recording.json").exists() else "a folder"
+        raise InputError(f"{path}: is {kind}; wanted is a file {made_by}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); {such}") from error
     if len(content) > LARGEST_FILE:

@@ -13,7 +13,13 @@ from pathlib import Path
 
 import polars as pl
 
-from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
+from chainshaper.analysis import (
+    LatencyAnalysis,
+    analyse_latency,
+    data_flow,
+    enumerate_chains,
+    graph_of,
+)
 from chainshaper.analysis.flow import DataFlow, left_when_taken
 from chainshaper.analysis.latency import summary
 from chainshaper.planning import ApplicationPlan, Plan
@@ -33,6 +39,8 @@ from chainshaper.verify.overruns import (
     overruns_in,
 )
 from chainshaper.verify.predictions import PredictionHeld, due_of, hold_prediction
+
+MOST_PROPOSED = 3  # chains, to who names none
 
 
 @dataclass(frozen=True)
@@ -95,12 +103,16 @@ def chain_of(recording: Recording, chain: str | None) -> str:
     Raises InputError: neither names one.
     """
     named = chain or recording.info.chain
-    if named is None:
-        raise InputError(
-            f"{recording.path} names no chain of interest: give one with --chain FIRST..LAST, "
-            "such as --chain /t1../t5"
-        )
-    return named
+    if named is not None:
+        return named
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    found = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
+    known = " or ".join(f"--chain {one.spec}" for one in found.chains)
+    more = "" if found.complete else ", or others (`chainshaper chains`)"
+    raise InputError(
+        f"{recording.path} names no chain of interest: "
+        + (f"add {known}{more}" if known else "and no chain is in it, see `chainshaper graph`")
+    )
 
 
 def measure_latency(
@@ -229,7 +241,7 @@ def compare_chains(
     opened = [_opened(recording) for recording in recordings]
     joint = _plan_of(opened[-1], plan)
     chains = [] if joint is None or chain is not None else [one.chain.spec for one in joint.chains]
-    chains = chains if len(chains) > 1 else [chain]
+    chains = chains if len(chains) > 1 else [chain or next(iter(chains), None)]
     columns = []
     for number, recording in enumerate(opened, start=1):
         progress((number - 1) / len(opened), f"analysing {recording.path}")

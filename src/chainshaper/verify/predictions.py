@@ -17,6 +17,7 @@ A verdict is found from the range and the figure as they are printed. A range ha
 finite samples may differ by, and no band is expected that so few outputs may well not have come in.
 """
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -26,8 +27,8 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
 from chainshaper.analysis.disturbance import Due
 from chainshaper.planning import Plan, publish_slots
-from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publisher_servers, server_of
+from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected
+from chainshaper.planning.plan import SHORTEST_SLOT_NS, publisher_servers, server_of
 from chainshaper.values.durations import milliseconds
 
 STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
@@ -48,6 +49,11 @@ class FigureHeld:
     to_ns: int
     measured_ns: int | None
     holds: bool | None
+
+    @property
+    def range_text(self) -> str:
+        """The range in ms."""
+        return " … ".join(dict.fromkeys(map(milliseconds, (self.from_ns, self.to_ns))))
 
 
 @dataclass(frozen=True)
@@ -78,7 +84,8 @@ class PredictionHeld:
 
     The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
     outputs that missed their last slot; they are in the figures, not in the bands. ``late_of_all``
-    counts those of all ``cycles`` (None: not known). Policies without slots have no ``bands``.
+    counts those of all ``cycles`` (None: not known), of which ``most_late`` were promised.
+    Policies without slots have no ``bands``.
     """
 
     mean: FigureHeld
@@ -89,6 +96,21 @@ class PredictionHeld:
     late_of_all: int | None
     cycles: int
     counted_from: Literal["chain", "cycle"]
+    most_late: int
+
+    @property
+    def broken(self) -> tuple[str, ...]:
+        """Which promises the measurement breaks, each with its figures."""
+        named = {"average": self.mean, "maximum": self.max, "jitter": self.jitter}
+        broken = [
+            f"{name} {milliseconds(one.measured_ns)} ms, not {one.range_text} ms"
+            for name, one in named.items()
+            if one.holds is False and one.measured_ns is not None
+        ]
+        if (self.late_of_all or 0) > self.most_late:
+            most = f"{self.most_late} at most" if self.most_late else "none"
+            broken.append(f"{self.late_of_all} of {self.cycles} outputs late, {most} expected")
+        return tuple(broken)
 
 
 def due_of(plan: Plan) -> tuple[Due, ...]:
@@ -131,7 +153,7 @@ def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
     late = int(outputs["late"].sum())
     shares = plan.predicted.shares
     if plan.modes is None:
-        known = shares if _represented(plan) else [None] * len(slots)
+        known = shares if expected(plan) is not None else [None] * len(slots)
         bands = [
             _band(slot, share, outputs, pl.col("slot") == number)
             for number, (slot, share) in enumerate(zip(slots, known, strict=True))
@@ -154,7 +176,14 @@ def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
         late_of_all=analysis.statistics.late,
         cycles=analysis.statistics.count,
         counted_from="cycle" if from_cycle else "chain",
+        most_late=_most_late(plan, analysis.statistics.count),
     )
+
+
+def _most_late(plan: Plan, cycles: int) -> int:
+    """How many of so many outputs may be late, by the plan's margin, as far as chance goes."""
+    share = plan.margin.overrun_probability or 0.0
+    return math.floor(cycles * share + STANDARD_ERRORS * math.sqrt(cycles * share))
 
 
 def _figures(
@@ -168,9 +197,10 @@ def _figures(
     # Where outputs do not come in bands, their variance is not in the plan; between two limits it
     # is at most (max − mean)·(mean − min).
     variance = float(max(0, longest - mean) * max(0, mean - (longest - jitter)))
-    if _represented(plan):
-        starts, ends = zip(*slots, strict=True)
-        mean = round(_weighted(predicted.shares, starts))
+    seen = expected(plan)
+    if seen is not None:
+        starts, ends = seen.leave_ns, [end for _, end in slots]
+        mean = seen.mean_ns
         average = _weighted(predicted.shares, ends)
         variance = _weighted(predicted.shares, [(end - average) ** 2 for end in ends])
         longest, jitter = starts[-1], starts[-1] - starts[0]
@@ -191,6 +221,8 @@ def _figures(
     def figure(at_start: int, name: str, lowest: int, above: int = 0) -> FigureHeld:
         at_end, found = getattr(predicted, name), getattr(measured, name)
         low, high, holds = min(lowest, at_start), at_end + above, None
+        if seen is not None and len(seen.leave_ns) == 1 and lowest == at_start:
+            high = min(high, at_start + GATE_NS + SHORTEST_SLOT_NS)  # however wide the slot is
         if plan.modes is None and found is not None:
             printed = [float(milliseconds(one)) for one in (low, found, high)]
             holds = printed == sorted(printed)
@@ -205,12 +237,6 @@ def _figures(
 
 def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
     return sum(share * value for share, value in zip(shares, values, strict=True))
-
-
-def _represented(plan: Plan) -> bool:
-    """Whether a slot's end stands for the outputs in it, as in eq. 5."""
-    slots = publish_slots(plan)
-    return plan.policy != "one-long-slot" and 0 < len(slots) == len(plan.predicted.shares)
 
 
 def _outputs(slots: list[tuple[int, int]], analysis: LatencyAnalysis, judged: str) -> pl.DataFrame:

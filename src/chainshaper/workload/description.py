@@ -405,7 +405,7 @@ def load_application(path: str | Path) -> Application:
 
     Raises InputError: with file, line, key, reason and remedy of each wrong value.
     """
-    return read_model(path, Application, made_by="like examples/synthetic_chain.yaml")
+    return read_model(path, Application, made_by="written by `chainshaper init`")
 
 
 def application_as_written(application: Application) -> dict[str, Any]:

@@ -79,6 +79,10 @@ class SubscriptionEntity:
     callback: Callable[[Message], None]
 
 
+IDLE_NS = 500_000_000
+"""An executor with nothing to do looks this often whether it is to end: no chain is so slow."""
+
+
 class Executor:
     """Runs the callbacks of one process on the calling thread."""
 
@@ -92,9 +96,14 @@ class Executor:
         self._wait_set.attach(self._guard)
         self._wait_for_work = log.point("rclcpp_executor_wait_for_work")
         self._next_ready = log.point("rclcpp_executor_get_next_ready")
+        self.over = False
         self._execute = log.point("rclcpp_executor_execute")
         takes = map(log.point, ("rmw_take", "rcl_take", "rclcpp_take"))
         self._rmw_take, self._rcl_take, self._rclcpp_take = takes
+
+    def end_early(self, *_: object) -> None:
+        """A signal's handler: the executor ends when it next looks."""
+        self.over = True
 
     def add_subscription(self, entity: SubscriptionEntity) -> None:
         self.subscriptions.append(entity)
@@ -106,10 +115,10 @@ class Executor:
         Timers expire up to ``last_timer_ns`` only, so that what they began can be completed. What
         a callback has taken beyond its own message, its backlog, is worked off first.
         """
-        while (now := monotonic_ns()) < stop_ns:
+        while (now := monotonic_ns()) < stop_ns and not self.over:
             more = [work_off() for work_off in self.backlogs]
             due = [timer.due_ns for timer in self.timers if timer.due_ns <= last_timer_ns]
-            timeout = 0 if any(more) else max(0, min([stop_ns, *due]) - now)
+            timeout = 0 if any(more) else max(0, min([stop_ns, now + IDLE_NS, *due]) - now)
             self._wait_for_work(now, timeout)
             self._wait_set.wait(timeout)
             now = min(monotonic_ns(), last_timer_ns)

@@ -15,6 +15,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 import tempfile
@@ -25,6 +26,9 @@ from typing import IO, Any
 
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
+
+ENOUGH = signal.SIGUSR1
+"""Has a child end its run early, and send what it recorded."""
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -39,7 +39,7 @@ from chainshaper.workload.description import (
     origin_timer,
 )
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
-from chainshaper.workload.launcher import Child, end_all, first_casualty, start_child
+from chainshaper.workload.launcher import ENOUGH, Child, end_all, first_casualty, start_child
 from chainshaper.workload.stall_meter import (
     far_from,
     meter_tables,
@@ -107,18 +107,14 @@ def run_application(
         InputError: ``output`` exists.
         PlatformError: a core is missing, DDS does not load.
         OperationError: a node died, discovery failed, the recording cannot be written. In every
-            case all processes are gone and no recording is left.
+            case all processes are gone and no recording is left; but where the run was interrupted
+            (KeyboardInterrupt), the whole cycles until then are, which the message says.
     """
     output = refuse_existing(output)
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be recorded: ask for at least 1")
     check_cores(application.cores())
-    permitted = may_use_fifo()
-    if realtime and not permitted:
-        raise PlatformError(
-            "real-time scheduling was asked for, but this process may not use SCHED_FIFO: run as "
-            "root, give your user an rtprio limit of 98 in /etc/security/limits.conf, or do without"
-        )
+    permitted = _permitted(realtime)
     realtime = permitted if realtime is None else realtime
     nodes: dict[str, Child] = {}
     meters: dict[int, Child] = {}
@@ -140,7 +136,9 @@ def run_application(
         with nullcontext() if enforcement is None else enforcement(started):
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
-            threads, governed = _watch(nodes, meters, timing, progress)
+            threads, governed, ended_ns = _watch(nodes, meters, timing, progress)
+            if ended_ns is not None:
+                timing = _ended_early([*nodes.values(), *meters.values()], timing, ended_ns)
         progress(1.0, "collecting events")
         logs = [_read_log(name, child, application) for name, child in nodes.items()]
         seen, meter_info = read_meters(meters, realtime) if meters else ([], None)
@@ -149,6 +147,10 @@ def run_application(
         end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
     tables = event_tables(logs, timing.record_from_ns)
     tables |= meter_tables(seen, tables.get("machine_stall"))
+    notes = list(_notes(realtime, permitted, memory_locked, clock_offset() - offset))
+    if ended_ns is not None:
+        tables = dict(events.happened(tables, 0, timing.stop_ns))
+        notes.append(f"interrupted: {timing.cycles} of {cycles} cycles were recorded")
     together = in_force_throughout(governed)
     in_force = None if plan is None else InForceInfo(since_ns=timing.record_from_ns)
     if plan is None and together is not None:
@@ -161,14 +163,28 @@ def run_application(
         processes=processes,
         threads=threads,
         realtime=realtime,
-        notes=tuple(_notes(realtime, permitted, memory_locked, clock_offset() - offset)),
+        notes=tuple(notes),
         stall_meter=meter_info,
         chain=application.chain,
         application=application_as_written(application),
         plan=plan or (together.plan if together else None),
         in_force=in_force,
     )
-    return write_recording(output, tables, info)
+    recording = write_recording(output, tables, info)
+    if ended_ns is not None:
+        raise OperationError(f"{notes[-1]}; they are in {output}")
+    return recording
+
+
+def _permitted(wanted: bool | None) -> bool:
+    """Whether SCHED_FIFO is. Raises PlatformError: it is wanted and is not."""
+    permitted = may_use_fifo()
+    if wanted and not permitted:
+        raise PlatformError(
+            "real-time scheduling was asked for, but this process may not use SCHED_FIFO: run as "
+            "root, give your user an rtprio limit of 98 in /etc/security/limits.conf, or do without"
+        )
+    return permitted
 
 
 def node_name(name: str) -> str:
@@ -186,6 +202,12 @@ class Timing:
     last_timer_ns: int
     stop_ns: int
     meter_from_ns: int
+    period_ns: int
+
+    @property
+    def cycles(self) -> int:
+        """How many whole cycles are recorded at ``stop_ns``."""
+        return (self.stop_ns - self.record_from_ns) // self.period_ns
 
 
 def timing_of(application: Application, cycles: int, start: int) -> Timing:
@@ -208,7 +230,18 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
         last_timer_ns=end - apart,
         stop_ns=end + max(2 * period, 200_000_000) + delayed * period,
         meter_from_ns=anchor + far_from(releases),
+        period_ns=period,
     )
+
+
+def _ended_early(children: Sequence[Child], timing: Timing, ended_ns: int) -> Timing:
+    """Have the run end now; it stops behind its last whole cycle. Raises OperationError: none."""
+    early = replace(timing, stop_ns=ended_ns)
+    if early.cycles < 1:
+        raise OperationError("interrupted before one whole cycle: nothing is recorded")
+    for child in children:
+        child.process.send_signal(ENOUGH)
+    return replace(early, stop_ns=timing.record_from_ns + early.cycles * timing.period_ns)
 
 
 def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
@@ -275,16 +308,18 @@ def _watch(
     meters: dict[int, Child],
     timing: Timing,
     progress: Progress,
-) -> tuple[tuple[ThreadInfo, ...], tuple[Governed, ...]]:
+) -> tuple[tuple[ThreadInfo, ...], tuple[Governed, ...], int | None]:
     """Wait for the end of the run; the threads as they were while it lasted.
 
-    And the plans that others put in force meanwhile (`chainshaper apply`).
+    And the plans that others put in force meanwhile (`chainshaper apply`), and when the run was
+    interrupted, if it was (ns).
 
     Raises OperationError: a process ended before its time.
     """
     children = [*nodes.values(), *meters.values()]
     threads: tuple[ThreadInfo, ...] = ()
     governed: tuple[Governed, ...] = ()
+    interrupted_ns: int | None = None
     pids, next_look = {child.pid for child in nodes.values()}, timing.start_ns
     while (now := time.monotonic_ns()) < timing.stop_ns:
         if (casualty := first_casualty(children)) is not None:
@@ -295,9 +330,13 @@ def _watch(
             governed, next_look = governing(pids, now, governed), now + LOOK_NS
         share = (now - timing.start_ns) / (timing.stop_ns - timing.start_ns)
         progress(max(0.0, share), "recording")
-        time.sleep(0.1)
+        try:
+            time.sleep(0.1)
+        except KeyboardInterrupt:
+            interrupted_ns = time.monotonic_ns()
+            break
     governed = governing(pids, time.monotonic_ns(), governed)
-    return threads or _snapshot(nodes, meters), governed
+    return threads or _snapshot(nodes, meters), governed, interrupted_ns
 
 
 def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:
@@ -385,7 +424,6 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
 def _notes(
     realtime: bool, permitted: bool, memory_locked: bool, clock_moved_ns: int
 ) -> Iterator[str]:
-    yield f"the first {WARM_UP_CYCLES} cycles warmed up and were not recorded"
     if not realtime:
         reason = "SCHED_FIFO was declined" if permitted else "the process may not use SCHED_FIFO"
         yield (

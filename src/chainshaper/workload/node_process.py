@@ -27,7 +27,7 @@ from chainshaper.linux.scheduling import (
 from chainshaper.workload import dds, executor
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
-from chainshaper.workload.launcher import receive, send, send_events, wait_for_leave
+from chainshaper.workload.launcher import ENOUGH, receive, send, send_events, wait_for_leave
 
 Body: TypeAlias = Callable[[dds.Message], None]
 
@@ -354,6 +354,7 @@ def main() -> None:
     signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name(spec["node"].strip("/").replace("/", "."))
     node = NodeProcess(spec)
+    signal.signal(ENOUGH, node.executor.end_early)
     missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
     send(missing=missing, memory_locked=lock_memory())
     times = receive()

@@ -32,6 +32,7 @@ from chainshaper.linux.scheduling import (
 )
 from chainshaper.linux.threads import list_threads
 from chainshaper.workload.launcher import (
+    ENOUGH,
     Child,
     end_all,
     receive,
@@ -50,7 +51,6 @@ PERIOD_NS = 1_000_000
 """A wake-up costs some 20 us on a virtual machine: more of them would disturb what they watch."""
 PRIORITY = 98
 """Above everything it watches, so that none of it looks like a stall."""
-ENOUGH = signal.SIGUSR1
 WAKEUPS_PER_PACE = 10
 """Wake-ups whose CPU time is taken together: reading that clock is a call of the kernel."""
 NO_PACE = -1
