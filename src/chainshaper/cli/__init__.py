@@ -18,6 +18,8 @@ from typing import Any
 __all__ = ["main"]
 
 REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
+OF_ANALYSIS = ("matplotlib", "scipy")
+"""What a robot does without, of the extra `analysis`; and Numba, without which all is slower."""
 _LACK_OF_MEMORY = (
     "cannot allocate memory",
     "failed to map segment",  # the loader, of a library
@@ -51,6 +53,15 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
     except ChainshaperError as error:
         say(f"error: {error}")  # the last line of a failed command
         sys.exit(error.exit_code)
+    except ModuleNotFoundError as error:
+        lacking = (error.name or "").partition(".")[0]
+        if lacking not in OF_ANALYSIS:
+            raise
+        say(
+            f"error: this needs {lacking}, which is not installed: "
+            "pip install 'chainshaper[analysis]'"
+        )
+        sys.exit(3)
     except BaseException as error:  # a panic of Polars is no Exception
         message = _exhausted(error)
         if message is None:
