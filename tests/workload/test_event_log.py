@@ -76,12 +76,12 @@ def test_a_discarded_message_has_no_release_and_no_slot() -> None:
 def test_another_threads_number_and_the_largest_numbers_fit() -> None:
     log = EventLog()
     sends = []
-    other = threading.Thread(
-        target=lambda: (
-            sends.append(threading.get_native_id())
-            or log.point("asynchronous_send")(9, 1, 2, number_of("outcome", "sent"), 5)
-        )
-    )
+
+    def send() -> None:
+        sends.append(threading.get_native_id())
+        log.point("asynchronous_send")(9, 1, 2, number_of("outcome", "sent"), 5)
+
+    other = threading.Thread(target=send)
     other.start()
     other.join()
     log.point("rmw_take")(2**62, 0x55D0_0000_0100, 2**47, 2**62, 1)

@@ -170,18 +170,16 @@ class Executor:
         due = [timer.due_ns for timer in free if timer.due_ns <= last_timer_ns]
         timeout = 0 if any(more) else max(0, min([stop_ns, *due]) - now)
         for entity in self.subscriptions if self._others else ():
-            busy = entity.group in self._busy
-            (self._wait_set.detach if busy else self._wait_set.attach)(
-                entity.subscription.condition
-            )
+            busy, condition = entity.group in self._busy, entity.subscription.condition
+            (self._wait_set.detach if busy else self._wait_set.attach)(condition)
         self._wait_for_work(now, timeout)
         self._wait_set.wait(timeout)
         if self._others:
             self._guard.set(False)
         now = min(monotonic_ns(), last_timer_ns)
-        ready = (one for one in self.subscriptions if one.subscription.ready())
-        entities = (*(timer for timer in self.timers if timer.due_ns <= now), *ready)
-        self._snapshot.extend(one for one in entities if one.group not in self._busy)
+        ready: list[Entity] = [timer for timer in self.timers if timer.due_ns <= now]
+        ready += [one for one in self.subscriptions if one.subscription.ready()]
+        self._snapshot.extend(one for one in ready if one.group not in self._busy)
 
     def _chosen(self, handle: int) -> int:
         """Record that a timer or subscription is executed next; when that is (ns)."""

@@ -137,15 +137,9 @@ def _full(name: str) -> str:
 
 
 def _node(application: Application, name: str) -> str:
-    node, own = (
-        application.nodes[name],
-        (
-            application.scheduling_of(name),
-            application.dds_scheduling_of(name),
-        ),
-    )
-    threads = [_list([one.core, one.priority]) for one in own]
-    threads = ", ".join([*threads, _list(application.cores_of(name))])
+    node, own = application.nodes[name], application.scheduling_of(name)
+    both = [_list([one.core, one.priority]) for one in (own, application.dds_scheduling_of(name))]
+    threads = ", ".join([*both, _list(application.cores_of(name))])
     callbacks = [_callback(application, node, one) for one in node.callbacks]
     return f"  {{{_text(_full(name))}, {threads}, {{\n    {f',{chr(10)}    '.join(callbacks)}}}}}"
 

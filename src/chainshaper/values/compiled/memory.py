@@ -98,7 +98,7 @@ class _Table:
     def __init__(self, address: int) -> None:
         self._numbers = ctypes.cast(int(address), ctypes.POINTER(ctypes.c_int64))
 
-    def __getitem__(self, index: int) -> np.int64:
+    def __getitem__(self, index: int) -> Any:
         return np.int64(self._numbers[index])
 
     def __setitem__(self, index: int, value: int) -> None:
