@@ -1,7 +1,7 @@
 """For colcon: the package of this repository that it builds, of the type `ament_python`.
 
 colcon installs no dependencies. Those without a package of a distribution come from PyPI, into the
-Python that ROS runs with: ``python3 -m pip install .`` in the folder above does that, and is all
+Python that ROS runs with, best in a virtual environment (docs/install.md), which is all
 that `ros2 chain` needs, with or without colcon.
 
 It stands in a folder of its own because colcon cannot read what setuptools makes of a

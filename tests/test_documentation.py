@@ -66,10 +66,11 @@ def shortened(command: str, cycles: int) -> str:
 
 def as_in_a_clone(folder: Path) -> None:
     """What a command or an example takes from a clone's folder."""
-    for name in ("examples", "scripts"):
-        shutil.copytree(ROOT / name, folder / name)
-    for file in ("Makefile", "pyproject.toml"):
-        shutil.copyfile(ROOT / file, folder / file)
+    for name in ("examples", "scripts", "src"):
+        unread = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(ROOT / name, folder / name, ignore=unread)
+    for file in filter(Path.is_file, ROOT.iterdir()):
+        shutil.copyfile(file, folder / file.name)
     (folder / "tests").mkdir()
     shutil.copyfile(ROOT / "tests/ctf_writing.py", folder / "tests/ctf_writing.py")
 

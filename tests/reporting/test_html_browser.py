@@ -184,3 +184,32 @@ def test_light_and_dark_and_paper_look_as_they_should(page: Page) -> None:
     assert page.run("getComputedStyle(document.querySelector('.controls')).display") == "none"
     assert page.ask("Page.printToPDF")["data"].startswith("JVBERi0"), "a PDF"
     page.ask("Emulation.setEmulatedMedia", media="")
+
+
+def test_the_page_begins_with_a_sentence_then_pictures_then_tables(page: Page) -> None:
+    said = str(page.run("document.querySelector('header .verdict').innerText"))
+    assert re.match(r"Jitter [\d.]+ ms \(.*before\) → [\d.]+ ms \(.*after\); average ", said)
+    assert re.search(r"as predicted|differs from the prediction", said)
+    order = page.run(
+        "[...document.querySelectorAll('main .chart, main section table')]"
+        ".filter(one => !one.closest('#timeline, [id^=plan]'))"
+        ".map(one => one.tagName === 'TABLE' ? 't' : 'p').join('')"
+    )
+    assert re.fullmatch("p+t+", order)
+
+
+@pytest.mark.parametrize(
+    ("width", "tables"), [(1280, "main .scroll"), (400, "#figures > .scroll:first-of-type")]
+)
+def test_no_column_is_cut_off(page: Page, width: int, tables: str) -> None:
+    """All tables on a laptop; on a telephone, the one of before and after."""
+    page.look(width, 900)
+    page.run("for (const one of document.querySelectorAll('details')) one.open = true")
+    cut = page.run(
+        f"[...document.querySelectorAll('{tables}')]"
+        ".filter(one => one.scrollWidth > one.clientWidth)"
+        ".map(one => [one.closest('section')?.id, one.scrollWidth, one.clientWidth].join(' '))"
+        ".join('; ')"
+    )
+    page.look(1280, 900)
+    assert cut == ""

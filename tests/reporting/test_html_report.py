@@ -108,7 +108,6 @@ def page(known: Recording) -> _Reader:
 @pytest.mark.parametrize(
     ("section", "row"),
     [
-        ("header", ["known", "0.000", "30.020", "30.020", "3", "30.020", "0"]),
         ("figures", ["average", "30.020"]),
         ("figures", ["disturbed by the machine", "0"]),
         ("figures", ["longest stall of the machine [ms]", "2.000"]),

@@ -1,5 +1,6 @@
 """The executor runs callbacks in ROS 2's order, on real DDS topics of a closed domain."""
 
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -49,7 +50,11 @@ class Bench:
         return publisher, subscription
 
     def subscribe(
-        self, name: str, depth: int = 10, then: Callable[[], None] = lambda: None
+        self,
+        name: str,
+        depth: int = 10,
+        then: Callable[[], None] = lambda: None,
+        group: str | None = None,
     ) -> dds.Publisher:
         """A subscription that writes its name into the diary; the publisher of its topic."""
         publisher, subscription = self.topic(f"/{name}", depth)
@@ -60,7 +65,7 @@ class Bench:
 
         self.handles += 2
         self.executor.add_subscription(
-            SubscriptionEntity(self.handles, self.handles + 1, subscription, callback)
+            SubscriptionEntity(self.handles, self.handles + 1, subscription, callback, group)
         )
         return publisher
 
@@ -85,7 +90,7 @@ class Bench:
         number = list(LAYOUT).index(event)
         rows = self.log.rows.tolist()
         all_rows = [rows[i : i + WIDTH] for i in range(0, len(rows), WIDTH)]
-        return [row[1:] for row in all_rows if row[0] == number]
+        return [[row[1], *row[3:]] for row in all_rows if row[0] == number]
 
 
 @pytest.fixture
@@ -99,6 +104,41 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 def _send(*publishers: dds.Publisher) -> None:
     for publisher in publishers:
         publisher.write(dds.data_message(bytes(8), 1), time.time_ns())
+
+
+@pytest.mark.parametrize(
+    ("groups", "beside"),
+    [(("a", "b"), True), ((None, None), True), (("a", "a"), False)],
+    ids=["two groups", "reentrant", "one group"],
+)
+def test_threads_run_callbacks_beside_each_other_unless_they_are_in_one_group(
+    bench: Bench, groups: tuple[str | None, str | None], beside: bool
+) -> None:
+    """Both wait for each other, in vain if one begins when the other has ended."""
+    bench.executor = Executor(bench.participant, bench.log, threads=2)
+    meeting = threading.Barrier(2)
+    met, running, most = [], [0], [0]
+
+    def meet() -> None:
+        running[0] += 1
+        most[0] = max(most[0], running[0])
+        try:
+            meeting.wait(timeout=0.2 if not beside else 10)
+            met.append(threading.get_native_id())
+        except threading.BrokenBarrierError:
+            meeting.reset()
+        running[0] -= 1
+
+    names = ("first", "second")
+    publishers = [
+        bench.subscribe(name, then=meet, group=group)
+        for name, group in zip(names, groups, strict=True)
+    ]
+    _send(*publishers)
+    bench.spin(1500 * MS)
+    assert (len(set(met)), most[0]) == ((2, 2) if beside else (0, 1))
+    assert sorted(bench.diary) == ["first", "second"]
+    assert len(bench.recorded("rclcpp_executor_wait_for_work")) < 20, "it spun while one was busy"
 
 
 def test_timers_run_before_subscriptions_each_in_order_of_registration(bench: Bench) -> None:

@@ -41,6 +41,12 @@ nodes:
         publishes: [/fused]
   log: {callbacks: [{subscription: /fused, execution: {samples: [1ms, 2ms], block: 2}}]}
   driver: {callbacks: [{timer: 4s, publishes: [/mode], announces: [city, 'a"\é']}]}
+  threads:
+    executor: multi_threaded
+    threads: 3
+    cores: [1, 0]
+    callback_groups: {slow: reentrant, one: mutually_exclusive}
+    callbacks: [{timer: 1s, group: slow}, {timer: 2s, group: one}, {timer: 3s}]
 """
 DISTRIBUTIONS: dict[str, dict[str, Any]] = {
     "constant": {"constant_ns": 5_000_000},
@@ -69,15 +75,19 @@ def test_a_package_has_what_the_description_says(tmp_path: Path) -> None:
     scan, data = '{"/scan", 3, false, 20000000, 7}', '{"/map", 10, true, 0, 1024}'
     fused = '{"/fused", 10, true, 0, 1024}'
     for line in (
-        '  {"/front/lidar", {0, 70}, {0, 90}, {',
+        '  {"/front/lidar", {0, 70}, {0, 90}, {0}, {',
         f"    {{50000000, 5000000, {{}}, {{Distribution::constant, {{2000000}}, 1}}, "
-        f"{{{scan}, {data}}}, {{}}}}",
-        '  {"/fusion", {1, 80}, {0, 60}, {',
+        f'{{{scan}, {data}}}, {{}}, "", false}}',
+        '  {"/fusion", {1, 80}, {0, 60}, {1}, {',
         f"    {{0, 0, {{{scan}, {data}}}, {{Distribution::normal, "
-        f"{{8000000, 2000000, 4000000, 14000000}}, 1}}, {{{fused}}}, {{}}}}",
+        f'{{8000000, 2000000, 4000000, 14000000}}, 1}}, {{{fused}}}, {{}}, "", false}}',
         f"    {{0, 0, {{{fused}}}, "
-        "{Distribution::samples, {1000000, 2000000}, 2}, {}, {}}",
-        r'{"city", "a\042\134\303\251"}}',
+        '{Distribution::samples, {1000000, 2000000}, 2}, {}, {}, "", false}',
+        '  {"/threads", {1, 80}, {0, 90}, {1, 0, 1}, {',
+        '    {1000000000, 0, {}, {Distribution::constant, {0}, 1}, {}, {}, "slow", true}',
+        '    {2000000000, 0, {}, {Distribution::constant, {0}, 1}, {}, {}, "one", false}',
+        '    {3000000000, 0, {}, {Distribution::constant, {0}, 1}, {}, {}, "", false}',
+        r'{"city", "a\042\134\303\251"}, "", false}}',
     ):
         assert line in table
     launch = (folder / "launch/robot.launch.py").read_text()
@@ -86,7 +96,9 @@ def test_a_package_has_what_the_description_says(tmp_path: Path) -> None:
         for node in ast.parse(launch).body
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
     }
-    assert ast.literal_eval(assigned["NODES"]) == ["/front/lidar", "/fusion", "/log", "/driver"]
+    assert ast.literal_eval(assigned["NODES"]) == [
+        "/front/lidar", "/fusion", "/log", "/driver", "/threads",
+    ]  # fmt: skip
     assert ast.literal_eval(assigned["ASYNCHRONOUS"]) == ["/fusion"]
     assert ast.literal_eval(assigned["LEAD_NS"]) == 7_000_000_000, "3 s and the longest period"
     assert "default_value='18446744073709551615'" in launch
@@ -212,6 +224,15 @@ nodes:
       - {synchronises: [/left, /right], execution: {constant: 4ms}, publishes: [/fused]}
   motor: {callbacks: [{subscription: /fused, execution: {constant: 100us}}]}
   late: {callbacks: [{timer: 50ms, phase: 20ms, execution: {constant: 1ms}, publishes: [/late]}]}
+  threads:
+    executor: multi_threaded
+    threads: 2
+    cores: [1, 0]
+    priority: 70
+    callback_groups: {other: mutually_exclusive}
+    callbacks:
+      - {timer: 100ms, phase: 50ms, execution: {constant: 20ms}, publishes: [/slow], group: other}
+      - {timer: 100ms, phase: 51ms, execution: {constant: 2ms}, publishes: [/quick]}
 """
 
 
@@ -242,7 +263,7 @@ def test_a_built_package_runs_as_the_live_workload_does(tmp_path: Path) -> None:
     assert run.returncode == 0, run.stderr[-3000:]
     real = cs.open_recording(tmp_path / "ros")
     live = cs.run_application(application, tmp_path / "live", cycles=100)
-    ways = ["/raw../left../fused", "/raw../right../fused"]
+    ways = ["/raw../left../fused", "/raw../right../fused", "/slow../slow", "/quick../quick"]
     medians: list[dict[str, float]] = []
     for recording in (real, live):
         measured = [cs.measure_latency(recording, way) for way in ways]

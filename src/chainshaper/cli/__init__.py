@@ -19,6 +19,8 @@ from typing import Any, NoReturn
 __all__ = ["main"]
 
 REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
+OF_ANALYSIS = ("matplotlib", "scipy")
+"""What a robot does without, of the extra `analysis`; and Numba, without which all is slower."""
 _LACK_OF_MEMORY = (
     "cannot allocate memory",
     "failed to map segment",  # the loader, of a library
@@ -69,6 +71,13 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
             f"{error.filename}: permission denied: name a place that you may read and write, or"
             " change its permissions",
             2,
+        )
+    except ModuleNotFoundError as error:
+        lacking = (error.name or "").partition(".")[0]
+        if lacking not in OF_ANALYSIS:
+            raise
+        fail(
+            f"this needs {lacking}, which is not installed: pip install 'chainshaper[analysis]'", 3
         )
     except BaseException as error:  # a panic of Polars is no Exception
         message = _exhausted(error)

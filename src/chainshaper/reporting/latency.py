@@ -279,15 +279,22 @@ def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
     return rows
 
 
-def headline_table(names: Sequence[str], measurements: Sequence[Measurement]) -> ResultTable:
-    """One row per recording: what a reader remembers."""
-    titles = ("jitter", "average", "maximum", "cycles", "maximum of all", "late of all")
-    table = ResultTable("", [*words("at publication [ms]"), *figures(*titles)])
-    for name, measurement in zip(names, measurements, strict=True):
-        calm, every = measurement.analysis.undisturbed, measurement.analysis.statistics
-        times = map(ms, (calm.jitter_ns, calm.mean_ns, calm.max_ns))
-        table.add(name, *times, f"{calm.count:,}", ms(every.max_ns), count(every.late))
-    return table
+def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
+    """What a reader remembers, in one sentence: the jitter and the average before and after, and
+    whether they are as the plan predicted. Cycles are undisturbed ones, at publication."""
+    calm = [one.analysis.undisturbed for one in measurements]
+    ends = [0, -1] if len(calm) > 1 else [0]
+    jitter, average = (
+        " → ".join(f"{ms(getattr(calm[n], field))} ms ({names[n]})" for n in ends)
+        for field in ("jitter_ns", "mean_ns")
+    )
+    said, prediction = f"Jitter {jitter}; average {average}", measurements[-1].held
+    if prediction is None:
+        return f"{said}."
+    named = ("average", prediction.mean), ("maximum", prediction.max), ("jitter", prediction.jitter)
+    broken = ", ".join(name for name, figure in named if figure.holds is False)
+    verdict = f"differs from the prediction: {broken}" if broken else "as predicted"
+    return f"{said}; {verdict}, {count(calm[-1].late)} of {calm[-1].count:,} late."
 
 
 def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ()) -> ResultTable:

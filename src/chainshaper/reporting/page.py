@@ -118,13 +118,13 @@ def report_page(
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
     embedded = json.dumps(_safe(drawn), ensure_ascii=True, separators=(",", ":"))
     about = f"{len(chains)} chains" if several else chains[0].chain
-    headline = of_chain.headline_table(names, shared)
+    headline = _verdict(of_chain.headline(names, shared))
     if several:
-        headline = of_chain.overview_table(chains, names)
+        headline = of_chain.overview_table(chains, names).html()
     left_out = [(name, one.left_out.text) for name, one in zip(names, shared, strict=True)]
     return Template(page).substitute(
         title=escape(f"End-to-end latency of {about}"),
-        headline=headline.html() + "".join(_paragraph(f"{n}: {t}.") for n, t in left_out if t),
+        headline=headline + "".join(_paragraph(f"{n}: {t}.") for n, t in left_out if t),
         chains=_lines(blocks),
         conditions=_conditions(names, chains),
         style=style,
@@ -194,7 +194,7 @@ def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
     incomplete = of_chain.incomplete_table(names, measurements)
     heading = (
-        f"<h1>{escape(compared.chain)}</h1>\n{of_chain.headline_table(names, measurements).html()}"
+        f"<h1>{escape(compared.chain)}</h1>\n{_verdict(of_chain.headline(names, measurements))}"
     )
     callbacks = f"<h2>Callbacks</h2>\n{_lines(map(_callbacks, parts))}"
     hops = (
@@ -376,6 +376,10 @@ def _recorded_threads(name: str, measurement: Measurement) -> str:
 
 def _paragraph(text: str) -> str:
     return f'<p class="about">{escape(text)}</p>' if text else ""
+
+
+def _verdict(text: str) -> str:
+    return f'<p class="verdict">{escape(text)}</p>'
 
 
 def _details(summary: str, content: str, *, unfolded: bool = False) -> str:

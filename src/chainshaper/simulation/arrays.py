@@ -24,7 +24,8 @@ from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.execution import BLOCK, blocks
 from chainshaper.workload.live import WARM_UP_CYCLES, Timing, node_name
 
-FIRST_PID = 1000
+FIRST_PID, FIRST_TID = 1000, 100_000
+"""Of processes, whose number the main thread has, and of threads beside it that execute."""
 ROLES = ("executor", "publisher", "dds")
 KINDS = ("timer", "subscription", "service", "client")
 STATIC_ORDER = ("subscription", "timer", "client", "service")
@@ -177,16 +178,20 @@ def _threads(
     for number, process in enumerate(processes):
         own = application.scheduling_of(process.key)
         named = process.node.strip("/").replace("/", ".")[:15]
-        wanted = [("executor", named, own.core, own.priority)]
+        executing = application.cores_of(process.key)
+        wanted = [("executor", named, core, own.priority) for core in executing]
         if any(p.asynchronous for p in publishers if p.process == number):
             below = max(1, own.priority - 1)  # as the live workload has it
             wanted.append(("publisher", "dds.publisher", own.core, below))
         if application.simulation.receive is not None:
             dds = application.dds_scheduling_of(process.key)
             wanted.append(("dds", "dds.dds", dds.core, dds.priority))
-        for role, comm, core, priority in wanted:
+        for place, (role, comm, core, priority) in enumerate(wanted):
+            several = 0 < place < len(executing)
             yield ThreadInfo(
-                tid=process.pid + ROLES.index(role),
+                tid=FIRST_TID + 100 * number + place
+                if several
+                else process.pid + ROLES.index(role),
                 pid=process.pid,
                 comm=comm,
                 node=process.node,
@@ -199,11 +204,11 @@ def _threads(
 
 def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
     """The server of each thread that is in one."""
-    numbers = {
-        Thread(node=thread.node, role=thread.role): number  # type: ignore[arg-type]
-        for number, thread in enumerate(threads)
-        if thread.role != "dds"
-    }
+    numbers: dict[Thread, list[int]] = {}
+    for number, one in enumerate(threads):
+        if one.role != "dds":
+            named = Thread(node=one.node, role=one.role)  # type: ignore[arg-type]
+            numbers.setdefault(named, []).append(number)
     found: dict[int, Server] = {}
     for server in plan.servers:
         for thread in server.threads:
@@ -212,7 +217,7 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
                     f"server {server.name!r} of the plan holds {thread.text}, which the application"
                     " does not have: plan again from a recording of it"
                 )
-            found[numbers[thread]] = server
+            found |= dict.fromkeys(numbers[thread], server)
     return found
 
 
@@ -470,12 +475,15 @@ def _fill_threads(
 ) -> None:
     described = system.application.simulation
     named = zip(threads, system.threads, strict=True)
-    places = {(info.pid, info.role): place for place, info in named}
+    # Of an executor, its first thread's.
+    places = {(info.pid, info.role): place for place, info in reversed([*named])}
     for number, (thread, info) in enumerate(zip(threads, system.threads, strict=True)):
         for column in (T.RUNNABLE, T.LEFT, T.SEQUENCE, T.PREEMPTED, T.USED):
             rows[thread + column] = 0
         rows[thread + T.ROW] = number
-        offset = FIRST_COST + len(COSTS) * ROLES.index(info.role)
+        pool = places[info.pid, "executor"]
+        worker = (thread - pool) // T.COLUMNS if info.role == "executor" else 0
+        offset = FIRST_COST + len(COSTS) * (ROLES.index(info.role) + len(ROLES) * worker)
         for place, name in enumerate(COSTS):
             if (times := getattr(described, name)) is not None:
                 stream = streams.add(times, info.node, offset + place)
@@ -487,10 +495,14 @@ def _fill_threads(
             continue
         kinds = {"static": at.STATIC, "events": at.EVENTS}
         rows[thread + T.KIND] = kinds.get(described.executor, at.SINGLE_THREADED)
+        rows[thread + T.POOL] = pool
+        rows[pool + T.POOL_END], rows[pool + T.OWNER] = thread + T.COLUMNS, pool
+        for several in range(pool, thread + 1, T.COLUMNS) if worker else ():
+            rows[several + T.KIND] = at.MULTI_THREADED
         pids = [system.processes[entity.process].pid for entity in system.entities]
         rows[thread + T.FIRST] = entities[pids.index(info.pid)]
         rows[thread + T.END] = rows[thread + T.FIRST] + pids.count(info.pid) * E.COLUMNS
-        rows[thread + T.STEP] = at.COLLECT
+        rows[thread + T.STEP] = at.TURN if worker else at.COLLECT
         rows[thread + T.PUBLISHER_THREAD] = places.get((info.pid, "publisher"), NONE)
         rows[thread + T.DDS_THREAD] = places.get((info.pid, "dds"), NONE)
 
@@ -500,7 +512,8 @@ def _fill_entities(
 ) -> None:
     threads, entities, publishers = areas
     named = zip(threads, system.threads, strict=True)
-    executors = {info.pid: place for place, info in named if info.role == "executor"}
+    executors = {info.pid: place for place, info in reversed([*named]) if info.role == "executor"}
+    groups: dict[tuple[int, str], int] = {}
     # What inputs of a synchroniser share, and a gate with its listener: stream, gate or inputs.
     executions: dict[tuple[int, int], int] = {}
     bodies: dict[tuple[int, int], int] = {}
@@ -524,6 +537,10 @@ def _fill_entities(
             first = rows[bodies[callback] + S.FIRST] + entity.number * I.COLUMNS
             rows[first : first + I.COLUMNS] = [on_chain, rows.ring(depth), depth, 0, 0]
         rows[row + E.ROW], rows[row + E.THREAD] = number, executors[process.pid]
+        group = system.application.nodes[process.key].exclusive_group(described)
+        if group is not None and (entity.process, group) not in groups:
+            groups[entity.process, group] = rows.put([0])[0]
+        rows[row + E.GROUP] = NONE if group is None else groups[entity.process, group]
         rows[row + E.KIND], rows[row + E.INPUT] = KINDS.index(entity.kind), entity.number
         rows[row + E.BODY], rows[row + E.BODY_ROW] = body, bodies.get(callback, NONE)
         rows[row + E.EXECUTION] = executions[callback]

@@ -211,6 +211,20 @@ def wake_waiting(m, thread, step):
 
 
 @compiled()
+def wake_executor(m, thread):
+    """Something may be ready for a thread's executor: wake the thread that waits for it."""
+    owner = m[m[thread + T.POOL] + T.OWNER]
+    if owner != NONE:
+        wake_waiting(m, owner, at.COLLECT)
+
+
+@compiled()
+def may_run(m, entity):
+    """Whether no other callback of its mutually exclusive group runs."""
+    return m[entity + E.GROUP] == NONE or m[m[entity + E.GROUP]] == 0
+
+
+@compiled()
 def publish(m, thread, publisher):
     """The executor publishes: what it passes on stands in its thread's row."""
     now, published = m[X.NOW], m[publisher + P.PUBLISHED]
@@ -305,7 +319,8 @@ def arrive(m, message):
     # The event of the message that was overwritten is still in the queue, for this one to use.
     if m[thread + T.KIND] == at.EVENTS and not overwrites:
         mark_event(m, thread, entity)
-    wake_waiting(m, thread, at.COLLECT)
+    if may_run(m, entity):
+        wake_executor(m, thread)
 
 
 @compiled()

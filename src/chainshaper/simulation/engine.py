@@ -18,7 +18,8 @@ is taken when its callback is about to run. A timer that missed whole periods fi
 in phase. *Static* (`static_single_threaded_executor.cpp`): subscriptions first, then timers,
 clients and services, and one callback per wait set. *Events* (`events_executor.cpp`): in the order
 in which things happened, every message and every expiry an event of its own. Entities stand in the
-order in which their executor looks at them.
+order in which their executor looks at them. *Multi-threaded* (`multi_threaded_executor.cpp`): as
+:mod:`chainshaper.workload.executor` has it.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
@@ -40,6 +41,8 @@ def advance(m, thread):
             _work_for_executor(m, thread)
         elif step == at.COLLECT:
             _collect(m, thread)
+        elif step == at.TURN:
+            _choose(m, thread)
         else:
             if step == at.TAKE:
                 goes_on = _take(m, thread)
@@ -48,6 +51,10 @@ def advance(m, thread):
             else:
                 goes_on = callbacks.pass_gate(m, thread)
             if not goes_on:
+                group = m[m[thread + T.ENTITY] + E.GROUP]
+                if group != NONE:
+                    m[group] = 0
+                    callbacks.wake_executor(m, thread)
                 _choose(m, thread)
 
 
@@ -58,7 +65,8 @@ def expire(m, entity):
     if m[thread + T.KIND] == at.EVENTS:
         callbacks.mark_event(m, thread, entity)
         _call_timer(m, entity)
-    callbacks.wake_waiting(m, thread, at.COLLECT)
+    if callbacks.may_run(m, entity):
+        callbacks.wake_executor(m, thread)
 
 
 @compiled()
@@ -88,7 +96,7 @@ def _collect(m, thread):
     any_ready = m[thread + T.KIND] == at.EVENTS and m[thread + T.HEAD] != NONE
     if m[thread + T.KIND] != at.EVENTS:
         for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
-            ready = _ready(m, entity)
+            ready = callbacks.may_run(m, entity) and _ready(m, entity)
             m[entity + E.READY] = ready
             any_ready |= ready
     if any_ready:
@@ -107,21 +115,15 @@ def _wait(m, thread):
 def _choose(m, thread):
     """The next of the snapshot is executed; if there is none left, a new one is taken."""
     chosen, kind = NONE, m[thread + T.KIND]
+    if kind == at.MULTI_THREADED and not _takes_turn(m, thread):
+        return
     if kind == at.EVENTS:
         if m[thread + T.HEAD] != NONE:
             event = callbacks.pop_head(m, thread)
             chosen = m[event + M.ENTITY]
             callbacks.free_message(m, event)
     else:
-        for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
-            if m[entity + E.READY] == 1:
-                if chosen == NONE:
-                    chosen = entity
-                    m[entity + E.READY] = 0
-                elif kind == at.STATIC:  # one callback per wait set
-                    m[entity + E.READY] = 0
-                else:
-                    break
+        chosen = _first_ready(m, thread)
     if chosen == NONE:
         _refill(m, thread)
         return
@@ -132,6 +134,50 @@ def _choose(m, thread):
         m[thread + T.LEFT] = callbacks.draw(m, m[thread + T.TAKE])
     elif kind != at.EVENTS:  # there, it was called when it expired
         _call_timer(m, chosen)
+    if kind == at.MULTI_THREADED:
+        if m[chosen + E.GROUP] != NONE:
+            m[m[chosen + E.GROUP]] = 1
+        _give_turn(m, m[thread + T.POOL])
+
+
+@compiled()
+def _first_ready(m, thread):
+    """Take what comes first of the snapshot and may run out of it, NONE if nothing does."""
+    chosen = NONE
+    for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
+        if m[entity + E.READY] == 1 and chosen == NONE:
+            m[entity + E.READY] = 0
+            if callbacks.may_run(m, entity):
+                chosen = entity
+        elif m[thread + T.KIND] == at.STATIC:  # one callback per wait set
+            m[entity + E.READY] = 0
+    return chosen
+
+
+@compiled()
+def _takes_turn(m, thread):
+    """Whether no other thread of the executor waits or takes what is next; else it queues up."""
+    pool = m[thread + T.POOL]
+    if m[pool + T.OWNER] == NONE or m[pool + T.OWNER] == thread:
+        m[pool + T.OWNER] = thread
+        return True
+    m[thread + T.STEP] = at.TURN
+    m[thread + T.SEQUENCE] = m[X.COUNTER]
+    m[X.COUNTER] += 1
+    _wait(m, thread)
+    return False
+
+
+@compiled()
+def _give_turn(m, pool):
+    """Wake the thread that has queued up for longest; another may be quicker."""
+    m[pool + T.OWNER], longest = NONE, NONE
+    for thread in range(pool, m[pool + T.POOL_END], T.COLUMNS):
+        queues = m[thread + T.RUNNABLE] == 0 and m[thread + T.STEP] == at.TURN
+        if queues and (longest == NONE or m[thread + T.SEQUENCE] < m[longest + T.SEQUENCE]):
+            longest = thread
+    if longest != NONE:
+        callbacks.wake(m, longest)
 
 
 @compiled()

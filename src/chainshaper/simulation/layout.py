@@ -32,29 +32,32 @@ FOREVER = 2**62
 # FIRST to END are entities in the order in which the executor looks at them. Streams of CPU times:
 # from being woken to being at work, from choosing a message to its callback, one publication (or
 # send), one message received; DELIVERY is the time until a message is at the subscriber's process.
+# POOL to POOL_END are the executor's threads; the first's OWNER waits, or takes what is next.
 # HEAD and TAIL are a queue of messages to send or to receive, or of events to execute. LEFT is the
 # CPU time to the next STEP, SEQUENCE the place among those of its rank; BEGAN is when sending began
 # or the gate woke. SOURCE to ARRIVAL are those of the message that it deals with, as in M.
 T = IntEnum(
     "T",
     "ROW CORE RANK SERVER KIND FIRST END WAKE TAKE PUBLISH RECEIVE DELIVERY PUBLISHER_THREAD"
-    " DDS_THREAD RUNNABLE STEP LEFT SEQUENCE PREEMPTED USED ENTITY PUBLICATION HEAD TAIL SOURCE"
-    " ORIGIN START NUMBER MODE ARRIVAL BEGAN COLUMNS",
+    " DDS_THREAD POOL POOL_END OWNER RUNNABLE STEP LEFT SEQUENCE PREEMPTED USED ENTITY PUBLICATION"
+    " HEAD TAIL SOURCE ORIGIN START NUMBER MODE ARRIVAL BEGAN COLUMNS",
     start=0,
 )
 
-SINGLE_THREADED, STATIC, EVENTS, PUBLISHER, DDS = range(5)
-"""Kinds of threads: three executors, and what works for them."""
+SINGLE_THREADED, STATIC, EVENTS, MULTI_THREADED, PUBLISHER, DDS = range(6)
+"""Kinds of threads: four executors, and what works for them."""
 
-COLLECT, TAKE, PUBLISH, GATE_WAKE, GATE_PUBLISHED, GATE_PAUSED = range(6)
-SEND, SENT, RECEIVE, RECEIVED = range(6, 10)
+COLLECT, TURN, TAKE, PUBLISH, GATE_WAKE, GATE_PUBLISHED, GATE_PAUSED = range(7)
+SEND, SENT, RECEIVE, RECEIVED = range(7, 11)
 """What a thread does next, when it has used the CPU time that is left to it."""
 
 # Entities: what an executor waits for. BODY_ROW is that of the gate or synchroniser, INPUT which
-# input of the latter. HISTORY is a ring, whose columns are as in Q. READY: in the snapshot.
+# input of the latter. GROUP is where stands whether its mutually exclusive group is busy, NONE if
+# its executor has one thread, or the group is reentrant. HISTORY is a ring, whose columns are as in
+# Q. READY: in the snapshot.
 E = IntEnum(
     "E",
-    "ROW THREAD KIND BODY BODY_ROW INPUT PERIOD EXECUTION PUBLISHERS PUBLISHERS_END LIFESPAN"
+    "ROW THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION PUBLISHERS PUBLISHERS_END LIFESPAN"
     " STARTS_CHAIN ON_CHAIN HISTORY DEPTH HEAD WAITING DUE READY INSTANCES COLUMNS",
     start=0,
 )

@@ -249,7 +249,7 @@ _LOGGED: dict[str, tuple[int, tuple[str, ...]]] = {
     "rclcpp_executor_get_next_ready": (at.L_EXECUTE, ("",)),
     "rclcpp_executor_execute": (at.L_EXECUTE, ("handle",)),
     "rclcpp_executor_wait_for_work": (at.L_WAIT, ("timeout",)),
-    "asynchronous_send": (at.L_SEND, LAYOUT["asynchronous_send"][1:]),
+    "asynchronous_send": (at.L_SEND, LAYOUT["asynchronous_send"]),
     "gate_release": (at.L_RELEASE, LAYOUT["gate_release"]),
 }
 """Each event's kind of entry, and the event's columns for that entry's fields."""

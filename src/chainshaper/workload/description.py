@@ -112,6 +112,7 @@ class SimulationDescription(Part):
 
 
 MOST_CORES = 8191  # that Linux can be built for
+MOST_THREADS = 64
 _FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
 _NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
@@ -186,7 +187,8 @@ class CallbackDescription(Part):
     ``synchronises`` has the inputs of a synchronising callback, which executes and publishes when
     a message of every input has come, with the stamp of the first input's. Executors look at the
     ``kind`` service and client behind subscriptions of topics. One that ``computes`` calls a Python
-    function instead of spending time (:mod:`chainshaper.workload.executor`).
+    function instead of spending time (:mod:`chainshaper.workload.executor`). ``group`` is one of
+    its node's ``callback_groups``; without, it is in the node's own, which is mutually exclusive.
     """
 
     timer_ns: PositiveDuration | None = None
@@ -199,6 +201,7 @@ class CallbackDescription(Part):
     publishes: tuple[FullName, ...] = ()
     announces: tuple[str, ...] = ()
     gate: GateDescription | None = None
+    group: str | None = None
 
     @property
     def subscriptions(self) -> tuple[str, ...]:
@@ -242,13 +245,52 @@ class NodeDescription(Part):
     """A node in a process of its own.
 
     ``core`` and ``priority`` override ``scheduling.executors``, ``dds_priority`` overrides that
-    of ``scheduling.dds`` for the DDS threads of this node.
+    of ``scheduling.dds`` for the DDS threads of this node. A multi-threaded executor has
+    ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a callback group,
+    callbacks run one at a time, or, where it is reentrant, whenever a thread is free.
     """
 
     callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
     core: int | None = Field(default=None, ge=0, le=MOST_CORES)
     priority: int | None = Field(default=None, ge=1, le=97)
     dds_priority: int | None = Field(default=None, ge=1, le=97)
+    executor: Literal["single_threaded", "multi_threaded"] = "single_threaded"
+    threads: int = Field(default=1, ge=2, le=MOST_THREADS)
+    cores: tuple[Annotated[int, Field(ge=0, le=MOST_CORES)], ...] = ()
+    callback_groups: dict[str, Literal["mutually_exclusive", "reentrant"]] = Field(
+        default_factory=dict
+    )
+
+    @model_validator(mode="after")
+    def _executor_exists(self) -> "NodeDescription":
+        several = {"threads", "cores", "callback_groups"} & self.model_fields_set
+        if self.executor == "single_threaded" and several:
+            raise wrong_value(
+                "is of several threads: write `executor: multi_threaded`, or remove it",
+                min(several),
+            )
+        if self.executor == "multi_threaded" and self.threads == 1:
+            raise wrong_value("say how many `threads` it has: 2 or more", "executor")
+        if self.core is not None and self.cores:
+            raise wrong_value("give `core` or `cores`, not both", "core")
+        for number, callback in enumerate(self.callbacks):
+            if callback.group is not None and callback.group not in self.callback_groups:
+                raise wrong_value(
+                    f"the node has no callback group {callback.group!r}: add it to"
+                    " `callback_groups`, as mutually_exclusive or reentrant",
+                    *("callbacks", number, "group"),
+                )
+            if callback.gate is not None and self.threads > 1:
+                raise wrong_value(
+                    "a gate needs a node with a single-threaded executor",
+                    *("callbacks", number, "gate"),
+                )
+        return self
+
+    def exclusive_group(self, callback: CallbackDescription) -> str | None:
+        """The group of which it runs alone; None: it may run beside any. "" is the node's own."""
+        reentrant = self.callback_groups.get(callback.group or "") == "reentrant"
+        return None if self.threads == 1 or reentrant else callback.group or ""
 
 
 class TopicDescription(Part):
@@ -362,7 +404,13 @@ class Application(Part):
         """Core and priority of a node's executor."""
         own, executors = self.nodes[node], self.scheduling.executors
         core = executors.core if own.core is None else own.core
+        core = own.cores[0] if own.cores else core
         return Scheduling(core=core, priority=own.priority or executors.priority)
+
+    def cores_of(self, node: str) -> tuple[int, ...]:
+        """The core of each thread of a node's executor."""
+        cores = self.nodes[node].cores or (self.scheduling_of(node).core,)
+        return tuple(cores[place % len(cores)] for place in range(self.nodes[node].threads))
 
     def dds_scheduling_of(self, node: str) -> Scheduling:
         """Core and priority of a node's DDS threads."""
@@ -371,7 +419,7 @@ class Application(Part):
 
     def cores(self) -> dict[int, str]:
         """Every core the application uses, with who asks for it."""
-        executors = {self.scheduling_of(node).core: f"node {node}" for node in self.nodes}
+        executors = {core: f"node {node}" for node in self.nodes for core in self.cores_of(node)}
         return {self.scheduling.dds.core: "scheduling.dds", **executors}
 
 

@@ -10,6 +10,7 @@ from array import array
 from collections.abc import Callable
 from functools import partial
 from itertools import count
+from threading import get_native_id
 from time import monotonic_ns
 from typing import Any
 
@@ -31,12 +32,12 @@ LAYOUT: dict[str, tuple[str, ...]] = {
     "rclcpp_executor_wait_for_work": ("timeout",),
     "rclcpp_executor_execute": ("handle",),
     "gate_release": (*_RELEASE.split(), "dropped", "moved"),
-    "asynchronous_send": ("tid", "rmw_publisher_handle", "timestamp", "outcome", "duration"),
+    "asynchronous_send": ("rmw_publisher_handle", "timestamp", "outcome", "duration"),
     "machine_stall": ("duration",),
 }
 """Event names and the order of their fields; an event's number is its place in this list."""
 
-WIDTH = 14  # event number, time, and up to twelve fields
+WIDTH = 15  # event number, time, thread, and up to twelve fields
 
 ABSENT = -1
 """Stands for null in fields that may be."""
@@ -119,12 +120,13 @@ class EventLog:
         return handle, rmw_handle
 
     def point(self, event: str) -> Callable[..., None]:
-        """A function of (time, *fields) that records one event; fields as in :data:`LAYOUT`."""
+        """A function of (time, *fields) that records one event of its thread; fields as in
+        :data:`LAYOUT`."""
         number = list(LAYOUT).index(event)
         extend = self.rows.extend
-        padding = (0,) * (WIDTH - 2 - len(LAYOUT[event]))
+        padding = (0,) * (WIDTH - 3 - len(LAYOUT[event]))
 
         def record(time_ns: int, *fields: int) -> None:
-            extend((number, time_ns, *fields, *padding))
+            extend((number, time_ns, get_native_id(), *fields, *padding))
 
         return record

@@ -9,6 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 BLOCK = 1024
+_DATA, _STEP_NS = bytes(16_384), 30_000
+"""Bytes for whose checksum the lock is released, and longer than that takes."""
 
 
 def draw(
@@ -72,9 +74,14 @@ class ExecutionTimes:
         return self._values.pop()
 
 
-def spend(cpu_ns: int, since_ns: int) -> None:
-    """Compute until this thread has used ``cpu_ns`` since its CPU clock showed ``since_ns``."""
+def spend(cpu_ns: int, since_ns: int, *, beside_others: bool = False) -> None:
+    """Compute until this thread has used ``cpu_ns`` since its CPU clock showed ``since_ns``.
+
+    ``beside_others``: without the interpreter's lock, so that other threads compute meanwhile.
+    """
     clock = time.thread_time_ns
     until = since_ns + cpu_ns
+    while beside_others and clock() < until - _STEP_NS:
+        zlib.crc32(_DATA)
     while clock() < until:
         pass

@@ -5,6 +5,11 @@ is ready, take a snapshot of all that is, then run it to the end: timers first, 
 each in the order of registration and each at most once. What becomes ready meanwhile waits for the
 next snapshot. A timer that missed whole periods fires once and keeps its phase.
 
+With several threads it is as rclcpp's `MultiThreadedExecutor` (Jazzy): one of them at a time takes
+the next of the snapshot, or waits if none is left; the others wait for their turn. Callbacks of a
+mutually exclusive group run one at a time: while one does, the others are no part of a snapshot,
+and when it is done, the thread that waits looks again.
+
 **Synchroniser** (message_filters). Each input has a subscription and a callback of its own. The
 callback that completes a set, of the oldest message of every input, computes and publishes; the
 others only leave their message.
@@ -61,6 +66,7 @@ class Timer:
     period_ns: int
     callback: Callable[[], None]
     due_ns: int = 0
+    group: str | None = None  # that it is alone in
 
     def call(self, now_ns: int) -> None:
         """Move on to the next expiry after ``now_ns``, as `rcl_timer_call` does."""
@@ -77,6 +83,10 @@ class SubscriptionEntity:
     rmw_handle: int
     subscription: Subscription
     callback: Callable[[Message], None]
+    group: str | None = None  # that it is alone in
+
+
+Entity: TypeAlias = Timer | SubscriptionEntity
 
 
 IDLE_NS = 500_000_000
@@ -84,9 +94,9 @@ IDLE_NS = 500_000_000
 
 
 class Executor:
-    """Runs the callbacks of one process on the calling thread."""
+    """Runs the callbacks of one process on the calling thread, and on ``threads`` − 1 others."""
 
-    def __init__(self, participant: Any, log: EventLog) -> None:
+    def __init__(self, participant: Any, log: EventLog, threads: int = 1) -> None:
         self.timers: list[Timer] = []
         self.subscriptions: list[SubscriptionEntity] = []
         self.backlogs: list[Callable[[], bool]] = []
@@ -100,6 +110,14 @@ class Executor:
         self._execute = log.point("rclcpp_executor_execute")
         takes = map(log.point, ("rmw_take", "rcl_take", "rclcpp_take"))
         self._rmw_take, self._rcl_take, self._rclcpp_take = takes
+        self._turn = threading.Lock()
+        self._snapshot: deque[Entity] = deque()
+        self._busy: set[str] = set()  # groups
+        self._begin: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
+        self._others: list[threading.Thread] = []
+        for _ in range(1, threads):  # they exist before they run: their priorities have to be set
+            self._others.append(threading.Thread(target=self._join_in, daemon=True))
+            self._others[-1].start()
 
     def end_early(self, *_: object) -> None:
         """A signal's handler: the executor ends when it next looks."""
@@ -115,26 +133,62 @@ class Executor:
         Timers expire up to ``last_timer_ns`` only, so that what they began can be completed. What
         a callback has taken beyond its own message, its backlog, is worked off first.
         """
-        while (now := monotonic_ns()) < stop_ns and not self.over:
-            more = [work_off() for work_off in self.backlogs]
-            due = [timer.due_ns for timer in self.timers if timer.due_ns <= last_timer_ns]
-            timeout = 0 if any(more) else max(0, min([stop_ns, now + IDLE_NS, *due]) - now)
-            self._wait_for_work(now, timeout)
-            self._wait_set.wait(timeout)
-            now = min(monotonic_ns(), last_timer_ns)
-            timers = [timer for timer in self.timers if timer.due_ns <= now]
-            subscriptions = [entity for entity in self.subscriptions if entity.subscription.ready()]
-            for timer in timers:
-                timer.call(self._chosen(timer.handle))
-                timer.callback()
-            for entity in subscriptions:
-                self._chosen(entity.handle)
-                message = entity.subscription.take()
-                if message is None:
-                    self._rmw_take(monotonic_ns(), entity.rmw_handle, id(message), 0, 0)
-                    continue
+        for _ in self._others:
+            self._begin.put((stop_ns, last_timer_ns))
+        self._spin(stop_ns, last_timer_ns)
+        for other in self._others:
+            other.join()
+
+    def _join_in(self) -> None:
+        self._spin(*self._begin.get())
+
+    def _spin(self, stop_ns: int, last_timer_ns: int) -> None:
+        while (entity := self._next(stop_ns, last_timer_ns)) is not None:
+            if isinstance(entity, Timer):
+                entity.callback()
+            elif (message := entity.subscription.take()) is None:
+                self._rmw_take(monotonic_ns(), entity.rmw_handle, id(message), 0, 0)
+            else:
                 self.record_take(entity.rmw_handle, message)
                 entity.callback(message)
+            if entity.group is not None:
+                self._busy.discard(entity.group)
+                self._guard.set(True)
+
+    def _next(self, stop_ns: int, last_timer_ns: int) -> Entity | None:
+        """What this thread executes next, waited for; None at the end."""
+        with self._turn:
+            while True:
+                while self._snapshot:
+                    entity = self._snapshot.popleft()
+                    if entity.group not in self._busy:
+                        now = self._chosen(entity.handle)
+                        if isinstance(entity, Timer):
+                            entity.call(now)
+                        if entity.group is not None:
+                            self._busy.add(entity.group)
+                        return entity
+                if monotonic_ns() >= stop_ns or self.over:
+                    return None
+                self._wait(stop_ns, last_timer_ns)
+
+    def _wait(self, stop_ns: int, last_timer_ns: int) -> None:
+        """Wait until something is ready, or a group is free again, and take a snapshot."""
+        more, now = [work_off() for work_off in self.backlogs], monotonic_ns()
+        free = [timer for timer in self.timers if timer.group not in self._busy]
+        due = [timer.due_ns for timer in free if timer.due_ns <= last_timer_ns]
+        timeout = 0 if any(more) else max(0, min([stop_ns, now + IDLE_NS, *due]) - now)
+        for entity in self.subscriptions if self._others else ():
+            busy, condition = entity.group in self._busy, entity.subscription.condition
+            (self._wait_set.detach if busy else self._wait_set.attach)(condition)
+        self._wait_for_work(now, timeout)
+        self._wait_set.wait(timeout)
+        if self._others:
+            self._guard.set(False)
+        now = min(monotonic_ns(), last_timer_ns)
+        ready: list[Entity] = [timer for timer in self.timers if timer.due_ns <= now]
+        ready += [one for one in self.subscriptions if one.subscription.ready()]
+        self._snapshot.extend(one for one in ready if one.group not in self._busy)
 
     def _chosen(self, handle: int) -> int:
         """Record that a timer or subscription is executed next; when that is (ns)."""
@@ -244,8 +298,8 @@ def noting_sends(record: Callable[..., None], rmw_handle: int) -> Note:
     """What records the sends of one publisher, whichever thread they happen in."""
 
     def note(time_ns: int, source_timestamp: int, outcome: str, duration_ns: int) -> None:
-        tid, number = threading.get_native_id(), number_of("outcome", outcome)
-        record(time_ns, tid, rmw_handle, source_timestamp, number, duration_ns)
+        number = number_of("outcome", outcome)
+        record(time_ns, rmw_handle, source_timestamp, number, duration_ns)
 
     return note
 
@@ -255,7 +309,13 @@ Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]
 start; gives what is published on each topic, in their order. Nothing: nothing is published."""
 
 
-def spending(times: ExecutionTimes, templates: Sequence[bytes], announced: list[bytes]) -> Work:
+def spending(
+    times: ExecutionTimes,
+    templates: Sequence[bytes],
+    announced: list[bytes],
+    *,
+    beside_others: bool = False,
+) -> Work:
     """Spend the next execution time; the first message's stamp is passed on to all topics.
 
     ``templates`` has the data for each topic. What is ``announced`` is published in turn instead.
@@ -267,7 +327,7 @@ def spending(times: ExecutionTimes, templates: Sequence[bytes], announced: list[
     def work(messages: Sequence[dds.Message], wall_ns: int, cpu_ns: int) -> Sequence[bytes]:
         stamp = (origin_of(messages[0].payload) or 0) if messages else wall_ns
         made = [next(announcements, None) or dds.data_message(one, stamp) for one in templates]
-        spend(times.next(), cpu_ns)
+        spend(times.next(), cpu_ns, beside_others=beside_others)
         return made
 
     return work

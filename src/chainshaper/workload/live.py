@@ -21,7 +21,7 @@ from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import LIBRARIES
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import Scheduling, apply_scheduling, check_cores, may_use_fifo
-from chainshaper.linux.threads import foreign_realtime_processes, list_threads
+from chainshaper.linux.threads import Thread, foreign_realtime_processes, list_threads
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -270,7 +270,11 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
             discovery_ns=DISCOVERY_NS,
             origin_phase=origin_timer(application)[1].phase_ns,
             delivery_core=dds.core if realtime and dds.core != executor.core else None,
-            callbacks=[callback.model_dump() for callback in node.callbacks],
+            callbacks=[
+                {**callback.model_dump(), "group": node.exclusive_group(callback)}
+                for callback in node.callbacks
+            ],
+            threads=node.threads,
             topics={topic: application.topic(topic).model_dump() for topic in writers},
             announced=sorted(application.announced()),
             expected={topic: (writers[topic], readers[topic]) for topic in writers},
@@ -293,10 +297,11 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
     """Give every thread its core and, where permitted, its SCHED_FIFO priority."""
     for name, child in nodes.items():
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
-        for thread in list_threads(child.pid):
+        cores = iter(application.cores_of(name))
+        for thread in _threads_of(child):
             core, priority = dds.core, dds.priority
             if thread.role == "executor":
-                core, priority = executor.core, executor.priority
+                core, priority = next(cores), executor.priority
             elif thread.role == "publisher":
                 # Below the executor: it shares the writer's lock with it, and may spin on it.
                 core, priority = executor.core, max(1, executor.priority - 1)
@@ -349,8 +354,20 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
             **{name: getattr(thread, name) for name in SHOWN},
         )
         for child, node in children
-        for thread in list_threads(child.pid)
+        for thread in _threads_of(child)
     )
+
+
+def _threads_of(child: Child) -> list[Thread]:
+    """The threads of a process. Those with the name of the main one execute with it, as rclcpp's
+    of a multi-threaded executor do: here, no other has that name."""
+    threads = list_threads(child.pid)
+    return [
+        replace(one, role="executor")
+        if (one.role, one.comm) == ("unknown", threads[0].comm)
+        else one
+        for one in threads
+    ]
 
 
 @dataclass(frozen=True)
@@ -358,7 +375,7 @@ class ProcessLog:
     """What one process recorded: rows of :mod:`~chainshaper.workload.event_log`, and objects."""
 
     pid: int
-    core: int | None  # the one its executor was pinned to
+    core: int | None  # the one its executor was pinned to, if it was one
     rows: bytes
     objects: tuple[dict[str, Any], ...]
     modes: tuple[str, ...] = ()  # that its gate knows
@@ -373,13 +390,13 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
         rows = rows[rows[:, 1] >= from_ns]
-        common = {"pid": log.pid, "tid": log.pid, "cpu": log.core}  # executors: the main thread
+        common = {"pid": log.pid, "tid": log.pid, "cpu": log.core}  # objects: the main thread
         found: list[tuple[str, pl.DataFrame]] = []
         for number, (name, fields) in enumerate(LAYOUT.items()):
             mine = rows[rows[:, 0] == number]
             if len(mine):
-                own = mine[:, 1 : 2 + len(fields)]
-                found.append((name, pl.DataFrame(own, schema=["time", *fields])))
+                own = mine[:, 1 : 3 + len(fields)]
+                found.append((name, pl.DataFrame(own, schema=["time", "tid", *fields])))
         for name in dict.fromkeys(created["event"] for created in log.objects):
             own_objects = [created for created in log.objects if created["event"] == name]
             found.append((name, pl.DataFrame(own_objects)))
@@ -415,10 +432,11 @@ def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl
 def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
     answer = child.hear(ANSWER_S)
     rows = child.hear_bytes(answer["bytes"], ANSWER_S)
-    core = application.scheduling_of(name).core
+    core, *others = {*application.cores_of(name)}
     modes = [cb.gate.modes for cb in application.nodes[name].callbacks if cb.gate is not None]
     names = tuple(modes[0].bands) if modes and modes[0] is not None else ()
-    return ProcessLog(child.pid, core, rows, tuple(answer["objects"]), names)
+    known = None if others else core
+    return ProcessLog(child.pid, known, rows, tuple(answer["objects"]), names)
 
 
 def _notes(

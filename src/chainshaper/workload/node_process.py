@@ -7,6 +7,7 @@ it is locked into memory.
 
 import os
 import signal
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -29,6 +30,7 @@ from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
 from chainshaper.workload.launcher import ENOUGH, receive, send, send_events, wait_for_leave
 
+NEVER_S = 1e6
 Body: TypeAlias = Callable[[dds.Message], None]
 
 
@@ -67,7 +69,8 @@ class NodeProcess:
         self.spec = spec
         self.log = EventLog()
         self.participant = dds.Participant(spec["domain"])
-        self.executor = executor.Executor(self.participant, self.log)
+        sys.setswitchinterval(NEVER_S)  # the kernel alone decides which thread of an executor runs
+        self.executor = executor.Executor(self.participant, self.log, spec["threads"])
         self.publishers: dict[str, dds.Publisher] = {}
         self.subscriptions: list[tuple[str, dds.Subscription]] = []
         self.publisher_thread: executor.PublisherThread | None = None
@@ -99,15 +102,15 @@ class NodeProcess:
                 handle = self.log.callback(f"message_filters::{symbol}.{number}")
                 complete = partial(synchroniser.add, number)
                 body = self._working_body(handle, work, publishers, complete)
-                self._subscribe(handle, topic, body)
+                self._subscribe(handle, topic, body, callback["group"])
             return
         handle = self.log.callback(symbol)
         body = self._working_body(handle, work, publishers)
         if topic is not None:
-            self._subscribe(handle, topic, body)
+            self._subscribe(handle, topic, body, callback["group"])
             return
-        period = callback["timer_ns"]
-        timer = executor.Timer(self.log.timer(handle, period), period, body)
+        period, group = callback["timer_ns"], callback["group"]
+        timer = executor.Timer(self.log.timer(handle, period), period, body, group=group)
         self.executor.timers.append(timer)
         self.first_due.append((timer, callback["phase_ns"]))
 
@@ -121,12 +124,14 @@ class NodeProcess:
         times = ExecutionTimes(callback["execution"], self.spec["seed"], self.spec["node"], index)
         self.execution_times.append(times)
         announced = [dds.text_message(mode) for mode in callback["announces"]]
-        return executor.spending(times, [publisher.template for publisher in publishers], announced)
+        templates, several = [one.template for one in publishers], self.spec["threads"] > 1
+        return executor.spending(times, templates, announced, beside_others=several)
 
-    def _subscribe(self, handle: int, topic: str, body: Body) -> None:
+    def _subscribe(self, handle: int, topic: str, body: Body, group: str | None = None) -> None:
         subscription, depth = self._subscription(topic), self.spec["topics"][topic]["depth"]
         own = self.log.subscription(handle, topic, depth)
-        self.executor.add_subscription(executor.SubscriptionEntity(*own, subscription, body))
+        entity = executor.SubscriptionEntity(*own, subscription, body, group)
+        self.executor.add_subscription(entity)
 
     def _subscription(self, topic: str, depth: int = 0) -> dds.Subscription:
         qos, text = self.spec["topics"][topic], topic in self.spec["announced"]

@@ -16,7 +16,12 @@ from typing import Any
 
 from chainshaper.values.errors import InputError, OperationError, escape
 from chainshaper.values.files import free_place, open_to_all, write_whole
-from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
+from chainshaper.workload.description import (
+    Application,
+    CallbackDescription,
+    ExecutionTime,
+    NodeDescription,
+)
 
 _TEMPLATES = Path(__file__).parent / "ros_nodes"
 _NAME = re.compile(r"[a-z](_?[a-z0-9])+")  # REP 144
@@ -132,19 +137,24 @@ def _full(name: str) -> str:
 
 
 def _node(application: Application, name: str) -> str:
-    own = (application.scheduling_of(name), application.dds_scheduling_of(name))
-    threads = ", ".join(_list([one.core, one.priority]) for one in own)
-    callbacks = [_callback(application, one) for one in application.nodes[name].callbacks]
+    node, own = application.nodes[name], application.scheduling_of(name)
+    both = [_list([one.core, one.priority]) for one in (own, application.dds_scheduling_of(name))]
+    threads = ", ".join([*both, _list(application.cores_of(name))])
+    callbacks = [_callback(application, node, one) for one in node.callbacks]
     return f"  {{{_text(_full(name))}, {threads}, {{\n    {f',{chr(10)}    '.join(callbacks)}}}}}"
 
 
-def _callback(application: Application, callback: CallbackDescription) -> str:
+def _callback(
+    application: Application, node: NodeDescription, callback: CallbackDescription
+) -> str:
     inputs, outputs = (
         _list(_topic(application, topic) for topic in topics)
         for topics in (callback.inputs, callback.publishes)
     )
     own = (callback.timer_ns or 0, callback.phase_ns, inputs, _execution(callback.execution))
-    return _list([*own, outputs, _list(map(_text, callback.announces))])
+    alone = "true" if callback.group and not node.exclusive_group(callback) else "false"
+    group = _text(callback.group or "")
+    return _list([*own, outputs, _list(map(_text, callback.announces)), group, alone])
 
 
 def _topic(application: Application, name: str) -> str:

@@ -26,10 +26,15 @@ from pathlib import Path
 from threading import Lock
 from typing import Any
 
-import llvmlite.binding as llvm  # type: ignore[import-untyped]
+import numpy as np
 
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import why_distrusted, write_whole
+
+try:
+    import llvmlite.binding as llvm  # type: ignore[import-untyped]
+except ModuleNotFoundError:  # Python interprets the functions (`memory`)
+    llvm = None
 
 __all__ = ["kernel"]
 
@@ -70,13 +75,18 @@ def kernel(module: str, name: str) -> Callable[..., int]:
         _engines.append(engine)
         return int(engine.get_function_address(symbol))
 
+    def interpreted(*numbers: int) -> int:
+        with np.errstate(over="ignore"):  # as machine code computes
+            function = getattr(importlib.import_module(module), name)
+            return int(function(*map(np.int64, numbers)))
+
     def call(*numbers: int) -> int:
         with _loading:
             place = address()
         function = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_int64] * len(numbers))(place)
         return int(function(*numbers))
 
-    return call
+    return interpreted if llvm is None else call
 
 
 @functools.cache

@@ -8,6 +8,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <atomic>
 #include <cerrno>
 #include <chrono>
 #include <cstdio>
@@ -16,7 +17,9 @@
 #include <filesystem>
 #include <fstream>
 #include <functional>
+#include <map>
 #include <memory>
+#include <mutex>
 #include <stdexcept>
 #include <string>
 #include <type_traits>
@@ -50,7 +53,32 @@ rclcpp::QoS lasting(const Topic &topic) {
   return topic.lifespan_ns > 0 ? quality(topic).lifespan(lifespan) : quality(topic);
 }
 
-// What a callback does: spend its time, and pass a stamp on to all its topics.
+void require(bool done, const std::string &what) {
+  if (!done) {
+    throw std::runtime_error{what + " is refused (" + std::strerror(errno) +
+                             "): permit it, or launch with scheduling:=false"};
+  }
+}
+
+void stay_on(pid_t thread, int core) {
+  std::vector<cpu_set_t> cores(8);  // of 1024 each
+  CPU_SET_S(core, cores.size() * sizeof(cpu_set_t), cores.data());
+  require(sched_setaffinity(thread, cores.size() * sizeof(cpu_set_t), cores.data()) == 0,
+          "core " + std::to_string(core));
+}
+
+std::vector<int> cores_in_turn;  // for threads of the executor, each at its first callback
+
+void take_core() {
+  static std::atomic<std::size_t> next{0};
+  thread_local bool taken = false;
+  if (taken || cores_in_turn.empty()) return;
+  taken = true;
+  stay_on(0, cores_in_turn[next++ % cores_in_turn.size()]);
+}
+
+// What a callback does: spend its time, and pass a stamp on to all its topics. Several threads may
+// at once, for callbacks of a reentrant group.
 class Work {
  public:
   Work(rclcpp::Node &node, const Callback &described, ExecutionTimes times)
@@ -66,14 +94,17 @@ class Work {
   }
 
   void run(const Stamp &stamp, std::int64_t since_ns) {
-    for (auto &message : messages_) message.header.stamp = stamp;
-    spend(times_.next(), since_ns);
-    for (std::size_t i = 0; i < outputs_.size(); ++i) outputs_[i]->publish(messages_[i]);
-    if (modes_) {
-      Text mode;
-      mode.data = announces_[turn_++ % announces_.size()];
-      modes_->publish(mode);
-    }
+    take_core();
+    std::unique_lock<std::mutex> alone{mutex_};
+    const auto cpu_ns = times_.next();
+    auto messages = messages_;
+    Text mode;
+    if (modes_) mode.data = announces_[turn_++ % announces_.size()];
+    alone.unlock();
+    for (auto &message : messages) message.header.stamp = stamp;
+    spend(cpu_ns, since_ns);
+    for (std::size_t i = 0; i < outputs_.size(); ++i) outputs_[i]->publish(messages[i]);
+    if (modes_) modes_->publish(mode);
   }
 
  private:
@@ -83,34 +114,38 @@ class Work {
   std::vector<Data> messages_;
   rclcpp::Publisher<Text>::SharedPtr modes_;
   std::size_t turn_{0};
+  std::mutex mutex_;
 };
 
 // `subscribe` takes another type of QoS from Kilted on; a template, for only one of them compiles.
 template <typename F>
-void subscribe(F &filter, rclcpp::Node *node, const Topic &input) {
+void subscribe(F &filter, rclcpp::Node *node, const Topic &input,
+               const rclcpp::SubscriptionOptions &options) {
   if constexpr (std::is_constructible_v<F, rclcpp::Node *, std::string, rclcpp::QoS>) {
-    filter.subscribe(node, input.name, quality(input));
+    filter.subscribe(node, input.name, quality(input), options);
   } else {
-    filter.subscribe(node, input.name, quality(input).get_rmw_qos_profile());
+    filter.subscribe(node, input.name, quality(input).get_rmw_qos_profile(), options);
   }
 }
 
 // Works for a set of the oldest message of every input, with the stamp of the first input's.
 class Synchroniser {
  public:
-  Synchroniser(rclcpp::Node *node, const std::vector<Topic> &inputs, std::shared_ptr<Work> work)
+  Synchroniser(rclcpp::Node *node, const std::vector<Topic> &inputs, std::shared_ptr<Work> work,
+               const rclcpp::SubscriptionOptions &options)
       : inputs_{inputs}, waiting_(inputs.size()), work_{std::move(work)} {
     for (std::size_t i = 0; i < inputs.size(); ++i) {
       filters_.push_back(std::make_unique<Filter>());
       filters_[i]->registerCallback(std::function<void(const Data::ConstSharedPtr &)>(
           [this, i](const Data::ConstSharedPtr &message) { add(i, message->header.stamp); }));
-      subscribe(*filters_[i], node, inputs[i]);
+      subscribe(*filters_[i], node, inputs[i], options);
     }
   }
 
  private:
   void add(std::size_t i, const Stamp &stamp) {
     const auto since_ns = used_ns();
+    std::unique_lock<std::mutex> alone{mutex_};
     waiting_[i].push_back(stamp);
     if (waiting_[i].size() > inputs_[i].depth) waiting_[i].pop_front();
     for (const auto &stamps : waiting_) {
@@ -118,6 +153,7 @@ class Synchroniser {
     }
     const Stamp first = waiting_[0].front();
     for (auto &stamps : waiting_) stamps.pop_front();
+    alone.unlock();
     work_->run(first, since_ns);
   }
 
@@ -125,6 +161,7 @@ class Synchroniser {
   std::vector<std::deque<Stamp>> waiting_;
   std::shared_ptr<Work> work_;
   std::vector<std::unique_ptr<Filter>> filters_;
+  std::mutex mutex_;
 };
 
 using Timer = std::pair<std::int64_t, rclcpp::TimerBase::SharedPtr>;  // when it is armed
@@ -139,14 +176,18 @@ class DescribedNode : public rclcpp::Node {
     for (const auto &callback : described.callbacks) {
       ExecutionTimes times{callback.execution, seed, number, index++};
       const auto work = std::make_shared<Work>(*this, callback, std::move(times));
+      rclcpp::SubscriptionOptions options;
+      options.callback_group = group_of(callback);
       if (callback.period_ns > 0) {
         add_timer(callback, work, start_ns);
       } else if (callback.inputs.size() > 1) {
-        synchronisers_.push_back(std::make_unique<Synchroniser>(this, callback.inputs, work));
+        synchronisers_.push_back(
+            std::make_unique<Synchroniser>(this, callback.inputs, work, options));
       } else {
         const Topic &input = callback.inputs[0];
         const auto run = [work](const Data &message) { work->run(message.header.stamp, used_ns()); };
-        subscriptions_.push_back(create_subscription<Data>(input.name, quality(input), run));
+        subscriptions_.push_back(
+            create_subscription<Data>(input.name, quality(input), run, options));
       }
     }
   }
@@ -163,34 +204,41 @@ class DescribedNode : public rclcpp::Node {
   }
 
  private:
+  rclcpp::CallbackGroup::SharedPtr group_of(const Callback &callback) {
+    using Type = rclcpp::CallbackGroupType;
+    if (callback.group.empty()) return nullptr;
+    auto &group = groups_[callback.group];
+    if (!group) {
+      group = create_callback_group(callback.reentrant ? Type::Reentrant : Type::MutuallyExclusive);
+    }
+    return group;
+  }
+
   void add_timer(const Callback &callback, std::shared_ptr<Work> work, std::int64_t start_ns) {
     const auto period_ns = callback.period_ns, now = clock_ns(CLOCK_MONOTONIC);
-    const auto timer = create_wall_timer(std::chrono::nanoseconds{period_ns}, [work] {
+    const auto run = [work] {
       const auto since_ns = used_ns(), wall_ns = clock_ns(CLOCK_REALTIME);
       Stamp stamp;
       stamp.sec = static_cast<std::int32_t>(wall_ns / 1'000'000'000);
       stamp.nanosec = static_cast<std::uint32_t>(wall_ns % 1'000'000'000);
       work->run(stamp, since_ns);
-    });
+    };
+    const auto timer =
+        create_wall_timer(std::chrono::nanoseconds{period_ns}, run, group_of(callback));
     timer->cancel();  // it expires first a period after it was armed
     const auto armed_ns = start_ns + callback.phase_ns - period_ns;
     const auto missed = armed_ns < now ? (now - armed_ns) / period_ns + 1 : 0;
     timers_.emplace_back(armed_ns + missed * period_ns, timer);
   }
 
+  std::map<std::string, rclcpp::CallbackGroup::SharedPtr> groups_;
   std::vector<Timer> timers_;
   std::vector<rclcpp::SubscriptionBase::SharedPtr> subscriptions_;
   std::vector<std::unique_ptr<Synchroniser>> synchronisers_;
 };
 
-void require(bool done, const std::string &what) {
-  if (!done) {
-    throw std::runtime_error{what + " is refused (" + std::strerror(errno) +
-                             "): permit it, or launch with scheduling:=false"};
-  }
-}
-
-// This thread is the executor, the others are those of DDS; LTTng's stay as they are.
+// This thread is the executor, from which its others inherit; the rest are those of DDS. LTTng's
+// stay as they are.
 void schedule(const Described &described) {
   for (const auto &task : std::filesystem::directory_iterator{"/proc/self/task"}) {
     std::string name;
@@ -201,11 +249,9 @@ void schedule(const Described &described) {
     sched_param parameters{};
     parameters.sched_priority = wanted.priority;
     require(sched_setscheduler(thread, SCHED_FIFO, &parameters) == 0, "SCHED_FIFO");
-    std::vector<cpu_set_t> cores(8);  // of 1024 each
-    CPU_SET_S(wanted.core, cores.size() * sizeof(cpu_set_t), cores.data());
-    require(sched_setaffinity(thread, cores.size() * sizeof(cpu_set_t), cores.data()) == 0,
-            "core " + std::to_string(wanted.core));
+    stay_on(thread, wanted.core);
   }
+  cores_in_turn = described.cores;
 }
 
 int main(int argc, char **argv) {
@@ -216,10 +262,16 @@ int main(int argc, char **argv) {
       const auto start_ns = std::stoll(words[3]);
       const auto node = std::make_shared<DescribedNode>(described, std::stoull(words[2]), start_ns);
       if (words[4] == "true") schedule(described);
-      rclcpp::executors::SingleThreadedExecutor executor;
-      executor.add_node(node);
-      node->start(executor);
-      executor.spin();
+      std::unique_ptr<rclcpp::Executor> executor;
+      if (const auto threads = described.cores.size(); threads > 1) {
+        executor = std::make_unique<rclcpp::executors::MultiThreadedExecutor>(
+            rclcpp::ExecutorOptions{}, threads);
+      } else {
+        executor = std::make_unique<rclcpp::executors::SingleThreadedExecutor>();
+      }
+      executor->add_node(node);
+      node->start(*executor);
+      executor->spin();
     } catch (const std::exception &error) {
       std::fprintf(stderr, "%s: %s\n", words[1].c_str(), error.what());
       return 1;

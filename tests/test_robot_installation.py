@@ -1,0 +1,120 @@
+"""What a robot needs runs with what `pip install chainshaper` brings, and nothing of the extras.
+
+A real environment: the interpreter below this one's, and a folder with the packages on which the
+core depends, by their own metadata. Nothing else is there to be imported.
+"""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+from small_chain import small_chain_text
+
+import chainshaper as cs
+from chainshaper.sources import open_source
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    tomllib = pytest.importorskip("tomli")
+
+ROOT = Path(__file__).parents[1]
+
+
+def _named(requirement: str) -> str | None:
+    """The distribution that a requirement asks for, None if it is one of an extra's."""
+    return None if "extra ==" in requirement else re.split(r"[^\w.-]", requirement)[0].lower()
+
+
+@pytest.fixture(scope="module")
+def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of links to the packages that the core needs, and those need."""
+    folder = tmp_path_factory.mktemp("core")
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    wanted, known = [_named(one) for one in project["dependencies"]], set[str]()
+    while wanted:
+        name = wanted.pop()
+        if name is None or name in known:
+            continue
+        known.add(name)
+        try:
+            found = metadata.distribution(name)
+        except metadata.PackageNotFoundError:  # for another Python or processor
+            continue
+        wanted += [_named(one) for one in found.requires or ()]
+        for top in {file.parts[0] for file in found.files or ()} - {"..", "__pycache__"}:
+            if not (folder / top).exists():
+                (folder / top).symlink_to(Path(str(found.locate_file(top))))
+    assert not known & {"numba", "llvmlite", "scipy", "matplotlib"}
+    return folder
+
+
+def _run(core: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    paths = os.pathsep.join([str(Path(cs.__file__).parents[1]), str(core)])
+    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
+    python = getattr(sys, "_base_executable", sys.executable)
+    command = [python, "-m", "chainshaper", *words]
+    return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+
+
+def test_measuring_planning_and_simulating_give_what_they_give_compiled(
+    core: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "app.yaml").write_text(small_chain_text())
+    words = ["simulate", str(tmp_path / "app.yaml"), "--cycles", "40", "-o"]
+    made = _run(core, *words, str(tmp_path / "robot"))
+    assert made.returncode == 0, made.stderr
+    cs.simulate(cs.load_application(tmp_path / "app.yaml"), tmp_path / "here", cycles=40)
+    for table in (tmp_path / "here").glob("*.parquet"):
+        assert table.read_bytes() == (tmp_path / "robot" / table.name).read_bytes()
+    latency = _run(core, "latency", str(tmp_path / "robot"), "--json")
+    here = cs.measure_latency(cs.open_recording(tmp_path / "here"))
+    assert json.loads(latency.stdout)["max_ns"] == here.analysis.statistics.max_ns
+    plan = _run(core, "plan", str(tmp_path / "robot"), "-o", str(tmp_path / "plan.yaml"))
+    assert plan.returncode == 0, plan.stderr
+    trace = [sys.executable, str(ROOT / "examples/write_trace.py"), str(tmp_path / "trace")]
+    subprocess.run(trace, check=True, capture_output=True, cwd=ROOT)
+    read = _run(core, "info", str(tmp_path / "trace"), "--json")
+    here_too = open_source(tmp_path / "trace")
+    counted = {name: table.height for name, table in here_too.events.items() if table.height}
+    events = json.loads(read.stdout)["events"]
+    assert {name.removeprefix("ros2:"): count for name, count in events.items()} == counted
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "said"),
+    [
+        (["doctor", "--watch", "200ms"], 0, "core 0"),
+        (["threads"], 0, "node"),
+        (["status"], 0, ""),
+        (["watch", "--json", "--chain", "/a../b", "--", "sleep", "1"], 0, ""),
+        (["apply", "no_such_plan.yaml"], 2, "no_such_plan.yaml"),
+        (["record", "--source", "preload", "--duration", "500ms", "-o", "REC", "--", "sleep", "1"],
+         1, "no process"),
+    ],
+    ids=lambda words: words[0] if isinstance(words, list) else "",
+)  # fmt: skip
+def test_what_runs_on_a_robot_needs_no_extra(
+    core: Path, tmp_path: Path, words: list[str], code: int, said: str
+) -> None:
+    finished = _run(core, *[str(tmp_path / one) if one == "REC" else one for one in words])
+    assert "Traceback" not in finished.stderr
+    assert "chainshaper[" not in finished.stderr
+    assert finished.returncode == code, finished.stderr
+    assert said in finished.stdout + finished.stderr
+
+
+def test_figures_name_the_extra_that_draws_them(core: Path, tmp_path: Path) -> None:
+    (tmp_path / "app.yaml").write_text(small_chain_text())
+    cs.simulate(cs.load_application(tmp_path / "app.yaml"), tmp_path / "rec", cycles=20)
+    recordings = [str(tmp_path / "rec")] * 2
+    refused = _run(core, "compare", *recordings, "--figures", str(tmp_path / "figures"))
+    assert refused.returncode == 3
+    assert refused.stderr.strip().splitlines()[-1] == (
+        "error: this needs matplotlib, which is not installed: pip install 'chainshaper[analysis]'"
+    )
