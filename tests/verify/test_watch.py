@@ -34,6 +34,7 @@ from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library, event_names
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.watch import SECOND, Seen, Watch, exporting
@@ -309,10 +310,20 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         assert process.poll() is None, "what is watched runs on"
         assert objects[-1]["chains"][0]["spans"]["hour"]["count"] > 5
         assert objects[-1]["processes"] == {str(process.pid): "/first, /second"}
-        shown = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+        (tmp_path / "budget.yaml").write_text(
+            f"format: 1\nchains: [{{chain: {CHAIN}, maximum: 1us, jitter: 10s}}]\n"
+        )
+        (tmp_path / "broken").mkdir()
+        words += ["--budget", str(tmp_path / "budget.yaml"), "--recorder", str(tmp_path / "broken")]
+        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+        shown = subprocess.Popen(words, **pipes)  # type: ignore[call-overload]
         time.sleep(6)
         shown.send_signal(signal.SIGINT)
-        text, _ = shown.communicate(timeout=20)
+        text, said = shown.communicate(timeout=20)
+    assert f"{CHAIN}: maximum" in said, "the limit that is broken, once"
+    assert said.count("budget 1us") == 1
+    (broken,) = (tmp_path / "broken").glob("watch-*")
+    assert open_recording(broken).info.chain == CHAIN
     assert re.search(rf"{CHAIN}: \d\d\.\d\d cycles a second", text)
     assert "incomplete" in text
     assert "/second" in text

@@ -272,9 +272,14 @@ def watch(
         "--longest DURATION", "What takes longer counts as incomplete.", 2_000_000_000
     ),
     every: int = opt.option("--every DURATION", "How often to look.", 1_000_000_000),
+    budget: Path | None = opt.option(
+        "--budget FILE",
+        "What chains have to keep to in the last minute: a limit that breaks is said, and the last"
+        " ten seconds are written.",
+    ),
     recorder: Path = opt.option(
         "--recorder DIR",
-        "Where Ctrl-\\ writes the last ten seconds, a recording in a folder named by its time.",
+        "Where these are written, also by Ctrl-\\: recordings in folders named by their time.",
         Path(),
     ),
     metrics: int | None = opt.option(
@@ -304,6 +309,7 @@ def watch(
     from chainshaper.planning import load_application_plan
     from chainshaper.reporting.overviews import watch_tables
     from chainshaper.sources.preload import installed_library, preloading
+    from chainshaper.verify.budgets import Budget, broken_limits, load_budget
     from chainshaper.verify.watch import Watch, exporting
 
     if environment:
@@ -311,9 +317,14 @@ def watch(
         return
     known = None if plan is None else load_application_plan(plan)
     specs = () if known is None else (one.chain.spec for one in known.chains)
-    chains = chain or [spec for spec in specs if spec]
+    limits = Budget() if budget is None else load_budget(budget)
+    chains = chain or [spec for spec in specs if spec] or [one.chain for one in limits.chains]
     if not chains:
-        raise InputError("no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan")
+        raise InputError(
+            "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget"
+        )
+    if strange := [one.chain for one in limits.chains if one.chain not in chains]:
+        raise InputError(f"{budget}: {strange[0]} is not watched: add --chain {strange[0]}")
     if command:
         check_command(command)
     with out.stop_on_signals() as stop, ExitStack() as until:
@@ -327,7 +338,7 @@ def watch(
         asked = until.enter_context(out.asked_for(signal.SIGQUIT))
         watched = Watch(chains, users=run_users(user or []), plan=known, longest_ns=longest)
         publish = _publisher(watched, until) if diagnostics else lambda _: None
-        next_look = time.monotonic_ns() + every
+        next_look, breaks = time.monotonic_ns() + every, set[tuple[str, str]]()
         while not stop.wait(0.1) and (started is None or started.poll() is None):
             watched.read()
             if asked.is_set():
@@ -337,8 +348,14 @@ def watch(
                 next_look += every
                 export(seen := watched.look())
                 publish(seen)
+                broken = broken_limits(limits, seen)
+                new = [one.text for one in broken if (one.where, one.what) not in breaks]
+                breaks = {(one.where, one.what) for one in broken}
+                if new:
+                    out.say("; ".join(new))
+                    _save(watched, recorder)
                 if json:
-                    out.print_json_line(seen.as_json())
+                    out.print_json_line(seen.as_json() | {"broken": [one.text for one in broken]})
                 else:
                     show(watch_tables(seen))
 

@@ -67,7 +67,8 @@ def _tool_checks() -> Iterator[Check]:
     yield _bpftrace()
     for name, purpose, remedy in (
         ("lttng", "recording ROS 2 with LTTng", "apt install lttng-tools"),
-        ("cc", "recording ROS 2 with `--source preload`", "apt install gcc libc6-dev"),
+        ("cc", "recording by the library in front of ROS 2", "apt install gcc libc6-dev"),
+        ("c++", "plans with `--publication in-process`", "apt install g++"),
         ("ros2", "shaping ROS 2 applications", "install ROS 2, and source its setup.bash"),
     ):
         yield _check(name, purpose, shutil.which(name), "absent", "not found", remedy)

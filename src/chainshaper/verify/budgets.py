@@ -15,7 +15,7 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol
 from xml.etree import ElementTree
 
 import polars as pl
@@ -24,7 +24,13 @@ from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.flow import DataFlow
-from chainshaper.analysis.latency import PERCENTILES, LatencyAnalysis, callback_statistics
+from chainshaper.analysis.latency import (
+    PERCENTILES,
+    LatencyAnalysis,
+    LatencyStatistics,
+    callback_statistics,
+    latency_statistics,
+)
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
@@ -35,10 +41,14 @@ from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
 from chainshaper.verify.measure import chain_of, hop_breakdown, measure_latency
 
+if TYPE_CHECKING:
+    from chainshaper.verify.watch import Seen
+
 __all__ = [
     "Budget",
     "Judged",
     "Verdict",
+    "broken_limits",
     "check_budget",
     "check_budgets",
     "junit_report",
@@ -222,14 +232,16 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         except InputError as error:
             found += (
                 Judged(name, chain.chain, what, limit, None, because=str(error))
-                for what, limit, _ in _chain_limits(chain)
+                for what, limit, _ in _chain_limits(chain, None, None)
             )
             continue
         calm, parts = _calm(analysis), hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, parts))
         because = _from_where(hops, parts)
-        for what, limit, of in _chain_limits(chain):
-            one = Judged(name, chain.chain, what, limit, of(analysis), of(calm))
+        every = _chain_limits(chain, analysis.statistics, _missing(analysis))
+        undisturbed = _chain_limits(chain, calm.statistics, _missing(calm))
+        for (what, limit, value), (_, _, at_rest) in zip(every, undisturbed, strict=True):
+            one = Judged(name, chain.chain, what, limit, value, at_rest)
             found.append(one if one.met else replace(one, because=because))
         found += hops
     rows = {
@@ -275,19 +287,32 @@ def _checked(
         return [Judged(str(path), str(path), "its events", 0, None, because=str(error))]
 
 
-_Figure = Callable[[LatencyAnalysis], float | None]
+def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
+    """What chains break of their limits in the last minute; one that does not run breaks none."""
+    of_chain = {one.chain: one.spans["minute"] for one in seen.chains}
+    found = []
+    for chain in budget.chains:
+        figures = of_chain.get(chain.chain)
+        if figures is not None and (every := figures.count + figures.incomplete):
+            missing = ((figures.late or 0) + figures.incomplete) / every
+            limits = _chain_limits(chain, figures, missing)
+            found += [Judged("now", chain.chain, *one) for one in limits]
+    return [one for one in found if not one.met]
 
 
-def _chain_limits(chain: ChainBudget) -> Iterator[tuple[str, float, _Figure]]:
-    """The limits that a chain has, and how their figures are taken."""
+def _chain_limits(
+    chain: ChainBudget, figures: LatencyStatistics | None, missing: float | None
+) -> Iterator[tuple[str, float, float | None]]:
+    """The limits that a chain has, each with what was found."""
+    found = figures or latency_statistics([])
     if chain.maximum_ns is not None:
-        yield "maximum", chain.maximum_ns, lambda found: found.statistics.max_ns
+        yield "maximum", chain.maximum_ns, found.max_ns
     for which, limit in chain.percentiles.items():
-        yield f"p{which}", limit, lambda f, w=which: f.statistics.percentiles_ns.get(w)  # type: ignore[misc]
+        yield f"p{which}", limit, found.percentiles_ns.get(which)
     if chain.jitter_ns is not None:
-        yield "jitter", chain.jitter_ns, lambda found: found.statistics.jitter_ns
+        yield "jitter", chain.jitter_ns, found.jitter_ns
     if chain.missing is not None:
-        yield "missing", chain.missing, _missing
+        yield "missing", chain.missing, missing
 
 
 def _calm(analysis: LatencyAnalysis) -> LatencyAnalysis:
