@@ -255,7 +255,7 @@ class NodeDescription(Part):
     priority: int | None = Field(default=None, ge=1, le=97)
     dds_priority: int | None = Field(default=None, ge=1, le=97)
     executor: Literal["single_threaded", "multi_threaded"] = "single_threaded"
-    threads: int = Field(default=1, ge=2, le=MOST_THREADS)
+    threads: int = Field(default=1, ge=1, le=MOST_THREADS)
     cores: tuple[Annotated[int, Field(ge=0, le=MOST_CORES)], ...] = ()
     callback_groups: dict[str, Literal["mutually_exclusive", "reentrant"]] = Field(
         default_factory=dict
@@ -263,7 +263,8 @@ class NodeDescription(Part):
 
     @model_validator(mode="after")
     def _executor_exists(self) -> "NodeDescription":
-        several = {"threads", "cores", "callback_groups"} & self.model_fields_set
+        several = {name for name in ("cores", "callback_groups") if getattr(self, name)}
+        several |= {"threads"} if self.threads > 1 else set()
         if self.executor == "single_threaded" and several:
             raise wrong_value(
                 "is of several threads: write `executor: multi_threaded`, or remove it",
