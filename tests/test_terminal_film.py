@@ -29,4 +29,4 @@ def test_the_film_of_the_readme_shows_verbs_that_the_readme_has() -> None:
     texts = ElementTree.parse(file).iter(TEXT)  # noqa: S314 - our own
     typed = [text.text or "" for text in texts if text.get("class") == "typed"]
     verbs = [known[1] for line in typed if (known := re.match(r"\$ chainshaper (\w+)", line))]
-    assert verbs == ["simulate", "plan", "simulate", "compare"]
+    assert verbs == ["run", "plan", "shape", "compare"]

@@ -13,12 +13,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from known import known
 from processes import wait_for
+from scipy.special import bdtrc
 from small_chain import small_chain_plan
 
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.threads import followed_chains
 from chainshaper.gate import handover
 from chainshaper.gate.handover import Turn
+from chainshaper.planning import margins
 from chainshaper.planning.application_plan import combined, reach, whole, with_slots_moved
 from chainshaper.planning.margins import Tail
 from chainshaper.planning.plan import Adaptation, Modes, Plan, revised, with_slots
@@ -240,3 +242,12 @@ def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> N
     again = SlotFollower(plan, (), (0, 8 * MS), put_in_force)
     assert known(turn.moved())[0] == 0, "not where the run before had them"
     again.end()
+
+
+def test_counts_of_chance_are_those_of_the_binomial_distribution() -> None:
+    for trials in (8, 64, 300, 3000):
+        for probability in (1e-4, 0.01, 0.25, 0.5):
+            sure = bdtrc(np.arange(trials + 1), trials, probability)
+            for doubt in (1e-9, 1e-6, 0.5, 1 - 1e-6):
+                expected = np.count_nonzero(sure > doubt)
+                assert margins._by_chance(trials, probability, doubt) == expected

@@ -318,13 +318,12 @@ def watch(
     known = None if plan is None else load_application_plan(plan)
     specs = () if known is None else (one.chain.spec for one in known.chains)
     limits = Budget() if budget is None else load_budget(budget)
-    chains = chain or [spec for spec in specs if spec] or [one.chain for one in limits.chains]
+    chains = [*(chain or filter(None, specs)), *(one.chain for one in limits.chains)]
+    chains = list(dict.fromkeys(chains))
     if not chains:
         raise InputError(
             "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget"
         )
-    if strange := [one.chain for one in limits.chains if one.chain not in chains]:
-        raise InputError(f"{budget}: {strange[0]} is not watched: add --chain {strange[0]}")
     if command:
         check_command(command)
     with out.stop_on_signals() as stop, ExitStack() as until:

@@ -338,14 +338,15 @@ def _quantile(
 
 def _anderson_darling(ordered: _Floats, shape: _Floats, scale: _Floats) -> _Floats:
     """A² of each row of ascending excesses."""
-    from scipy.stats import genpareto
-
-    size = ordered.shape[1]
-    parameters = {"c": shape[:, np.newaxis], "scale": scale[:, np.newaxis]}
-    below = genpareto.logcdf(ordered, **parameters)
-    above = genpareto.logsf(ordered, **parameters)[:, ::-1]
+    size, (column, scales) = ordered.shape[1], (shape[:, np.newaxis], scale[:, np.newaxis])
+    nearly_zero = np.abs(column) < 1e-9
+    safe = np.where(nearly_zero, 1.0, column)
+    with np.errstate(divide="ignore"):  # nothing is beyond the end, nor below the beginning
+        bounded = -np.log(np.maximum(0.0, 1 + safe * ordered / scales)) / safe
+        above = np.where(nearly_zero, -ordered / scales, bounded)
+        below = np.log(-np.expm1(above))
     weights = (2 * np.arange(1, size + 1) - 1) / size
-    logarithms = np.maximum(below, LEAST_LOG) + np.maximum(above, LEAST_LOG)
+    logarithms = np.maximum(below, LEAST_LOG) + np.maximum(above[:, ::-1], LEAST_LOG)
     result: _Floats = -size - (logarithms * weights).sum(axis=1)
     return result
 
@@ -518,10 +519,13 @@ class Tail:
 
 @cache
 def _by_chance(trials: int, probability: float, doubt: float) -> int:
-    """The most of independent trials that are hit, but for this doubt."""
-    from scipy.special import bdtrc
-
-    return int(np.count_nonzero(bdtrc(np.arange(trials + 1), trials, probability) > doubt))
+    """The most of independent trials that are hit, but for this doubt. Robots lack SciPy for it."""
+    hits = np.arange(trials + 1)
+    factorials = np.concatenate([[0.0], np.cumsum(np.log(hits[1:]))])
+    logarithm = factorials[-1] - factorials - factorials[::-1]
+    logarithm += hits * math.log(probability) + hits[::-1] * math.log1p(-probability)
+    beyond = np.cumsum(np.exp(logarithm[::-1]))[::-1]  # the small ones first
+    return int(np.count_nonzero(beyond[1:] > doubt))
 
 
 def _without_drift(latencies: _Floats) -> tuple[_Floats, float]:
