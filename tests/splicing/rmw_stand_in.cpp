@@ -3,13 +3,15 @@
 // PROGRAM, it is a process that publishes instead: each line of its standard input is
 //
 //   publisher TOPIC NODE DEPTH | at NS PUBLISHER STAMP | serialized NS PUBLISHER STAMP
-//   | loaned NS PUBLISHER | mode NS TOPIC NAME | end NS PUBLISHER | until NS
+//   | loaned NS PUBLISHER | mode NS TOPIC NAME | end NS PUBLISHER | fork NS PUBLISHER | until NS
 //
 // in the order of their times, which count from the instant in the first argument
 // (CLOCK_MONOTONIC). A STAMP counts from there too; - is none. What is written to DDS, and what
 // tracers see, is on standard output.
 
+#include <sys/wait.h>
 #include <time.h>
+#include <unistd.h>
 
 #include <cstdint>
 #include <cstdio>
@@ -253,6 +255,12 @@ int main(int, char ** arguments) {
     }
     if (what == "mode" || what == "until") continue;
     Publisher *& publisher = publishers[std::stoul(word)];
+    if (what == "fork") {  // a child that ends as its parent would
+      const pid_t child = fork();
+      if (child == 0) _exit(rmw_destroy_publisher(&nodes[0], publisher));
+      waitpid(child, nullptr, 0);
+      continue;
+    }
     if (what == "end") {
       rmw_destroy_publisher(&nodes[0], publisher);
       continue;

@@ -16,7 +16,6 @@ from launch_cases import NDT, ROBOTS, plan_for
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
 from chainshaper.flow.launch_splicing import undo_splice
 from chainshaper.planning.plan import publish_slots, revised
-from chainshaper.splicing.shaping_process import set_phase
 from chainshaper.splicing.spliced_launch import parse_launch_command
 from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.recording import Recording, open_recording
@@ -112,9 +111,6 @@ def test_a_gate_in_the_publisher_s_process_adds_no_node_and_redirects_nothing(ro
     ]
     slots = [int(line.split()[1]) for line in lines if line.startswith("slots_ns")]
     assert slots == [bound for slot in publish_slots(plan) for bound in slot]
-    # Where cycles begin goes to another file, beside the log: the folder stays as it was written.
-    set_phase(out / "shaping_nodes/gates", "chainshaper_pose", 42)
-    assert (out / "logs/chainshaper_pose.changes").read_text() == "phase_ns 42\n"
     undo_splice(out)
     assert not out.exists()
 

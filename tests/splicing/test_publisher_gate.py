@@ -21,8 +21,13 @@ from chainshaper.gate.decision import Gate, gate_parameters
 from chainshaper.gate.handover import page_folders
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.sources.gate_log import read_gate_log
-from chainshaper.splicing.shaped_outputs import FollowedOutput, ShapedOutput, find_outputs
-from chainshaper.splicing.shaping_process import gate_library, set_phase, settings_text
+from chainshaper.splicing.shaped_outputs import (
+    FollowedOutput,
+    ShapedOutput,
+    ask_phase,
+    find_outputs,
+)
+from chainshaper.splicing.shaping_process import gate_library, settings_text
 from chainshaper.values.errors import OperationError
 
 MS = 1_000_000
@@ -80,7 +85,7 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
             node = f"shaping_{topic[1:]}"
             about = {"output": topic, "input": f"{topic}_tmp", "node": node, "log": logs[topic]}
             about |= {"thread": gate_thread_name(node), "publisher": "/node5"}
-            about |= {"changes": logs[topic].with_suffix(".changes"), "depth": gate.depth}
+            about["depth"] = gate.depth
             values = gate_parameters(gate, f"/modes{topic}") | {"handover": node}
             values["phase_ns"] = (start + gate.phase_ns) % gate.cycle_ns
             blocks.append(settings_text(about | values))
@@ -258,20 +263,25 @@ def test_messages_that_wait_as_their_publisher_ends_are_counted(run: Callable[..
     assert "/t5: its publisher has ended, messages that were not published: 2" in done.errors
 
 
+def test_a_child_of_fork_has_no_gate_and_ends(run: Callable[..., Run]) -> None:
+    lines = [at(20 * MS, stamp=0), (40 * MS, f"fork {40 * MS} 1"), at(120 * MS, stamp=100 * MS)]
+    assert run({"/t5": SLOT}, lines).written() == [0, 1]
+
+
 def test_cycles_begin_elsewhere_from_the_next_one_on(run: Callable[..., Run]) -> None:
-    gate, times = replace(SLOT, anchor="cycle"), [n * 100 * MS + 20 * MS for n in range(6)]
+    gate, times = replace(SLOT, anchor="cycle"), [n * 100 * MS + 20 * MS for n in range(9)]
 
     def move(gates: Path) -> None:
         values = dict(line.split(" ", 1) for line in gates.read_text().splitlines())
-        time.sleep(0.5)
-        set_phase(gates, "shaping_t5", int(values["phase_ns"]) + 10 * MS)
+        time.sleep(0.6)
+        ask_phase("/t5", (), int(values["phase_ns"]) + 10 * MS)
 
     done = run({"/t5": gate}, [at(ns) for ns in times], move)
     origins = [(row["origin"] - done.start_ns) % (100 * MS) for row in done.logs["/t5"]]
     assert sorted(set(origins)) == [0, 10 * MS]
     assert origins == sorted(origins)
-    with pytest.raises(OperationError, match="has no gate of other"):
-        set_phase(Path(os.devnull), "other", 0)
+    with pytest.raises(OperationError, match="no gates publish it now"):
+        ask_phase("/t5", (), 0)
 
 
 def test_its_output_is_shown_and_its_slots_move_while_they_are_followed(

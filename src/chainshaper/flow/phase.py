@@ -27,7 +27,7 @@ from chainshaper.enforcement.threads import Allocation
 from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.planning.plan import ShapingNode
-from chainshaper.splicing.shaping_process import GATES, set_phase
+from chainshaper.splicing.shaped_outputs import ask_phase
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 
@@ -306,28 +306,26 @@ def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int)
     The nodes of a chain are in one domain: any of them has the environment in which all are found.
     """
     names = [node.thread.node for node in nodes]
-    loaded = {node.thread.node for node in nodes if node.in_process}
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:
         return NO_NODE
+    asked = tuple(pids)
     # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
     from chainshaper.sources.ros import script as ros_script
     from chainshaper.sources.ros import start_with_rclpy
 
     try:
+        for node in nodes:
+            if node.in_process and node.thread.node in pids:
+                ask_phase(node.output, {pids.pop(node.thread.node)}, phase_ns)
         environments = {node: _environment_for(pid) for node, pid in pids.items()}
-        for node in loaded & pids.keys():
-            file = environments.pop(node).variables.get(GATES)
-            if file is None:
-                raise OperationError(f"process {pids[node]} was started without ${GATES}")
-            set_phase(Path(file), node.strip("/"), phase_ns)
         ours = tuple(node for node, one in environments.items() if _is_ros(one))
         if not ours:  # they are the live workload's
             return NO_NODE
         arguments = ("parameter", "phase_ns", str(phase_ns), *ours)
         script = start_with_rclpy(environments[ours[0]], ros_script.__file__, *arguments)
     except OperationError as error:
-        return Telling(tuple(pids), None, 0.0, str(error))
+        return Telling(asked, None, 0.0, str(error))
     return Telling(ours, script, time.monotonic())
 
 

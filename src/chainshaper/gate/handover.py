@@ -63,7 +63,9 @@ FIELDS = (
     "measured",  # how many latencies, from origin to arrival, are in their ring
     "moved_ns",  # by how much slots are moved from where the gate has them,
     "moved_from_ns",  # for cycles that begin then or later; 0: it is being written, or never was
-    "in_process",  # 1: the gate is in the publisher's process, which needs no standby
+    "in_process",  # 1: the gate is in the publisher's process, which needs no standby,
+    "asked_phase_ns",  # and no ROS parameter: where its cycles are asked to begin,
+    "phases_asked",  # so often so far
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 

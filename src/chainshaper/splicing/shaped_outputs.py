@@ -96,6 +96,28 @@ def moved_text(moved_ns: int) -> str:
     return f"are moved by {'-' if moved_ns < 0 else '+'}{format_duration(abs(moved_ns))}"
 
 
+def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
+    """Have the cycles of a gate in its publisher's process begin elsewhere (ns of CLOCK_MONOTONIC).
+
+    Raises OperationError: none of these processes publishes the output, or several do.
+    """
+    with closing(_page_of(topic, pids)) as page:
+        page.put("asked_phase_ns", phase_ns)
+        page.put("phases_asked", page["phases_asked"] + 1)
+
+
+def _page_of(topic: str, pids: Collection[int]) -> Page:
+    found = [one for one in find_outputs() if one.topic == topic and one.shaping_node]
+    found = [one for one in found if one.shaping_node in pids] or found
+    if len(found) != 1:
+        raise OperationError(
+            f"slots of {topic} cannot follow: {len(found) or 'no'} gates publish it now that show"
+            " their latencies; start the shaping node, one of this version"
+        )
+    folder, _, name = found[0].page.rpartition("/")
+    return Page(folder, name, flags=os.O_RDWR)
+
+
 class FollowedOutput:
     """An output whose latencies are read, and whose slots are moved, until it is closed.
 
@@ -104,15 +126,7 @@ class FollowedOutput:
 
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
         """``pids`` are processes that it may be of, where several have a gate for it."""
-        found = [one for one in find_outputs() if one.topic == topic and one.shaping_node]
-        found = [one for one in found if one.shaping_node in pids] or found
-        if len(found) != 1:
-            raise OperationError(
-                f"slots of {topic} cannot follow: {len(found) or 'no'} gates publish it now that"
-                " show their latencies; start the shaping node, one of this version"
-            )
-        folder, _, name = found[0].page.rpartition("/")
-        self._page = Page(folder, name, flags=os.O_RDWR)
+        self._page = _page_of(topic, pids)
         if not self._page.is_locked(MOVING):  # by how much a run before moved them is over
             self._page.put("moved_from_ns", 0)
         if not self._page.lock(MOVING):

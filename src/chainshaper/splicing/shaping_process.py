@@ -300,7 +300,6 @@ def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> s
         "node": node.name,
         "publisher": publisher,
         "thread": gate_thread_name(node.name),
-        "changes": log.with_suffix(".changes").absolute(),
     }
     values |= shaping_parameters(plan, node, log) | {"handover": _page_name(node, log)}
     return settings_text(values)
@@ -310,25 +309,6 @@ def settings_text(values: Mapping[str, Any]) -> str:
     """A block of that file: ``NAME VALUE``, once for each value of a list; ``output`` is first."""
     several = {name: one if isinstance(one, list) else [one] for name, one in values.items()}
     return "".join(f"{name} {value}\n" for name, own in several.items() for value in own)
-
-
-def set_phase(file: Path, node: str, phase_ns: int) -> None:
-    """Have the cycles of the gate of this node, in such a file, begin elsewhere.
-
-    Raises OperationError: the file has no such gate, or what changes it cannot be written.
-    """
-    try:
-        values: dict[str, str] = {}
-        for line in file.read_text(encoding="utf-8").splitlines():
-            name, _, value = line.partition(" ")
-            values = {} if name == "output" else values
-            values[name] = value
-            if (values.get("node"), name) == (node, "changes"):
-                write_whole(Path(value), [b"phase_ns %d\n" % phase_ns])
-                return
-    except OSError as error:
-        raise OperationError(f"{error.filename}: {error.strerror}") from error
-    raise OperationError(f"{file} has no gate of {node}: splice again")
 
 
 def gate_library() -> Path:

@@ -4,7 +4,7 @@
 //
 // CHAINSHAPER_GATES names a file with the outputs, a block of lines `NAME VALUE` each, which begins
 // with `output`: what ROS parameters say to a shaping node, and `node`, `input`, `publisher`,
-// `thread`, `changes`. A line in the file `changes`, which may come later, goes before them.
+// `thread`.
 //
 // Tracers see what they would see of a shaping node (`node`): the node of the application publishes
 // on `input`, our thread takes that, as a callback of `node`, and publishes it on `output`.
@@ -191,7 +191,7 @@ struct Settings {
       return found == values.end() ? std::string() : found->second.front();
     };
     output = text("output"), input = text("input"), node = text("node");
-    publisher = text("publisher"), thread = text("thread"), changes = text("changes");
+    publisher = text("publisher"), thread = text("thread");
     parameters.each([&](const char * name, auto & value) {
       const auto found = values.find(name);
       if (found != values.end()) assign(value, found->second);
@@ -212,7 +212,7 @@ struct Settings {
     for (const auto & word : words) value.push_back(std::stoll(word));
   }
 
-  std::string output, input, node, publisher, thread, changes;
+  std::string output, input, node, publisher, thread;
   Parameters parameters;
 };
 
@@ -453,7 +453,9 @@ private:
       oldest = newest;
       newest = before;
     }
-    if (oldest != nullptr) read_changes();
+    // Where cycles begin is found while the application runs.
+    if (const auto phase = turn_ ? turn_->asked_phase_ns() : std::nullopt)
+      shaper_.set_phase(*phase, monotonic_ns());
     if (const auto moved = turn_ ? turn_->moved() : std::nullopt)
       shaper_.move_slots(moved->first, moved->second);
     while (oldest != nullptr) {
@@ -473,18 +475,6 @@ private:
       if (!shaper_.announce(mode, at_ns))
         say("%s: there is no mode '%s'", settings_.output.c_str(), mode.c_str());
     });
-  }
-
-  // Where cycles begin is found while the application runs.
-  void read_changes() {
-    struct stat known {};
-    if (settings_.changes.empty() || stat(settings_.changes.c_str(), &known) != 0) return;
-    const auto version = std::pair(known.st_ino, known.st_mtim.tv_nsec);
-    if (version == changes_) return;
-    changes_ = version;
-    for (const auto & block : blocks_of(settings_.changes))
-      if (const auto found = block.find("phase_ns"); found != block.end())
-        shaper_.set_phase(std::stoll(found->second.front()), monotonic_ns());
   }
 
   // The oldest message leaves, or is dropped.
@@ -533,7 +523,6 @@ private:
   std::atomic<std::int64_t> stamp_{0};
   std::atomic<bool> over_{false};
   bool failed_{false};
-  std::pair<ino_t, long> changes_{};  // NOLINT(runtime/int)
   sem_t more_{};
   std::optional<Turn> turn_;
   Shaper<Message> shaper_;
@@ -552,12 +541,18 @@ Output * output_of(const RmwPublisher * publisher) {
   return nullptr;
 }
 
+// A child of fork() has none of our threads, so nothing of it is shaped.
+void in_child() {
+  for (auto & one : outputs) one = nullptr;
+}
+
 void shape(const RmwNode * node, const RmwPublisher * publisher, const void * type_support,
            const RmwQos & qos) {
   if (node == nullptr || publisher == nullptr || publisher->topic == nullptr) return;
   try {
     auto settings = settings_of(publisher->topic, *node);
     if (!settings || !usable()) return;
+    [[maybe_unused]] static const int once = pthread_atfork(nullptr, nullptr, in_child);
     const auto wanted = static_cast<std::size_t>(settings->parameters.depth);
     const auto depth = wanted > 0 ? wanted : std::max<std::size_t>(schema::depth, qos.depth);
     auto output = std::make_unique<Output>(*settings, node, publisher, type_support, depth);

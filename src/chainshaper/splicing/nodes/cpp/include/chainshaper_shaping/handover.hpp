@@ -173,6 +173,7 @@ public:
       : name_(std::move(name)), topic_(std::move(topic)), folders_(std::move(folders)) {
     page_ = open_page(name_, topic_, folders_);
     page_->set(Field::in_process, in_process ? 1 : 0);
+    phases_asked_ = page_->get(Field::phases_asked);
     const auto now = monotonic_ns();
     if (now - page_->get(Field::started_ns) > schema::at_once_ns)
       page_->set(Field::failed_starts, 0);
@@ -257,6 +258,14 @@ public:
   // A message that was received has no room any more, and is never published.
   void drop(std::int64_t key) { page_->note_released(key); }
 
+  // Where cycles are asked to begin, once each time; none: as they do.
+  Maybe asked_phase_ns() {
+    const auto asked = page_->get(Field::phases_asked);
+    if (asked == phases_asked_) return std::nullopt;
+    phases_asked_ = asked;
+    return page_->get(Field::asked_phase_ns);
+  }
+
   // By how much slots are to be moved, and from when on; none: as they are.
   std::optional<std::pair<std::int64_t, std::int64_t>> moved() const {
     const auto since = page_->get(Field::moved_from_ns);
@@ -310,6 +319,7 @@ private:
   std::unique_ptr<Page> page_;
   bool in_force_{false};
   bool gave_up_{false};
+  std::int64_t phases_asked_{0};
   // Of the standby's messages: how many there were at the last look, and which.
   std::int64_t seen_{-1};
   std::int64_t oldest_{0};
