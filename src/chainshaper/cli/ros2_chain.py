@@ -39,9 +39,9 @@ def _run(arguments: list[str]) -> int:
         main(arguments, "ros2 chain")
     except ModuleNotFoundError as error:  # built with colcon, which installs no dependencies
         say(  # the last line of a failed command
-            f"error: ros2 chain needs the Python package {error.name}: install chainshaper's "
-            "packages from PyPI into the Python that ROS runs with (`python3 -m pip install .` in "
-            "its folder)"
+            f"error: ros2 chain needs the Python package {error.name}: install it into a virtual "
+            "environment that sees the system's packages, and start `python $(which ros2) chain` "
+            "there (docs/install.md)"
         )
         return PlatformError.exit_code
     except SystemExit as ended:
