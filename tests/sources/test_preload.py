@@ -159,8 +159,9 @@ def test_execution_times_are_the_threads_own_cpu_time(
     )
     used = np.array([int(row[4]) for row in run.printed if row[0] == "instance"])
     assert len(used) == 2 * CYCLES
-    # The program reads the clock around both calls, so it counts them too.
-    assert ((ends - starts) <= used).all()
+    # The program reads the clock around both calls, so it counts them too; time that the host takes
+    # from a thread on its core is in what is reckoned since the last reading, SURELY_USED at most.
+    assert ((ends - starts) <= used + 200_000).all()
     assert np.median(used - (ends - starts)) < 50_000
 
 

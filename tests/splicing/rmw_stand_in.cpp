@@ -5,8 +5,8 @@
 //   publisher TOPIC NODE DEPTH | at NS PUBLISHER STAMP | serialized NS PUBLISHER STAMP
 //   | loaned NS PUBLISHER | mode NS TOPIC NAME | end NS PUBLISHER | fork NS PUBLISHER | until NS
 //
-// in the order of their times, which count from the instant in the first argument
-// (CLOCK_MONOTONIC). A STAMP counts from there too; - is none. What is written to DDS, and what
+// in the order of their times, which count from the instant in the first line (CLOCK_MONOTONIC),
+// which is asked for by "ready". A STAMP counts from there too; - is none. What is written to DDS, and what
 // tracers see, is on standard output.
 
 #include <sys/wait.h>
@@ -222,8 +222,11 @@ void ros_trace_rcl_publish(const void * handle, const void *) {
 
 #else
 
-int main(int, char ** arguments) {
-  const std::int64_t start = std::atoll(arguments[1]);
+int main() {
+  std::puts("ready");
+  std::fflush(stdout);
+  std::int64_t start = 0;
+  std::cin >> start;
   const std::int64_t offset = now(CLOCK_REALTIME) - now(CLOCK_MONOTONIC);
   std::deque<Publisher *> publishers;
   std::deque<std::string> names;

@@ -68,7 +68,7 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
     def started(
         gates: Mapping[str, Gate],
         lines: list[tuple[int, str]],
-        meanwhile: Callable[[Path], None] = lambda _: None,
+        meanwhile: Callable[[int, Path], None] = lambda *_: None,
         change: tuple[str, str] = ("", ""),
         **env: str,
     ) -> Run:
@@ -76,25 +76,10 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
 
         The process lives for half a second behind the last.
         """
-        start, logs = time.monotonic_ns() + 300 * MS, {}
+        logs: dict[str, Path] = {}
         domain = str(uuid.uuid4().int % 10**9)  # so that pages of other runs are not ours
-        blocks, makes = [], ["publisher /other /nobody 10"]
-        for topic, gate in gates.items():
-            logs[topic] = tmp_path / f"{topic[1:]}.csv"
-            logs[topic].unlink(missing_ok=True)
-            node = f"shaping_{topic[1:]}"
-            about = {"output": topic, "input": f"{topic}_tmp", "node": node, "log": logs[topic]}
-            about |= {"thread": gate_thread_name(node), "publisher": "/node5"}
-            about["depth"] = gate.depth
-            values = gate_parameters(gate, f"/modes{topic}") | {"handover": node}
-            values["phase_ns"] = (start + gate.phase_ns) % gate.cycle_ns
-            blocks.append(settings_text(about | values))
-            makes.append(f"publisher {topic} node5 {gate.depth}")
-        (tmp_path / "gates").write_text("".join(blocks).replace(*change))
-        over = max((ns for ns, _ in lines), default=0) + 500 * MS
-        ordered = [text for _, text in sorted([*lines, (over, f"until {over}")])]
         with subprocess.Popen(
-            [program, str(start)],
+            [program],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -109,9 +94,28 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
                 **env,
             },
         ) as process:
-            beside = threading.Thread(target=meanwhile, args=(tmp_path / "gates",))
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            start = time.monotonic_ns() + 200 * MS
+            blocks, makes = [], ["publisher /other /nobody 10"]
+            for topic, gate in gates.items():
+                logs[topic] = tmp_path / f"{topic[1:]}.csv"
+                logs[topic].unlink(missing_ok=True)
+                node = f"shaping_{topic[1:]}"
+                about = {"output": topic, "input": f"{topic}_tmp", "node": node, "log": logs[topic]}
+                about |= {"thread": gate_thread_name(node), "publisher": "/node5"}
+                about["depth"] = gate.depth
+                values = gate_parameters(gate, f"/modes{topic}") | {"handover": node}
+                values["phase_ns"] = (start + gate.phase_ns) % gate.cycle_ns
+                blocks.append(settings_text(about | values))
+                makes.append(f"publisher {topic} node5 {gate.depth}")
+            (tmp_path / "gates").write_text("".join(blocks).replace(*change))
+            over = max((ns for ns, _ in lines), default=0) + 500 * MS
+            ordered = [text for _, text in sorted([*lines, (over, f"until {over}")])]
+            beside = threading.Thread(target=meanwhile, args=(process.pid, tmp_path / "gates"))
             beside.start()
-            out, err = process.communicate("\n".join([*makes, *ordered]) + "\n", timeout=30)
+            words = [str(start), *makes, *ordered]
+            out, err = process.communicate("\n".join(words) + "\n", timeout=30)
             beside.join()
         assert process.returncode == 0, err
         for folder in page_folders():
@@ -271,17 +275,17 @@ def test_a_child_of_fork_has_no_gate_and_ends(run: Callable[..., Run]) -> None:
 def test_cycles_begin_elsewhere_from_the_next_one_on(run: Callable[..., Run]) -> None:
     gate, times = replace(SLOT, anchor="cycle"), [n * 100 * MS + 20 * MS for n in range(9)]
 
-    def move(gates: Path) -> None:
+    def move(pid: int, gates: Path) -> None:
         values = dict(line.split(" ", 1) for line in gates.read_text().splitlines())
         time.sleep(0.6)
-        ask_phase("/t5", (), int(values["phase_ns"]) + 10 * MS)
+        ask_phase("/t5", (pid,), int(values["phase_ns"]) + 10 * MS)
 
     done = run({"/t5": gate}, [at(ns) for ns in times], move)
     origins = [(row["origin"] - done.start_ns) % (100 * MS) for row in done.logs["/t5"]]
     assert sorted(set(origins)) == [0, 10 * MS]
     assert origins == sorted(origins)
     with pytest.raises(OperationError, match="no gates publish it now"):
-        ask_phase("/t5", (), 0)
+        ask_phase("/not_published", (), 0)
 
 
 def test_its_output_is_shown_and_its_slots_move_while_they_are_followed(
@@ -290,10 +294,10 @@ def test_its_output_is_shown_and_its_slots_move_while_they_are_followed(
     times = [n * 100 * MS + 20 * MS for n in range(12)]
     seen, latencies = list[ShapedOutput](), list[int]()
 
-    def follow(_: Path) -> None:
+    def follow(pid: int, _: Path) -> None:
         time.sleep(0.7)
-        seen.extend(one for one in find_outputs() if one.topic == "/t5")
-        followed = FollowedOutput("/t5")
+        seen.extend(one for one in find_outputs() if one.shaping_node == pid)
+        followed = FollowedOutput("/t5", (pid,))
         followed.move(10 * MS, time.monotonic_ns() + 100 * MS)
         time.sleep(0.4)
         latencies.extend(followed.latencies())
