@@ -186,16 +186,17 @@ struct Settings {
   using Values = std::map<std::string, std::vector<std::string>>;
 
   explicit Settings(const Values & values) {
-    const auto text = [&](const char * name) {
-      const auto found = values.find(name);
-      return found == values.end() ? std::string() : found->second.front();
-    };
-    output = text("output"), input = text("input"), node = text("node");
-    publisher = text("publisher"), thread = text("thread");
+    output = first_of(values, "output"), input = first_of(values, "input");
+    node = first_of(values, "node"), thread = first_of(values, "thread");
     parameters.each([&](const char * name, auto & value) {
       const auto found = values.find(name);
       if (found != values.end()) assign(value, found->second);
     });
+  }
+
+  static std::string first_of(const Values & values, const char * name) {
+    const auto found = values.find(name);
+    return found == values.end() ? std::string() : found->second.front();
   }
 
   static void assign(std::string & value, const std::vector<std::string> & words) {
@@ -212,7 +213,7 @@ struct Settings {
     for (const auto & word : words) value.push_back(std::stoll(word));
   }
 
-  std::string output, input, node, publisher, thread;
+  std::string output, input, node, thread;
   Parameters parameters;
 };
 
@@ -236,12 +237,9 @@ std::optional<Settings> settings_of(const std::string & topic, const RmwNode & n
   const std::string within = node.name_space;
   const std::string name = (within == "/" ? "" : within) + "/" + node.name;
   for (const auto & block : blocks_of(path)) {
-    const auto & of = [&](const char * key) {
-      const auto found = block.find(key);
-      return found == block.end() ? std::string() : found->second.front();
-    };
-    const auto publisher = of("publisher");
-    if (of("output") == topic && (publisher.empty() || publisher == name)) return Settings(block);
+    const auto publisher = Settings::first_of(block, "publisher");
+    if (Settings::first_of(block, "output") == topic && (publisher.empty() || publisher == name))
+      return Settings(block);
   }
   return std::nullopt;
 }
@@ -284,13 +282,8 @@ public:
       const auto now = monotonic_ns();
       const auto sent = info.source_timestamp;
       const auto at = sent > 0 ? std::min(now, sent - clock_offset()) : now;
-      // Encapsulation, length with the final NUL, characters.
-      const auto * const bytes = text.bytes.buffer;
-      if (!taken || text.bytes.length < 8) continue;
-      std::size_t size = 0;
-      for (int i = 3; i >= 0; --i) size = size << 8 | bytes[4 + (bytes[1] & 1 ? i : 3 - i)];
-      if (size >= 1 && size <= text.bytes.length - 8)
-        announced(std::string(reinterpret_cast<const char *>(bytes + 8), size - 1), at);
+      if (!taken) continue;
+      if (const auto mode = text_of(text.bytes.buffer, text.bytes.length)) announced(*mode, at);
     }
   }
 

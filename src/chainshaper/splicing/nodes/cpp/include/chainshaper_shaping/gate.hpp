@@ -227,20 +227,30 @@ inline bool missed(const Gate & gate, const Release & release, std::int64_t now_
                                        gate.slots[*release.slot].end;
 }
 
+// Four bytes of a serialized message, in the byte order that its encapsulation header names.
+inline std::uint32_t word_at(const std::uint8_t * payload, std::size_t at) {
+  const bool little = payload[1] & 1;
+  std::uint32_t value = 0;
+  for (std::size_t i = 0; i < 4; ++i)
+    value |= std::uint32_t{payload[at + i]} << (8 * (little ? i : 3 - i));
+  return value;
+}
+
 // The header stamp of a serialized message in ns of its clock; none if it is zero or short.
 inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
   if (size < 12) return std::nullopt;
-  const bool little = payload[1] & 1;
-  const auto word = [&](std::size_t at) {
-    std::uint32_t value = 0;
-    for (std::size_t i = 0; i < 4; ++i)
-      value |= std::uint32_t{payload[at + i]} << (8 * (little ? i : 3 - i));
-    return value;
-  };
-  const std::int64_t seconds = static_cast<std::int32_t>(word(4));
-  const std::int64_t nanoseconds = word(8);
+  const std::int64_t seconds = static_cast<std::int32_t>(word_at(payload, 4));
+  const std::int64_t nanoseconds = word_at(payload, 8);
   if ((seconds == 0 && nanoseconds == 0) || nanoseconds >= 1'000'000'000) return std::nullopt;
   return seconds * 1'000'000'000 + nanoseconds;
+}
+
+// The text of a serialized std_msgs/String; none where the bytes are none.
+inline std::optional<std::string> text_of(const std::uint8_t * payload, std::size_t size) {
+  if (size < 8) return std::nullopt;
+  const std::size_t length = word_at(payload, 4);  // with the final NUL
+  if (length < 1 || length > size - 8) return std::nullopt;
+  return std::string(reinterpret_cast<const char *>(payload + 8), length - 1);
 }
 
 // A message that has come and not left; `number` tells it from the others.
