@@ -373,15 +373,10 @@ private:
     if (name.empty()) return;
     try {
       turn_.emplace(name, settings_.output, page_folders(), true);
+      turn_->go_on(shaper_);
     } catch (const std::runtime_error & error) {
       say("%s is not among the outputs that are shown: %s", settings_.output.c_str(), error.what());
-      return;
     }
-    const auto & gate = shaper_.queue.gate;
-    if (const auto phase = turn_->phase_ns())
-      shaper_.set_phase(*phase, monotonic_ns() - gate.cycle_ns);  // from now on
-    if (const auto mode = turn_->mode(); gate.modes && mode && *mode < gate.modes->names.size())
-      shaper_.announce(gate.modes->names[*mode], 0);
   }
 
   void note(const Outcome<Message> & outcome, Maybe published_ns = {}, Maybe stalled_ns = {}) {

@@ -180,7 +180,7 @@ public:
             [this](const Release & release, std::int64_t phase_ns) {
               if (turn_) turn_->hold(release.at_ns, phase_ns, release.mode);
             }) {
-    if (turn_) go_on();
+    if (turn_) turn_->go_on(shaper_);
     const auto & log = parameters_.log;
     if (!log.empty() && !log_.open_file(log, parameters_.log_bytes)) {
       RCLCPP_WARN(node.get_logger(), "no log is written to %s: %s", log.c_str(),
@@ -339,15 +339,6 @@ private:
       said_ = losses;
       said_ns_ = now;
     }
-  }
-
-  // Have cycles begin where they did for the node before this one, in its mode.
-  void go_on() {
-    const auto & gate = shaper_.queue.gate;
-    if (const auto phase = turn_->phase_ns())
-      shaper_.set_phase(*phase, monotonic_ns() - gate.cycle_ns);  // from now on, not the next cycle
-    if (const auto mode = turn_->mode(); gate.modes && mode && *mode < gate.modes->names.size())
-      shaper_.announce(gate.modes->names[*mode], 0);
   }
 
   rclcpp::Node & node_;

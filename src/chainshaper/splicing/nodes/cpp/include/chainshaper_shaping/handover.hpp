@@ -203,6 +203,16 @@ public:
     return number > 0 ? std::optional<std::size_t>(number - 1) : std::nullopt;
   }
 
+  // Have cycles of a gate begin where they did for the one before it, in its mode.
+  template <typename Shaper>
+  void go_on(Shaper & shaper) const {
+    const auto & gate = shaper.queue.gate;
+    if (const auto phase = phase_ns())
+      shaper.set_phase(*phase, monotonic_ns() - gate.cycle_ns);  // from now on, not the next cycle
+    if (const auto last = mode(); gate.modes && last && *last < gate.modes->names.size())
+      shaper.announce(gate.modes->names[*last], 0);
+  }
+
   bool take(std::int64_t key) {
     if (!in_force_ && !come_into_force(key)) return false;
     page_->set(Field::until_ns, monotonic_ns());
