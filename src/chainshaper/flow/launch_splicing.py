@@ -29,6 +29,7 @@ from chainshaper.splicing.shaping_process import (
     STANDBY,
     NodeKind,
     ShapingProcess,
+    delivery_settings,
     gate_library,
     gate_settings,
     write_shaping_process,
@@ -147,12 +148,12 @@ def splice_launch_files(
             )
             for chain, one in nodes
         ]
-        if not gates:
-            return made, redirects, {}
-        blocks = (
+        blocks = [
             gate_settings(chain, one, _publisher(chain, one, publishers), logs[one.name])
             for chain, one in gates
-        )
+        ] + [delivery_settings(one) for _, one in every]
+        if not any(blocks):
+            return made, redirects, {}
         into.mkdir(parents=True, exist_ok=True)
         (into / "gates").write_text("".join(blocks), encoding="utf-8")
         loaded = {"LD_PRELOAD": str(gate_library()), GATES: str(folder / NODES / "gates")}

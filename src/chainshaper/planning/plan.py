@@ -199,7 +199,8 @@ class ShapingNode(Part):
     to the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait
     in it; None: as many as the history of the output's publisher has room for, and 10 at least.
     With ``in_process`` it is no node of its own but a thread in the publisher's process, where a
-    library takes what is published: ``input`` is what tracers call that.
+    library takes what is published: ``input`` is what tracers call that. With ``delivery_ns`` a
+    library in the receivers' processes hands them each message that long behind its publication.
     """
 
     name: Annotated[str, _plain_name("node")]
@@ -213,6 +214,7 @@ class ShapingNode(Part):
     receivers: tuple[FullName, ...] = ()
     depth: FromOne | None = None
     in_process: bool = False
+    delivery_ns: PositiveDuration | None = None
 
     @property
     def thread(self) -> Thread:

@@ -147,6 +147,7 @@ def _gate(
         pause_ns=pause,
         receivers=tuple(receivers),
         in_process=wishes.publication == "in-process",
+        delivery_ns=wishes.delivery_ns,
     )
     return node, (node.thread,)
 

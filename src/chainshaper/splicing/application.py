@@ -109,6 +109,12 @@ def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) ->
             "`announces` modes there: describe one, or remove `modes` from the plan"
         )
     for node in (shaping, *plan.further_shaping_nodes):
+        if node.delivery_ns is not None:
+            raise InputError(
+                f"the plan hands {node.output} to its subscribers at a constant time, which a"
+                " library in ROS 2 nodes does, and a described application has none: plan without"
+                " --delivery, or generate ROS 2 nodes (`chainshaper generate`)"
+            )
         application = _spliced(application, joint, plan, node)
     return application
 

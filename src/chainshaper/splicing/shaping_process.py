@@ -283,10 +283,11 @@ def _add_part(path: Path, parts: dict[Path, str]) -> None:
     parts[path] = "".join(lines)
 
 
-# The gate in the publisher's process --------------------------------------------------------------
+# Gates in the processes that publish and subscribe ------------------------------------------------
 
 GATES = "CHAINSHAPER_GATES"
-"""The variable that names the file with all gates of an application (`publisher_gate.cpp`)."""
+"""The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
+_GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp")
 _GATE_FILE = "libchainshaper_gate.so"
 _GATE_OPTIONS = ("-O2", "-std=c++17", "-shared", "-fPIC", "-static-libstdc++", "-static-libgcc")
 _EXPORTED = "{ global: rmw_*; ros_trace_*; local: *; };\n"
@@ -305,6 +306,16 @@ def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> s
     return settings_text(values)
 
 
+def delivery_settings(node: ShapingNode) -> str:
+    """The block of an output that is handed to its receivers at a constant time; none: empty."""
+    if node.delivery_ns is None:
+        return ""
+    receivers = list(node.receivers)
+    return settings_text(
+        {"output": node.output, "delivery_ns": node.delivery_ns, "receiver": receivers}
+    )
+
+
 def settings_text(values: Mapping[str, Any]) -> str:
     """A block of that file: ``NAME VALUE``, once for each value of a list; ``output`` is first."""
     several = {name: one if isinstance(one, list) else [one] for name, one in values.items()}
@@ -312,22 +323,29 @@ def settings_text(values: Mapping[str, Any]) -> str:
 
 
 def gate_library() -> Path:
-    """The library with the gate, in the user's cache; compiled at the first use.
+    """The library with both gates, in the user's cache; compiled at the first use.
 
     Raises PlatformError: there is no C++ compiler, or as :func:`.in_cache`.
     """
-    program = _NODES / "publisher_gate.cpp"
-    headers = {path: text for path, text in generic_package().items() if path.endswith(".hpp")}
+    programs = [_NODES / name for name in _GATE_SOURCES]
+    shared = _NODES / "in_front_of_rmw.hpp"
+    headers = {shared.name: shared.read_text()} | {
+        path: text for path, text in generic_package().items() if path.endswith(".hpp")
+    }
 
     def build(folder: Path) -> Path:
         files = {**headers, "exported.map": _EXPORTED}
         _write(folder, files)
-        included = (f"-I{folder / 'include'}", f"-Wl,--version-script={folder / 'exported.map'}")
-        words = (*_GATE_OPTIONS, *included, str(program), "-ldl", "-lpthread")
+        included = (
+            f"-I{folder}",
+            f"-I{folder / 'include'}",
+            f"-Wl,--version-script={folder / 'exported.map'}",
+        )
+        words = (*_GATE_OPTIONS, *included, *map(str, programs), "-ldl", "-lpthread")
         options = "--publication in-process", "--publication synchronous"
         return compile_library("c++", words, folder / _GATE_FILE, options)
 
-    return in_cache(_GATE_FILE, [program.read_text(), *headers.values()], build)
+    return in_cache(_GATE_FILE, [*(one.read_text() for one in programs), *headers.values()], build)
 
 
 # Packages in C++ ----------------------------------------------------------------------------------

@@ -131,6 +131,10 @@ class Wishes:
     pause_ns: Annotated[int | None, Option(
         "How long the gate rests after publishing. Default: 2ms, a twentieth of the cycle at"
         " most.")] = None
+    delivery_ns: Annotated[int | None, Option(
+        "Hand the output to its subscribers' callbacks at this constant time behind its"
+        " publication, such as 500us, whatever the transport takes; their executors wait"
+        " meanwhile. Default: as it comes.", least=1)] = None
     equal_priorities: Annotated[EqualPriorities, Option(
         "Servers of one priority on a core: their slots stay apart; or, with one priority for all"
         " (eq. 3), they take turns.")] = "apart"

@@ -8,101 +8,20 @@
 //
 // Tracers see what they would see of a shaping node (`node`): the node of the application publishes
 // on `input`, our thread takes that, as a callback of `node`, and publishes it on `output`.
-//
-// Upstream: rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling. The first fields of these structs
-// and the arguments of these functions are the same in all of them. Where ROS 2 is another one,
-// everything passes as if we were not here, and a line on stderr says so.
 
-#include <dlfcn.h>
 #include <pthread.h>
 #include <semaphore.h>
 
-#include <atomic>
-#include <fstream>
-#include <map>
 #include <memory>
 #include <thread>
 
 #include "chainshaper_shaping/gate_log.hpp"
 #include "chainshaper_shaping/handover.hpp"
-
-#define EXPORTED extern "C" __attribute__((visibility("default")))
+#include "in_front_of_rmw.hpp"
 
 namespace {
 
 using namespace chainshaper;  // NOLINT
-
-// What we need of rmw's structs.
-struct RmwNode {
-  const char * implementation;
-  void * data;
-  const char * name;
-  const char * name_space;
-};
-
-struct RmwPublisher {
-  const char * implementation;
-  void * data;
-  const char * topic;
-};
-
-struct RmwQos {
-  int history;
-  std::size_t depth;
-  int reliability;
-  int durability;
-  std::uint64_t deadline[2];
-  std::uint64_t lifespan[2];
-  int liveliness;
-  std::uint64_t liveliness_lease[2];
-  bool avoid_ros_namespace_conventions;
-};
-enum { keep_last = 1, reliable = 1, best_available_reliability = 4 };
-enum { volatile_durability = 2, best_available_durability = 4 };
-
-struct Allocator {
-  void * (*allocate)(std::size_t, void *);
-  void (*deallocate)(void *, void *);
-  void * (*reallocate)(void *, std::size_t, void *);
-  void * (*zero_allocate)(std::size_t, std::size_t, void *);
-  void * state;
-};
-
-struct Bytes {  // rcutils_uint8_array_t
-  std::uint8_t * buffer;
-  std::size_t length;
-  std::size_t capacity;
-  Allocator allocator;
-};
-
-struct SubscriptionOptions {
-  void * room[16];  // returned by value: more than any version has
-};
-
-struct MessageInfo {
-  std::int64_t source_timestamp;  // CLOCK_REALTIME
-  std::uint64_t others[31];       // more than any version has
-};
-
-template <typename... Values>
-void say(const char * format, Values... values) {
-  const std::string line = std::string("[chainshaper] ") + format + "\n";
-  std::fprintf(stderr, line.c_str(), values...);
-}
-
-// The function behind ours. What Python's nodes load is in no scope of ours: rcl needs all of it.
-void * behind(const char * name) {
-  if (void * const found = dlsym(RTLD_NEXT, name)) return found;
-  void * const loaded = dlopen("librcl.so", RTLD_LAZY | RTLD_NOLOAD);
-  return loaded == nullptr ? nullptr : dlsym(loaded, name);
-}
-
-// Calls a function of rmw, which is there: `usable` has looked, or its caller has linked to it.
-#define RMW(type, name) \
-  (*[] { \
-    static const auto found = reinterpret_cast<type>(behind(name)); \
-    return found; \
-  }())
 
 // Emits an event of ros2_tracing, whose arguments are all integers or pointers.
 template <typename... Values>
@@ -119,43 +38,12 @@ void emit(void * event, Values... values) {
     emit(event, __VA_ARGS__); \
   } while (false)
 
-bool is_humble() {
-  const char * const distribution = std::getenv("ROS_DISTRO");
-  return distribution != nullptr && std::strcmp(distribution, "humble") == 0;
-}
-
 // `rmw_publish` as the distribution has it: from Jazzy on with publisher and time stamp.
 void emit_write(const void * publisher, const void * message, std::int64_t stamp) {
   if (is_humble())
     EMIT(rmw_publish, message);
   else
     EMIT(rmw_publish, publisher, message, stamp);
-}
-
-// Whether we know this ROS 2; said once where we do not.
-bool usable() {
-  static const bool known = [] {
-    const char * const distribution = std::getenv("ROS_DISTRO");
-    const auto is_one_of = [](const char * word, std::initializer_list<const char *> words) {
-      return word != nullptr && std::any_of(words.begin(), words.end(), [&](const char * one) {
-               return std::strcmp(one, word) == 0;
-             });
-    };
-    const auto identify =
-        reinterpret_cast<const char * (*)()>(behind("rmw_get_implementation_identifier"));
-    const char * const rmw = identify == nullptr ? "no rmw" : identify();
-    bool all = is_one_of(distribution, {"humble", "jazzy", "kilted", "lyrical", "rolling"}) &&
-               is_one_of(rmw, {"rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp",
-                               "rmw_zenoh_cpp", "rmw_connextdds"});
-    for (const char * name : {"rmw_serialize", "rmw_publish", "rmw_publish_serialized_message"})
-      all = all && behind(name) != nullptr;
-    all = all && behind("rcutils_get_default_allocator") != nullptr;
-    if (!all)
-      say("ROS 2 %s with %s is not known to the gate: outputs leave at once",
-          distribution == nullptr ? "(no ROS_DISTRO)" : distribution, rmw);
-    return all;
-  }();
-  return known;
 }
 
 // A message as it is sent.
@@ -183,20 +71,13 @@ using Message = std::unique_ptr<Serialized>;
 
 // A block of the file.
 struct Settings {
-  using Values = std::map<std::string, std::vector<std::string>>;
-
-  explicit Settings(const Values & values) {
+  explicit Settings(const Block & values) {
     output = first_of(values, "output"), input = first_of(values, "input");
     node = first_of(values, "node"), thread = first_of(values, "thread");
     parameters.each([&](const char * name, auto & value) {
       const auto found = values.find(name);
       if (found != values.end()) assign(value, found->second);
     });
-  }
-
-  static std::string first_of(const Values & values, const char * name) {
-    const auto found = values.find(name);
-    return found == values.end() ? std::string() : found->second.front();
   }
 
   static void assign(std::string & value, const std::vector<std::string> & words) {
@@ -216,33 +97,6 @@ struct Settings {
   std::string output, input, node, thread;
   Parameters parameters;
 };
-
-std::vector<Settings::Values> blocks_of(const std::string & path) {
-  std::vector<Settings::Values> blocks;
-  std::ifstream file(path);
-  for (std::string line; std::getline(file, line);) {
-    const auto space = line.find(' ');
-    if (space == std::string::npos) continue;
-    const auto name = line.substr(0, space);
-    if (name == "output" || blocks.empty()) blocks.emplace_back();
-    blocks.back()[name].push_back(line.substr(space + 1));
-  }
-  return blocks;
-}
-
-// The settings of an output, if it is one of the file's, and published by the node that is meant.
-std::optional<Settings> settings_of(const std::string & topic, const RmwNode & node) {
-  const char * const path = std::getenv("CHAINSHAPER_GATES");
-  if (path == nullptr) return std::nullopt;
-  const std::string within = node.name_space;
-  const std::string name = (within == "/" ? "" : within) + "/" + node.name;
-  for (const auto & block : blocks_of(path)) {
-    const auto publisher = Settings::first_of(block, "publisher");
-    if (Settings::first_of(block, "output") == topic && (publisher.empty() || publisher == name))
-      return Settings(block);
-  }
-  return std::nullopt;
-}
 
 // The topic on which modes are announced, as the gate's thread reads it: a std_msgs/String.
 class ModeTopic {
@@ -538,12 +392,16 @@ void shape(const RmwNode * node, const RmwPublisher * publisher, const void * ty
            const RmwQos & qos) {
   if (node == nullptr || publisher == nullptr || publisher->topic == nullptr) return;
   try {
-    auto settings = settings_of(publisher->topic, *node);
-    if (!settings || !usable()) return;
+    const auto block = block_of(publisher->topic, *node, [](const auto & one, const auto & name) {
+      const auto meant = first_of(one, "publisher");
+      return !first_of(one, "node").empty() && (meant.empty() || meant == name);
+    });
+    if (!block || !usable()) return;
+    const Settings settings(*block);
     [[maybe_unused]] static const int once = pthread_atfork(nullptr, nullptr, in_child);
-    const auto wanted = static_cast<std::size_t>(settings->parameters.depth);
+    const auto wanted = static_cast<std::size_t>(settings.parameters.depth);
     const auto depth = wanted > 0 ? wanted : std::max<std::size_t>(schema::depth, qos.depth);
-    auto output = std::make_unique<Output>(*settings, node, publisher, type_support, depth);
+    auto output = std::make_unique<Output>(settings, node, publisher, type_support, depth);
     Output * none = nullptr;
     for (auto & one : outputs)
       if (none = nullptr; one.compare_exchange_strong(none, output.get())) {
