@@ -1,8 +1,8 @@
-// Stands in for rmw, rcutils, tracetools and std_msgs where no ROS 2 is: what the gate in the
-// publisher's process (splicing/nodes/publisher_gate.cpp) calls, and is called by. Compiled with
-// PROGRAM, it is a process that publishes instead: each line of its standard input is
+// Stands in for rmw, rcutils, tracetools and std_msgs where no ROS 2 is: what the gates in the
+// processes that publish and subscribe (splicing/nodes/) call, and are called by. Compiled with
+// PROGRAM, it is such a process instead: each line of its standard input is
 //
-//   publisher TOPIC NODE DEPTH | at NS PUBLISHER STAMP | serialized NS PUBLISHER STAMP
+//   subscription TOPIC NODE | take NS SUBSCRIPTION STAMP | publisher TOPIC NODE DEPTH | at NS PUBLISHER STAMP | serialized NS PUBLISHER STAMP
 //   | loaned NS PUBLISHER | mode NS TOPIC NAME | end NS PUBLISHER | fork NS PUBLISHER | until NS
 //
 // in the order of their times, which count from the instant in the first line (CLOCK_MONOTONIC),
@@ -74,6 +74,8 @@ Options rmw_get_default_subscription_options();
 void * rmw_create_subscription(const Node *, const void *, const char *, const Qos *,
                                const Options *);
 int rmw_take_serialized_message_with_info(const void *, Bytes *, bool *, Info *, void *);
+int rmw_take_with_info(const void *, void *, bool *, Info *, void *);
+int rmw_destroy_subscription(Node *, void *);
 Allocator rcutils_get_default_allocator();
 const void * rosidl_typesupport_c__get_message_type_support_handle__std_msgs__msg__String();
 void ros_trace_rcl_publisher_init(const void *, const void *, const void *, const char *,
@@ -156,14 +158,13 @@ Options rmw_get_default_subscription_options() { return {}; }
 
 void * rmw_create_subscription(const Node *, const void *, const char * topic, const Qos *,
                                const Options *) {
-  const std::lock_guard<std::mutex> lock(one_at_a_time);
-  return &all_modes[topic];
+  return new std::string(topic);
 }
 
 int rmw_take_serialized_message_with_info(const void * from, Bytes * bytes, bool * taken,
                                           Info * info, void *) {
   const std::lock_guard<std::mutex> lock(one_at_a_time);
-  auto & modes = *static_cast<Modes *>(const_cast<void *>(from));
+  auto & modes = all_modes[*static_cast<const std::string *>(from)];
   *taken = !modes.empty();
   if (!*taken) return 0;
   const auto [mode, stamp] = modes.front();
@@ -176,6 +177,18 @@ int rmw_take_serialized_message_with_info(const void * from, Bytes * bytes, bool
   std::memcpy(bytes->buffer, little, 4);
   std::memcpy(bytes->buffer + 4, &length, 4);
   std::memcpy(bytes->buffer + 8, mode.c_str(), mode.size() + 1);
+  return 0;
+}
+
+// A message is nothing but its source timestamp; without one there is none to take.
+int rmw_take_with_info(const void *, void * message, bool * taken, Info * info, void *) {
+  info->source_timestamp = *static_cast<std::int64_t *>(message);
+  *taken = info->source_timestamp != 0;
+  return 0;
+}
+
+int rmw_destroy_subscription(Node *, void * subscription) {
+  delete static_cast<std::string *>(subscription);
   return 0;
 }
 
@@ -229,6 +242,7 @@ int main() {
   std::cin >> start;
   const std::int64_t offset = now(CLOCK_REALTIME) - now(CLOCK_MONOTONIC);
   std::deque<Publisher *> publishers;
+  std::deque<void *> subscriptions;
   std::deque<std::string> names;
   std::deque<Node> nodes;
   std::int64_t number = 0;
@@ -245,6 +259,14 @@ int main() {
                                    topic.c_str(), depth);
       continue;
     }
+    if (what == "subscription") {
+      std::string topic;
+      std::cin >> topic >> names.emplace_back();
+      const Node node{"", nullptr, names.back().c_str(), "/"};
+      subscriptions.push_back(
+          rmw_create_subscription(&node, &nodes, topic.c_str(), nullptr, nullptr));
+      continue;
+    }
     std::int64_t at = 0;
     std::cin >> at;
     const timespec until{(start + at) / 1'000'000'000, (start + at) % 1'000'000'000};
@@ -257,6 +279,18 @@ int main() {
       announce(word.c_str(), mode.c_str(), start + at + offset);
     }
     if (what == "mode" || what == "until") continue;
+    if (what == "take") {
+      std::int64_t stamp = 0;
+      bool taken = false;
+      Info info[32]{};
+      std::cin >> stamp;
+      if (stamp != 0) stamp += start + offset;
+      const auto began = now(CLOCK_MONOTONIC);
+      rmw_take_with_info(subscriptions[std::stoul(word)], &stamp, &taken, info, nullptr);
+      std::printf("handed %s %lld %lld\n", word.c_str(), static_cast<long long>(began - start),
+                  static_cast<long long>(now(CLOCK_MONOTONIC) - start));
+      continue;
+    }
     Publisher *& publisher = publishers[std::stoul(word)];
     if (what == "fork") {  // a child that ends as its parent would
       const pid_t child = fork();
@@ -284,6 +318,7 @@ int main() {
     }
     std::printf("took %lld\n", static_cast<long long>(now(CLOCK_MONOTONIC) - began));
   }
+  for (auto * one : subscriptions) rmw_destroy_subscription(nullptr, one);
   for (auto * publisher : publishers) rmw_destroy_publisher(&nodes[0], publisher);
 }
 

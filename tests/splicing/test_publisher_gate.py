@@ -1,4 +1,4 @@
-"""The gate in the publisher's process, loaded into a process that publishes.
+"""The gates in the processes that publish and subscribe, loaded into such a process.
 
 `rmw_stand_in.cpp` stands in for ROS 2, which is not here; `test_shape_in_ros.py` has the real one.
 """
@@ -70,6 +70,7 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
         lines: list[tuple[int, str]],
         meanwhile: Callable[[int, Path], None] = lambda *_: None,
         change: tuple[str, str] = ("", ""),
+        deliveries: str = "",
         **env: str,
     ) -> Run:
         """Publish as the lines say, each at a time (ns), on outputs with gates, and /other.
@@ -97,7 +98,8 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
             assert process.stdout is not None
             assert process.stdout.readline() == "ready\n"
             start = time.monotonic_ns() + 200 * MS
-            blocks, makes = [], ["publisher /other /nobody 10"]
+            blocks, makes = [deliveries], ["subscription /t5 sink", "subscription /t5 other"]
+            makes += ["publisher /other /nobody 10"]
             for topic, gate in gates.items():
                 logs[topic] = tmp_path / f"{topic[1:]}.csv"
                 logs[topic].unlink(missing_ok=True)
@@ -286,6 +288,40 @@ def test_cycles_begin_elsewhere_from_the_next_one_on(run: Callable[..., Run]) ->
     assert origins == sorted(origins)
     with pytest.raises(OperationError, match="no gates publish it now"):
         ask_phase("/not_published", (), 0)
+
+
+DELIVERY_NS = 3 * MS
+
+
+def test_its_receivers_get_an_output_at_a_constant_time_behind_it(run: Callable[..., Run]) -> None:
+    """Taken 0.2 to 2 ms behind the publication; the other subscription is not meant."""
+    taken = [(n * 20 * MS, n % 10 * MS // 5 + MS // 5) for n in range(1, 21)]
+    lines = [(ns, f"take {ns} 0 {ns - age}") for ns, age in taken]
+    lines += [(ns, f"take {ns} 1 {ns - MS}") for ns in range(5 * MS, 400 * MS, 40 * MS)]
+    block = settings_text(
+        {"output": "/t5", "delivery_ns": DELIVERY_NS, "receiver": ["/x", "/sink"]}
+    )
+    done = run({}, lines, deliveries=block)
+    behind = [
+        int(line[3]) - (ns - age) - DELIVERY_NS
+        for line, (ns, age) in zip(done.of("handed", "0"), taken, strict=True)
+    ]
+    assert min(behind) > -20_000, "never before; the two clocks are read one behind the other"
+    assert sorted(behind)[10] < 50_000
+    passed = sorted(int(line[3]) - int(line[2]) for line in done.of("handed", "1"))
+    assert passed[5] < 50_000, "waits for nothing"
+
+
+def test_no_receiver_waits_longer_than_that(run: Callable[..., Run]) -> None:
+    """For a message that was older, for none, and for one from the future: its clock was set."""
+    ages = {20 * MS: 4 * MS, 40 * MS: 40 * MS, 60 * MS: -10_000 * MS}
+    lines = [(ns, f"take {ns} 0 {ns - age}") for ns, age in ages.items()]
+    block = settings_text({"output": "/t5", "delivery_ns": DELIVERY_NS, "receiver": "/sink"})
+    old, none, future = (
+        int(line[3]) - int(line[2]) for line in run({}, lines, deliveries=block).of("handed", "0")
+    )
+    assert max(old, none) < DELIVERY_NS
+    assert DELIVERY_NS <= future < 100 * DELIVERY_NS
 
 
 def test_its_output_is_shown_and_its_slots_move_while_they_are_followed(
