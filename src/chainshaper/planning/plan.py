@@ -229,6 +229,13 @@ class ShapingNode(Part):
                 f" let the chain publish on another topic, such as {self.output}_tmp",
                 "input",
             )
+        if self.delivery_ns is not None and not self.receivers:
+            raise wrong_value(
+                f"{self.output} is to be handed to its receivers at a constant time, and none is"
+                " named: plan from a recording that has its subscribers, with --receivers, or leave"
+                " out --delivery",
+                "delivery_ns",
+            )
         return self
 
 

@@ -162,8 +162,9 @@ def _node_like(
     node: ShapingNode, output: str, publisher: str | None, receivers: Sequence[str] = ()
 ) -> ShapingNode:
     """A shaping node for another topic, with the core, priority and waiting of a given one."""
-    others = {**_names(output), "publisher": publisher, "receivers": tuple(receivers)}
-    return ShapingNode.model_validate({**node.model_dump(), **others})
+    delivery_ns = node.delivery_ns if receivers else None
+    others = {"publisher": publisher, "receivers": tuple(receivers), "delivery_ns": delivery_ns}
+    return ShapingNode.model_validate({**node.model_dump(), **_names(output), **others})
 
 
 def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
