@@ -11,10 +11,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
+import polars as pl
 import pytest
 from ros2 import ros2_environment
 
-from chainshaper import load_application, load_application_plan, load_plan, open_recording
+from chainshaper import (
+    load_application,
+    load_application_plan,
+    load_plan,
+    measure_latency,
+    open_recording,
+)
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning.overruns import cycles_until_output
 
@@ -248,6 +256,25 @@ def test_each_mode_has_the_slot_of_its_own_profile(
     after = open_recording(folder / "after").events["gate_release"]
     assert {*after["mode"]} == {"city", "highway"}
     assert values["recordings"][1]["count"] > 100
+
+
+@pytest.mark.parametrize("publication", ["synchronous", "in-process"])
+def test_receivers_get_the_output_at_a_constant_time_behind_it(
+    run: Callable[..., Result], publication: str
+) -> None:
+    options = ("--chain", "/ticked../commands", "--duration", "20s", "--publication", publication)
+    _, folder = run(DRIVING, "shape", "delivered", *options, "--delivery", "2ms")
+    behind, unshaped = (
+        measure_latency(folder / name)
+        .analysis.traversals.drop_nulls("reception_ns")
+        .select(pl.col("reception_ns") - pl.col("latency_ns"))
+        .to_series()
+        for name in ("after", "before")
+    )
+    least, most = np.quantile(behind, (0.1, 0.9))
+    assert len(behind) > 100
+    assert least >= 2 * MS - MS // 20, "the message is stamped as it is written"
+    assert most - least < np.subtract(*np.quantile(unshaped, (0.9, 0.1))) / 2
 
 
 def _driving(attempt: Callable[..., Attempt], folder: Path, topic: str, duration: str) -> Attempt:
