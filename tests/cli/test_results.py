@@ -14,6 +14,7 @@ from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 from chainshaper import load_plan, measure_latency, open_recording
 from chainshaper.cli import output
 from chainshaper.cli.app import VERBS
+from chainshaper.flow import doctor
 from chainshaper.planning import Plan, save_plan
 from chainshaper.reporting.tables import ResultTable, figures, words
 from chainshaper.values.recording import Recording
@@ -107,6 +108,38 @@ def test_doctor_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
     assert checks["bpftrace"]["state"] == "limited"
     as_root = "does not work: ERROR: tracepoint not found: sched:sched_switch"
     assert checks["bpftrace"]["found"] == (as_root if os.geteuid() == 0 else "needs root")
+
+
+@pytest.mark.parametrize(
+    ("variables", "found"),
+    [
+        ({}, None),
+        ({"ROS_DISTRO": "jazzy"}, "rmw_fastrtps_cpp"),
+        ({"ROS_DISTRO": "humble"}, "have no names"),
+        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, "rmw_cyclonedds_cpp"),
+        (
+            {
+                "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp",
+                "CYCLONEDDS_URI": "<PubSubMessageExchange name='iox'/>",
+            },
+            "iceoryx",
+        ),
+        ({"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ROS_DISTRO": "kilted"}, "Zenoh"),
+        ({"RMW_IMPLEMENTATION": "rmw_connextdds"}, "RTI Connext"),
+        ({"RMW_IMPLEMENTATION": "rmw_own_cpp"}, "rmw_own_cpp is not known"),
+    ],
+)
+def test_doctor_says_what_is_limited_on_a_middleware(
+    variables: dict[str, str], found: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("ROS_DISTRO", "RMW_IMPLEMENTATION", "CYCLONEDDS_URI"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    checks = list(doctor._middleware())
+    assert [(found or "") in check.found for check in checks] == [True] * bool(found)
+    works = found in ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp")
+    assert {check.state for check in checks} <= {"good" if works else "limited"}
 
 
 @pytest.mark.timed

@@ -119,7 +119,8 @@ def test_what_each_thread_of_a_process_does(
     assert roles == expected.split()
     assert {t.nodes_known_by for t in found.threads} == {known_by}
     guess = "process 1 is called /talker after its program, which is a guess"
-    assert [guess in note for note in found.notes] == [True] * (known_by == "program's name")
+    guesses = [note for note in found.notes if guess in note]
+    assert len(guesses) == (known_by == "program's name")
 
 
 def test_the_nodes_of_a_process_and_of_its_threads() -> None:
@@ -305,6 +306,38 @@ def test_servers_stand_below_dds_in_the_order_of_their_priority() -> None:
         201: Scheduling(90, (0,)),
         # Best effort, unknown threads and other processes are left alone.
     }
+
+
+ZENOH = ("app-0", "net-0", "acc-0", "tx-0", "rx-0", "rx-1")
+
+
+def test_on_zenoh_its_router_delivers_too_and_notes_say_what_was_never_run(tmp_path: Path) -> None:
+    """Real processes with threads of those names; of Cyclone DDS's nodes it is no part."""
+    plan = _plan(_server("chain", EXECUTOR_A))
+    router = tmp_path / "rmw_zenohd"
+    for names in (ZENOH, CYCLONE):
+        arguments = ("--ros-args", "-r", "__node:=a")
+        with acting(tmp_path, *names, arguments=arguments) as node, acting(tmp_path, *ZENOH) as box:
+            daemon = replace(known(read_process(box.pid)), command=(str(router),))
+            found = allocate([known(read_process(node.pid)), daemon])
+        wanted = _by_tid(plan_scheduling(plan, found, (0, 1)))
+        comms = {one.thread.tid: one.thread.comm for one in found.threads}
+        of_router = {one.tid for one in daemon.threads} & wanted.keys()
+        assert {comms[tid] for tid in of_router} == (set(ZENOH) if names == ZENOH else set())
+        receiving = {comms[tid] for tid, one in wanted.items() if one == Scheduling(91, (0,))}
+        assert receiving == ({"rx-0", "rx-1"} if names == ZENOH else {"recv"})
+        (note,) = found.notes
+        assert note.startswith("/a, /rmw_zenohd: Zenoh: " if names == ZENOH else "/rmw_zenohd: ")
+        assert note.endswith("known by rules from its sources, and chainshaper never ran on it")
+
+
+def test_threads_without_names_are_left_alone_and_a_note_says_so() -> None:
+    found = allocate([_process(1, X, "talker", "talker", "talker")])
+    assert _by_tid(
+        plan_scheduling(_plan(_server("c", PlannedThread(node="/x"))), found, (0, 1))
+    ) == {1: Scheduling(87, (1,))}
+    (note,) = found.notes
+    assert note.startswith("/x: the middleware's threads have no names (Fast DDS before 2.13")
 
 
 def test_the_cycle_begins_with_the_first_node() -> None:

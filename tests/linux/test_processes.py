@@ -2,6 +2,7 @@
 
 import os
 import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from chainshaper.linux.processes import (
     find_applications,
     guessed_name,
     list_processes,
+    middleware_limit,
     named_nodes,
     read_process,
     takes_ros_arguments,
@@ -143,6 +145,30 @@ def test_threads_that_only_dds_has_tell_a_participant(tmp_path: Path) -> None:
             process = known(read_process(actor.pid))
             assert process.participates is participates
             assert bool(find_applications([process])) is participates
+
+
+ZENOH = ("app-0", "net-0", "acc-0", "tx-0", "rx-0")
+
+
+@pytest.mark.parametrize(
+    ("names", "limit"),
+    [
+        (CYCLONE, None),
+        (("dds.udp.7410", "dds.shm.7411"), None),
+        (ZENOH, "zenoh"),
+        ((*CYCLONE, "KeepAlive"), "iceoryx"),
+        (("recv", "rCo00001##Evt"), "connext"),
+        (("talker", "talker"), "unnamed"),
+        ((), None),
+    ],
+)
+def test_middleware_that_is_known_in_part_is_named(
+    names: tuple[str, ...], limit: str | None, tmp_path: Path
+) -> None:
+    with acting(tmp_path, *names) as actor:
+        process = known(read_process(actor.pid))
+    assert middleware_limit(replace(process, participates=True)) == limit
+    assert process.participates is (limit != "unnamed" and bool(names))
 
 
 def test_a_forked_helper_takes_no_part_whatever_its_command_line_says(tmp_path: Path) -> None:

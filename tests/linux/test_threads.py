@@ -41,24 +41,43 @@ KINDS: dict[DdsKind, tuple[str, ...]] = {
     "garbage collection": ("gc",),
     "asynchronous publisher": ("dds.asyn.0.1", "dds.asyn.10.12"),
     "connection": ("dds.tcp_accept", "dds.tcp_keep", "fsm"),
-    "housekeeping": ("dds.shm.wdog", "dds.log", "dds.fwatch.cb", "dds.something", "debmon"),
+    "housekeeping": (
+        *("dds.shm.wdog", "dds.log", "dds.fwatch.cb", "dds.something", "debmon"),
+        *("rCo00001##Evt", "rTr00001UDPv4", "Watchdog Confir", "Watchdog Valida"),
+    ),
 }
 
 
 @pytest.mark.parametrize(("kind", "names"), KINDS.items(), ids=list(KINDS))
-def test_threads_of_cyclone_dds_and_fast_dds_are_known_by_name(
-    kind: DdsKind, names: tuple[str, ...]
-) -> None:
+def test_threads_of_middleware_are_known_by_name(kind: DdsKind, names: tuple[str, ...]) -> None:
     assert {dds_kind(name) for name in names} == {kind}
     role = "publisher" if kind == "asynchronous publisher" else "dds"
     assert {role_of(name, is_main=False) for name in names} == {role}
 
 
-@pytest.mark.parametrize("name", ["talker", "recvX", "gcc", "ddsperf", "", "python3", "tevatron"])
+OTHERS = ["talker", "recvX", "gcc", "ddsperf", "", "python3", "tevatron", "rx-0", "rController"]
+
+
+@pytest.mark.parametrize("name", OTHERS)
 def test_names_of_others_say_nothing(name: str) -> None:
     assert dds_kind(name) is None
     assert role_of(name, is_main=False) == "unknown"
     assert role_of(name, is_main=True) == role_of("gc", is_main=True) == "executor"
+
+
+ZENOH = ("app-0", "net-0", "acc-0", "tx-0", "rx-0", "rx-1", "rx-12")
+
+
+def test_threads_of_zenoh_are_known_where_several_of_its_runtimes_are(tmp_path: Path) -> None:
+    with acting(tmp_path, *ZENOH, "rx", "rx-0a") as actor:
+        found = {one.comm: (one.role, one.kind) for one in list_threads(actor.pid)[1:]}
+    assert [found[name][1] for name in ZENOH] == [
+        *("event", "connection", "connection", "transmit", "receive", "receive", "receive")
+    ]
+    assert {found[name][0] for name in ZENOH} == {"dds"}
+    assert found["rx"] == found["rx-0a"] == ("unknown", None)
+    with acting(tmp_path, "rx-0", "tx-0", "rx-1", "tx-1") as actor:  # a serial line's, perhaps
+        assert {one.kind for one in list_threads(actor.pid)} == {None}
 
 
 def test_a_process_has_its_main_thread_first_and_named_threads_by_name() -> None:

@@ -66,4 +66,6 @@ def test_rmw() -> None:
     assert rmw_of_gids(named) == "rmw_zenoh_cpp"
     assert rmw_of_threads(["node", "recvUC"]) == "rmw_cyclonedds_cpp"
     assert rmw_of_threads(["dds.udp.7412"]) == "rmw_fastrtps_cpp"
+    assert rmw_of_threads(["app-0", "net-0", "rx-0"]) == "rmw_zenoh_cpp"
+    assert rmw_of_threads(["rCo00001##Evt"]) == "rmw_connextdds"
     assert rmw_of_threads(["node"]) is None

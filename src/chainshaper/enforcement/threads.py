@@ -8,7 +8,8 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 
 * DDS threads stand above all servers, on other cores where there are any: what they deliver must
   not wait for what it is delivered to. Those that receive stand above the others; where the output
-  is received, they have the first of these cores, which the shaping node leaves clear;
+  is received, they have the first of these cores, which the shaping node leaves clear. Zenoh's
+  router, which may pass a chain's messages on, is treated alike;
 * servers stand below 88 in the order of their own priority, smaller first; several threads of one
   server share a priority under SCHED_RR, so that they take turns;
 * the thread that begins a chain stands one above the others of its server, if there are any: the
@@ -30,15 +31,24 @@ from typing import NamedTuple
 
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.linux.processes import (
+    MIDDLEWARE_LIMITS,
+    ROUTERS,
     Process,
     descendants,
     guessed_name,
+    middleware_limit,
     named_nodes,
     takes_ros_arguments,
     user_name,
 )
 from chainshaper.linux.scheduling import Scheduling
-from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole, gate_thread_name
+from chainshaper.linux.threads import (
+    TICK_NS,
+    Thread,
+    ThreadRole,
+    gate_thread_name,
+    is_of_zenoh,
+)
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import Plan, Server, ShapingNode, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
@@ -149,7 +159,7 @@ def allocate(
         f"process {one.process.pid} is called {one.nodes[0]} after its program, which is a guess: "
         "name its recording, or start it with `--ros-args -r __node:=NAME`"
         for one in chosen
-        if one.nodes_known_by == "program's name" and one.nodes
+        if one.nodes_known_by == "program's name" and one.nodes and one.nodes[0] not in ROUTERS
     ]
     ambiguities = [
         f"node {name} is ambiguous: processes "
@@ -160,7 +170,18 @@ def allocate(
     in_order = [one for one in chosen if one.in_order]
     notes = (f"process {o.process.pid} of {', '.join(o.nodes)}: {IN_ORDER}" for o in in_order)
     threads = tuple(thread for one in chosen for thread in _threads_of(one))
-    return Allocation(threads, (*guesses, *ambiguities, *notes))
+    return Allocation(threads, (*guesses, *ambiguities, *notes, *_limits(chosen)))
+
+
+def _limits(identified: Iterable[_Identified]) -> Iterator[str]:
+    """A line for each middleware that is supported in part only, with whom it concerns."""
+    found: dict[str, set[str]] = {}
+    for one in identified:
+        if one.nodes and (limit := middleware_limit(one.process)) is not None:
+            found.setdefault(limit, set()).update(one.nodes)
+    for limit, nodes in found.items():
+        more = ", …" if len(nodes) > _MOST_NAMED else ""
+        yield f"{', '.join(sorted(nodes)[:_MOST_NAMED])}{more}: {MIDDLEWARE_LIMITS[limit]}"
 
 
 def with_gates(found: Allocation, nodes: Iterable[ShapingNode]) -> Allocation:
@@ -398,7 +419,7 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
         if planned.role == "publisher":
             what = (
                 "asynchronous publisher. Fast DDS has one if RMW_FASTRTPS_PUBLICATION_MODE is "
-                "ASYNCHRONOUS, Cyclone DDS has none: plan with --publication synchronous, or "
+                "ASYNCHRONOUS, Cyclone DDS and Zenoh have none: plan with --publication synchronous, or "
             )
         raise OperationError(
             f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
@@ -528,10 +549,13 @@ def scheduling_around(
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
     receivers = {one.thread.thread.pid for one in receiving}
+    concerned = set(planned.values())
+    if any(one.thread.pid in concerned and is_of_zenoh(one.thread) for one in allocation.threads):
+        concerned |= {one.thread.pid for one in allocation.threads if set(one.nodes) & ROUTERS}
     beside = (
         _beside(one, own, free_cores, one.thread.pid in receivers)
         for one in allocation.threads
-        if one.thread.pid in planned.values() and one.thread.identity not in planned
+        if one.thread.pid in concerned and one.thread.identity not in planned
     )
     wanted = [*own, *receiving, *(one for one in beside if one is not None)]
     # What a person reads: servers' threads, DDS threads, the others.

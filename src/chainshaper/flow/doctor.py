@@ -6,6 +6,7 @@ Each check names what was found and, where something is missing, the remedy. Not
 import importlib.metadata
 import os
 import platform
+import re
 import resource
 import shutil
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 
 from chainshaper.enforcement.back_ends import offered_back_ends
 from chainshaper.linux.own_processes import tool_environment
+from chainshaper.linux.processes import MIDDLEWARE_LIMITS
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
 from chainshaper.values.recording import Check, MachineReport, State
@@ -60,6 +62,7 @@ def _scheduling_checks(realtime: bool) -> Iterator[Check]:
 
 def _tool_checks() -> Iterator[Check]:
     yield _dds()
+    yield from _middleware()
     for offer in offered_back_ends():  # what `chainshaper apply` can use here, strongest first
         found, _, remedy = (offer.missing or "").partition(": ")
         good = "can be used" if offer.missing is None else None
@@ -107,9 +110,32 @@ def _dds() -> Check:
         from chainshaper.workload import dds  # noqa: F401 - loading it is the check
     except Exception as error:
         found, problem = None, str(error)
-    remedy = "use Python 3.10 to 3.13 on x86-64, for which a wheel exists"
+    remedy = (
+        "ROS 2 applications need none; else use Python 3.10 to 3.13 on x86-64, for which a wheel "
+        "exists, or `pip install cyclonedds` with CYCLONEDDS_HOME naming a Cyclone DDS 11"
+    )
     purpose = "the live workload and `chainshaper demo`"
     return _check("Cyclone DDS for Python", purpose, found, "absent", problem, remedy)
+
+
+def _middleware() -> Iterator[Check]:
+    """What is limited on the middleware that the environment chooses; no check without ROS 2."""
+    distribution = os.environ.get("ROS_DISTRO")
+    rmw = os.environ.get("RMW_IMPLEMENTATION") or ("rmw_fastrtps_cpp" if distribution else None)
+    if rmw is None:
+        return
+    limits = {"rmw_zenoh_cpp": "zenoh", "rmw_connextdds": "connext", "rmw_gurumdds_cpp": "unnamed"}
+    limit = limits.get(rmw)
+    if rmw.startswith("rmw_fastrtps") and distribution in ("humble", "iron"):
+        limit = "unnamed"
+    configured = os.environ.get("CYCLONEDDS_URI", "")
+    if rmw == "rmw_cyclonedds_cpp" and re.search(r"iox|<SharedMemory>", configured):
+        limit = "iceoryx"
+    found = MIDDLEWARE_LIMITS.get(limit or "", f"{rmw} is not known")
+    good = None if limit or not re.match("rmw_(cyclonedds|fastrtps)", rmw) else rmw
+    purpose = "delivery threads, in their place beside a chain"
+    remedy = "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or measure what `shape` makes of it"
+    yield _check("middleware", purpose, good, "limited", found, remedy)
 
 
 def _check(  # noqa: PLR0917 - a check's columns

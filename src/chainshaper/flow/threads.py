@@ -29,7 +29,13 @@ from chainshaper.enforcement.threads import (
     allocate,
 )
 from chainshaper.flow.phase import Phase, measure_phase
-from chainshaper.linux.processes import descendants, find_applications, list_processes, run_users
+from chainshaper.linux.processes import (
+    ROUTERS,
+    descendants,
+    find_applications,
+    list_processes,
+    run_users,
+)
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread, ThreadRole
 from chainshaper.planning.application_plan import (
@@ -104,7 +110,7 @@ def find_threads(
             joint = whole(where)
             servers = joint.servers
             hosted = {receiver for gate in gates for receiver in gate.receivers}
-            hosted |= {thread.node for server in servers for thread in server.threads}
+            hosted |= {thread.node for server in servers for thread in server.threads} | ROUTERS
         chosen = tuple(
             process
             for process in processes

@@ -23,6 +23,7 @@ from pathlib import PurePath
 from chainshaper.linux.threads import (
     Thread,
     innermost_id,
+    is_of_zenoh,
     list_threads,
     parents,
     read_proc,
@@ -45,6 +46,20 @@ _LIBRARIES_WITHOUT_NAMED_THREADS = (
     b"/libgurumdds.so",
     b"/librmw_zenoh_cpp.so",
 )
+ROUTERS = frozenset({"/rmw_zenohd", "/zenohd"})
+"""Zenoh's router, by the name of its program: messages may pass through it."""
+
+_OF_ICEORYX = "KeepAlive"  # `posh_runtime_impl.cpp`; its `Listener` names no thread
+_FROM_SOURCES = "threads are known by rules from its {}, and chainshaper never ran on it"
+MIDDLEWARE_LIMITS = {
+    "zenoh": f"Zenoh: its {_FROM_SOURCES.format('sources')}",
+    "connext": f"RTI Connext: its {_FROM_SOURCES.format('manual')}",
+    "iceoryx": f"Cyclone DDS with iceoryx: its {_FROM_SOURCES.format('sources')}; the thread that"
+    " delivers has no name, and stays as it is",
+    "unnamed": "the middleware's threads have no names (Fast DDS before 2.13, GurumDDS): those that"
+    " deliver stay as they are, and may wait for a chain on the same core",
+}
+"""What is limited on a middleware, in a line; what is not here was run."""
 
 
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
@@ -188,6 +203,21 @@ def _participates(pid: int, threads: tuple[Thread, ...]) -> bool:
     except OSError:
         return False  # another user's: its threads' names are all there is to see
     return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS)
+
+
+def middleware_limit(process: Process) -> str | None:
+    """The key in :data:`MIDDLEWARE_LIMITS` of a process that takes part, by its threads."""
+    others = [one for one in process.threads if one.tid != process.pid]
+    if not process.participates or not others:
+        return None
+    if any(map(is_of_zenoh, others)):
+        return "zenoh"
+    if any(one.comm == _OF_ICEORYX for one in others):
+        return "iceoryx"
+    named = {one.comm[:3] for one in others if one.kind is not None}
+    if named & {"rCo", "rTr"}:
+        return "connext"
+    return None if named else "unnamed"
 
 
 def takes_ros_arguments(command: Sequence[str]) -> bool:

@@ -2,17 +2,20 @@
 
 A thread is identified by its id *and* its start: ids are used again. Cyclone DDS has always named
 its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); others carry the name of their process.
+Zenoh's names are short words (`rx-0`), so they count only in a process that has several of them.
 
-Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading".
+Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading";
+Zenoh, `commons/zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, User's Manual, "Identifying
+Threads".
 """
 
 import functools
 import os
 import re
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
@@ -68,7 +71,20 @@ _DDS_NAMES: tuple[tuple[str, DdsKind], ...] = (  # the first that matches a whol
     (r"dds\.ev\..*", "event"),
     (r"dds\.(ds_ev|tls)\..*", "discovery"),
     (r"dds\..*", "housekeeping"),
+    # RTI Connext: module, domain, participant, then a task that no manual lists completely.
+    (r"r(Co|Tr)\d{5}.*", "housekeeping"),
+    (r"Watchdog (Confir|Valida)\w*", "housekeeping"),  # Zenoh's shared memory
 )
+
+_ZENOH_RUNTIMES: dict[str, DdsKind] = {
+    "rx": "receive",  # takes messages from links, and runs what subscriptions registered
+    "tx": "transmit",  # sends what publishers hand over, and what keeps a link alive
+    "acc": "connection",
+    "net": "connection",
+    "app": "event",
+}
+_ZENOH_NAME = re.compile(rf"({'|'.join(_ZENOH_RUNTIMES)})-\d+")
+_SURELY_ZENOH = 3  # runtimes; the variable ZENOH_RUNTIME may join two of the five to others
 
 
 @functools.lru_cache(maxsize=1024)
@@ -130,7 +146,27 @@ def list_threads(pid: int) -> tuple[Thread, ...]:
         return ()
     tids.sort(key=lambda tid: (tid != pid, tid))
     found = (_thread(pid, tid, inner_pid) for tid in tids)
-    return tuple(thread for thread in found if thread is not None)
+    return with_zenoh(thread for thread in found if thread is not None)
+
+
+def with_zenoh(threads: Iterable[Thread]) -> tuple[Thread, ...]:
+    """The threads of a process, of which Zenoh's have their roles; without enough of them, none."""
+    every = tuple(threads)
+    own = {one.tid: match[1] for one in every if (match := _ZENOH_NAME.fullmatch(one.comm))}
+    if len(set(own.values())) < _SURELY_ZENOH:
+        return every
+    kinds = {tid: _ZENOH_RUNTIMES[runtime] for tid, runtime in own.items()}
+    return tuple(
+        replace(one, role="dds", kind=kinds[one.tid])
+        if one.tid in kinds and one.tid != one.pid
+        else one
+        for one in every
+    )
+
+
+def is_of_zenoh(thread: Thread) -> bool:
+    """Whether a thread with its role is one of Zenoh's runtimes."""
+    return thread.kind is not None and _ZENOH_NAME.fullmatch(thread.comm) is not None
 
 
 def find_thread(tid: int) -> Thread | None:

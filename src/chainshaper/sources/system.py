@@ -24,6 +24,8 @@ _VENDORS = {
 _THREADS = {
     "rmw_cyclonedds_cpp": re.compile(r"recvUC|recvMC|dq\.builtins|dq\.user|xmit\.user"),
     "rmw_fastrtps_cpp": re.compile(r"dds\.(asyn|ev|udp|shm|tcp)"),
+    "rmw_connextdds": re.compile(r"rCo\d{5}"),
+    "rmw_zenoh_cpp": re.compile(r"net-\d+$"),
 }
 
 

@@ -29,7 +29,8 @@ try:
 except ImportError as error:  # no wheel for this Python or processor
     raise PlatformError(
         f"the live workload needs the `cyclonedds` package, which does not load here ({error}); "
-        "it exists for Python 3.10 to 3.13 on x86-64: use one of these"
+        "wheels exist for Python 3.10 to 3.13 on x86-64: use one of these, or build it "
+        "(`chainshaper doctor` says how)"
     ) from error
 
 GuardCondition, WaitSet = core.GuardCondition, core.WaitSet
