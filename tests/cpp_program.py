@@ -11,17 +11,17 @@ from chainshaper.splicing.shaping_process import generic_package
 __all__ = ["compiled"]
 
 
-def compiled(source: Path, folder: Path) -> Path:
+def compiled(source: Path, folder: Path, name: str = "g++") -> Path:
     """The program of a source file, compiled into a folder; no warning is let pass."""
-    compiler = shutil.which("g++")
+    compiler = shutil.which(name)
     if compiler is None:
-        pytest.skip("g++ is not installed, so the gate in C++ cannot be compiled")
+        pytest.skip(f"{name} is not installed, so the gate in C++ cannot be compiled")
     for path, text in generic_package().items():
         if path.endswith(".hpp"):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_text(text)
     program = folder / source.stem
     warnings = ["-Wall", "-Wextra", "-Wconversion", "-Werror"]
-    options = ["-std=c++17", "-O1", *warnings, f"-I{folder / 'include'}"]
+    options = ["-std=c++17", "-O1", *warnings, f"-I{folder / 'include'}", "-static"]
     subprocess.run([compiler, *options, source, "-o", program], check=True, timeout=150)
     return program

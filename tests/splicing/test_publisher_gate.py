@@ -21,6 +21,7 @@ from chainshaper.gate.decision import Gate, gate_parameters
 from chainshaper.gate.handover import page_folders
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.sources.gate_log import read_gate_log
+from chainshaper.splicing import shaping_process
 from chainshaper.splicing.shaped_outputs import (
     FollowedOutput,
     ShapedOutput,
@@ -130,6 +131,22 @@ def run(program: Path, tmp_path: Path) -> Callable[..., Run]:
         return Run([line.split() for line in out.splitlines()], err, rows, start)
 
     return started
+
+
+def test_it_compiles_for_arm64(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    compiler = shutil.which("aarch64-linux-gnu-g++")
+    if compiler is None:
+        pytest.skip("aarch64-linux-gnu-g++ is not installed")
+
+    def compile_there(_: str, words: list[str], library: Path, __: tuple[str, str]) -> Path:
+        warnings = ["-Wall", "-Wextra", "-Werror"]
+        command = [compiler, *words, "-O0", *warnings, "-o", str(library)]
+        subprocess.run(command, check=True, timeout=100)
+        return library
+
+    monkeypatch.setattr(shaping_process, "compile_library", compile_there)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    assert int.from_bytes(gate_library().read_bytes()[18:20], "little") == 183  # EM_AARCH64
 
 
 def at(ns: int, publisher: int = 1, stamp: int | None = None, what: str = "at") -> tuple[int, str]:

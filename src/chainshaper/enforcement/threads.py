@@ -419,7 +419,8 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
         if planned.role == "publisher":
             what = (
                 "asynchronous publisher. Fast DDS has one if RMW_FASTRTPS_PUBLICATION_MODE is "
-                "ASYNCHRONOUS, Cyclone DDS and Zenoh have none: plan with --publication synchronous, or "
+                "ASYNCHRONOUS, Cyclone DDS and Zenoh have none: plan with --publication "
+                "synchronous, or "
             )
         raise OperationError(
             f"process {pids[0]} of node {planned.node} has no thread that is known to be its "

@@ -5,8 +5,8 @@ its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); others carry the name of 
 Zenoh's names are short words (`rx-0`), so they count only in a process that has several of them.
 
 Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading";
-Zenoh, `commons/zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, User's Manual, "Identifying
-Threads".
+Zenoh, `commons/zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, User's Manual,
+"Identifying Threads".
 """
 
 import functools
