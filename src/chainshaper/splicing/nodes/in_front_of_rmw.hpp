@@ -100,7 +100,7 @@ void * behind(const char * name) {
     return found; \
   }())
 
-bool is_humble() {
+[[maybe_unused]] bool is_humble() {
   const char * const distribution = std::getenv("ROS_DISTRO");
   return distribution != nullptr && std::strcmp(distribution, "humble") == 0;
 }
