@@ -9,16 +9,6 @@ from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.workload.description import Application, load_application
 
-__all__ = [
-    "DDS_CORE",
-    "EXECUTOR_CORE",
-    "NODES",
-    "PERIOD_NS",
-    "small_chain",
-    "small_chain_plan",
-    "small_chain_text",
-]
-
 DDS_CORE = available_cores()[0]
 EXECUTOR_CORE = available_cores()[-1]
 PERIOD_NS = 50_000_000

@@ -42,8 +42,6 @@ from chainshaper.workload.description import Application, ExecutionTime, applica
 from chainshaper.workload.event_log import LAYOUT, EventLog
 from chainshaper.workload.live import node_name
 
-__all__ = ["samples", "simulate", "simulate_latencies", "with_recorded_times"]
-
 _run_engine = kernel("chainshaper.simulation.engine", "run")
 
 START_NS = 1_000_000_000

@@ -44,21 +44,6 @@ from chainshaper.verify.measure import chain_of, hop_breakdown, measure_latency
 if TYPE_CHECKING:
     from chainshaper.verify.watch import Seen
 
-__all__ = [
-    "Budget",
-    "Judged",
-    "Verdict",
-    "broken_limits",
-    "check_budget",
-    "check_budgets",
-    "junit_report",
-    "load_budget",
-    "markdown_report",
-    "named_callbacks",
-    "propose_budget",
-    "save_budget",
-]
-
 ROOM = 0.1
 """A proposal leaves as much room beyond what was measured."""
 GRAIN_NS = 10_000

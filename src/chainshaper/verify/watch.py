@@ -53,8 +53,6 @@ from chainshaper.values.recording import (
 )
 from chainshaper.verify.predictions import due_of
 
-__all__ = ["SPANS", "ChainNow", "Hop", "Seen", "Watch", "exporting"]
-
 SECOND = 1_000_000_000
 SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
 RECORDER_NS = 10 * SECOND
