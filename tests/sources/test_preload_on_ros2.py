@@ -126,8 +126,8 @@ def test_what_is_watched_is_what_lttng_records(
     known = cs.measure_latency(tmp_path / "lttng", "/t1../t3").analysis.traversals
     theirs = known.drop_nulls("latency_ns")
     last = theirs["start"].to_numpy()[-1]  # LTTng's session ends before the application does
-    whole = (seen.latency >= 0) & (seen.begun < last)
-    start, latency = seen.begun[whole], seen.latency[whole]
+    cycles = seen.cycles.drop_nulls("latency_ns").filter(pl.col("start") < last)
+    start, latency = cycles["start"].to_numpy(), cycles["latency_ns"].to_numpy()
     assert start.size > 40
     nearest = np.abs(theirs["start"].to_numpy()[:, None] - start).argmin(axis=0)
     assert np.unique(nearest).size == start.size, "one of theirs for each of ours"

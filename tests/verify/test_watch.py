@@ -96,20 +96,20 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     whole = analyse_latency(tables, CHAIN, info.clock_offset_ns).traversals
     (chain,) = watch.chains
     latencies = dict(whole.select("start", "latency_ns").iter_rows())
-    assert 30 <= chain.begun.size <= 50
-    assert [latencies[begun] for begun in chain.begun.tolist()] == chain.latency.tolist()
-    begun = whole.filter(whole["start"].is_between(int(chain.begun[0]), int(chain.begun[-1])))
-    assert begun.height == chain.begun.size, "none is passed over, none counted twice"
+    begun, found, count = chain.cycles["start"], chain.cycles["latency_ns"], chain.cycles.height
+    assert 30 <= count <= 50
+    assert [latencies[one] for one in begun] == found.to_list()
+    same_time = whole.filter(whole["start"].is_between(begun[0], begun[-1]))
+    assert same_time.height == count, "none is passed over, none counted twice"
     last = seen[-1].chains[0]
-    assert last.spans["hour"].count == chain.begun.size
-    assert last.spans["hour"].max_ns == int(chain.latency.max())
-    lasted = int(chain.begun[-1] - chain.begun[0]) / SECOND
-    assert last.rate_hz == pytest.approx((chain.begun.size - 1) / lasted)
+    assert last.spans["hour"].count == count
+    assert last.spans["hour"].max_ns == found.max()
+    assert last.rate_hz == pytest.approx((count - 1) * SECOND / (begun[-1] - begun[0]))
     assert sum(h.communication_ns + h.computation_ns for h in last.hops) == pytest.approx(
-        float(chain.latency.mean()), rel=1e-6
+        found.mean(), rel=1e-6
     )
     assert [hop.node for hop in last.hops] == ["/first", "/second"]
-    assert abs(other_seen.chains[0].spans["hour"].count - chain.begun.size) <= 5
+    assert abs(other_seen.chains[0].spans["hour"].count - count) <= 5
     assert seen[-1].lost == 0
 
 
@@ -248,10 +248,11 @@ def test_a_clock_that_is_set_spoils_no_figure(
     starts = [int(row[2]) for row in printed if row[0] == "instance"][::2]
     outputs = [int(row[2]) for row in printed if row[:2] == ["publication", "/ebpf2"]]
     (chain,) = watch.chains
-    first = np.searchsorted(starts, chain.begun) - 1  # the program reads the clock before the event
+    begun, latency = (chain.cycles[one].to_numpy() for one in ("start", "latency_ns"))
+    first = np.searchsorted(starts, begun) - 1  # the program reads the clock before the event
     expected = np.array(outputs)[first] - np.array(starts)[first]
-    whole = chain.latency >= 0
-    assert (np.abs(chain.latency - expected)[whole] < PERIOD_NS // 2).all(), "of its own cycle"
+    whole = latency >= 0  # none: NaN
+    assert (np.abs(latency - expected)[whole] < PERIOD_NS // 2).all(), "of its own cycle"
     assert first[-1] - first[0] + 1 <= first.size + counted["unclear"], "none is passed over"
     assert first.size > 30
     assert counted["incomplete"] <= 1
@@ -260,35 +261,21 @@ def test_a_clock_that_is_set_spoils_no_figure(
 
 
 def test_memory_does_not_grow(tmp_path: Path) -> None:
-    """An hour of cycles stays, events of seconds: days are simulated by setting the clock on."""
-    watch = own_watch()
-    (chain,) = watch.chains
-
-    from chainshaper.analysis.traversals import traverse  # noqa: F401 - the frame's columns
-
-    hops = pl.DataFrame(
-        schema={
-            "traversal": pl.UInt32(),
-            "hop": pl.UInt32(),
-            "communication_ns": pl.Int64(),
-            "computation_ns": pl.Int64(),
-        }
+    """An hour of cycles stays, events of seconds: hours are simulated by setting the clock on."""
+    (chain,) = own_watch().chains
+    hops = pl.DataFrame(schema=["traversal", "hop", "communication_ns", "computation_ns"])
+    hops = hops.cast(pl.UInt32())
+    minute = pl.DataFrame({"start": range(0, 60 * SECOND, SECOND // 10)}).with_columns(
+        pl.lit(5_000_000).alias("latency_ns"),
+        pl.lit(5_000_000).alias("place_ns"),
+        late=False,
+        complete=True,
+        traversal=pl.int_range(pl.len(), dtype=pl.UInt32()),
     )
-    rate = 10
-    for second in range(2 * 3600):
-        start = np.arange(rate) * (SECOND // rate) + second * SECOND
-        frame = pl.DataFrame(
-            {
-                "traversal": np.arange(rate, dtype=np.uint32),
-                "start": start,
-                "latency_ns": np.full(rate, 5_000_000),
-                "late": np.zeros(rate, bool),
-                "place_ns": np.full(rate, 5_000_000),
-                "complete": np.ones(rate, bool),
-            }
-        )
-        chain.take_over(frame, hops, (second + 1) * SECOND)
-    assert chain.begun.size == pytest.approx(3600 * rate, rel=0.001)
+    for number in range(1, 121):
+        chain.take_over(minute, hops, number * 60 * SECOND)
+        minute = minute.with_columns(pl.col("start") + 60 * SECOND)
+    assert chain.cycles.height == pytest.approx(3600 * 10, rel=0.001)
 
 
 def test_the_command_shows_and_streams(tmp_path: Path) -> None:

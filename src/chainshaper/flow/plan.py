@@ -36,8 +36,8 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import chain_of, longest_stall
-from chainshaper.workload.description import Application
-from chainshaper.workload.live import Enforcement, Progress, node_name, run_application, timing_of
+from chainshaper.workload.description import Application, node_name
+from chainshaper.workload.live import Enforcement, Progress, run_application, timing_of
 
 __all__ = ["plan_recording", "profile_chains", "shape_application"]
 

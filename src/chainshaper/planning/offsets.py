@@ -23,7 +23,7 @@ import random
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, combinations
+from itertools import combinations
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -192,13 +192,14 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
             allowed[k, j] = common, [(-end % common, -start % common) for start, end in intervals]
     for (core, priority), load in _loads(tables).items():
         if load > 1 + 1e-9:
+            names = ", ".join(one.name for one in tables if (core, priority) in one.slots)
             raise OperationError(
-                f"the slots of {_names_on(tables, core, priority)} on core {core} at priority"
-                f" {priority} fill {load:.1%} of its time, {load - 1:.1%} too much: move a chain to"
-                " another core, or give servers different priorities"
+                f"the slots of {names} on core {core} at priority {priority} fill {load:.1%} of its"
+                f" time, {load - 1:.1%} too much: move a chain to another core, or give servers"
+                " different priorities"
             )
     offsets = dict.fromkeys(range(len(tables)), 0)
-    for group in _joined(len(tables), allowed):
+    for group in linked(len(tables), allowed):
         if len(group) == 1:
             continue
         if len(group) <= MOST_SEARCHED:
@@ -216,10 +217,6 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
             )
         offsets.update(solution)
     return offsets
-
-
-def _slots_of(table: Timetable) -> Iterator[Slot]:
-    return chain.from_iterable(table.slots.values())
 
 
 def _collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
@@ -247,13 +244,13 @@ def _between(forbidden: _Intervals, common: int) -> _Intervals:
     return allowed
 
 
-def _joined(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
+def linked(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
     """The numbers below ``count``, together where pairs link them, directly or through others."""
-    groups = [{k} for k in range(count)]
-    for pair in pairs:
-        merged = set().union(*(group for group in groups if group.intersection(pair)))
-        groups = [group for group in groups if not group & merged] + [merged]
-    return sorted(sorted(group) for group in groups)
+    of = {number: {number} for number in range(count)}
+    for one, two in pairs:
+        joined = of[one] | of[two]
+        of.update(dict.fromkeys(joined, joined))
+    return sorted(sorted(group) for group in {id(group): group for group in of.values()}.values())
 
 
 def _search(
@@ -310,7 +307,7 @@ def _fitted(
     hard ones come to stay and the others move around them (guided ejection: Nagata and Bräysy,
     Operations Research Letters 37, 2009).
     """
-    busy = [sum(end - start for start, end in _slots_of(table)) for table in tables]
+    busy = [sum(b - a for slots in one.slots.values() for a, b in slots) for one in tables]
     waiting = sorted(group, key=lambda k: (-tables[k].cycle_ns, busy[k]))
     weight = dict.fromkeys(group, 1)
     placed: dict[int, int] = {}
@@ -425,10 +422,6 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
         f" {format_duration(needed)}{excess}). Move one to another core, give their servers"
         " different priorities, or use periods with a larger common divisor"
     )
-
-
-def _names_on(tables: Sequence[Timetable], core: int, priority: int) -> str:
-    return ", ".join(table.name for table in tables if (core, priority) in table.slots)
 
 
 def chain_name(plan: Plan) -> str:
