@@ -29,6 +29,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.planning.overruns import slots_without
 from chainshaper.planning.plan import Plan, Slot, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import format_duration
@@ -185,7 +186,9 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
     for j, k in combinations(range(len(tables)), 2):
         common, forbidden = _collisions(tables[j], tables[k])
         if forbidden:
-            intervals = _between(forbidden, common)
+            taken = [(first, last + 1) for first, last in forbidden]
+            free = slots_without([(0, common)], taken)
+            intervals = [(first, end - 1) for first, end in free]
             if not intervals:
                 raise OperationError(_pair_too_long(tables[j], tables[k], common))
             allowed[j, k] = common, intervals
@@ -233,15 +236,6 @@ def _collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
                 first, last = first % common, last % common
                 forbidden += [(first, last)] if first <= last else [(0, last), (first, common - 1)]
     return common, forbidden
-
-
-def _between(forbidden: _Intervals, common: int) -> _Intervals:
-    allowed, free = [], 0
-    for first, last in sorted([*forbidden, (common, common)]):
-        if first > free:
-            allowed.append((free, first - 1))
-        free = max(free, last + 1)
-    return allowed
 
 
 def linked(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
