@@ -66,10 +66,10 @@ def test_measuring_planning_and_simulating_give_what_they_give_compiled(
     core: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "app.yaml").write_text(small_chain_text())
-    words = ["simulate", str(tmp_path / "app.yaml"), "--cycles", "40", "-o"]
+    words = ["simulate", str(tmp_path / "app.yaml"), "--cycles", "15", "-o"]
     made = _run(core, *words, str(tmp_path / "robot"))
     assert made.returncode == 0, made.stderr
-    cs.simulate(cs.load_application(tmp_path / "app.yaml"), tmp_path / "here", cycles=40)
+    cs.simulate(cs.load_application(tmp_path / "app.yaml"), tmp_path / "here", cycles=15)
     for table in (tmp_path / "here").glob("*.parquet"):
         assert table.read_bytes() == (tmp_path / "robot" / table.name).read_bytes()
     latency = _run(core, "latency", str(tmp_path / "robot"), "--json")
