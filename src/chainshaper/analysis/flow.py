@@ -72,6 +72,8 @@ def data_flow(
     instances, taken = _with_assumed_readers(instances, taken, timer_calls(tables, objects), objects)
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
+    if "rcl_timer_call" not in tables and instances["assumed"].any():
+        published = _begun_outside(published, instances)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
     notes = list(objects.notes)
@@ -294,6 +296,20 @@ def _published_in(
     return published.with_columns(
         by_number(every, "publication", column, published.height) for column in columns[1:]
     )
+
+
+def _begun_outside(published: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
+    """The publications, of which those of rclpy's timers are in no instance of a subscription.
+
+    Where nothing tells of timers, a topic that was published before anything was taken is one's:
+    what came behind takes later is no output of theirs.
+    """
+    inside = pl.lit(instances["assumed"]).gather("instance")
+    published = published.with_columns(assumed=inside)
+    first = pl.col("instance").first().is_null()
+    own = (first & pl.col("assumed").fill_null(True).all()).over("publisher")
+    columns = (pl.when(~own).then(column).alias(column) for column in ("instance", "callback_id"))
+    return published.with_columns(columns).drop("assumed")
 
 
 def _with_assumed_writers(
