@@ -4,6 +4,8 @@ import random
 import sys
 import threading
 import time
+from contextlib import suppress
+from pathlib import Path
 
 import rclpy
 from geometry_msgs.msg import PointStamped
@@ -12,12 +14,13 @@ from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, Si
 from rclpy.node import Node
 
 
-class Worker(Node):
+class Worker(Node):  # type: ignore[misc]
     """A timer → /begun → /worked → /done, the second callback in a reentrant group."""
 
-    def __init__(self, words):
+    def __init__(self, words: list[str]) -> None:
         super().__init__("worker")
-        self.notes, self.origin = [], 0
+        self.notes: list[tuple[object, ...]] = []
+        self.origin = 0
         self.least, self.most = (float(word) / 1e3 for word in words[5:7])
         self.clock = time.monotonic if words[7] == "sleep" else time.thread_time
         groups = [MutuallyExclusiveCallbackGroup(), ReentrantCallbackGroup(), None]
@@ -29,14 +32,14 @@ class Worker(Node):
                 PointStamped, topic, lambda m, n=name: self.work(n, m), 50, callback_group=group
             )
 
-    def begin(self):
+    def begin(self) -> None:
         message = PointStamped()
         message.header.stamp = self.get_clock().now().to_msg()
         message.header.frame_id = str(self.origin)
         self.origin += 1
         self.work("timer", message)
 
-    def work(self, name, message):
+    def work(self, name: str, message: PointStamped) -> None:
         began, since = time.monotonic_ns(), self.clock()
         duration = (name == "work" or 0.1) * random.uniform(self.least, self.most)
         while (left := since + duration - self.clock()) > 0:
@@ -48,17 +51,15 @@ class Worker(Node):
         self.notes.append((name, *at, time.monotonic_ns()))
 
 
-def main():
+def main() -> None:
     rclpy.init()
     words = rclpy.utilities.remove_ros_args(sys.argv)
     node = Worker(words)
     executor = MultiThreadedExecutor(4) if words[2] == "multi" else SingleThreadedExecutor()
     executor.add_node(node)
-    try:
+    with suppress(KeyboardInterrupt, ExternalShutdownException):
         executor.spin()
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
-    with open(words[1], "w") as file:
+    with Path(words[1]).open("w") as file:
         file.writelines(" ".join(map(str, line)) + "\n" for line in node.notes)
 
 

@@ -12,8 +12,8 @@ are assumed (``assumed``, no ``end``, no response time):
   its subscription begins with each take, one of its timer with each `rcl_timer_call`. What its
   thread publishes for the same node until the next of these counts as that instance's output.
 * A driver's own thread, a player of recorded data, the callback of a service's client, or a Python
-  timer without such events publishes outside all callbacks that events show. A topic that its node publishes only
-  like this gets a callback of kind ``unknown``, with the handle 0 and one instance per
+  timer without such events publishes outside all callbacks that events show. A topic that its node
+  publishes only like this gets a callback of kind ``unknown``, with the handle 0 and one instance per
   publication, so that chains can begin there.
 """
 
@@ -69,7 +69,9 @@ def data_flow(
         published = publications(tables, objects)
         taken = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
-    instances, taken = _with_assumed_readers(instances, taken, timer_calls(tables, objects), objects)
+    instances, taken = _with_assumed_readers(
+        instances, taken, timer_calls(tables, objects), objects
+    )
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
@@ -217,7 +219,7 @@ def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
 def _with_assumed_readers(
     instances: pl.DataFrame, taken: pl.DataFrame, calls: pl.DataFrame, objects: Objects
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Add an instance for every take of a subscription, or call of a timer, without callback events.
+    """Add an instance for every take, or timer's call, of what has no callback events.
 
     Returns the instances, renumbered in order of start, and the takes with ``assumed_instance``.
     """

@@ -107,7 +107,9 @@ def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[
             ids = [one.id for one in writers]
             own = pl.col("callback_id").is_in(ids) & (pl.col("topic") == topic)
             # Not when it was published: on another thread the next inputs may have come by then.
-            begun = flow.publications.filter(own).join(flow.instances, on="instance")["start"].sort()
+            begun = (
+                flow.publications.filter(own).join(flow.instances, on="instance")["start"].sort()
+            )
             if len(begun) < 2:
                 continue  # nothing lies between
             ran = flow.instances.filter(pl.col("callback_id").is_in(ids))
