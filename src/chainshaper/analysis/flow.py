@@ -13,8 +13,8 @@ are assumed (``assumed``, no ``end``, no response time):
   thread publishes for the same node until the next of these counts as that instance's output.
 * A driver's own thread, a player of recorded data, the callback of a service's client, or a Python
   timer without such events publishes outside all callbacks that events show. A topic that its node
-  publishes only like this gets a callback of kind ``unknown``, with the handle 0 and one instance per
-  publication, so that chains can begin there.
+  publishes only like this gets a callback of kind ``unknown``, with the handle 0 and one instance
+  per publication, so that chains can begin there.
 """
 
 from collections.abc import Collection
