@@ -5,6 +5,7 @@ import pytest
 from story import Callback, Publisher, Story
 
 from chainshaper.analysis import data_flow, executors, find_chain, graph_of, traverse
+from chainshaper.flow.plan import _instances_apart_from
 
 
 def latencies(story: Story, spec: str) -> list[tuple[int, int | None]]:
@@ -114,6 +115,14 @@ def test_what_a_timer_in_python_publishes_is_not_what_its_thread_took_before() -
     assert threads(story) == [{10, 11, 12}], "the main thread gives the others their work"
     timer = data_flow(story.tables()).objects.callbacks.filter(pl.col("kind") == "timer")
     assert timer.select("node", "period_ns", "observed").rows() == [("/python", 100, False)]
+
+
+def test_an_instance_in_python_lasts_until_its_last_publication() -> None:
+    """Of which a plan is made: 5 of the timer's, 10 of the subscription's."""
+    flow = data_flow(python_node(calls=True).tables())
+    none = pl.DataFrame(schema={"start": pl.Int64(), "end": pl.Int64()})
+    seen = _instances_apart_from(flow, none)
+    assert seen["response"].to_list() == [5, 10] * 4
 
 
 def test_without_calls_of_timers_a_topic_that_came_before_all_takes_is_no_output_of_one() -> None:
