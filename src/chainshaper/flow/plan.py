@@ -405,8 +405,16 @@ def _steps(
 
 
 def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:
-    """Finished instances, with their response time, that began in none of these traversals."""
-    seen = flow.instances.filter(pl.col("end").is_not_null() & ~pl.col("assumed"))
+    """Finished instances, with their response time, that began in none of these traversals.
+
+    Where no event says that one ended (rclpy), it did with its last publication.
+    """
+    left = flow.publications.drop_nulls("instance").group_by("instance")
+    ended = flow.instances.join(
+        left.agg(left=pl.col("time").max()), on="instance", how="left", maintain_order="left"
+    )
+    until = pl.coalesce("end", pl.when("assumed").then("left"))
+    seen = ended.with_columns(end=until).drop_nulls("end")
     began = seen["start"].to_numpy()
     # An instance that begins just as a traversal ends is hit by it as well.
     hit = overlapping(began, began, disturbed["start"].to_numpy(), disturbed["end"].to_numpy() + 1)

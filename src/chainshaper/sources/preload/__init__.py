@@ -85,7 +85,7 @@ _HEADER = np.dtype(
     ]
 )
 _RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
-_MAGIC, _FORMAT = 0x63687368, 1
+_MAGIC, _FORMAT = 0x63687368, 2
 _TEXT, _LIBRARY, _FIRST_EVENT = 1, 2, 3
 _TEXT_BYTES, _PLACES = 40, 16
 _LARGEST = 1 << 30
