@@ -23,7 +23,13 @@ import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
 from chainshaper.sources.ctf import tsdl as ctf
-from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
+from chainshaper.sources.system import (
+    NEXT_HOST,
+    distribution_of,
+    processes_of,
+    rmw_of_gids,
+    rmw_of_threads,
+)
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import CREATION
@@ -33,9 +39,6 @@ __all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace", "table_na
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Gets the share of the work that is done, from 0 to 1, and what is being done."""
-
-NEXT_HOST = 10_000_000
-"""Added to the process and thread numbers of the next host; Linux goes up to 4,194,304."""
 
 _CARET_INIT = "caret_init"
 """An event that is read with the creation, but is no table of ours."""
