@@ -89,7 +89,8 @@ def _in_containers() -> dict[str, dict[str, dict[int, int]]]:
 
     With each are its processes, by what they call themselves: a page has them so.
     """
-    own, pages = Path("/proc/self/ns/mnt").stat().st_ino, dict[int, tuple[str, str]]()
+    own = Path("/proc/self/ns/mnt").stat().st_ino
+    pages: dict[tuple[int, int], tuple[str, str]] = {}
     found: dict[str, dict[str, dict[int, int]]] = {}
     for pid in parents():
         folder = f"/proc/{pid}/fd"
@@ -99,8 +100,8 @@ def _in_containers() -> dict[str, dict[str, dict[int, int]]]:
             inner = innermost_id(read_proc(f"/proc/{pid}/status")) or pid
             for name in os.listdir(folder):  # noqa: PTH208
                 if _PAGE.search(os.readlink(f"{folder}/{name}")):  # noqa: PTH115
-                    file = os.stat(f"{folder}/{name}").st_ino  # noqa: PTH116
-                    at, known = pages.setdefault(file, (folder, name))
+                    file = os.stat(f"{folder}/{name}")  # noqa: PTH116
+                    at, known = pages.setdefault((file.st_dev, file.st_ino), (folder, name))
                     found.setdefault(at, {}).setdefault(known, {})[inner] = pid
     return found
 
