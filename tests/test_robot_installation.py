@@ -144,8 +144,8 @@ mount -t tmpfs none "$0/root/tmp" && cp "$1" "$0/root/tmp/package.deb"
 exec chroot "$0/root" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin sh -ec "$2"
 """
 INSTALLED = """
-there() { find /etc /opt /root /run /usr /var -xdev -name '*chainshaper*' | sort; }
-cd /tmp && there > before
+there() { find /etc /usr /var/lib/dpkg /opt/chainshaper* -name '*chainshaper*' | sort; }
+cd /tmp && there > before 2> /dev/null
 dpkg -i package.deb > /dev/null
 python3 -c "
 from importlib.metadata import entry_points
@@ -159,7 +159,7 @@ chainshaper record -o recorded -- true 2>&1 | grep "no process has loaded the tr
 python3 -c 'import polars' 2>&1 | grep ModuleNotFoundError
 chainshaper status
 dpkg -r chainshaper > /dev/null
-rm -rf simulated recorded plan.yaml && there > after
+rm -rf simulated recorded plan.yaml && there > after 2> /dev/null
 diff before after && echo nothing is left
 """
 
