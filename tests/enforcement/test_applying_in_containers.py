@@ -4,6 +4,7 @@ import json
 import signal
 import time
 from contextlib import ExitStack
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
@@ -30,6 +31,10 @@ pytestmark = [needs_fifo, needs_cgroups, needs_namespaces, pytest.mark.timed]
 PLAN = plan_for(server("first", "origin", (0, 30)), server("second", "other", (40, 70)))
 
 
+def _has_lines(output: Path) -> bool:
+    return output.exists() and output.stat().st_size > 0
+
+
 def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> None:
     """Each is process 1 in its container; one is governed in each slot, both are as before."""
     with ExitStack() as both:
@@ -39,7 +44,7 @@ def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> 
             command = node_command(name, output, period=10 * MS, busy=busy)
             _, process = both.enter_context(contained(command, user=name == "other"))
             assert process.inner_pid == 1
-            wait_for(lambda output=output: output.exists() and output.stat().st_size > 0, name)
+            wait_for(partial(_has_lines, output), name)
             pids[name] = process.pid
         before = {name: scheduling(pid) for name, pid in pids.items()}
         with applied(PLAN, tmp_path, *FREEZER, "--json") as run:
