@@ -51,6 +51,8 @@ def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> 
             time.sleep(1.5)
             policies = {name: list_threads(pid)[0].policy for name, pid in pids.items()}
             assert policies == dict.fromkeys(pids, "SCHED_FIFO")
+            released = called("release", "--crashed")
+            assert (released.code, run.poll()) == (0, None), "what is in force stays so"
             (status,) = json.loads(called("status", "--json").out)
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=30)
