@@ -13,6 +13,7 @@ import numpy as np
 import polars as pl
 import pytest
 from command_line import called, json_of
+from containers import in_container
 from ros2 import ros2_environment
 from small_chain import small_chain
 
@@ -163,3 +164,22 @@ def test_diagnostics_are_published_where_ros_2_reads_them(launch: list[str]) -> 
     ]
     assert counted == sorted(counted)
     assert counted[-1] > 20
+
+
+@pytest.mark.ros2
+@pytest.mark.timeout(300)
+def test_a_launch_in_a_container_is_recorded_under_the_numbers_of_here(
+    launch: list[str], tmp_path: Path
+) -> None:
+    if os.geteuid() != 0:
+        pytest.skip("a container needs root")
+    done = record_command(
+        tmp_path / "rec", in_container(launch), source="preload", duration_ns=SECONDS * SECOND
+    )
+    tables, info = done.recording.events, done.recording.info
+    executing = {(one.pid, one.tid) for one in info.threads if one.role == "executor"}
+    started = set(tables["callback_start"].select("pid", "tid").unique().iter_rows())
+    assert started <= executing
+    assert min(pid for pid, _ in executing) > 100, "in there they are among the first"
+    assert info.lost == {"lost_events": 0}
+    assert len({thread.node for thread in info.threads}) > 1
