@@ -27,7 +27,7 @@ Source: TypeAlias = Literal["lttng", "preload", "ebpf"]
 DESCRIPTIONS = (".yaml", ".yml")
 """What files that people write end with: applications and plans."""
 
-NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
+NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
 """How a shaping node is made."""
 
 
@@ -152,7 +152,10 @@ SOURCE: Source | None = option(
     "--source", "Tracer. Default: preload, or lttng where that cannot be had."
 )
 NODE: NodeKind = option(
-    "--node", "A script; a package for all types; or one generated for the type.", "python"
+    "--node",
+    "A script; a package for all types; one generated for the type; or that as a component, in the "
+    "publisher's container.",
+    "python",
 )
 
 

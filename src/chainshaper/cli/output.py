@@ -17,6 +17,8 @@ from chainshaper.values.errors import OperationError, shown
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from chainshaper.splicing.shaping_process import NodeKind
+
 Progress: TypeAlias = Callable[[float, str], None]
 """Gets the share that is done, and what is done now."""
 
@@ -83,12 +85,16 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
-def warn(plan: "cs.Plan | cs.ApplicationPlan") -> None:
-    """What is doubtful about a plan, before it is used."""
+def warn(plan: "cs.Plan | cs.ApplicationPlan", node: "NodeKind | None" = None) -> None:
+    """What is doubtful about a plan, before it is used; and what such a ``node`` would cost."""
     from chainshaper.planning import plan_warnings
     from chainshaper.planning.application_plan import whole
 
     notes(plan_warnings(*whole(plan).chains))
+    if node is not None:
+        from chainshaper.splicing.shaping_process import zero_copy_lost
+
+        notes(zero_copy_lost(whole(plan), node))
 
 
 @contextmanager

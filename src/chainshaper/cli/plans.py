@@ -255,7 +255,8 @@ def splice(
     ),
     node: opt.NodeKind = opt.NODE,
     message_type: str | None = opt.option(
-        "--type PKG/msg/TYPE", "Of the output, for --node typed. Default: what the recording says."
+        "--type PKG/msg/TYPE",
+        "Of the output, for --node typed and component. Default: what the recording says.",
     ),
     recording: Path | None = opt.option(
         "--recording REC",
@@ -302,7 +303,7 @@ def splice(
     if throttle:
         if fallback is not None:
             raise InputError("a throttler has no fallback: --fallback goes with a plan")
-        if message_type is not None or node == "typed":
+        if message_type is not None or node in ("typed", "component"):
             raise InputError(
                 "a throttler is for all types: choose --node python or cpp, and no --type"
             )
@@ -316,7 +317,7 @@ def splice(
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
         planned = cs.load_application_plan(plan)
-        out.warn(planned)
+        out.warn(planned, node)
         common |= {"message_type": message_type, "fallback": fallback}
         known = _opened(recording or recording_of(planned))
         splicing = cs.splice_launch_files(planned, recording=known, **common)

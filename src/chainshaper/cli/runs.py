@@ -582,7 +582,7 @@ def _shape_described(
 
 
 def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, **how: Any) -> None:
-    """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
+    """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`, with the ``node``."""
     from chainshaper.reporting.latency import comparison_json
 
     with out.stop_on_signals() as stop:
@@ -591,7 +591,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, 
             folder,
             choose=_ask if sys.stdin.isatty() and not json else None,
             stop=stop,
-            planned=out.warn,
+            planned=lambda plan: out.warn(plan, how["node"]),
             progress=out.stage_lines("shape"),
             **how,
         )

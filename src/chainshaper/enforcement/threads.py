@@ -189,8 +189,10 @@ def _limits(identified: Iterable[_Identified]) -> Iterator[str]:
 
 
 def with_gates(found: Allocation, nodes: Iterable[ShapingNode]) -> Allocation:
-    """The threads, of which those that work for gates in publishers' processes are these nodes'."""
-    names = {gate_thread_name(one.name): one.thread.node for one in nodes if one.in_process}
+    """The threads, of which those that work for gates in publishers' processes are these nodes':
+    of a library in front of rmw, or of a component.
+    """
+    names = {gate_thread_name(one.name): one.thread.node for one in nodes}
     threads = tuple(
         replace(one, thread=replace(one.thread, role="executor"), nodes=(node,), known_by="name")
         if (node := names.get(one.thread.comm))

@@ -148,6 +148,8 @@ def splice_launch_files(
             )
             for chain, one in nodes
         ]
+        for redirect, process in zip(redirects, made, strict=True):
+            redirect.component = process.component
         blocks = [
             gate_settings(chain, one, _publisher(chain, one, publishers), logs[one.name])
             for chain, one in gates
@@ -161,7 +163,11 @@ def splice_launch_files(
 
     dry = dict(arguments or {}) if dry_run else None
     spliced = _spliced(launch_files, folder, written, throttled=False, dry=dry)
-    standbys = [logs[one.name].with_stem(f"{one.name}{STANDBY}") for _, one in nodes]
+    standbys = [
+        logs[process.name].with_stem(process.standby.name)
+        for process in spliced.processes
+        if process.standby is not None
+    ]
     return replace(spliced, logs=(*logs.values(), *standbys))
 
 

@@ -13,6 +13,7 @@ from functools import partial
 from itertools import chain as joined
 from pathlib import Path
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -536,10 +537,10 @@ def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
     return "publisher" in roles
 
 
-def _goes_without_dds(flow: DataFlow, node: str, topic: str) -> bool:
+def _goes_without_dds(flow: DataFlow, node: str, topic: str) -> Literal[True] | None:
     """Whether messages of a node's topic are handed to subscribers of the same process."""
     sent = flow.publications.filter((pl.col("topic") == topic) & (pl.col("node") == node))
-    return sent["intra_time"].count() > 0
+    return True if sent["intra_time"].count() else None
 
 
 def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:

@@ -80,8 +80,8 @@ class Evidence(Part):
     the share of its core that the chain takes. ``interference_ns`` of every latency are for others
     (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's
     asynchronous publisher, ``longest_publication_ns`` of its synchronous one, for which Δ was
-    ``given``, is as long as ``measured``, or the ``least``. ``modes`` has each mode's own. ``None``
-    is: not known.
+    ``given``, is as long as ``measured``, or the ``least``. ``intra_process``: subscribers of the
+    output get it without DDS. ``modes`` has each mode's own. ``None`` is: not known.
     """
 
     recording: str | None = None
@@ -101,6 +101,7 @@ class Evidence(Part):
     publish_slot: Literal["given", "measured", "least"] | None = None
     lost_events: FromOne | None = None
     all_disturbed: Literal[True] | None = None
+    intra_process: Literal[True] | None = None
     modes: "dict[ModeName, Evidence] | None" = None
 
     @model_validator(mode="after")

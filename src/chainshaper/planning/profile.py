@@ -21,7 +21,7 @@ import math
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
-from typing import NamedTuple, TypeAlias
+from typing import Literal, NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,7 +95,7 @@ class Profile:
     longest_send_ns: int | None = None
     longest_publication_ns: int | None = None
     asynchronous: bool | None = None
-    intra_process: bool = False
+    intra_process: Literal[True] | None = None
     lost_events: int | None = None
     all_disturbed: bool | None = None
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)

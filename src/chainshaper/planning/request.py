@@ -386,7 +386,8 @@ def _shaped(
         raise InputError(
             f"subscribers of {profile.topics[-1]} get its messages inside the process of {last},"
             " without DDS, and a gate before DDS would not see these: switch intra-process"
-            " communication off for it, or plan with --publication synchronous"
+            " communication off for it, or plan with --publication synchronous and splice with"
+            " --node component"
         )
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it

@@ -5,6 +5,8 @@
 for whatever reason it is started: `Executable.prepare` has made the command line of a process, and
 `get_composable_node_load_request` the request to a container (Humble to Rolling). Behind both,
 rules are added for the nodes that are meant, each bound to the node's name (``ndt:/pose:=…``).
+`LoadComposableNodes._load_node` sends such a request; behind that of a publisher whose shaping node
+is a component, one for the shaping node goes to the same container.
 
 ROS 2 follows the first rule that matches a name, and does not match the result again (upstream:
 `rcl_remap_first_match`). So a rule that leads to the topic is preceded by ours for the same name,
@@ -27,6 +29,12 @@ DISCOVERY_S = 5.0  # how long before that it begins to listen for who publishes 
 
 _DRY_RUN = "chainshaper_dry_run"
 _RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
+_NOT_RUNNING = "no node {} runs"
+_NOT_LOADED = (
+    "no launch file has a container load {}, and its shaping node is a component (what `ros2 "
+    "component load` loads cannot be redirected: load it in a launch file; if it is a process of its "
+    "own, splice with another --node)"
+)
 _FOR_A_SHELL = re.compile(r"[;&|<>()$`*?~#\n]")
 
 
@@ -55,13 +63,15 @@ class Redirect:
     target: str
     nodes: Sequence[str]
     added: Sequence[str]  # our own nodes, which have the topic instead
+    component: dict[str, Any] | None = None  # our own node, where a container is to load it
     started: list[Started] = field(default_factory=list)
     others: list[str] = field(default_factory=list)  # what else was started
     elsewhere: list[str] = field(default_factory=list)  # who has another topic by its own rule
+    loaded: bool = False  # whether a container was asked to load the component
 
     def values(self) -> dict[str, Any]:
         """What a launch file says of it, and a dry run is asked."""
-        keys = ("kind", "topic", "target", "nodes", "added")
+        keys = ("kind", "topic", "target", "nodes", "added", "component")
         return {key: getattr(self, key) for key in keys}
 
     def see(
@@ -108,8 +118,9 @@ class Redirect:
         if elsewhere:
             return f"nothing was redirected: {_names(elsewhere)} has another topic in place of it"
         if lacking:
-            others = _names(self.others)
-            return f"nothing was redirected: no node {_names(lacking)} runs; started were {others}"
+            what = _NOT_RUNNING if self.component is None else _NOT_LOADED
+            what = what.format(_names(lacking))
+            return f"nothing was redirected: {what}; started were {_names(self.others)}"
         if self.kind == "subscription":
             past, does = [one for one in on_topic if one in self.nodes], "subscribes to"
         else:
@@ -117,6 +128,8 @@ class Redirect:
             if surplus := [one for one in on_target if one not in self.nodes]:
                 too = f"{_names(surplus)} publishes {self.target} too"
                 return f"more was redirected than meant: {too}"
+        if self.loaded and not on_topic:
+            return f"the container did not load {_names(self.added)}, which was to publish it"
         return f"{_names(past)} {does} it past {_names(self.added)}" if past else None
 
     def message(self, problem: str, on_topic: Sequence[str], on_target: Sequence[str]) -> str:
@@ -182,6 +195,9 @@ def redirect_command(
     if "--ros-args" not in parts and not any(runs):
         return
     for redirect in redirects:
+        if redirect.component is not None:  # for containers only
+            redirect.others.append(label)
+            continue
         places = list(_places(parts))
         rules = [parts[place + 1] for place in places]
         name = _of_rule(rules, "__node", "__name")
@@ -195,15 +211,42 @@ def redirect_command(
         words[:] = [shlex.join(parts)]
 
 
-def redirect_request(request: Any, redirects: Sequence[Redirect]) -> None:
-    """Add rules to a request to load a component (`composition_interfaces/srv/LoadNode`)."""
+def redirect_request(request: Any, redirects: Sequence[Redirect]) -> list[Redirect]:
+    """Add rules to a request to load a component (`composition_interfaces/srv/LoadNode`).
+
+    Returns the redirects that added some.
+    """
+    found = []
     for redirect in redirects:
         rules = list(request.remap_rules)
         name = _of_rule(rules, "__node", "__name") or request.node_name or None
         namespace = _of_rule(rules, "__ns") or request.node_namespace or None
-        for number, rule in reversed(redirect.see(rules, name, namespace, request.plugin_name)):
+        added = redirect.see(rules, name, namespace, request.plugin_name)
+        for number, rule in reversed(added):
             rules.insert(number, rule)
         request.remap_rules = rules
+        found += [redirect] if added else []
+    return found
+
+
+def component_request(component: dict[str, Any], publisher: Any, context: Any) -> Any:
+    """The request to load our component into the container of a publisher, as that was loaded:
+    with or without intra-process communication.
+    """
+    from pathlib import Path
+
+    from launch_ros.utilities import to_parameters_list
+
+    request = type(publisher)()
+    request.package_name, request.plugin_name = component["package"], component["plugin"]
+    request.node_name, request.node_namespace = component["name"], "/"
+    request.remap_rules = [f"{match}:={target}" for match, target in component["remappings"]]
+    files = [Path(component["parameters"])]
+    found = to_parameters_list(context, request.node_name, "/", files)
+    request.parameters = [one.to_parameter_msg() for one in found]
+    same = (one for one in publisher.extra_arguments if one.name == "use_intra_process_comms")
+    request.extra_arguments = list(same)
+    return request
 
 
 def _places(words: Sequence[str]) -> Iterator[int]:
@@ -308,6 +351,8 @@ def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
     from launch_ros.actions import load_composable_nodes as loading
 
     prepare, requested = Executable.prepare, loading.get_composable_node_load_request
+    load = loading.LoadComposableNodes._load_node
+    redirected: list[tuple[Any, list[Redirect]]] = []
 
     def prepare_redirected(executable: Any, context: Any, action: Any) -> None:
         prepare(executable, context, action)
@@ -317,11 +362,29 @@ def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:
     def request_redirected(description: Any, context: Any) -> Any:
         request = requested(description, context)
         if request is not None:  # its condition does not hold
-            redirect_request(request, redirects)
+            redirected.append((request, redirect_request(request, redirects)))
         return request
+
+    def load_with_shaping_node(action: Any, request: Any, context: Any) -> None:
+        own = [redirect for one, found in redirected if one is request for redirect in found]
+        before = [_times_loaded(context, redirect) for redirect in own]
+        load(action, request, context)
+        for redirect, times in zip(own, before, strict=True):
+            # One that was given no name may be another node.
+            if redirect.component is not None and _times_loaded(context, redirect) > times:
+                load(action, component_request(redirect.component, request, context), context)
+                redirect.loaded = True
 
     Executable.prepare = prepare_redirected
     loading.get_composable_node_load_request = request_redirected
+    loading.LoadComposableNodes._load_node = load_with_shaping_node
+
+
+def _times_loaded(context: Any, redirect: Redirect) -> int:
+    """How often launch has seen containers load the publishers of a redirect."""
+    from launch_ros.utilities import get_node_name_count
+
+    return sum(get_node_name_count(context, node) for node in redirect.nodes)
 
 
 def _check(context: Any, redirects: Sequence[Redirect]) -> None:

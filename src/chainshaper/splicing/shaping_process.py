@@ -1,9 +1,10 @@
 """The shaping node of a plan as a ROS 2 process: its files, and what a launch file has to start.
 
-Three kinds do the same: ``python`` needs no building, ``cpp`` is one package for all types,
-``typed`` is the paper's package (section 4.2), generated for one type. All read the same
-parameters, which say what the plan says, and write the same log. So does the gate in the
-publisher's process, for plans with ``in_process``: a library that stands in front of rmw.
+Four kinds do the same: ``python`` needs no building, ``cpp`` is one package for all types,
+``typed`` is the paper's package (section 4.2), generated for one type, and ``component`` is that as
+a component, for the container of the output's publisher. All read the same parameters, which say
+what the plan says, and write the same log. So does the gate in the publisher's process, for plans
+with ``in_process``: a library that stands in front of rmw.
 """
 
 import ast
@@ -23,13 +24,15 @@ from chainshaper.analysis.chains import close_names
 from chainshaper.gate import decision, handover, throttling
 from chainshaper.gate.decision import DEPTH, Gate, Modes, NodeParameters, gate_parameters
 from chainshaper.linux.threads import gate_thread_name
+from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
 from chainshaper.sources.preload import compile_library, in_cache
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.files import write_whole
 
-NodeKind: TypeAlias = Literal["python", "cpp", "typed"]
+NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
+OF_ONE_TYPE = ("typed", "component")
 _SOURCES = Path(__file__).parents[2]
 _NODES = Path(__file__).parent / "nodes"
 
@@ -47,7 +50,8 @@ SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half 
 class ShapingProcess:
     """A process that a launch file starts, again when it ends: a shaping node, or a throttler.
 
-    It is either a ``command`` (without ``--ros-args``) or an ``executable`` of a ``package``.
+    It is either a ``command`` (without ``--ros-args``) or an ``executable`` of a ``package``; with
+    ``plugin`` a component of it, which is loaded into the publisher's container and ends with that.
     """
 
     name: str
@@ -58,6 +62,7 @@ class ShapingProcess:
     parameters_file: Path  # of ROS 2
     remappings: tuple[tuple[str, str], ...]  # such as ("input", "/t5_tmp")
     standby: "ShapingProcess | None" = None  # passes its output on meanwhile
+    plugin: str | None = None
 
     @property
     def command_line(self) -> list[str]:
@@ -66,6 +71,19 @@ class ShapingProcess:
         remaps = [word for match, target in rules for word in ("-r", f"{match}:={target}")]
         parameters = ["--params-file", str(self.parameters_file)]
         return [*(self.command or ()), "--ros-args", *remaps, *parameters]
+
+    @property
+    def component(self) -> dict[str, Any] | None:
+        """What is needed to have a container load it (`redirection.component_request`)."""
+        if self.plugin is None:
+            return None
+        return {
+            "package": self.package,
+            "plugin": self.plugin,
+            "name": self.name,
+            "remappings": self.remappings,
+            "parameters": str(self.parameters_file),
+        }
 
 
 def write_shaping_process(
@@ -80,16 +98,16 @@ def write_shaping_process(
 ) -> ShapingProcess:
     """Write a shaping node of a plan into ``folder``; what a launch file has to start.
 
-    ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``: the
-    ``typed`` kind is generated for it, the others find it out when they run. ``log`` is where the
-    node notes what it did with each message. Files that are there and equal are left alone. Those
-    that are to be moved to ``folder`` later are written ``into`` another one. Raises InputError: a
-    file is there with another content; no type for the typed kind, or none that there is.
-    OperationError: a file cannot be written.
+    ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``: ``typed``
+    and ``component`` are generated for it, the others find it out when they run. ``log`` is where
+    the node notes what it did with each message. Files that are there and equal are left alone.
+    Those that are to be moved to ``folder`` later are written ``into`` another one. Raises
+    InputError: a file is there with another content; no type for a kind that needs one, or none
+    that there is. OperationError: a file cannot be written.
     """
-    if kind == "typed" and message_type is None:
+    if kind in OF_ONE_TYPE and message_type is None:
         raise InputError(
-            f"the typed shaping node is generated for one type, and that of {node.output} is not "
+            f"the {kind} shaping node is generated for one type, and that of {node.output} is not "
             "known: name it, as `ros2 topic type` prints it, or choose the kind cpp"
         )
     remappings = (("input", node.input), ("output", node.output))
@@ -99,9 +117,13 @@ def write_shaping_process(
         remappings=remappings,
         message_type=message_type,
     )
-    beside, files_beside = _process("python", "standby", standby, folder, remappings=remappings)
     parameters = shaping_parameters(plan, node, log)
     parameters["handover"] = _page_name(node, log or folder)
+    if process.plugin is not None:  # it ends with its publisher, and a standby's copy costs one
+        given = {name: value for name, value in parameters.items() if value != []}  # of no type
+        _write(into or folder, {**files, f"{node.name}.yaml": _yaml(given)})
+        return process
+    beside, files_beside = _process("python", "standby", standby, folder, remappings=remappings)
     of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
         "shaping_node": node.name,
         "fallback": plan.fallback,
@@ -114,6 +136,20 @@ def write_shaping_process(
     files |= {f"{node.name}.yaml": _yaml(parameters), f"{standby}.yaml": _yaml(of_standby)}
     _write(into or folder, {**files, **files_beside})
     return replace(process, standby=beside)
+
+
+def zero_copy_lost(plan: ApplicationPlan, kind: NodeKind) -> list[str]:
+    """A line for each output of which a node of this kind would need copies that are not made now.
+
+    Messages that go through DDS anyway are copied without it as well.
+    """
+    return [
+        f"{chain.chain.output}: subscribers in the process of {chain.chain.publisher} get its "
+        f"messages without a copy; with --node {kind} each message is serialized and copied, to "
+        "the shaping node and back: choose --node component"
+        for chain in plan.chains
+        if chain.evidence.intra_process and chain.shaping_node is not None and kind != "component"
+    ]
 
 
 def _page_name(node: ShapingNode, place: Path) -> str:
@@ -216,20 +252,23 @@ def _process(
     message_type: str | None = None,
 ) -> tuple[ShapingProcess, dict[str, str]]:
     """A process with its program's files, by their paths below the folder."""
-    folder, command, package = folder.absolute(), None, None
+    folder, command, package, plugin = folder.absolute(), None, None, None
     if kind == "python":
         command = ("python3", str(folder / f"{name}.py"))
         files = {f"{name}.py": python_node(executable)}
         if executable != "standby":  # that stands beside one that has it
             files["respawning.py"] = _respawning()
     else:
-        known = message_type_named(message_type) if kind == "typed" and message_type else None
+        known = message_type_named(message_type) if kind in OF_ONE_TYPE and message_type else None
         package = GENERIC_PACKAGE if known is None else known.node_package
-        filled = generic_package() if known is None else typed_package(known)
+        component = kind == "component"
+        plugin = f"{package}::ShapingNode" if component else None
+        filled = generic_package() if known is None else typed_package(known, component=component)
         files = {f"{package}/{path}": text for path, text in filled.items()}
-    runs = None if package is None else executable
+    runs = None if package is None or plugin is not None else executable
     parameters = folder / f"{name}.yaml"
-    return ShapingProcess(name, "/", command, package, runs, parameters, remappings), files
+    made = ShapingProcess(name, "/", command, package, runs, parameters, remappings, plugin=plugin)
+    return made, files
 
 
 def _respawning() -> str:
@@ -422,12 +461,12 @@ def generic_package() -> dict[str, str]:
     return files
 
 
-def typed_package(message_type: MessageType) -> dict[str, str]:
+def typed_package(message_type: MessageType, *, component: bool = False) -> dict[str, str]:
     """The files of the package generated for one type: paths inside it, and their text."""
     package, name = message_type.package, message_type.full_name
     messages = sorted({"std_msgs", package})  # the modes of the system are a std_msgs/String
     files = _filled(
-        *(message_type.node_package, name, messages, "shaping_node"),
+        *(message_type.node_package, name, messages, "" if component else "shaping_node"),
         TYPE=name,
         HEADER=f"{package}/msg/{message_type.snake_name}.hpp",
         CLASS=f"{package}::msg::{message_type.name}",
@@ -446,7 +485,11 @@ def _filled(
         "NODES": nodes,
         "FIND_MESSAGES": "\n".join(f"find_package({name} REQUIRED)" for name in messages),
         "MESSAGE_TARGETS": " ".join(f"${{{name}_TARGETS}}" for name in messages),
-        "DEPENDS": "\n".join(f"  <depend>{name}</depend>" for name in messages),
+        "COMPONENT": "FALSE" if nodes else "TRUE",
+        "DEPENDS": "\n".join(
+            f"  <depend>{name}</depend>"
+            for name in (*messages, *(() if nodes else ("rclcpp_components",)))
+        ),
     }
     files = {"scripts/respawning": _respawning()}
     for path in sorted((_NODES / "cpp").rglob("*.*")):

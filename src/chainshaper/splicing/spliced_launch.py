@@ -144,7 +144,12 @@ def launch_text(
     ``words`` are the files, or `ros2 run …`; what is launched gets the ``environment`` as well.
     """
     run = [{"cmd": [*words], "output": "screen"}] if is_run(words) else []
-    every = [one for process in processes for one in (process, process.standby) if one is not None]
+    every = [
+        one
+        for process in processes
+        for one in (process, process.standby)
+        if one is not None and one.plugin is None
+    ]
     what = words[3] if run else ", ".join(Path(word).name for word in words)
     return _TEXT.format(
         what=re.sub(r"[^\w., -]", "_", what),  # a file's name cannot end the text it stands in

@@ -1,10 +1,15 @@
 // The latency-shaping node: what it receives on `input` it republishes on `output` in the slots of
 // its server (Managing End-to-End Timing Jitters in ROS2 Computation Chains, section 3.2.2), as
-// chainshaper's Python node, which explains it. One source for two packages: with `message.hpp` it
-// is for that type of message, without it for any, byte for byte.
+// chainshaper's Python node, which explains it. One source for three packages: with `message.hpp` it
+// is for that type of message, without it for any, byte for byte. With CHAINSHAPER_COMPONENT it is a
+// component for that type: in the publisher's container it takes the publisher's own message, and
+// publishes that very one. The container's executor has the services of its node only.
 
 #include <dlfcn.h>
 
+#include <filesystem>
+#include <set>
+#include <thread>
 #include <type_traits>
 
 #include "chainshaper_shaping/gate_log.hpp"
@@ -21,6 +26,11 @@ namespace {
 using chainshaper::Message;
 using Publisher = rclcpp::Publisher<Message>;
 using Input = rclcpp::Subscription<Message>;
+#ifdef CHAINSHAPER_COMPONENT
+using Pointer = std::unique_ptr<Message>;
+#else
+using Pointer = std::shared_ptr<Message>;
+#endif
 
 template <typename T, typename = void>
 struct HasStamp : std::false_type {};
@@ -49,21 +59,62 @@ auto make_publisher(rclcpp::Node & node, const std::string & type, const rclcpp:
 }
 
 template <typename Taken>
-auto subscribe(rclcpp::Node & node, const std::string &, const rclcpp::QoS & qos, Taken taken) {
-  return node.create_subscription<Message>("input", qos, taken);
+auto subscribe(rclcpp::Node & node, const std::string &, const rclcpp::QoS & qos,
+               const rclcpp::SubscriptionOptions & options, Taken taken) {
+  return node.create_subscription<Message>("input", qos, taken, options);
 }
+
+#ifdef CHAINSHAPER_COMPONENT
+
+// What a publisher of this process sent to subscribers of others as well, the executor leaves out.
+struct Open : Input {
+  using Input::matches_any_intra_process_publishers;
+};
+
+bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
+  while (input.take(message, info)) {
+    const auto & sender = info.get_rmw_message_info().publisher_gid;
+    if (!(input.*&Open::matches_any_intra_process_publishers)(&sender)) return true;
+  }
+  return false;
+}
+
+// What a ring buffer of rclcpp gives its subscription.
+using Within = std::pair<std::shared_ptr<const Message>, Pointer>;
+
+// The oldest message that came without DDS, or none.
+Pointer take_within(Input & input) {
+  const auto waitable = input.get_intra_process_waitable();
+  const auto data = waitable ? waitable->take_data() : nullptr;
+  return data ? std::move(std::static_pointer_cast<Within>(data)->second) : nullptr;
+}
+
+// The callback has its message already, so it is given none, or an empty one.
+void execute(Input & input, const Pointer &, bool within, const rclcpp::MessageInfo & info) {
+  std::shared_ptr<void> nothing = std::make_shared<Within>();
+  if (within) return input.get_intra_process_waitable()->execute(nothing);
+  nothing = std::make_shared<Message>();
+  input.handle_message(nothing, info);
+}
+
+void publish(Publisher & output, Pointer & message) { output.publish(std::move(message)); }
+
+#else
 
 bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
   return input.take(message, info);
 }
 
-void execute(Input & input, const std::shared_ptr<Message> & message,
-             const rclcpp::MessageInfo & info) {
+Pointer take_within(Input &) { return nullptr; }
+
+void execute(Input & input, const Pointer & message, bool, const rclcpp::MessageInfo & info) {
   std::shared_ptr<void> untyped = message;
   input.handle_message(untyped, info);
 }
 
-void publish(Publisher & output, const Message & message) { output.publish(message); }
+void publish(Publisher & output, const Pointer & message) { output.publish(*message); }
+
+#endif
 
 }  // namespace
 
@@ -73,6 +124,7 @@ namespace {
 using Message = rclcpp::SerializedMessage;
 using Publisher = rclcpp::GenericPublisher;
 using Input = rclcpp::GenericSubscription;
+using Pointer = std::shared_ptr<Message>;
 
 chainshaper::Maybe stamp_of(const Message & message) {
   const auto & bytes = message.get_rcl_serialized_message();
@@ -84,7 +136,7 @@ auto make_publisher(rclcpp::Node & node, const std::string & type, const rclcpp:
 }
 
 auto subscribe(rclcpp::Node & node, const std::string & type, const rclcpp::QoS & qos,
-               chainshaper::Taken taken) {
+               const rclcpp::SubscriptionOptions &, chainshaper::Taken taken) {
   return chainshaper::subscribe_serialized(node, "input", type, qos, std::move(taken));
 }
 
@@ -92,13 +144,14 @@ bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
   return input.take_serialized(message, info);
 }
 
-void execute(Input & input, const std::shared_ptr<Message> & message,
-             const rclcpp::MessageInfo & info) {
+Pointer take_within(Input &) { return nullptr; }
+
+void execute(Input & input, const Pointer & message, bool, const rclcpp::MessageInfo & info) {
   input.handle_serialized_message(message, info);
 }
 
-void publish(Publisher & output, const Message & message) {
-  chainshaper::publish_serialized(output, message);
+void publish(Publisher & output, const Pointer & message) {
+  chainshaper::publish_serialized(output, *message);
 }
 
 }  // namespace
@@ -126,7 +179,8 @@ std::optional<Turn> turn_of(rclcpp::Node & node) {
   if (page.empty()) return std::nullopt;
   std::optional<Turn> turn;
   try {
-    turn.emplace(page, node.get_node_topics_interface()->resolve_topic_name("output"));
+    const auto topic = node.get_node_topics_interface()->resolve_topic_name("output");
+    turn.emplace(page, topic, page_folders(), unloaded != nullptr);
   } catch (const std::runtime_error & error) {  // the standby has none either
     RCLCPP_ERROR(node.get_logger(),
                  "nothing can be agreed with the standby, which does nothing: %s", error.what());
@@ -163,12 +217,16 @@ rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
   return qos;
 }
 
-// The gate of a node, with its endpoints and its log.
+// By what the standby and the log's readers know a message; one that came without DDS has no stamp.
+std::int64_t key_of(const Waiting<Pointer> & one) {
+  return one.source_timestamp.value_or(one.arrival_ns);
+}
+
+// The gate of a node, with its endpoints, which are in the group if one is given, and its log.
 class Shaping {
 public:
-  using Pointer = std::shared_ptr<Message>;
-
-  Shaping(rclcpp::Node & node, const Offer & offer, std::optional<Turn> turn)
+  Shaping(rclcpp::Node & node, const Offer & offer, std::optional<Turn> turn,
+          rclcpp::CallbackGroup::SharedPtr group = nullptr)
       : node_(node),
         parameters_(parameters_of(node)),
         turn_(std::move(turn)),
@@ -188,9 +246,10 @@ public:
     }
     phase_ =
         node.add_on_set_parameters_callback([this](const std::vector<rclcpp::Parameter> & changed) {
+          const std::lock_guard<std::mutex> locked(asking_);  // the executor may be another one
           for (const auto & parameter : changed)
             if (parameter.get_name() == "phase_ns")
-              shaper_.set_phase(parameter.as_int(), monotonic_ns());
+              asked_phase_.emplace(parameter.as_int(), monotonic_ns());
           rcl_interfaces::msg::SetParametersResult result;
           result.successful = true;
           return result;
@@ -200,10 +259,11 @@ public:
         offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
     output_ = make_publisher(node, offer.type,
                              latched ? offer.publisher : deeper(offer.publisher, depth));
+    options_.callback_group = group;
     listen_to_modes();
     const auto asked =
         deeper(offer.subscription, std::max<std::size_t>(schema::reader_depth, depth));
-    input_ = subscribe(node, offer.type, asked,
+    input_ = subscribe(node, offer.type, asked, options_,
                        [this](Pointer message, const rclcpp::MessageInfo & info) {
                          shape(std::move(message), info);
                        });
@@ -213,23 +273,25 @@ public:
   bool await_receivers() {
     const auto topic = node_.get_node_topics_interface()->resolve_topic_name("output");
     const auto give_up = monotonic_ns() + 2'000'000'000;
-    while (turn_ && turn_->has_standby() && rclcpp::ok() && monotonic_ns() < give_up) {
+    while (turn_ && turn_->has_standby() && goes_on() && monotonic_ns() < give_up) {
       if (output_->get_subscription_count() >= node_.count_subscribers(topic)) return wait(0.1);
       wait(0.01);
     }
-    return rclcpp::ok();
+    return goes_on();
   }
 
-  // Deal with what waits at the gate; whether some are left.
+  // Deal with what waits at the gate; whether some are left. Where nothing says which message of a
+  // buffer a callback has, but that it was the last one taken, the executor takes none meanwhile.
   bool work_off() {
-    for (bool served = false; rclcpp::ok(); served = true) {
+    for (bool served = false; goes_on(); served = true) {
       for (const auto & gone : shaper_.overflowed) note(gone);
       shaper_.overflowed.clear();
-      if (shaper_.queue.waiting.empty() || (served && shaper_.nothing_due())) break;
-      const auto oldest = shaper_.queue.waiting.front();
-      take_again(*input_, oldest.message.get(), oldest.source_timestamp);
+      if (shaper_.queue.waiting.empty() || (served && !ahead_ && shaper_.nothing_due())) break;
+      const auto & oldest = shaper_.queue.waiting.front();
+      const bool within = !oldest.source_timestamp;
+      if (!within) take_again(*input_, oldest.message.get(), oldest.source_timestamp);
       its_turn_ = true;
-      execute(*input_, oldest.message, rclcpp::MessageInfo());
+      execute(*input_, oldest.message, within, rclcpp::MessageInfo());
       its_turn_ = false;
     }
     return !shaper_.queue.waiting.empty();
@@ -245,12 +307,14 @@ private:
       if (info.qos_profile().durability() == rclcpp::DurabilityPolicy::TransientLocal)
         qos.transient_local();
     modes_ = node_.create_subscription<std_msgs::msg::String>(
-        topic, qos, [this](std::shared_ptr<const std_msgs::msg::String> mode) {
+        topic, qos,
+        [this](std::shared_ptr<const std_msgs::msg::String> mode) {
           if (shaper_.announce(mode->data, monotonic_ns()))
             RCLCPP_INFO(node_.get_logger(), "mode %s", mode->data.c_str());
           else
             RCLCPP_WARN(node_.get_logger(), "there is no mode '%s'", mode->data.c_str());
-        });
+        },
+        options_);
   }
 
   // The subscription's callback.
@@ -260,12 +324,13 @@ private:
       arrive(std::move(message), info.get_rmw_message_info(), false);
       if (!alone) return;
     }
-    const auto key = shaper_.queue.waiting.front().source_timestamp.value_or(0);
+    ahead_ = false;
+    const auto key = key_of(shaper_.queue.waiting.front());
     if (turn_ && !turn_->take(key)) {
       shaper_.queue.leave({}, monotonic_ns());
       return;
     }
-    const auto outcome = shaper_.hold();
+    auto outcome = shaper_.hold();
     if (!outcome) return;
     if (turn_ && turn_->was_bypassed(key)) {
       readiness_.relax();
@@ -275,7 +340,7 @@ private:
     Maybe stalled_ns;
     if (outcome->release.at_ns) {
       try {
-        publish(*output_, *outcome->waiting.message);
+        publish(*output_, outcome->waiting.message);
       } catch (const rclcpp::exceptions::RCLError &) {
         if (rclcpp::ok()) throw;
         return;  // it was interrupted meanwhile; to ask before publishing would cost time
@@ -291,22 +356,32 @@ private:
     note(*outcome, published_ns, stalled_ns);
   }
 
-  // Take all that has come.
+  // Take all that has come, but of what came without DDS one message only: see `work_off`.
   void look() {
     rclcpp::MessageInfo info;
-    for (auto message = std::make_shared<Message>(); take(*input_, *message, info);
-         message = std::make_shared<Message>())
-      arrive(message, info.get_rmw_message_info(), true);
+    for (Pointer message(new Message); take(*input_, *message, info); message.reset(new Message))
+      arrive(std::move(message), info.get_rmw_message_info(), true);
+    auto message = ahead_ ? nullptr : take_within(*input_);
+    if (!message) return;
+    ahead_ = true;
+    info.get_rmw_message_info().from_intra_process = true;
+    arrive(std::move(message), info.get_rmw_message_info(), true);
   }
 
   void arrive(Pointer message, const rmw_message_info_t & info, bool waited) {
     const auto stamp = stamp_of(*message);
+    const bool within = info.from_intra_process;  // without anything else of DDS
+    if (const std::unique_lock<std::mutex> ours(asking_, std::try_to_lock); ours && asked_phase_) {
+      shaper_.set_phase(asked_phase_->first, asked_phase_->second);
+      asked_phase_.reset();
+    }
     if (const auto moved = turn_ ? turn_->moved() : std::nullopt)
       shaper_.move_slots(moved->first, moved->second);
     const auto before = shaper_.overflowed.size();
-    shaper_.arrive(std::move(message), stamp, info.source_timestamp, waited, missing_before(info));
+    shaper_.arrive(std::move(message), stamp, within ? Maybe() : Maybe(info.source_timestamp),
+                   waited, within ? Maybe() : missing_before(info));
     if (!turn_ || shaper_.overflowed.size() == before) return;
-    const auto gone = shaper_.overflowed.back().waiting.source_timestamp.value_or(0);
+    const auto gone = key_of(shaper_.overflowed.back().waiting);
     if (turn_->was_bypassed(gone))
       shaper_.overflowed.pop_back();
     else
@@ -343,6 +418,7 @@ private:
 
   rclcpp::Node & node_;
   Parameters parameters_;
+  rclcpp::SubscriptionOptions options_;
   std::optional<Turn> turn_;
   Readiness readiness_;
   Shaper<Pointer> shaper_;
@@ -350,14 +426,92 @@ private:
   std::shared_ptr<Publisher> output_;
   std::shared_ptr<Input> input_;
   bool its_turn_{false};  // of the oldest message
+  bool ahead_{false};     // one that came without DDS waits behind it
   Maybe number_;          // its publisher's, of the last message
   std::string said_;
   std::int64_t said_ns_{0};
+  std::mutex asking_;
+  std::optional<std::pair<std::int64_t, std::int64_t>> asked_phase_;  // which, and when
   rclcpp::node_interfaces::OnSetParametersCallbackHandle::SharedPtr phase_;
   rclcpp::Subscription<std_msgs::msg::String>::SharedPtr modes_;
 };
 
 }  // namespace
+
+#ifdef CHAINSHAPER_COMPONENT
+
+// Its class has the name of the package: a container may have one for each of several types.
+namespace CHAINSHAPER_COMPONENT {
+
+// What is loaded into a container. The gate waits in a thread of its own, as an executor of its own.
+class ShapingNode {
+public:
+  explicit ShapingNode(rclcpp::NodeOptions options)
+      : node_(std::make_shared<rclcpp::Node>(
+            "chainshaper_shaping", options.automatically_declare_parameters_from_overrides(true))),
+        group_(node_->create_callback_group(rclcpp::CallbackGroupType::MutuallyExclusive, false)),
+        before_(threads()),
+        services_(node_->create_wall_timer(std::chrono::nanoseconds(0), [this] { name_thread(); })),
+        thread_([this] { run(); }) {}
+
+  ~ShapingNode() {
+    unloaded_ = true;
+    executor_.cancel();
+    thread_.join();
+  }
+
+  auto get_node_base_interface() { return node_->get_node_base_interface(); }
+
+private:
+  static std::set<std::string> threads() {
+    std::set<std::string> found;
+    for (const auto & one : std::filesystem::directory_iterator("/proc/self/task"))
+      found.insert(one.path().filename());
+    return found;
+  }
+
+  // In the container's executor. One that it has started for this node alone gets a name of its
+  // own: an isolated container's threads are told apart by their order, as it had them without us.
+  void name_thread() {
+    services_->cancel();
+    if (before_.count(std::to_string(syscall(SYS_gettid))) == 0)
+      pthread_setname_np(pthread_self(), "gate_services");
+  }
+
+  void run() {
+    unloaded = &unloaded_;
+    pthread_setname_np(pthread_self(), gate_thread_name(node_->get_name()).c_str());
+    try {
+      auto turn = turn_of(*node_);
+      const auto offer = wait_for_publisher(*node_, "input");
+      if (!offer) return;
+      Shaping shaping(*node_, *offer, std::move(turn), group_);
+      executor_.add_callback_group(group_, get_node_base_interface());
+      become_realtime(*node_);
+      while (goes_on()) {
+        executor_.spin_once();
+        while (shaping.work_off()) continue;
+      }
+    } catch (const std::exception & error) {
+      RCLCPP_FATAL(node_->get_logger(), "nothing is published any more: %s", error.what());
+    }
+  }
+
+  std::atomic<bool> unloaded_{false};
+  rclcpp::Node::SharedPtr node_;
+  rclcpp::CallbackGroup::SharedPtr group_;
+  rclcpp::executors::SingleThreadedExecutor executor_;
+  std::set<std::string> before_;
+  rclcpp::TimerBase::SharedPtr services_;
+  std::thread thread_;
+};
+
+}  // namespace CHAINSHAPER_COMPONENT
+
+#include "rclcpp_components/register_node_macro.hpp"
+RCLCPP_COMPONENTS_REGISTER_NODE(CHAINSHAPER_COMPONENT::ShapingNode)
+
+#else
 
 int main(int argc, char ** argv) {
   std::optional<Shaping> shaping;
@@ -370,3 +524,5 @@ int main(int argc, char ** argv) {
     return [&] { return shaping->work_off(); };
   });
 }
+
+#endif

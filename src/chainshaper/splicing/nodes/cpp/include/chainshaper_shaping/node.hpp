@@ -7,6 +7,7 @@
 #include <sched.h>
 #include <sys/mman.h>
 
+#include <atomic>
 #include <chrono>
 #include <csignal>
 #include <cstring>
@@ -58,19 +59,36 @@ inline Offer offer_of(const rclcpp::TopicEndpointInfo & info, std::size_t depth)
   return {info.topic_type(), asked, rclcpp::QoS(history, offered)};
 }
 
-// Wait, unless the process is to stop; whether it goes on.
-inline bool wait(double seconds) {
-  const auto until = monotonic_ns() + static_cast<std::int64_t>(seconds * 1e9);
-  while (rclcpp::ok() && monotonic_ns() < until)
-    sleep_until(std::min(until, monotonic_ns() + 50'000'000));
-  return rclcpp::ok();
+// Set in the thread of a component, which is to stop when it is unloaded.
+inline thread_local const std::atomic<bool> * unloaded = nullptr;
+
+inline bool goes_on() { return rclcpp::ok() && (unloaded == nullptr || !*unloaded); }
+
+// What chainshaper knows the thread of a gate in another's process by (`gate_thread_name`).
+inline std::string gate_thread_name(const std::string & node) {
+  std::uint32_t sum = ~0u;
+  for (const char letter : node) {
+    sum ^= static_cast<std::uint8_t>(letter);
+    for (int bit = 0; bit < 8; ++bit) sum = (sum >> 1) ^ ((sum & 1) != 0 ? 0xEDB88320u : 0u);
+  }
+  char text[16];
+  std::snprintf(text, sizeof(text), "gate-%08x", ~sum);
+  return text;
 }
 
-// Wait until a topic has a publisher; none when the process is to stop.
+// Wait, unless the node is to stop; whether it goes on.
+inline bool wait(double seconds) {
+  const auto until = monotonic_ns() + static_cast<std::int64_t>(seconds * 1e9);
+  while (goes_on() && monotonic_ns() < until)
+    sleep_until(std::min(until, monotonic_ns() + 50'000'000));
+  return goes_on();
+}
+
+// Wait until a topic has a publisher; none when the node is to stop.
 inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::string & topic) {
   const auto depth = static_cast<std::size_t>(parameters_of(node).output_depth);
   const std::string name = node.get_node_topics_interface()->resolve_topic_name(topic);
-  for (bool said = false; rclcpp::ok(); said = true) {
+  for (bool said = false; goes_on(); said = true) {
     const auto found = node.get_publishers_info_by_topic(topic);
     if (!found.empty() && !found[0].topic_type().empty()) {
       if (found.size() > 1) {
@@ -89,15 +107,16 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
   return std::nullopt;
 }
 
-// Lock the memory and give the calling thread its core and SCHED_FIFO priority. To be called when
-// all endpoints exist: threads inherit, and those of DDS must not; later ones do not get the class.
+// Give the calling thread its core and SCHED_FIFO priority, and lock the memory of a process that is
+// ours. To be called when all endpoints exist: threads inherit, and those of DDS must not; later
+// ones do not get the class.
 inline void become_realtime(rclcpp::Node & node) {
   const auto parameters = parameters_of(node);
   const auto warn = [&](const char * what, const char * remedy) {
     RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", what, std::strerror(errno),
                 remedy);
   };
-  if (mlockall(MCL_CURRENT | MCL_FUTURE) != 0)
+  if (unloaded == nullptr && mlockall(MCL_CURRENT | MCL_FUTURE) != 0)
     warn("memory cannot be locked", "give the user a memlock limit of unlimited");
   if (parameters.fifo_priority > 0) {
     sched_param wanted{};
