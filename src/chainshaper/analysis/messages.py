@@ -18,7 +18,8 @@ of ROS 2 show different halves of that:
 Publishing and leaving are two things where a thread of its own sends for the executor: the
 `rmw_publish` of an asynchronous publisher is recorded when the message is handed over;
 `asynchronous_send` says when, and whether, it was sent. A gate's decision about a message
-(`gate_release`) is found by its callback and the message's source timestamp.
+(`gate_release`) is found by its callback and the message's source timestamp; where the message came
+without DDS, and so has none, by the instance that ran on the gate's thread then.
 """
 
 import polars as pl
@@ -280,33 +281,42 @@ def _sends(published: pl.DataFrame, tables: events.EventTables, objects: Objects
 
 
 def discarded_instances(
-    taken: pl.DataFrame, tables: events.EventTables, objects: Objects, instances: int
+    taken: pl.DataFrame, tables: events.EventTables, objects: Objects, instances: pl.DataFrame
 ) -> pl.Series:
     """Per callback instance whether it was a gate's that discarded its message (else null)."""
     key = ["callback_id", "source_timestamp"]
     discarded = gate_decisions(tables, objects).filter(pl.col("release").is_null())
-    found = taken.drop_nulls("instance").join(discarded, on=key, how="semi")
+    stamped = taken.drop_nulls("instance").join(discarded, on=key, how="semi")
+    within = instances.join(discarded, on=["callback_id", "start"], how="semi")
+    found = pl.concat([one.select("instance") for one in (stamped, within)])
     found = found.with_columns(discarded=pl.lit(True))
-    return by_number(found, "instance", "discarded", instances)
+    return by_number(found, "instance", "discarded", instances.height)
 
 
 def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     """The table `gate_release` with the ``callback_id`` of each gate.
 
     A shaping node in ROS 2 does not know its callback's handle. A decision of its is there once for
-    each subscription of its process; which one took the message, the source timestamp tells.
+    each subscription of its process; which one took the message, the source timestamp tells. About
+    a message without one it was made in an instance on its thread, which began at ``start``.
     """
     decisions = events.table(tables, "gate_release", ["mode", "moved"])
     key = ["pid", "callback"]
     callbacks = objects.callbacks.with_columns(callback="handle")
     handles = callbacks.select(*key, "callback_id").unique()
     known = decisions.join(handles, on=key, maintain_order="left")
+    known = known.with_columns(start=_NO_TIME)
     nameless = decisions.join(handles, on=key, how="anti", maintain_order="left")
     if not nameless.height:
         return known
+    unstamped = pl.col("source_timestamp").is_null()
+    began = events.table(tables, "callback_start").select("pid", "tid", "callback", start="time")
+    within = nameless.filter(unstamped).drop("callback")
+    within = latest_before(within, began, ["pid", "tid"], "time", "start").join(handles, on=key)
+    nameless = nameless.filter(~unstamped).with_columns(start=_NO_TIME)
     listening = callbacks.filter(pl.col("kind") == "subscription").select("pid", "callback_id")
     unknown = nameless.join(listening.unique(), on="pid", maintain_order="left")
-    return pl.concat([known, unknown.select(known.columns)])
+    return pl.concat([known, *(one.select(known.columns) for one in (unknown, within))])
 
 
 def with_overrun(decisions: pl.DataFrame, due_cycles: int = 0) -> pl.DataFrame:
@@ -332,8 +342,11 @@ def gated_hops(
     """
     key = ["callback_id", "source_timestamp"]
     decided = with_overrun(gate_decisions(tables, objects), due_cycles).with_columns(let_go="time")
-    reached = hops.select("traversal", "hop", "start", *key).drop_nulls(key)
-    found = reached.join(decided, on=key)
+    reached = hops.select("traversal", "hop", "start", *key)
+    columns = [*reached.columns, *(n for n in decided.columns if n not in reached.columns)]
+    stamped = reached.drop_nulls(key).join(decided.drop("start"), on=key)
+    within = reached.drop("source_timestamp").join(decided, on=["callback_id", "start"])
+    found = pl.concat([one.select(columns) for one in (stamped, within)])
     apart = (pl.col("arrival") - pl.col("start")).abs()
     found = found.sort("traversal", "hop", apart, maintain_order=True)
     return found.unique(["traversal", "hop"], keep="first", maintain_order=True).select(

@@ -184,7 +184,7 @@ def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataF
     ended = _looked_up(flow.instances, "end", f"instance_{hop}").is_not_null()
     why = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
     if "gate_release" in flow.events:
-        withheld = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances.height)
+        withheld = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances)
         gone = pl.lit(withheld).gather(instance)
         why = pl.when(ended & gone.is_not_null()).then(pl.lit("discarded")).otherwise(why)
     state = _broken(state, stuck, hop, why)

@@ -32,8 +32,8 @@ _RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTAL
 _NOT_RUNNING = "no node {} runs"
 _NOT_LOADED = (
     "no launch file has a container load {}, and its shaping node is a component (what `ros2 "
-    "component load` loads cannot be redirected: load it in a launch file; if it is a process of its "
-    "own, splice with another --node)"
+    "component load` loads cannot be redirected: load it in a launch file; if it is a process, "
+    "splice with another --node)"
 )
 _FOR_A_SHELL = re.compile(r"[;&|<>()$`*?~#\n]")
 
