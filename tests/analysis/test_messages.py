@@ -1,9 +1,13 @@
 """Which take read which publication, in the dialects of ROS 2's versions."""
 
+from typing import Any
+
+import polars as pl
 import pytest
-from story import OFFSET, Callback, Publisher, Story
+from story import OFFSET, Callback, Node, Publisher, Story
 
 from chainshaper.analysis import DataFlow, application_graph, data_flow
+from chainshaper.analysis.messages import discarded_instances, gate_decisions, gated_hops
 
 
 def read(flow: DataFlow) -> list[tuple[int, int | None]]:
@@ -175,6 +179,32 @@ def test_intra_process_messages_travel_by_buffer_and_index() -> None:
     # The twin is the same callback as the subscription's own.
     callbacks = application_graph(story.tables()).callbacks
     assert [callback.kind for callback in callbacks if callback.handle] == ["subscription"]
+
+
+def test_a_gate_s_decision_about_a_message_without_dds_is_found_by_its_instance() -> None:
+    """The gate's thread has no other instance meanwhile; the process has other subscriptions."""
+    story = Story()
+    publisher, twin, buffer = intra_process(story)
+    other = story.subscription(Node(1, story.rows["rcl_node_init"][0]["node_handle"]), "/z")
+    for begin, release in ((20, 22), (40, None)):
+        hand_over(story, publisher, begin - 10, buffer, 0)
+        receive(story, twin, begin, buffer, 0)
+        decided: dict[str, Any] = {"callback": None, "source_timestamp": None, "arrival": begin}
+        decided |= {"origin": begin, "release": release, "slot": 0, "cycles_waited": 0}
+        story.event("gate_release", begin + 2, 1, **decided, anchor="stamp", overrun=None)
+    story.start(other, 60)
+    story.end(other, 70)
+    flow = data_flow(story.tables())
+    decisions = gate_decisions(flow.events, flow.objects)
+    read_by = flow.instances.filter(pl.col("intra_process"))["callback_id"][0]
+    assert decisions.select("callback_id", "start").rows() == [(read_by, 20), (read_by, 40)]
+    gone = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances)
+    assert gone.to_list()[:3] == [None, True, None]
+
+    hops = flow.instances.select("callback_id", "start", traversal="instance", hop=pl.lit(1))
+    hops = hops.with_columns(source_timestamp=pl.lit(None, dtype=pl.Int64))
+    found = gated_hops(flow.events, flow.objects, hops)
+    assert found.select("traversal", "arrival", "release").rows() == [(0, 20, 22), (1, 40, None)]
 
 
 def test_a_message_given_to_buffers_and_to_dds_is_one_publication() -> None:

@@ -28,11 +28,12 @@ from chainshaper.enforcement.threads import (
     plan_scheduling,
     server_members,
     server_priorities,
+    with_gates,
 )
 from chainshaper.flow.threads import check_publishers, first_threads
 from chainshaper.linux.processes import Process, read_process
 from chainshaper.linux.scheduling import Scheduling
-from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, role_of
+from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.plan import Server, ShapingNode, revised
@@ -406,6 +407,26 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
     alone = whole(revised(bare, shaping_node=node.model_copy(update={"receivers": ()})))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
+
+
+def test_a_gate_in_a_container_is_known_by_its_threads_name() -> None:
+    """Of a component, as of a library before rmw: the container's other threads stay its nodes'."""
+    gate = ShapingNode(
+        name="gate",
+        input="/out_tmp",
+        output="/out",
+        core=1,
+        fifo_priority=84,
+        spin_ns=0,
+        pause_ns=0,
+    )
+    main, other = _node("/a", 100, "executor", "unknown")
+    named = replace(other, thread=replace(other.thread, comm=gate_thread_name("gate")))
+    found = with_gates(Allocation((main, named), ()), [gate]).threads
+    assert [(one.thread.tid, one.thread.role, one.nodes) for one in found] == [
+        (100, "executor", ("/a",)),
+        (101, "executor", ("/gate",)),
+    ]
 
 
 def test_best_effort_runs_under_the_fair_class_and_equal_servers_take_turns() -> None:

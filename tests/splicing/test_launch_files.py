@@ -15,7 +15,9 @@ from launch_cases import NDT, ROBOTS, plan_for
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
 from chainshaper.flow.launch_splicing import undo_splice
+from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan import publish_slots, revised
+from chainshaper.splicing.shaping_process import zero_copy_lost
 from chainshaper.splicing.spliced_launch import parse_launch_command
 from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.recording import Recording, open_recording
@@ -146,6 +148,33 @@ def test_a_package_s_node_is_started_with_its_parameters_and_remaps(robot: Path)
         "name": "chainshaper_pose",
         **same,
     }
+
+
+def test_a_component_goes_into_its_publishers_container_and_has_no_standby(robot: Path) -> None:
+    out, type_ = robot.parent / "out", "sensor_msgs/msg/PointCloud2"
+    spliced = splice_launch_files(PLAN, [robot], out, node="component", message_type=type_)
+    written, nodes = launched(spliced), out / "shaping_nodes"
+    assert written["PROCESSES"] == []
+    assert written["REDIRECTS"][0]["component"] == {
+        "package": "shaping_sensor_msgs_point_cloud2",
+        "plugin": "shaping_sensor_msgs_point_cloud2::ShapingNode",
+        "name": "chainshaper_pose",
+        "remappings": (("input", "/pose_tmp"), ("output", "/pose")),
+        "parameters": str(nodes / "chainshaper_pose.yaml"),
+    }
+    (values,) = yaml.safe_load((nodes / "chainshaper_pose.yaml").read_text()).values()
+    assert [] not in values["ros__parameters"].values(), "a list without elements has no type"
+    assert [log.name for log in spliced.logs] == ["chainshaper_pose.csv"]
+    assert not list(nodes.glob("*standby*"))
+
+
+def test_what_a_node_costs_where_messages_are_not_copied_is_said() -> None:
+    assert zero_copy_lost(whole(PLAN), "python") == []
+    evidence = PLAN.evidence.model_copy(update={"intra_process": True})
+    plan = whole(revised(PLAN, evidence=evidence))
+    (said,) = zero_copy_lost(plan, "cpp")
+    assert said.startswith("/pose: subscribers in the process of /ndt get its messages without a")
+    assert zero_copy_lost(plan, "component") == []
 
 
 def test_several_launch_files_are_launched_together(robot: Path) -> None:

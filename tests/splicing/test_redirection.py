@@ -143,6 +143,25 @@ def test_a_request_for_a_component_is_redirected_if_it_loads_the_node(
     assert request.remap_rules == (ours if redirected else rules)
 
 
+def test_a_shaping_node_that_is_a_component_stands_behind_components_only() -> None:
+    redirect = pose()
+    redirect.component = {"name": "shaping"}
+    words = ["n", "--ros-args", "-r", "__node:=ndt"]
+    redirect_command(words, [redirect], "n-1")
+    assert words == ["n", "--ros-args", "-r", "__node:=ndt"], "nothing would publish its output"
+    assert (redirect.mistake(["/ndt"], []) or "").startswith(
+        "nothing was redirected: no launch file has a container load /ndt, and its shaping node is"
+    )
+
+    request = SimpleNamespace(node_name="ndt", node_namespace="", plugin_name="l::N")
+    request.remap_rules = []
+    assert redirect_request(request, [redirect, pose("/icp")]) == [redirect]
+    assert redirect.mistake([], ["/ndt"]) is None, "it is not loaded yet"
+    redirect.loaded = True
+    assert (redirect.mistake([], ["/ndt"]) or "").startswith("the container did not load /shaping")
+    assert redirect.mistake(["/shaping"], ["/ndt"]) is None
+
+
 def started(redirect: Redirect, *commands: str, ended: bool = False) -> Redirect:
     for number, command in enumerate(commands):
         action = SimpleNamespace(shell=False, return_code=0 if ended and number == 0 else None)

@@ -27,6 +27,7 @@ from chainshaper.planning import Plan, ShapingNode, let_per_callback
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
+    NodeKind,
     ShapingProcess,
     gate_of,
     write_shaping_process,
@@ -173,8 +174,10 @@ def test_what_cannot_be_written_is_named(full_disk: Path, plan: Plan, node: Shap
 
 
 def test_a_typed_node_needs_a_type(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
-    with pytest.raises(InputError, match="that of /t3 is not known: name it"):
-        write_shaping_process(plan, node, "typed", tmp_path)
+    kinds: list[NodeKind] = ["typed", "component"]
+    for kind in kinds:
+        with pytest.raises(InputError, match=f"the {kind} shaping .* /t3 is not known: name it"):
+            write_shaping_process(plan, node, kind, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 

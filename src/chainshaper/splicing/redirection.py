@@ -71,8 +71,9 @@ class Redirect:
 
     def values(self) -> dict[str, Any]:
         """What a launch file says of it, and a dry run is asked."""
-        keys = ("kind", "topic", "target", "nodes", "added", "component")
-        return {key: getattr(self, key) for key in keys}
+        keys = ("kind", "topic", "target", "nodes", "added")
+        component = {} if self.component is None else {"component": self.component}
+        return {key: getattr(self, key) for key in keys} | component
 
     def see(
         self,
