@@ -540,7 +540,8 @@ def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
 def _goes_without_dds(flow: DataFlow, node: str, topic: str) -> Literal[True] | None:
     """Whether messages of a node's topic are handed to subscribers of the same process."""
     sent = flow.publications.filter((pl.col("topic") == topic) & (pl.col("node") == node))
-    return True if sent["intra_time"].count() else None
+    own = pl.col("publication").is_in(sent["publication"].implode())
+    return True if flow.takes.filter(own & pl.col("intra_process")).height else None
 
 
 def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:

@@ -488,10 +488,7 @@ private:
       Shaping shaping(*node_, *offer, std::move(turn), group_);
       executor_.add_callback_group(group_, get_node_base_interface());
       become_realtime(*node_);
-      while (goes_on()) {
-        executor_.spin_once();
-        while (shaping.work_off()) continue;
-      }
+      while (goes_on()) executor_.spin_once(std::chrono::nanoseconds(shaping.work_off() ? 0 : -1));
     } catch (const std::exception & error) {
       RCLCPP_FATAL(node_->get_logger(), "nothing is published any more: %s", error.what());
     }
