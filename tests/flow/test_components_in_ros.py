@@ -111,8 +111,8 @@ def test_a_container_loads_the_shaping_node_and_nothing_is_copied(
     found = handed_on(said)
     assert len(found) > 50
     assert {how for how, _ in found} == {"same"}
-    if not apart:  # one for each cloud: that of the source
-        assert found[-1][1] - found[0][1] <= len(found) + 5
+    if not apart:  # one for each cloud, that of the source; some are overwritten on a busy machine
+        assert found[-1][1] - found[0][1] < 1.3 * len(found)
 
 
 @pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
