@@ -170,6 +170,8 @@ def test_a_component_goes_into_its_publishers_container_and_has_no_standby(robot
 
 def test_what_a_node_costs_where_messages_are_not_copied_is_said() -> None:
     assert zero_copy_lost(whole(PLAN), "python") == []
+    (said,) = zero_copy_lost(whole(PLAN), "component")
+    assert said.startswith("/pose: subscribers in the process of /ndt do not get its messages now;")
     evidence = PLAN.evidence.model_copy(update={"intra_process": True})
     plan = whole(revised(PLAN, evidence=evidence))
     (said,) = zero_copy_lost(plan, "cpp")

@@ -139,16 +139,25 @@ def write_shaping_process(
 
 
 def zero_copy_lost(plan: ApplicationPlan, kind: NodeKind) -> list[str]:
-    """A line for each output of which a node of this kind would need copies that are not made now.
+    """A line for each output of which a node of this kind would need copies that are not made now,
+    or would be a component where none was seen to be of use.
 
     Messages that go through DDS anyway are copied without it as well.
     """
+    within = (
+        f"get its messages without a copy; with --node {kind} each message is serialized and "
+        "copied, to the shaping node and back: choose --node component"
+    )
+    outside = (
+        "do not get its messages now; --node component needs a publisher that a launch file has a "
+        "container load: for one that is a process of its own choose --node typed"
+    )
+    component = kind == "component"
     return [
-        f"{chain.chain.output}: subscribers in the process of {chain.chain.publisher} get its "
-        f"messages without a copy; with --node {kind} each message is serialized and copied, to "
-        "the shaping node and back: choose --node component"
+        f"{chain.chain.output}: subscribers in the process of {chain.chain.publisher} "
+        f"{outside if component else within}"
         for chain in plan.chains
-        if chain.evidence.intra_process and chain.shaping_node is not None and kind != "component"
+        if chain.shaping_node is not None and component is not bool(chain.evidence.intra_process)
     ]
 
 
