@@ -162,7 +162,7 @@ def _publish_by_sibling(
     state = state.with_columns(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
-    if callback.symbol is not None and MESSAGE_FILTER not in callback.symbol:
+    if callback.kind == "service" or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER):
         return state, []  # a callback that stores its latest message: old values are its purpose
     reached = state[publication].drop_nulls()
     between = here.filter(pl.col("later").is_between(reached.min(), reached.max())).height
@@ -302,7 +302,7 @@ def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -
     candidates = [
         callback.id
         for callback in graph.callbacks
-        if callback.kind == "subscription" and callback.topic == traversals.chain.topics[-1]
+        if callback.trigger == traversals.chain.topics[-1]
     ]
     taken = flow.takes.filter(pl.col("callback_id").is_in(candidates))
     taken = taken.drop_nulls(["publication", "instance"])
