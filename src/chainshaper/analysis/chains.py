@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from itertools import count as counting
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import TypeAlias
 
@@ -282,7 +282,9 @@ class _Search:
 
     def _starts(self, name: str, vertices: frozenset[Vertex]) -> set[int]:
         if not any(isinstance(vertex, str) for vertex in vertices):
-            return {vertex for vertex in vertices if isinstance(vertex, int)}
+            own = {vertex for vertex in vertices if isinstance(vertex, int)}
+            # What a node does with a response, it began with the request.
+            return {one for one in own if self.callbacks[one].kind != "client"} or own
         starts = {
             one.id
             for one in self.graph.callbacks
@@ -338,6 +340,11 @@ class _Search:
 
     def why_no_path(self) -> str:
         """Why there is no path, for a message."""
+        if self.roots and not self.cyclic:
+            return (
+                f"chain {self.spec!r}: it leads through a service to a node that did not call it; "
+                "responses go back to the node that sent the request"
+            )
         if self.roots:
             return (
                 f"chain {self.spec!r}: it can only be closed by passing the same callback or topic "
@@ -386,10 +393,24 @@ class _Search:
                     if path:
                         path.popitem()
                 elif state in self.ends:
-                    yield (*path, state[0])
+                    if self._returns((*path, state[0])):
+                        yield (*path, state[0])
                 else:
                     path[state[0]] = None
                     stack.append(iter(onward(self.successors[state], path)))
+
+    def _returns(self, path: GraphPath) -> bool:
+        """Whether responses go to the nodes that sent their requests."""
+        callers: dict[Vertex, tuple[int, str]] = {}
+        for vertex, after in pairwise((*path, "")):
+            if not isinstance(vertex, int):
+                continue
+            one = self.callbacks[vertex]
+            here = one.pid, one.node
+            if one.kind == "client" and callers.get(f"{one.topic}{REQUEST}", here) != here:
+                return False
+            callers[after] = here
+        return True
 
     def _by_length(self, limit: int) -> tuple[list[GraphPath], int, bool]:
         """The shortest paths: up to ``limit`` of them, how many were met, whether that is all.

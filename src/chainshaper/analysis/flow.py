@@ -37,7 +37,7 @@ from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objec
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 
-_FEEDBACK = "/_action/feedback"
+_ACTION = "/_action/"
 _LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
 
 
@@ -217,7 +217,9 @@ def _with_assumed_readers(
     Of services, clients and actions it ends when the thread's executor looks for work again.
     Returns the instances, renumbered in order of start, and the takes with ``assumed_instance``.
     """
-    by_executor = (pl.col("kind") != "subscription") | pl.col("topic").str.ends_with(_FEEDBACK)
+    by_executor = (pl.col("kind") != "subscription") | pl.col("topic").str.contains(
+        _ACTION, literal=True
+    )
     silent = objects.callbacks.filter(~pl.col("observed")).unique("callback_id")
     silent = silent.select("callback_id", by_executor=by_executor)
     assumed = taken.join(silent, on="callback_id", maintain_order="left").select(

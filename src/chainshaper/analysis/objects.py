@@ -323,6 +323,7 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
                 "no node was created during the recording: names of nodes cannot be known."
             )
     silent = callbacks.filter(~pl.col("observed") & (pl.col("kind") == "subscription"))
+    silent = silent.filter(~pl.col("topic").str.contains("/_action/", literal=True))
     notes += [
         f"{node} takes {topic} without callback events (a Python node, or a wait set): its "
         "response times cannot be known; what its thread publishes until its next take is "
