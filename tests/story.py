@@ -114,8 +114,8 @@ class Story:
         end = Callback(node.pid, self.handle(), self.handle())
         about: dict[str, Any] = {"node_handle": node.handle, "service_name": service}
         if gid is not None:
-            about_gid = {"rmw_client_handle": end.rmw_subscription, "gid": [gid] * 16}
-            self.event("rmw_client_init", 0, node.pid, **about_gid)
+            named: dict[str, Any] = {"rmw_client_handle": end.rmw_subscription, "gid": [gid] * 16}
+            self.event("rmw_client_init", 0, node.pid, **named)
         about |= {"client_handle": end.handle, "rmw_client_handle": end.rmw_subscription}
         self.event("rcl_client_init", 0, node.pid, **about)
         return end

@@ -47,6 +47,7 @@ class Objects:
       what emits no callback events: subscriptions and services of rclpy, those of actions, and
       all clients.
     * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
+    * ``activity``: ``time, pid, node, active``: when lifecycle nodes became active, or inactive.
     * ``notes``: what cannot be known from this recording, in plain words.
     """
 
@@ -55,6 +56,7 @@ class Objects:
     subscriptions: pl.DataFrame
     callbacks: pl.DataFrame
     buffers: pl.DataFrame
+    activity: pl.DataFrame
     notes: tuple[str, ...]
 
 
@@ -88,6 +90,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         subscriptions=subscriptions.with_columns(names),
         callbacks=callbacks.select(pl.col(name).cast(t) for name, t in CALLBACK_SCHEMA.items()),
         buffers=_buffers(tables, callbacks),
+        activity=_activity(tables, nodes),
         notes=_notes(tables, callbacks),
     )
 
@@ -296,6 +299,19 @@ def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     joined = nearest(owned, added, ["pid", "subscription"], "owned", "added").drop_nulls("added")
     joined = latest_before(joined, ids, ["pid", "handle"], "added", "registered")
     return joined.select("pid", "buffer", "valid_from", "callback_id").sort("valid_from")
+
+
+def _activity(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Changes between active and not, of lifecycle nodes: in none of their states at first."""
+    machine = ["pid", "state_machine"]
+    created = events.table(tables, "rcl_lifecycle_state_machine_init")
+    created = _with_node(created.select("time", *machine, "node_handle"), nodes, "time")
+    changed = events.table(tables, "rcl_lifecycle_transition")
+    changed = changed.with_columns(active=pl.col("goal_label") == "active")
+    created = created.rename({"time": "created"}).select(*machine, "created", "node")
+    changed = latest_before(changed, created, machine, "time", "created")
+    first = created.select(time="created", pid="pid", node="node", active=pl.lit(False))
+    return pl.concat([first, changed.select(first.columns)]).sort("time")
 
 
 def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ...]:

@@ -161,7 +161,7 @@ def _profile_of(
         every_step_ns=steps[every["traversal"].to_numpy()],
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=analysis.traversals.height - every.height,
+        incomplete=analysis.statistics.incomplete,
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),
@@ -266,7 +266,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
         needs[key] = set()
         for number in key[0]:
             on_chain = key in along and number in before
-            read = graph.callbacks[number].topic
+            read = graph.callbacks[number].trigger
             for one in before[number] if on_chain else writers_of(read):
                 if one not in above:  # what feeds back comes from a cycle before
                     needs[key].add(one)
@@ -297,7 +297,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
 def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> frozenset[str]:
     """The topics that the chain's output waits for, those before its first callback included."""
     found = {stage.topic for stage in stages}
-    first = graph.callbacks[chain.callbacks[0]].topic
+    first = graph.callbacks[chain.callbacks[0]].trigger
     ahead = set() if first is None else {first}
     while ahead:
         found |= ahead
@@ -307,7 +307,7 @@ def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> fr
             for topic in ahead.intersection(callback.publishes)
         ]
         inputs = [number for one, topic in writers for number in inputs_of(graph, one, topic)]
-        read = {graph.callbacks[number].topic for number in inputs}
+        read = {graph.callbacks[number].trigger for number in inputs}
         ahead = {topic for topic in read if topic is not None} - found
     return frozenset(found - {chain.topics[-1]})
 
@@ -317,9 +317,9 @@ def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
     first = graph.callbacks[chain.callbacks[0]]
     own = {graph.callbacks[number].node for number in chain.callbacks}
     found: set[str] = set()
-    fed = set() if first.topic is None else {first.node}
+    fed = set() if first.trigger is None else {first.node}
     while fed:
-        topics = {callback.topic for callback in graph.callbacks if callback.node in fed}
+        topics = {callback.trigger for callback in graph.callbacks if callback.node in fed}
         fed = {writer.node for writer in graph.callbacks if topics.intersection(writer.publishes)}
         fed -= found | own
         found |= fed

@@ -67,6 +67,10 @@ FIELDS: dict[str, dict[str, pl.DataType]] = {
     "rclcpp_timer_callback_added": {"timer_handle": _HANDLE, "callback": _HANDLE},
     "rclcpp_timer_link_node": {"timer_handle": _HANDLE, "node_handle": _HANDLE},
     "rclcpp_callback_register": {"callback": _HANDLE, "symbol": _NAME},
+    "rcl_lifecycle_state_machine_init": {"node_handle": _HANDLE, "state_machine": _HANDLE},
+    "rcl_lifecycle_transition": {
+        "state_machine": _HANDLE, "start_label": _NAME, "goal_label": _NAME,
+    },
     # What happens, again and again. Timestamps of messages are DDS source timestamps:
     # CLOCK_REALTIME, as the publisher wrote them.
     "callback_start": {"callback": _HANDLE, "is_intra_process": _NUMBER},
@@ -202,9 +206,9 @@ VERSION_FIELDS = {
 
 _CREATION_ENDINGS = ("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription")
 CREATION = frozenset(name for name in FIELDS if name.endswith(_CREATION_ENDINGS)) | {
-    *("rmw_implementation", "rclcpp_construct_ring_buffer")
+    *("rmw_implementation", "rclcpp_construct_ring_buffer", "rcl_lifecycle_transition")
 }
-"""The events of objects' creation, which say what all others are about."""
+"""The events of objects' creation, and changes of their state, which all others depend on."""
 NODE_NAME = pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + pl.col("node_name")
 """The full name of the node that a row of `rcl_node_init` is about: ``/front/filter``."""
 

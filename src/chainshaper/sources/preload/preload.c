@@ -365,6 +365,8 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
   CREATION(rclcpp_construct_ring_buffer, 0, 0) \
   CREATION(rclcpp_buffer_to_ipb, 0, 0) \
   CREATION(rclcpp_ipb_to_subscription, 0, 0) \
+  CREATION(rcl_lifecycle_state_machine_init, 0, 0) \
+  CREATION(rcl_lifecycle_transition, BIT(1) | BIT(2), 0) \
   TIMED(callback_start, 2) \
   TIMED(callback_end, 1) \
   EVENT(rclcpp_publish, 2) \
