@@ -42,7 +42,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize("node", ["client", "other"])
 def test_every_call_is_followed_to_the_client_that_made_it(recording: Path, node: str) -> None:
-    """Both clients call one server at one pace; each prints when it began, and when it published."""
+    """Both clients call one server at one pace; each prints when it began and published."""
     output = {"client": "/sum", "other": "/sum_of_other"}[node]
     analysis = cs.analyse_latency(cs.open_source(recording), f"/{node}../add..{output}")
     assert analysis.incomplete.keys() <= {"not taken", "not executed", "still running"}

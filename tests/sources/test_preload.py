@@ -273,7 +273,8 @@ CALLS = """
 address, number, taken = ctypes.c_void_p, ctypes.c_int64(), ctypes.c_bool()
 info = ctypes.create_string_buffer(40)
 for client in (1, 2): library.rmw_send_request(address(client), address(2), ctypes.byref(number))
-for request in (0, 3): library.rmw_take_request(address(4), info, address(request), ctypes.byref(taken))
+for request in (0, 3):
+    library.rmw_take_request(address(4), info, address(request), ctypes.byref(taken))
 library.rmw_send_response(address(4), ctypes.byref(info, 16), address(5))
 library.rmw_take_response(address(1), info, address(6), ctypes.byref(taken))
 assert number.value == 41 and taken.value

@@ -239,6 +239,6 @@ def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
     return latency_statistics(
         measured[column].to_numpy(),
         measured[hit].to_numpy(),
-        incomplete=frame.height - measured.height - (frame["reason"] == "inactive").sum(),
+        incomplete=frame.height - measured.height - frame.filter(reason="inactive").height,
         late=int(measured["late"].sum()) if known else None,
     )

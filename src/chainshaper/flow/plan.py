@@ -44,6 +44,8 @@ __all__ = ["plan_recording", "profile_chains", "shape_application"]
 DEFAULT_PRIORITY = 80
 _STANDARD = PlanRequest()
 
+_SAME_SPEED = 0.02  # so far may /clock be from the speed of time
+
 
 def profile_chains(
     recording: Recording | str | Path,
@@ -133,6 +135,7 @@ def _profile_of(
     all_disturbed = calm.height < 2
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
     period = _period(analysis, period_ns)
+    simulated = _simulated(flow, analysis)
     nodes = dict.fromkeys(stage.node for stage in stages)
     running, named = _running(flow, stages)
     cores, priority = _executors(recording, graph, running)
@@ -172,6 +175,7 @@ def _profile_of(
         asynchronous=_publishes_asynchronously(recording, stages[-1].node),
         intra_process=_goes_without_dds(flow, stages[-1].node, chain.topics[-1]),
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
+        simulated=simulated,
         all_disturbed=all_disturbed or None,
     )
 
@@ -223,6 +227,24 @@ def _period(analysis: LatencyAnalysis, given: int | None) -> int:
         f" not known{seen if len(starts) > 1 else ''}: add --period, or begin the chain at the"
         " timer callback that starts it"
     )
+
+
+def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
+    """The nodes of a chain that follow `/clock`, which is to run at the speed of time."""
+    callbacks = [analysis.graph.callbacks[number] for number in analysis.chain.callbacks]
+    follow = set(flow.takes.filter(topic="/clock")["node"])
+    found = tuple(dict.fromkeys(one.node for one in callbacks if one.node in follow))
+    first, starts = callbacks[0], analysis.traversals["start"].unique().sort().to_numpy()
+    if first.node in found and first.period_ns is not None and len(starts) > 1:
+        apart = float(np.median(np.diff(starts)))
+        if not 1 - _SAME_SPEED < (speed := first.period_ns / apart) < 1 + _SAME_SPEED:
+            raise InputError(
+                f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
+                f" timer of {format_duration(first.period_ns)} expires every"
+                f" {format_duration(round(apart, -5))}. Replay at that speed (`ros2 bag play --rate"
+                " 1.0`), or start the nodes with use_sim_time:=false"
+            )
+    return found
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,11 @@ INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chains
 """Topics that every node has for itself, or every shaping node: they connect no computation."""
 
 _PARAMETERS = ("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters")
-INTERNAL_SERVICES = frozenset(_PARAMETERS) | {
-    *("get_type_description", "set_parameters", "set_parameters_atomically")
+_STATES = ("change_state", "get_state", "get_available_states", "get_available_transitions")
+INTERNAL_SERVICES = frozenset((*_PARAMETERS, *_STATES)) | {
+    *("get_type_description", "set_parameters", "set_parameters_atomically", "get_transition_graph")
 }
-"""The last parts of the names of services that every node has for itself."""
+"""The last parts of the names of services that every node, or lifecycle node, has for itself."""
 
 REQUEST, RESPONSE = ":request", ":response"
 """Behind a service's name: what its clients publish, and what its server does, as if on topics."""
