@@ -57,7 +57,7 @@ def test_stamps_of_nodes_that_follow_clock_are_no_anchor() -> None:
     with pytest.raises(InputError, match=FOLLOWS + ".*use_sim_time:=false.*--anchor cycle"):
         plan_chain(profile)
     with pytest.raises(InputError, match=FOLLOWS):
-        plan_application([replace(profile, topics=("/a", "/b"), begins=(7, "/a")), profile])
+        plan_application([replace(profile, topics=("/a", "/b"), begins=None), profile])
     assert plan_chain(profile, PlanRequest(anchor="cycle")).anchor == "cycle"
     assert plan_chain(profile, PlanRequest(policy="server-per-chain")).shaping_node is None
     assert plan_chain(profile_at(1.0, simulated=False)).anchor == "stamp"

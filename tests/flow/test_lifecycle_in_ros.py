@@ -1,0 +1,76 @@
+"""A lifecycle node that is shaped: cycles without it are counted apart, and nothing is late after."""
+
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+from command_line import called, json_of
+from roles import role, ros2_alone
+
+import chainshaper as cs
+
+LAUNCH = Path(__file__).parents[1] / "roles/managed.launch.py"
+WHILE_SHAPED = """
+(sleep {begin}; for to in {changes}; do ros2 lifecycle set /managed $to; sleep 1; done) &
+exec ros2 launch {launch}
+"""
+
+
+@pytest.fixture(scope="module")
+def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """What was recorded of the launch file, unshaped."""
+    folder = tmp_path_factory.mktemp("lifecycle") / "before"
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in {**ros2_alone(), "ROLE": str(role())}.items():
+            patch.setenv(name, value)
+        words = ("record", "--source", "preload", "-o", folder, "--duration", "8s", "--")
+        made = called(*words, "ros2", "launch", LAUNCH)
+    assert made.code == 0, made.err
+    return folder
+
+
+@pytest.mark.ros2
+@pytest.mark.timeout(300)
+@pytest.mark.parametrize(
+    ("where", "changes"),
+    [
+        ("node", "deactivate activate"),
+        ("in-process", "deactivate activate"),
+        ("in-process", "deactivate cleanup configure activate"),  # another publisher
+    ],
+)
+def test_a_node_that_is_made_inactive_is_shaped_again_when_it_is_active(
+    before: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    where: str,
+    changes: str,
+) -> None:
+    for name, value in {**ros2_alone(), "ROLE": str(role())}.items():
+        monkeypatch.setenv(name, value)
+    plan, spliced, after = (tmp_path / name for name in ("plan.yaml", "spliced", "after"))
+    publication = ("--publication", "in-process") if where == "in-process" else ()
+    wishes = ("--epsilon", "10ms", "--publish-slot", "1ms", *publication)
+    planned = called("plan", before, "--chain", "/source../t2", *wishes, "-o", plan)
+    assert planned.code == 0, planned.err
+    made = called("splice", plan, LAUNCH, "-o", spliced)
+    assert made.code == 0, made.err
+    script = WHILE_SHAPED.format(begin=9, changes=changes, launch=spliced / LAUNCH.name)
+    apply = (sys.executable, "-m", "chainshaper", "apply", plan, "--wait", "15s", "--")
+    record = ("record", "--source", "preload", "-o", after, "--duration", "22s", "--")
+    recorded = called(*record, *apply, "bash", "-c", script)
+    assert recorded.code == 0, recorded.err
+    chain = "/source../chainshaper_t2../t2" if where == "node" else "/source../t2"
+    found = json_of("latency", after, "--chain", chain, "--json")
+    assert found["incomplete_by_reason"]["inactive"] > 10
+    assert found["incomplete"] <= 3, found["incomplete_by_reason"]
+    assert found["late"] == 0
+    (log,) = (one for one in (spliced / "logs").glob("*.csv") if "standby" not in one.name)
+    rows = cs.read_gate_log(log).sort("arrival").with_columns(gap=pl.col("arrival").diff())
+    (again,) = rows.with_row_index("place").filter(pl.col("gap") > 1_000_000_000)["place"]
+    assert len(rows) - again > 20
+    shaped = rows.slice(again)
+    assert shaped["anchor"].unique().to_list() == ["stamp"]
+    assert shaped["overrun"].null_count() == len(shaped), "none came late"
+    assert set(shaped["cycles_waited"]) == {0}
