@@ -1,4 +1,4 @@
-"""A lifecycle node that is shaped: cycles without it are counted apart, and nothing is late after."""
+"""A lifecycle node that is shaped: cycles without it count apart, and nothing is late after."""
 
 import sys
 from pathlib import Path
