@@ -12,8 +12,14 @@ import chainshaper as cs
 
 LAUNCH = Path(__file__).parents[1] / "roles/managed.launch.py"
 WHILE_SHAPED = """
-(sleep {begin}; for to in {changes}; do ros2 lifecycle set /managed $to; sleep 1; done) &
-exec ros2 launch {launch}
+set -m
+ros2 launch {launch} &
+until "{python}" -m chainshaper status --json | grep -q '"in_force_ns": *[0-9]'; do sleep 0.3; done
+sleep 2
+for to in {changes}; do ros2 lifecycle set /managed $to; sleep 1; done
+sleep 3
+kill -INT %1
+wait
 """
 
 
@@ -56,9 +62,10 @@ def test_a_node_that_is_made_inactive_is_shaped_again_when_it_is_active(
     assert planned.code == 0, planned.err
     made = called("splice", plan, LAUNCH, "-o", spliced)
     assert made.code == 0, made.err
-    script = WHILE_SHAPED.format(begin=9, changes=changes, launch=spliced / LAUNCH.name)
+    launch = spliced / LAUNCH.name
+    script = WHILE_SHAPED.format(changes=changes, launch=launch, python=sys.executable)
     apply = (sys.executable, "-m", "chainshaper", "apply", plan, "--wait", "15s", "--")
-    record = ("record", "--source", "preload", "-o", after, "--duration", "22s", "--")
+    record = ("record", "--source", "preload", "-o", after, "--duration", "90s", "--")
     recorded = called(*record, *apply, "bash", "-c", script)
     assert recorded.code == 0, recorded.err
     chain = "/source../chainshaper_t2../t2" if where == "node" else "/source../t2"

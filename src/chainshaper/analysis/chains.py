@@ -150,7 +150,7 @@ def enumerate_chains(
         chains=chains,
         complete=complete,
         count=len(chains) if complete else max(count, met),
-        exact=complete or not search.cyclic,
+        exact=complete or not (search.cyclic or search.calls),
         heaviest=heaviest,
         heaviest_ns=heaviest_ns if heaviest else None,
     )
@@ -215,6 +215,7 @@ class _Search:
         if any_start:  # every source is as good as a first way point
             self.stages.insert(0, ("any source", frozenset[Vertex](starts)))
         listening = [c for c in graph.callbacks if c.trigger is not None]
+        self.calls = any(c.kind == "client" and c.publishes for c in listening)
         self.going_on = {c.trigger for c in listening if set(c.publishes) - INTERNAL_TOPICS}
         self.subscribers: dict[Vertex, list[int]] = {}
         for callback in listening:
@@ -256,6 +257,8 @@ class _Search:
         for candidate in (name, f"/{name}"):
             if candidate in topics:
                 return candidate, frozenset[Vertex]((candidate,))
+            if candidate in nodes:
+                return candidate, frozenset[Vertex](nodes[candidate])
             if calls := topics & {candidate + REQUEST, candidate + RESPONSE}:
                 return candidate, frozenset[Vertex](calls)
             if candidate in services:
@@ -264,8 +267,6 @@ class _Search:
                     "Kilted (tracetools 8.5), calls have no trace points: `record --source "
                     "preload` sees them on all distributions"
                 )
-            if candidate in nodes:
-                return candidate, frozenset[Vertex](nodes[candidate])
         if not topics:
             raise InputError(
                 f"chain {self.spec!r}: the recording shows no topics at all; tracing has to start "
@@ -473,6 +474,8 @@ class _Search:
 
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
+
+        Paths on which a response goes to another node than the request's count as well.
 
         If ``cyclic``, of those that never step back in one order of the vertices: the depth-first
         one, or the greedy one if more paths agree with it.

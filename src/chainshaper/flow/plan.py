@@ -241,8 +241,8 @@ def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
             raise InputError(
                 f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
                 f" timer of {format_duration(first.period_ns)} expires every"
-                f" {format_duration(round(apart / 1e5) * 100_000)}. Replay at that speed (`ros2 bag play --rate"
-                " 1.0`), or start the nodes with use_sim_time:=false"
+                f" {format_duration(round(apart / 1e5) * 100_000)}. Replay at that speed (`ros2 bag"
+                " play --rate 1.0`), or start the nodes with use_sim_time:=false"
             )
     return found
 
