@@ -105,15 +105,14 @@ def test_the_commands_show_services_and_clients(recording: Path) -> None:
 def test_lttng_has_no_calls_before_kilted_and_latency_says_so(tmp_path: Path) -> None:
     environment = ros2_alone()
     if environment["ROS_DISTRO"] not in ("humble", "jazzy"):
-        pytest.skip("tracetools of this distribution has trace points for calls")
+        return  # tracetools has trace points for calls
     script = f'"{role()}" server & "{role()}" client 50 & sleep 5; kill %1 %2; wait'
     with pytest.MonkeyPatch.context() as patch:
         for name, value in environment.items():
             patch.setenv(name, value)
         folder = tmp_path / "lttng"
         made = called("record", "--source", "lttng", "-o", folder, "--", "bash", "-mc", script)
-        if made.code == 3:
-            pytest.skip(made.err)
+    assert made.code == 0, made.err
     shown = called("latency", folder, "--chain", "/client../add../sum")
     assert shown.code == 2
     assert "no call of the service /add was recorded" in shown.err

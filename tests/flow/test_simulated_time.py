@@ -100,7 +100,7 @@ def test_running_nodes_that_follow_clock_are_refused_before_anything_changes(
 NODES = """
 trap 'kill $(jobs -p)' INT TERM
 "$0" clock $1 & "$0" sink & "$0" managed --ros-args -p use_sim_time:=true &
-"$0" source 50 --ros-args -p use_sim_time:=$2 &
+"$0" source 100 --ros-args -p use_sim_time:=$2 &
 ros2 lifecycle set /managed configure; ros2 lifecycle set /managed activate
 wait; wait
 """
@@ -124,7 +124,7 @@ def test_a_replayed_clock_is_seen_in_ros(
         for name, value in ros2_alone().items():
             patch.setenv(name, value)
         made = called(
-            *("record", "--source", "preload", "-o", tmp_path / "recording", "--duration", "8s"),
+            *("record", "--source", "preload", "-o", tmp_path / "recording", "--duration", "12s"),
             *("--", "bash", "-c", NODES, role(), str(percent), simulated),
         )
     assert made.code == 0, made.err
@@ -132,5 +132,5 @@ def test_a_replayed_clock_is_seen_in_ros(
     assert planned.code == 2
     assert said in planned.err
     if percent == 100:
-        anchored = ("--chain", "/source../t2", "--anchor", "cycle")
+        anchored = ("--chain", "/source../t2", "--anchor", "cycle", "--percentile", "50")
         assert called("plan", tmp_path / "recording", *anchored).code == 0

@@ -475,9 +475,8 @@ class _Search:
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
 
-        Paths on which a response goes to another node than the request's count as well.
-
-        If ``cyclic``, of those that never step back in one order of the vertices: the depth-first
+        Paths on which a response goes to another node than the request's count as well. If
+        ``cyclic``, of those that never step back in one order of the vertices: the depth-first
         one, or the greedy one if more paths agree with it.
         """
         results = [self._counted_in(self.order, weights)]
