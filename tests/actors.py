@@ -17,8 +17,6 @@ from pathlib import Path
 
 from chainshaper.linux.threads import Thread, list_threads
 
-__all__ = ["Actor", "acting"]
-
 _PROGRAM = """
 import ctypes, json, os, signal, sys, threading
 libc = ctypes.CDLL(None)

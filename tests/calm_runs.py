@@ -12,8 +12,6 @@ from small_chain import PERIOD_NS
 from chainshaper import measure_latency
 from chainshaper.values.recording import Recording
 
-__all__ = ["calm_run"]
-
 _ATTEMPTS = 5
 
 

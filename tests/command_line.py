@@ -23,8 +23,6 @@ from processes import marked_processes, wait_for
 
 from chainshaper.cli import main
 
-__all__ = ["Finished", "Running", "called", "chainshaper", "json_of", "message_of", "refused"]
-
 
 @dataclass(frozen=True)
 class Finished:

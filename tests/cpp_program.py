@@ -8,8 +8,6 @@ import pytest
 
 from chainshaper.splicing.shaping_process import generic_package
 
-__all__ = ["compiled"]
-
 
 def compiled(source: Path, folder: Path, name: str = "g++") -> Path:
     """The program of a source file, compiled into a folder; no warning is let pass."""

@@ -17,8 +17,6 @@ from chainshaper.gate.decision import sleep_until
 from chainshaper.linux.threads import list_threads
 from chainshaper.workload.live import Enforcement, StartedNodes
 
-__all__ = ["freezing_publisher_of", "need_threaded_cgroups"]
-
 
 def need_threaded_cgroups() -> Path:
     """The group in which this process is; a machine that has no such thing skips the test."""

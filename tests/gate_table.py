@@ -9,8 +9,6 @@ import yaml
 
 from chainshaper.gate.decision import Gate, Modes, Queue, Release, missed
 
-__all__ = ["PUBLISHING_NS", "Case", "Outcome", "cases", "walk"]
-
 MS = 1_000_000
 PUBLISHING_NS = MS // 8
 

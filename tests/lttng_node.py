@@ -14,8 +14,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["LTTNG", "chain_command", "required_node"]
-
 LTTNG = ("--source", "lttng")
 """The program emits its events to LTTng itself: no library in front of libtracetools sees them."""
 

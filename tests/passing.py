@@ -5,8 +5,6 @@ import time
 
 from chainshaper.gate.decision import Outcome, Release, Shaper
 
-__all__ = ["decided", "held", "serialized"]
-
 
 def decided(shaper: Shaper, payload: bytes, arrival_ns: int) -> Release:
     """What is decided about a message that comes then, before it is withdrawn."""

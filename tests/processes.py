@@ -6,8 +6,6 @@ from pathlib import Path
 
 from chainshaper.linux.threads import list_threads, parents
 
-__all__ = ["children_of", "is_alive", "marked_processes", "real_time_threads", "wait_for"]
-
 
 def children_of(pid: int) -> list[int]:
     """Processes whose parent is ``pid``, zombies included."""

@@ -12,8 +12,6 @@ from chainshaper.sources import open_source
 from chainshaper.sources.ctf import open_trace, read_events
 from chainshaper.values import events
 
-__all__ = ["CHAINS", "DATA", "TRACES", "ReferenceTrace", "reference_folder", "reference_trace"]
-
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 TRACES = (
     "jazzy_chain_cyclonedds",

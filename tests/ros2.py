@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["ros2_environment"]
-
 
 def ros2_environment() -> dict[str, str]:
     """The environment of ROS 2; without one the test is skipped, with the reason."""

@@ -1,5 +1,6 @@
 """A chain of three short nodes and an actuator, described for the cores of this machine."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -7,17 +8,7 @@ import numpy as np
 
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning import Plan, plan_shaping
-from chainshaper.workload.description import Application, load_application
-
-__all__ = [
-    "DDS_CORE",
-    "EXECUTOR_CORE",
-    "NODES",
-    "PERIOD_NS",
-    "small_chain",
-    "small_chain_plan",
-    "small_chain_text",
-]
+from chainshaper.workload.description import Application, ExecutionTime, load_application
 
 DDS_CORE = available_cores()[0]
 EXECUTOR_CORE = available_cores()[-1]
@@ -61,6 +52,15 @@ def small_chain(folder: Path, *, publication: str = "synchronous") -> Applicatio
     path = folder / "small_chain.yaml"
     path.write_text(small_chain_text(publication=publication))
     return load_application(path)
+
+
+def with_times(application: Application, times: Mapping[str, ExecutionTime]) -> Application:
+    """An application in which nodes of one callback take other times."""
+    nodes = dict(application.nodes)
+    for name, execution in times.items():
+        changed = nodes[name].callbacks[0].model_copy(update={"execution": execution})
+        nodes[name] = nodes[name].model_copy(update={"callbacks": (changed,)})
+    return application.model_copy(update={"nodes": nodes})
 
 
 def small_chain_plan(shortest_ns: int, longest_ns: int, **wishes: Any) -> Plan:

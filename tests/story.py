@@ -11,8 +11,6 @@ import polars as pl
 
 from chainshaper.values import events
 
-__all__ = ["OFFSET", "Callback", "Node", "Publisher", "Story"]
-
 OFFSET = 1_000_000
 """CLOCK_REALTIME minus the event clock."""
 

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-__all__ = ["NOBODY", "named", "needs_root", "open_folder", "strange"]
-
 NOBODY = 65534
 needs_root = pytest.mark.skipif(os.geteuid() != 0, reason="only root starts others' processes")
 _SLEEPS = "while :; do sleep 0.05; done"

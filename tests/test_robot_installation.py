@@ -7,6 +7,7 @@ core depends, by their own metadata. Nothing else is there to be imported.
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from importlib import metadata
@@ -66,10 +67,10 @@ def test_measuring_planning_and_simulating_give_what_they_give_compiled(
     core: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "app.yaml").write_text(small_chain_text())
-    words = ["simulate", str(tmp_path / "app.yaml"), "--cycles", "40", "-o"]
+    words = ["simulate", str(tmp_path / "app.yaml"), "--cycles", "15", "-o"]
     made = _run(core, *words, str(tmp_path / "robot"))
     assert made.returncode == 0, made.stderr
-    cs.simulate(cs.load_application(tmp_path / "app.yaml"), tmp_path / "here", cycles=40)
+    cs.simulate(cs.load_application(tmp_path / "app.yaml"), tmp_path / "here", cycles=15)
     for table in (tmp_path / "here").glob("*.parquet"):
         assert table.read_bytes() == (tmp_path / "robot" / table.name).read_bytes()
     latency = _run(core, "latency", str(tmp_path / "robot"), "--json")
@@ -118,3 +119,62 @@ def test_figures_name_the_extra_that_draws_them(core: Path, tmp_path: Path) -> N
     assert refused.stderr.strip().splitlines()[-1] == (
         "error: this needs matplotlib, which is not installed: pip install 'chainshaper[analysis]'"
     )
+
+
+def test_the_unit_is_one_that_systemd_takes(tmp_path: Path) -> None:
+    if shutil.which("systemd-analyze") is None:
+        pytest.skip("systemd-analyze is not installed (package systemd)")
+    text = (ROOT / "systemd/chainshaper@.service").read_text()
+    commands = re.findall(r"^Exec\w+=/usr/bin/chainshaper (\w+)", text, re.MULTILINE)
+    assert commands == ["apply", "release"]
+    unit = tmp_path / "chainshaper@.service"
+    unit.write_text(text.replace("/usr/bin/chainshaper", "/bin/true"))
+    said = subprocess.run(
+        ["systemd-analyze", "verify", str(unit)], capture_output=True, text=True, check=False
+    )
+    assert (said.returncode, said.stderr) == (0, "")
+
+
+IN_A_COPY = """
+mount --make-rprivate /
+mount -t tmpfs none "$0" && mkdir "$0/changed" "$0/work" "$0/root"
+mount -t overlay none -o "lowerdir=/,upperdir=$0/changed,workdir=$0/work" "$0/root"
+mount -t proc none "$0/root/proc" && mount --rbind /dev "$0/root/dev"
+mount -t tmpfs none "$0/root/tmp" && cp "$1" "$0/root/tmp/package.deb"
+exec chroot "$0/root" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin sh -ec "$2"
+"""
+INSTALLED = """
+there() { find /etc /usr /var/lib/dpkg /opt/chainshaper* -name '*chainshaper*' | sort; }
+cd /tmp && there > before 2> /dev/null
+dpkg -i package.deb > /dev/null
+python3 -c "
+from importlib.metadata import entry_points
+(found,) = entry_points(group='ros2cli.command', name='chain')
+found.load()().main(args=__import__('argparse').Namespace(arguments=['--version']))"
+chainshaper simulate /opt/chainshaper/lib/chainshaper/examples/synthetic_chain.yaml \\
+    --cycles 20 -o simulated
+chainshaper plan simulated -o plan.yaml
+chainshaper apply plan.yaml --dry-run --backend litmus
+chainshaper record -o recorded -- true 2>&1 | grep "no process has loaded the tracing library"
+python3 -c 'import polars' 2>&1 | grep ModuleNotFoundError
+chainshaper status
+dpkg -r chainshaper > /dev/null
+rm -rf simulated recorded plan.yaml && there > after 2> /dev/null
+diff before after && echo nothing is left
+"""
+
+
+@pytest.mark.timeout(600)
+def test_a_debian_package_installs_works_and_leaves_nothing(tmp_path: Path) -> None:
+    if "CHAINSHAPER_DEB" not in os.environ:
+        pytest.skip("CHAINSHAPER_DEB=1 builds and installs a Debian package")
+    environment = {**os.environ, "DEB_COMPRESSION": "0"}
+    subprocess.run([ROOT / "scripts/build_deb", tmp_path], env=environment, check=True)
+    (package,) = tmp_path.glob("*.deb")
+    copy = tmp_path / "copy"
+    copy.mkdir()
+    command = ["unshare", "--mount", "sh", "-ec", IN_A_COPY, str(copy), str(package), INSTALLED]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr + done.stdout
+    assert done.stdout.startswith("chainshaper ")
+    assert done.stdout.endswith("no plan is in force\nnothing is left\n")

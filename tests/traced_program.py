@@ -19,17 +19,6 @@ from chainshaper.values import events
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = [
-    "Program",
-    "Traced",
-    "assert_same",
-    "build",
-    "built",
-    "of_process",
-    "skip_without_bpftrace",
-    "traced",
-]
-
 _SOURCES = Path(__file__).parent / "sources/tracetools"
 _PACKAGE = "<package><name>tracetools</name><version>{}</version></package>"
 

@@ -92,9 +92,8 @@ def test_the_commands_show_services_and_clients(recording: Path) -> None:
         (one["node"], one["kind"], one["topic"]): one
         for one in json_of("callbacks", recording, "--json")
     }
-    server, client = callbacks["/server", "service", "/add"], callbacks["/client", "client", "/add"]
-    assert server["count"] > client["count"] > 100
-    assert client["response_ns"]["min"] >= 500_000
+    assert callbacks["/server", "service", "/add"]["count"] > 200
+    assert callbacks["/server", "service", "/add"]["response_ns"]["min"] >= 2_000_000
     shown = called("chains", recording, "--from", "/client", "--to", "/sum")
     assert "/add:request" in shown.out
     assert "/add:response" in shown.out

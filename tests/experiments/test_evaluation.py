@@ -10,6 +10,7 @@ import table_1
 import table_5
 from configurations import simulated
 from results import MS, Run
+from small_chain import with_times
 
 from chainshaper import load_application
 from chainshaper.workload.description import Application, ExecutionTime, SimulationDescription
@@ -44,15 +45,10 @@ def test_a_callback_that_overruns_its_server_delays_its_own_output_alone() -> No
     In one cycle the third takes 33 ms: it ends at 65 ms, the fourth at 77, the fifth at 89.
     """
     application = table_1.application(0)
-    nodes = dict(application.nodes)
-    for name in table_1.NODES:
-        taken = [12 * MS] * 20
-        taken[5] = 33 * MS if name == "/node3" else 12 * MS
-        callback = nodes[name[1:]].callbacks[0]
-        drawn = ExecutionTime(samples_ns=tuple(taken), block=20)
-        callback = callback.model_copy(update={"execution": drawn})
-        nodes[name[1:]] = nodes[name[1:]].model_copy(update={"callbacks": (callback,)})
-    application = application.model_copy(update={"nodes": nodes})
+    times = dict.fromkeys((name[1:] for name in table_1.NODES), ExecutionTime(constant_ns=12 * MS))
+    taken = (12 * MS,) * 5 + (33 * MS,) + (12 * MS,) * 14
+    times["node3"] = ExecutionTime(samples_ns=taken, block=20)
+    application = with_times(application, times)
     plan = table_1.five_servers(np.full(100, 62 * MS))
     found = simulated("", application, plan, cycles=20).latency_ns / MS
     *others, overran = sorted(found)
@@ -111,16 +107,12 @@ def test_the_graphs_longest_path_on_its_two_cores_is_560_ms(graph: Application) 
 
 
 def test_worst_cases_take_560_ms_in_simulation(graph: Application) -> None:
-    nodes = {}
-    for name, node in graph.nodes.items():
-        callback = node.callbacks[0]
-        times = callback.execution.uniform_ns or (0, 0)
-        longest = callback.model_copy(update={"execution": ExecutionTime(constant_ns=times[1])})
-        nodes[name] = node.model_copy(update={"callbacks": (longest,)})
+    drawn = {name: node.callbacks[0].execution.uniform_ns for name, node in graph.nodes.items()}
+    longest = {n: ExecutionTime(constant_ns=(two or (0, 0))[1]) for n, two in drawn.items()}
     free = SimulationDescription(
         wake_up=NOTHING, take=NOTHING, publish=NOTHING, delivery=NOTHING, interrupts=0
     )
-    worst = graph.model_copy(update={"nodes": nodes, "simulation": free})
+    worst = with_times(graph, longest).model_copy(update={"simulation": free})
     assert set(simulated("", worst, cycles=3).latency_ns) == {560 * MS}
 
 

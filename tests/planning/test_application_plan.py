@@ -5,25 +5,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from bare_plans import MS, bare_plan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper import load_application_plan, save_application_plan, save_plan
 from chainshaper.planning.application_plan import ApplicationPlan, combined, plan_of_chain, whole
-from chainshaper.planning.plan import (
-    ChainOfPlan,
-    Evidence,
-    Margin,
-    Plan,
-    Prediction,
-    Server,
-    Slot,
-    Thread,
-)
+from chainshaper.planning.plan import Plan, Server, Slot, Thread
 from chainshaper.planning.plan_file import plan_in, plan_values, plans_as_text
 from chainshaper.values.errors import InputError
-
-MS = 1_000_000
 
 
 def _server(
@@ -36,16 +26,8 @@ def _server(
 
 def _chain(name: str, cycle: int, offset: int, *servers: Server) -> Plan:
     """A chain's plan; times in ms."""
-    return Plan(
-        chain=ChainOfPlan(spec=f"/{name}..", output=f"/{name}", period_ns=cycle * MS),
-        evidence=Evidence(samples=1, min_latency_ns=0, mean_latency_ns=1, max_latency_ns=1),
-        margin=Margin(epsilon_ns=0),
-        policy="server-per-chain",
-        cycle_ns=cycle * MS,
-        offset_ns=offset * MS,
-        servers=servers,
-        predicted=Prediction(mean_ns=1, max_ns=1, jitter_ns=0),
-    )
+    named = f"/{name}"
+    return bare_plan(f"{named}..", cycle * MS, *servers, output=named, offset_ns=offset * MS)
 
 
 def test_slots_are_played_out_over_the_hyper_period() -> None:

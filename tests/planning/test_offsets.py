@@ -6,36 +6,20 @@ import random
 from collections.abc import Sequence
 
 import pytest
+from bare_plans import MS, bare_plan
 
 from chainshaper.planning import offsets
 from chainshaper.planning.offsets import place_chains, with_offsets
-from chainshaper.planning.plan import (
-    ChainOfPlan,
-    Evidence,
-    Margin,
-    Plan,
-    Prediction,
-    Server,
-    revised,
-)
+from chainshaper.planning.plan import Plan, Server, revised
 from chainshaper.values.errors import InputError, OperationError
-
-MS = 1_000_000
 
 
 def _plan(name: str, cycle: int, *servers: tuple[int, int, list[tuple[int, int]]]) -> Plan:
-    return Plan(
-        chain=ChainOfPlan(spec=name, period_ns=cycle),
-        evidence=Evidence(samples=1, min_latency_ns=0, mean_latency_ns=1, max_latency_ns=1),
-        margin=Margin(epsilon_ns=0),
-        policy="shaped",
-        cycle_ns=cycle,
-        servers=tuple(
-            Server(name=f"s{number}", core=core, priority=priority, slots=tuple(slots))
-            for number, (core, priority, slots) in enumerate(servers)
-        ),
-        predicted=Prediction(mean_ns=1, max_ns=1, jitter_ns=0),
+    own = (
+        Server(name=f"s{number}", core=core, priority=priority, slots=tuple(slots))
+        for number, (core, priority, slots) in enumerate(servers)
     )
+    return bare_plan(name, cycle, *own, policy="shaped")
 
 
 def collides(plans: Sequence[Plan], shifts: Sequence[int]) -> bool:

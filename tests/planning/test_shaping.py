@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bare_plans import MS, slots_ms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,19 +34,10 @@ from chainshaper.planning.shaping import (
 )
 from chainshaper.values.errors import InputError, OperationError
 
-MS = 1_000_000
-
 
 def _plan(samples: int = 100, period_ns: int = 100 * MS, **options: Any) -> Plan:
     latencies = np.linspace(30 * MS, 60 * MS, samples).astype(np.int64)
     return plan_shaping(latencies, period_ns, **options)
-
-
-def _slots_ms(plan: Plan) -> dict[str, list[tuple[float, float]]]:
-    return {
-        server.name: [(start / MS, end / MS) for start, end in server.slots]
-        for server in plan.servers
-    }
 
 
 def test_the_papers_synthetic_chain() -> None:
@@ -54,7 +46,7 @@ def test_the_papers_synthetic_chain() -> None:
     given: dict[str, Any] = {"output": "/ns/t5", "publisher": "/n5", "nodes": ["/n1", "/n5"]}
     plan = plan_shaping(latencies, 100 * MS, epsilon_ns=MS // 2, **given)
     chain, output = plan.servers
-    assert _slots_ms(plan) == {"chain": [(0, 59)], "output": [(59, 60)]}
+    assert slots_ms(plan) == {"chain": [(0, 59)], "output": [(59, 60)]}
     assert chain.threads == (Thread(node="/n1"), Thread(node="/n5"))
     assert publish_slots(plan) == output.slots
     assert (output.core, output.priority, chain.core, chain.priority) == (1, 1, 1, 2)
@@ -197,7 +189,7 @@ AVP_CALLBACKS = [
 
 def test_table_4_row_1_waits_for_the_front_filter() -> None:
     plan = server_per_callback(_avp(), AVP_CALLBACKS)
-    assert _slots_ms(plan) == {
+    assert slots_ms(plan) == {
         "throttler": [(0, 2)],
         "rear_filter": [(2, 23)],
         "front_filter": [(2, 33)],
@@ -216,11 +208,11 @@ def test_section_2_5_gives_each_callback_a_millisecond_more() -> None:
     callbacks = [_callback("/n0", 15_000)]
     callbacks += [_callback(f"/n{number}", 15_000, after=(number - 1,)) for number in range(1, 5)]
     plan = server_per_callback(_avp(), callbacks, margin_ns=MS)
-    assert list(_slots_ms(plan).values()) == [[(16 * n, 16 * n + 16)] for n in range(5)]
+    assert list(slots_ms(plan).values()) == [[(16 * n, 16 * n + 16)] for n in range(5)]
     # What overran finishes behind its slot; what begins the chain waits for its own.
     enforced = open_until_done(plan, 2 * MS)
     longer = [[(0, 16)], *([(16 * n, 98)] for n in range(1, 5))]
-    assert list(_slots_ms(enforced).values()) == longer
+    assert list(slots_ms(enforced).values()) == longer
     assert open_until_done(enforced, 2 * MS) == enforced
 
 
@@ -232,7 +224,7 @@ def test_callbacks_of_one_node_share_a_server() -> None:
         _callback("/a", 1000, after=(2,)),
     ]
     slots = {"a": [(0, 3), (4, 5)], "b": [(3, 4)]}
-    assert _slots_ms(server_per_callback(_avp(), callbacks)) == slots
+    assert slots_ms(server_per_callback(_avp(), callbacks)) == slots
 
 
 @pytest.mark.parametrize(
@@ -262,9 +254,9 @@ def test_impossible_slots_per_callback_are_refused(
 
 def test_table_4_rows_2_and_3_hold_the_throttler_apart() -> None:
     shaped = with_first_node_apart(_avp(), "/throttler", 2 * MS)
-    assert _slots_ms(shaped) == {"first": [(0, 2)], "chain": [(2, 86)], "output": [(86, 87)]}
+    assert slots_ms(shaped) == {"first": [(0, 2)], "chain": [(2, 86)], "output": [(86, 87)]}
     bare = server_per_chain(shaped)
-    assert _slots_ms(bare) == {"first": [(0, 2)], "chain": [(2, 86)]}
+    assert slots_ms(bare) == {"first": [(0, 2)], "chain": [(2, 86)]}
     assert bare.policy == "server-per-chain"
     assert (bare.predicted.max_ns, bare.predicted.jitter_ns) == (84_700_000, 51_800_000)
     with pytest.raises(InputError, match="no node of the chain's server"):
@@ -278,7 +270,7 @@ def test_table_4_rows_2_and_3_hold_the_throttler_apart() -> None:
 
 def test_let_per_chain_takes_one_period() -> None:
     plan = let_per_chain(_avp())
-    assert _slots_ms(plan) == {"chain": [(0, 100)], "output": [(0, 1)]}
+    assert slots_ms(plan) == {"chain": [(0, 100)], "output": [(0, 1)]}
     assert (plan.predicted.max_ns, plan.predicted.jitter_ns) == (101 * MS, MS)
     assert plan.servers[1].priority < plan.servers[0].priority
     with pytest.raises(InputError, match="could leave in its own cycle"):
@@ -299,7 +291,7 @@ def test_let_per_callback_takes_as_many_periods_as_callbacks() -> None:
     starts = [server.slots[0][0] for server in servers if server is not None]
     assert starts == [4 * MS, 3 * MS, 2 * MS, MS, 0]  # never data through two callbacks a cycle
     assert publish_slots(plan) == ((0, MS),)
-    assert _slots_ms(plan)["chain"] == [(0, 100)]
+    assert slots_ms(plan)["chain"] == [(0, 100)]
     for wrong in ([], ["/t1"], ["/pose", "/t1"]):
         with pytest.raises(InputError, match="its output last"):
             let_per_callback(_avp(), wrong)
@@ -336,7 +328,7 @@ def test_a_graph_on_two_cores_has_two_servers_and_one_output() -> None:
     # Section 5.4: 450 ms on two cores, output in [450, 451) on core 1.
     plan = over_cores(_two_nodes(epsilon_ns=0), {"/n0": 0, "/n1": 1, "/n2": 0})
     slots = {"chain_core0": [(0, 450)], "chain_core1": [(0, 450)], "output": [(450, 451)]}
-    assert _slots_ms(plan) == slots
+    assert slots_ms(plan) == slots
     assert [thread.node for thread in plan.servers[0].threads] == ["/n0", "/n2"]
     with pytest.raises(InputError, match="no core is named for /n1"):
         over_cores(_two_nodes(), {"/n0": 0})
@@ -346,11 +338,11 @@ def test_a_graph_on_two_cores_has_two_servers_and_one_output() -> None:
 def test_further_sinks_get_slots_of_their_own() -> None:
     plan = _two_nodes()  # chain [0, 451), output [451, 452)
     earlier = with_sink(plan, np.array([300, 400]) * MS, "/early", publisher="/n0")
-    assert _slots_ms(earlier)["output_chainshaper_early"] == [(401, 402)]
-    assert _slots_ms(earlier)["chain"] == [(0, 451)]
+    assert slots_ms(earlier)["output_chainshaper_early"] == [(401, 402)]
+    assert slots_ms(earlier)["chain"] == [(0, 451)]
     close = with_sink(earlier, np.array([449_500_000, 450_500_000]), "/late")
-    assert _slots_ms(close)["output_chainshaper_late"] == [(452, 453)]
-    assert _slots_ms(close)["chain"] == [(0, 451.5)]
+    assert slots_ms(close)["output_chainshaper_late"] == [(452, 453)]
+    assert slots_ms(close)["chain"] == [(0, 451.5)]
     further = [(node.output, node.publisher) for node in close.further_shaping_nodes]
     assert further == [("/early", "/n0"), ("/late", None)]
     with pytest.raises(OperationError, match="after the cycle of 764ms"):
@@ -368,7 +360,7 @@ def test_further_sinks_of_asynchronous_publishers_gate_their_threads() -> None:
     plan = _two_nodes(publisher="/n1", publication="asynchronous")
     latencies = np.array([300, 470]) * MS
     sinks = with_sink(plan, latencies, "/late", publisher="/n0")
-    assert _slots_ms(sinks) == {
+    assert slots_ms(sinks) == {
         "chain": [(0, 471)],  # open until the slower sink is done
         "output": [(451, 452)],
         "output_n0": [(471, 472)],

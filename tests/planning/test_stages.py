@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from bare_plans import MS, slots_ms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,8 +20,6 @@ from chainshaper.planning.plan import publish_slots, revised
 from chainshaper.planning.plan_file import dump_plan, load_plan
 from chainshaper.planning.request import cores_for
 from chainshaper.values.errors import InputError, OperationError
-
-MS = 1_000_000
 
 
 def longest_of(rows: Sequence[Sequence[int]]) -> Longest:
@@ -150,10 +149,6 @@ def planned(
 ) -> Plan:
     request = {"policy": "pipelined", "cores": (0, 1), "epsilon_ns": MS, **wishes}
     return plan_chain(profile(rows, nodes), PlanRequest(**request))  # type: ignore[arg-type]
-
-
-def slots_ms(plan: Plan) -> dict[str, list[tuple[float, float]]]:
-    return {s.name: [(start / MS, end / MS) for start, end in s.slots] for s in plan.servers}
 
 
 ROWS = [[30, 40, 50, 40], [20, 30, 40, 30], [40, 40, 30, 20]]

@@ -19,8 +19,6 @@ from typing import Any
 
 import pytest
 
-__all__ = ["Page", "opened"]
-
 PATIENCE_S = 40.0
 
 

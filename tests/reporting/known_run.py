@@ -22,8 +22,6 @@ from chainshaper.values.recording import (
     write_recording,
 )
 
-__all__ = ["LATENCY_NS", "MS", "PERIOD_NS", "known_plan", "known_run"]
-
 MS = 1_000_000
 PERIOD_NS = 100 * MS
 LATENCY_NS = 30 * MS + 20_000

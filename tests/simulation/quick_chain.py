@@ -7,8 +7,6 @@ from schedules import application
 
 from chainshaper.workload.description import Application
 
-__all__ = ["quick_chain"]
-
 
 def quick_chain(first: Any = None, second: Any = None, **simulation: Any) -> Application:
     """``/t1../t2`` every 50 ms on core 1; execution times as in a description (default: 2 ms)."""

@@ -66,50 +66,16 @@ def worker(start: Start, scheduler: str, path: Path | None = None) -> Any:
     return start("worker", scheduler, "--no-nanny", "--nthreads", "1", path=path)
 
 
+@pytest.fixture(scope="module")
+def helped(start: Start, scheduler: str) -> str:
+    """The same address, from now on of a cluster with a worker."""
+    worker(start, scheduler)
+    return scheduler
+
+
 def swept(output: Path, **wishes: Any) -> pl.DataFrame:
     application = quick_chain(*[{"uniform": ["1ms", "6ms"]}] * 2)
     return sweep(application, AXES, output, cycles=50, **wishes).drop("seconds")
-
-
-def test_the_rows_are_the_same_although_a_worker_is_killed(
-    start: Start, scheduler: str, tmp_path: Path
-) -> None:
-    both = [worker(start, scheduler), worker(start, scheduler)]
-
-    def kill_one(share: float, _: str) -> None:
-        if share:
-            both[0].send_signal(signal.SIGKILL)
-
-    try:
-        on_cluster = swept(tmp_path / "cluster.parquet", scheduler=scheduler, progress=kill_one)
-        assert both[0].wait() == -signal.SIGKILL
-    finally:
-        _end(*both)
-    assert on_cluster.equals(swept(tmp_path / "here.parquet", workers=1))
-
-
-def test_a_fleet_is_checked_as_here(start: Start, scheduler: str, tmp_path: Path) -> None:
-    """Against a budget and a baseline, a file that cannot be read included."""
-    application = quick_chain(*[{"uniform": ["1ms", "6ms"]}] * 2)
-    paths = [simulate(application, tmp_path / f"r{n}", cycles=60).path for n in range(3)]
-    budget = propose_budget(open_recording(paths[0]))
-    every = [*paths, tmp_path / "gone"]
-    one = worker(start, scheduler)
-    try:
-        assert check_budgets(every, budget, scheduler=scheduler) == check_budgets(every, budget)
-        assert slowdowns_in(paths[:2], paths[2:], scheduler=scheduler) == slowdowns_in(
-            paths[:2], paths[2:]
-        )
-        with pytest.raises(InputError, match="gone: no such folder"):
-            slowdowns_in(every, paths, scheduler=scheduler)
-    finally:
-        _end(one)
-
-
-def _end(*processes: "subprocess.Popen[bytes]") -> None:
-    for process in processes:
-        process.kill()
-        process.wait()
 
 
 def test_a_worker_with_another_version_is_named(
@@ -123,7 +89,8 @@ def test_a_worker_with_another_version_is_named(
     other = worker(start, scheduler, path=tmp_path / "other")
     with pytest.raises(OperationError) as refused:
         swept(tmp_path / "out.parquet", scheduler=scheduler)
-    _end(other)
+    other.kill()
+    other.wait()
     assert "the Dask worker at tcp://127.0.0.1:" in str(refused.value)
     assert "has chainshaper 9.9, not " in str(refused.value)
     assert "numpy" not in str(refused.value)
@@ -158,3 +125,30 @@ def test_where_no_scheduler_answers_the_address_is_named(
     with pytest.raises(InputError, match="'nowhere' is no scheduler's address"):
         swept(tmp_path / "out.parquet", scheduler="nowhere")
     assert not list(tmp_path.iterdir())
+
+
+def test_the_rows_are_the_same_although_a_worker_is_killed(
+    start: Start, helped: str, tmp_path: Path
+) -> None:
+    victim = worker(start, helped)
+
+    def kill(share: float, _: str) -> None:
+        if share:
+            victim.send_signal(signal.SIGKILL)
+
+    on_cluster = swept(tmp_path / "cluster.parquet", scheduler=helped, progress=kill)
+    assert victim.wait() == -signal.SIGKILL
+    assert on_cluster.equals(swept(tmp_path / "here.parquet", workers=1))
+
+
+def test_a_fleet_is_checked_as_here(helped: str, tmp_path: Path) -> None:
+    """Against a budget and a baseline, a file that cannot be read included."""
+    application = quick_chain(*[{"uniform": ["1ms", "6ms"]}] * 2)
+    paths = [simulate(application, tmp_path / f"r{n}", cycles=60).path for n in range(3)]
+    budget = propose_budget(open_recording(paths[0]))
+    every = [*paths, tmp_path / "gone"]
+    assert check_budgets(every, budget, scheduler=helped) == check_budgets(every, budget)
+    sides = paths[:2], paths[2:]
+    assert slowdowns_in(*sides, scheduler=helped) == slowdowns_in(*sides)
+    with pytest.raises(InputError, match="gone: no such folder"):
+        slowdowns_in(every, paths, scheduler=helped)

@@ -6,11 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from bare_plans import bare_plan
 from schedules import MS, application, begin_of, callbacks, ran, simulated
 
 from chainshaper.analysis import data_flow
 from chainshaper.planning import Plan
-from chainshaper.planning.plan import ChainOfPlan, Evidence, Margin, Prediction, Server, Thread
+from chainshaper.planning.plan import Server, Thread
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
@@ -20,17 +21,7 @@ CASES = yaml.safe_load(Path(__file__).with_name("schedules.yaml").read_text())
 
 def plan(*servers: Server, cycle_ms: int = 20, offset_ms: int = 0, **more: Any) -> Plan:
     """A plan that consists of servers only."""
-    return Plan(
-        chain=ChainOfPlan(spec="a", period_ns=cycle_ms * MS),
-        evidence=Evidence(samples=1, min_latency_ns=1, mean_latency_ns=1, max_latency_ns=1 * MS),
-        margin=Margin(epsilon_ns=0),
-        policy="server-per-chain",
-        cycle_ns=cycle_ms * MS,
-        offset_ns=offset_ms * MS,
-        servers=servers,
-        predicted=Prediction(mean_ns=1, max_ns=1, jitter_ns=0),
-        **more,
-    )
+    return bare_plan("a", cycle_ms * MS, *servers, offset_ns=offset_ms * MS, **more)
 
 
 def server(priority: int, nodes: list[str], slots: list[list[int]]) -> Server:

@@ -311,6 +311,18 @@ def test_containers_with_the_same_process_numbers_are_told_apart(tmp_path: Path)
     assert together == {name: 2 * count for name, count in alone.items()}
 
 
+def test_containers_with_the_hosts_own_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    container(tmp_path / "one", "host", ("a", "b"), 0)
+    container(tmp_path / "two", "host", ("c", "d"), 120)
+    recording = open_source(tmp_path / "one", tmp_path / "two")
+    moved = NEXT_HOST + 10
+    assert recording.info.host == "host"
+    assert recording.info.processes == {10: "/a", 11: "/b", moved: "/c", moved + 1: "/d"}
+    assert [note for note in recording.info.notes if f"host in {tmp_path / 'two'} have" in note]
+    for chain in ("/a../b../y", "/c../d../y"):
+        assert analyse_latency(recording, chain).statistics.count == 5
+
+
 def test_hosts_with_different_process_numbers_keep_them(tmp_path: Path) -> None:
     tables = shifted(chain_story())
     for pid, host in ((10, "one"), (11, "two")):

@@ -73,6 +73,37 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Traced, dict[s
     return traced(tracer_of(tmp_path_factory.mktemp("trace")), run_all), printed
 
 
+def recorded(printed: list[list[str]]) -> list[list[str]]:
+    """Without what an executor of several threads emits while it waits, and nothing reads."""
+    rows = [row for row in printed if row[0] in event_names()]
+    left = {row[0] for row in printed} - {row[0] for row in rows}
+    assert left == {"rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work"}
+    return rows
+
+
+TIMERS = """
+int rcl_timer_call_with_info(long timer, void *information) { return timer == 13; }
+int rcl_timer_call(long timer) { return rcl_timer_call_with_info(timer, 0); }
+"""
+"""As rcl since Jazzy; the timer 13 is cancelled."""
+
+
+def test_calls_of_timers_are_recorded_once(tmp_path: Path) -> None:
+    """Also where rcl is in no global scope, as Python loads it."""
+    words = ["gcc", "-x", "c", "-shared", "-fPIC", "-Wl,-soname,librcl.so", "-o"]
+    library = tmp_path / "librcl.so"
+    subprocess.run([*words, str(library), "-"], input=TIMERS.encode(), check=True)
+    program = f"""
+ctypes.CDLL({str(library)!r})
+library.rcl_timer_call(7)
+library.rcl_timer_call_with_info(8, 1)
+"""
+    program += f"open({str(tmp_path / 'said')!r}, 'w').write(str(library.rcl_timer_call(13)))"
+    run = traced(tracer_of(tmp_path), lambda: python(program))
+    assert run.tables["rcl_timer_call"]["timer_handle"].to_list() == [7, 8]
+    assert (tmp_path / "said").read_text() == "1", "what rcl returned"
+
+
 def test_every_argument_of_every_function_arrives_as_it_was_passed(
     everything: tuple[Traced, dict[str, Any]],
 ) -> None:
@@ -81,7 +112,7 @@ def test_every_argument_of_every_function_arrives_as_it_was_passed(
     assert run.info.distribution == "jazzy"
     for version, rows in printed.items():
         own = of_process(run.tables, int(rows[0][1]))
-        assert_same(own, rows, version)
+        assert_same(own, recorded(rows), version)
         assert own["rcl_take"].item(0, "tid") != int(rows[0][1])
 
 
@@ -104,7 +135,7 @@ def test_every_argument_arrives_on_arm64(tmp_path: Path) -> None:
     (tmp_path / "trace").mkdir()
     run_there = traced(tracer_of(tmp_path / "trace"), run)
     assert run_there.info.lost == {"lost_events": 0}
-    assert_same(run_there.tables, run_there.printed, "8.2.3")
+    assert_same(run_there.tables, recorded(run_there.printed), "8.2.3")
 
 
 def test_a_wheel_brings_the_library_that_works_for_its_machine(tmp_path: Path) -> None:

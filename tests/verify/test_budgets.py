@@ -8,7 +8,7 @@ from xml.etree import ElementTree
 import polars as pl
 import pytest
 from command_line import called, json_of
-from small_chain import small_chain
+from small_chain import small_chain, with_times
 
 from chainshaper import simulate
 from chainshaper.values.errors import InputError
@@ -27,6 +27,7 @@ from chainshaper.verify.budgets import (
     save_budget,
 )
 from chainshaper.verify.measure import hop_breakdown, measure_latency
+from chainshaper.workload.description import ExecutionTime
 
 MS = 1_000_000
 
@@ -40,13 +41,9 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 def slowed(recording: Recording, folder: Path, node: str, by_ns: int) -> Recording:
     """The same application, whose node computes longer by a constant."""
     application = small_chain(folder)
-    (callback,) = application.nodes[node].callbacks
-    low, high = callback.execution.uniform_ns or (0, 0)
-    execution = callback.execution.model_copy(update={"uniform_ns": (low + by_ns, high + by_ns)})
-    nodes = dict(application.nodes)
-    changed = callback.model_copy(update={"execution": execution})
-    nodes[node] = nodes[node].model_copy(update={"callbacks": (changed,)})
-    return simulate(application.model_copy(update={"nodes": nodes}), folder / "slowed", cycles=200)
+    low, high = application.nodes[node].callbacks[0].execution.uniform_ns or (0, 0)
+    longer = {node: ExecutionTime(uniform_ns=(low + by_ns, high + by_ns))}
+    return simulate(with_times(application, longer), folder / "slowed", cycles=200)
 
 
 def test_a_recording_keeps_the_budget_that_was_proposed_from_it(

@@ -19,7 +19,7 @@ from applied_plans import leftovers, needs_fifo
 from calm_runs import calm_run
 from command_line import called, json_of
 from gated import needs_cgroups
-from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan
+from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan, with_times
 
 from chainshaper import measure_latency, save_plan, shape_application, simulate
 from chainshaper.flow.apply import apply_plan
@@ -101,16 +101,9 @@ def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> Non
 
 def _with_long_executions(folder: Path) -> Application:
     """The small chain, in which every tenth callback of /second takes 36 ms, the others 2 ms."""
-    application = small_chain(folder)
-    nodes = dict(application.nodes)
-    for name in ("first", "second", "third"):
-        (callback,) = nodes[name].callbacks
-        long = (2 * MS,) * 9 + (36 * MS,)
-        usual = ExecutionTime(samples_ns=long, block=10)
-        execution = usual if name == "second" else ExecutionTime(constant_ns=2 * MS)
-        changed = callback.model_copy(update={"execution": execution})
-        nodes[name] = nodes[name].model_copy(update={"callbacks": (changed,)})
-    return application.model_copy(update={"nodes": nodes})
+    second = ExecutionTime(samples_ns=(2 * MS,) * 9 + (36 * MS,), block=10)
+    others = dict.fromkeys(("first", "third"), ExecutionTime(constant_ns=2 * MS))
+    return with_times(small_chain(folder), {"second": second, **others})
 
 
 def _frozen_outside_slots(plan: Plan) -> Enforcement:

@@ -13,7 +13,7 @@ import pytest
 from command_line import called, refused
 from hypothesis import given
 from hypothesis import strategies as st
-from small_chain import small_chain
+from small_chain import small_chain, with_times
 
 from chainshaper import simulate
 from chainshaper.values.errors import InputError
@@ -29,6 +29,7 @@ from chainshaper.verify.slowdowns import (
     find_slowdowns,
     sample_of,
 )
+from chainshaper.workload.description import ExecutionTime
 
 MS = 1_000_000
 NAMES = [(f"/n{number}", f"/t{number}") for number in range(5)]
@@ -170,18 +171,10 @@ def test_a_median_with_equal_weights_is_the_median(values: list[float]) -> None:
 def simulated(folder: Path, factor: float = 1.0) -> Recording:
     """The small chain, whose node `second` takes ``factor`` times as long."""
     folder.mkdir()
-    text = (small_chain(folder), "second")
-    application, (callback,) = text[0], text[0].nodes[text[1]].callbacks
-    low, high = callback.execution.uniform_ns or (0, 0)
-    uniform = (round(low * factor), round(high * factor))
-    changed = callback.model_copy(
-        update={"execution": callback.execution.model_copy(update={"uniform_ns": uniform})}
-    )
-    node = application.nodes["second"].model_copy(update={"callbacks": (changed,)})
-    nodes = {**application.nodes, "second": node}
-    return simulate(
-        application.model_copy(update={"nodes": nodes}), folder / "recording", cycles=200
-    )
+    application = small_chain(folder)
+    low, high = application.nodes["second"].callbacks[0].execution.uniform_ns or (0, 0)
+    longer = {"second": ExecutionTime(uniform_ns=(round(low * factor), round(high * factor)))}
+    return simulate(with_times(application, longer), folder / "recording", cycles=200)
 
 
 def test_the_command(tmp_path: Path) -> None:

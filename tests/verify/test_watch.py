@@ -28,7 +28,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from traced_program import built
 
 from chainshaper import plan_recording
-from chainshaper.analysis import analyse_latency
+from chainshaper.analysis import analyse_latency, latency_statistics
 from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
@@ -37,7 +37,7 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
 from chainshaper.verify.measure import measure_latency
-from chainshaper.verify.watch import SECOND, Seen, Watch, exporting
+from chainshaper.verify.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 
 CHAIN, PERIOD_NS = "/ebpf1../ebpf2", 50_000_000
 LONGEST_NS = SECOND // 5
@@ -96,35 +96,21 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     whole = analyse_latency(tables, CHAIN, info.clock_offset_ns).traversals
     (chain,) = watch.chains
     latencies = dict(whole.select("start", "latency_ns").iter_rows())
-    assert 30 <= chain.begun.size <= 50
-    assert [latencies[begun] for begun in chain.begun.tolist()] == chain.latency.tolist()
-    begun = whole.filter(whole["start"].is_between(int(chain.begun[0]), int(chain.begun[-1])))
-    assert begun.height == chain.begun.size, "none is passed over, none counted twice"
+    begun, found, count = chain.cycles["start"], chain.cycles["latency_ns"], chain.cycles.height
+    assert 30 <= count <= 50
+    assert [latencies[one] for one in begun] == found.to_list()
+    same_time = whole.filter(whole["start"].is_between(begun[0], begun[-1]))
+    assert same_time.height == count, "none is passed over, none counted twice"
     last = seen[-1].chains[0]
-    assert last.spans["hour"].count == chain.begun.size
-    assert last.spans["hour"].max_ns == int(chain.latency.max())
-    lasted = int(chain.begun[-1] - chain.begun[0]) / SECOND
-    assert last.rate_hz == pytest.approx((chain.begun.size - 1) / lasted)
+    assert last.spans["hour"].count == count
+    assert last.spans["hour"].max_ns == found.max()
+    assert last.rate_hz == pytest.approx((count - 1) * SECOND / (begun[-1] - begun[0]))
     assert sum(h.communication_ns + h.computation_ns for h in last.hops) == pytest.approx(
-        float(chain.latency.mean()), rel=1e-6
+        found.mean(), rel=1e-6
     )
     assert [hop.node for hop in last.hops] == ["/first", "/second"]
-    assert abs(other_seen.chains[0].spans["hour"].count - chain.begun.size) <= 5
+    assert abs(other_seen.chains[0].spans["hour"].count - count) <= 5
     assert seen[-1].lost == 0
-
-
-def test_the_flight_recorder_has_the_last_seconds(tmp_path: Path) -> None:
-    with running(tmp_path, 200):
-        watch = own_watch()
-        watched(watch, 1.5)
-        recording = watch.save(tmp_path / "flight")
-        with pytest.raises(InputError, match="exists"):
-            watch.save(tmp_path / "flight")
-    measured = measure_latency(recording)
-    assert measured.analysis.statistics.count >= 20
-    assert list(recording.info.processes.values()) == ["/first, /second"]
-    shown = called("latency", tmp_path / "flight")
-    assert shown.code == 0, shown.err
 
 
 def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path: Path) -> None:
@@ -146,11 +132,14 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
 
 
 def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> None:
-    """The plan is made from what the flight recorder has, for a cycle that outputs cannot hold."""
+    """The plan is made from the last seconds, which the flight recorder has, for a cycle that
+    outputs cannot hold."""
     with running(tmp_path, 400):
         watch = own_watch()
         watched(watch, 1.5)
         recording = watch.save(tmp_path / "flight")
+        with pytest.raises(InputError, match="exists"):
+            watch.save(tmp_path / "flight")
         plan = plan_recording(recording, CHAIN)
         (slot,) = publish_slots(plan)
         beside = own_watch(plan=whole(plan))
@@ -162,6 +151,10 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
     assert in_time.shares == (1.0,)
     assert in_time.spans["hour"].late is not None
     assert in_time.spans["hour"].late <= 2, "of a machine that stands still"
+    assert measure_latency(recording).analysis.statistics.count >= 20
+    assert list(recording.info.processes.values()) == ["/first, /second"]
+    shown = called("latency", recording.path)
+    assert shown.code == 0, shown.err
     counted = too_late.spans["hour"].count - in_time.spans["hour"].count
     assert counted > 10
     assert too_late.spans["hour"].late == in_time.spans["hour"].late + counted
@@ -248,10 +241,11 @@ def test_a_clock_that_is_set_spoils_no_figure(
     starts = [int(row[2]) for row in printed if row[0] == "instance"][::2]
     outputs = [int(row[2]) for row in printed if row[:2] == ["publication", "/ebpf2"]]
     (chain,) = watch.chains
-    first = np.searchsorted(starts, chain.begun) - 1  # the program reads the clock before the event
+    begun, latency = (chain.cycles[one].to_numpy() for one in ("start", "latency_ns"))
+    first = np.searchsorted(starts, begun) - 1  # the program reads the clock before the event
     expected = np.array(outputs)[first] - np.array(starts)[first]
-    whole = chain.latency >= 0
-    assert (np.abs(chain.latency - expected)[whole] < PERIOD_NS // 2).all(), "of its own cycle"
+    whole = latency >= 0  # none: NaN
+    assert (np.abs(latency - expected)[whole] < PERIOD_NS // 2).all(), "of its own cycle"
     assert first[-1] - first[0] + 1 <= first.size + counted["unclear"], "none is passed over"
     assert first.size > 30
     assert counted["incomplete"] <= 1
@@ -260,35 +254,21 @@ def test_a_clock_that_is_set_spoils_no_figure(
 
 
 def test_memory_does_not_grow(tmp_path: Path) -> None:
-    """An hour of cycles stays, events of seconds: days are simulated by setting the clock on."""
-    watch = own_watch()
-    (chain,) = watch.chains
-
-    from chainshaper.analysis.traversals import traverse  # noqa: F401 - the frame's columns
-
-    hops = pl.DataFrame(
-        schema={
-            "traversal": pl.UInt32(),
-            "hop": pl.UInt32(),
-            "communication_ns": pl.Int64(),
-            "computation_ns": pl.Int64(),
-        }
+    """An hour of cycles stays, events of seconds: hours are simulated by setting the clock on."""
+    (chain,) = own_watch().chains
+    hops = pl.DataFrame(schema=["traversal", "hop", "communication_ns", "computation_ns"])
+    hops = hops.cast(pl.UInt32())
+    minute = pl.DataFrame({"start": range(0, 60 * SECOND, SECOND // 10)}).with_columns(
+        pl.lit(5_000_000).alias("latency_ns"),
+        pl.lit(5_000_000).alias("place_ns"),
+        late=False,
+        complete=True,
+        traversal=pl.int_range(pl.len(), dtype=pl.UInt32()),
     )
-    rate = 10
-    for second in range(2 * 3600):
-        start = np.arange(rate) * (SECOND // rate) + second * SECOND
-        frame = pl.DataFrame(
-            {
-                "traversal": np.arange(rate, dtype=np.uint32),
-                "start": start,
-                "latency_ns": np.full(rate, 5_000_000),
-                "late": np.zeros(rate, bool),
-                "place_ns": np.full(rate, 5_000_000),
-                "complete": np.ones(rate, bool),
-            }
-        )
-        chain.take_over(frame, hops, (second + 1) * SECOND)
-    assert chain.begun.size == pytest.approx(3600 * rate, rel=0.001)
+    for number in range(1, 121):
+        chain.take_over(minute, hops, number * 60 * SECOND)
+        minute = minute.with_columns(pl.col("start") + 60 * SECOND)
+    assert chain.cycles.height == pytest.approx(3600 * 10, rel=0.001)
 
 
 def test_the_command_shows_and_streams(tmp_path: Path) -> None:
@@ -317,7 +297,8 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         words += ["--budget", str(tmp_path / "budget.yaml"), "--recorder", str(tmp_path / "broken")]
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
         shown = subprocess.Popen(words, **pipes)  # type: ignore[call-overload]
-        time.sleep(6)
+        wait_for(lambda: any((tmp_path / "broken").glob("watch-*/recording.json")), "what broke")
+        time.sleep(1)  # a look or two
         shown.send_signal(signal.SIGINT)
         text, said = shown.communicate(timeout=20)
     assert f"{CHAIN}: maximum" in said, "the limit that is broken, once"
@@ -343,9 +324,13 @@ class Collector(BaseHTTPRequestHandler):
         pass
 
 
-def test_metrics_are_the_figures_that_are_shown(tmp_path: Path) -> None:
-    with running(tmp_path, 200):
-        seen = watched(own_watch(), 1.5)[-1]
+def test_metrics_are_the_figures_that_are_shown() -> None:
+    hour = latency_statistics(np.arange(5, 25) * 1_000_000, late=1)
+    hops = (Hop("/first", "/ebpf1", 0.0, 2e6), Hop("/second", "/ebpf2", 1e6, 3e6))
+    counted = {"complete": hour.count, "late": 1, "incomplete": 0, "unclear": 0}
+    spans = dict.fromkeys(SPANS, hour)
+    chain = ChainNow(CHAIN, spans, 20.0, hops, (), None, 0, counted, problem=None)
+    seen = Seen(at_ns=0, processes={1: "/first"}, lost=0, chains=(chain,))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -358,8 +343,6 @@ def test_metrics_are_the_figures_that_are_shown(tmp_path: Path) -> None:
                 pass
             text = urlopen(f"http://127.0.0.1:{port}/metrics").read().decode()
         server.shutdown()
-    (chain,) = seen.chains
-    hour = chain.spans["hour"]
     families = {one.name: one for one in text_string_to_metric_families(text)}
     found = {
         (one.labels["span"], one.labels["statistic"]): one.value
@@ -367,8 +350,8 @@ def test_metrics_are_the_figures_that_are_shown(tmp_path: Path) -> None:
     }
     assert found["hour", "max"] == known(hour.max_ns) / SECOND
     assert found["hour", "p50"] == hour.percentiles_ns["50"] / SECOND
-    counted = {s.labels["outcome"]: s.value for s in families["chainshaper_chain_cycles"].samples}
-    assert counted["complete"] == hour.count > 10
+    cycles = families["chainshaper_chain_cycles"].samples
+    assert {one.labels["outcome"]: one.value for one in cycles} == counted
     assert len(families["chainshaper_hop_time_seconds"].samples) == 4
     request = ExportMetricsServiceRequest.FromString(Collector.received[-1])
     (metrics,) = request.resource_metrics[0].scope_metrics

@@ -16,6 +16,7 @@ from command_line import called
 from ros2 import ros2_environment
 
 import chainshaper as cs
+from chainshaper.analysis import data_flow
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.workload.execution import draw
 
@@ -266,6 +267,7 @@ def test_a_built_package_runs_as_the_live_workload_does(tmp_path: Path) -> None:
     ways = ["/raw../left../fused", "/raw../right../fused", "/slow../slow", "/quick../quick"]
     medians: list[dict[str, float]] = []
     for recording in (real, live):
+        assert _beside_slow_ones(recording) > 0.9, "the other thread runs /quick meanwhile"
         measured = [cs.measure_latency(recording, way) for way in ways]
         medians.append({})
         for way, one in zip(ways, measured, strict=True):
@@ -274,3 +276,15 @@ def test_a_built_package_runs_as_the_live_workload_does(tmp_path: Path) -> None:
             medians[-1][way] = float(np.median(values.to_numpy())) / 1e6
     for way in ways:
         assert medians[0][way] == pytest.approx(medians[1][way], abs=1.0), medians
+
+
+def _beside_slow_ones(recording: cs.Recording) -> float:
+    """The share of those that publish /quick which start while another thread is about /slow."""
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    slow, quick = (
+        flow.instances.join(flow.publications.filter(topic=topic), on="instance", how="semi")
+        for topic in ("/slow", "/quick")
+    )
+    met = quick.join_asof(slow, on="start")
+    beside = (met["end_right"] > met["start"]) & (met["tid_right"] != met["tid"])
+    return float(beside.sum()) / len(quick)

@@ -9,14 +9,15 @@ An instance runs from `callback_start` to `callback_end` of the same callback on
 are assumed (``assumed``, no ``end``, no response time):
 
 * A Python node (rclpy), or one that takes from a wait set, has no callback events. An instance of
-  its subscription begins with each take. What its thread publishes for the same node until its
-  next take counts as that instance's output.
+  its subscription begins with each take, one of its timer with each `rcl_timer_call`. What its
+  thread publishes for the same node until the next of these counts as that instance's output.
 * The callback of a service's client, and what an action's client and server do, begin with the
   take as well. They end when the thread's executor looks for work again, where events tell that
   (then they are not ``assumed``).
-* A driver's own thread, a player of recorded data or a Python timer publishes outside all callbacks
-  that events show. A topic that its node publishes only like this gets a callback of kind
-  ``unknown``, with the handle 0 and one instance per publication, so that chains can begin there.
+* A driver's own thread, a player of recorded data or a Python timer without such events publishes
+  outside all callbacks that events show. A topic that its node publishes only like this gets a
+  callback of kind ``unknown``, with the handle 0 and one instance per publication, so that chains
+  can begin there.
 """
 
 from collections.abc import Collection
@@ -81,9 +82,13 @@ def data_flow(
         published = publications(tables, objects, sent)
         taken = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
-    instances, taken = _with_assumed_readers(instances, taken, objects, tables)
+    instances, taken = _with_assumed_readers(
+        instances, taken, timer_calls(tables, objects), objects, tables
+    )
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
+    if "rcl_timer_call" not in tables and instances["assumed"].any():
+        published = _begun_outside(published, instances)
     if sent.height:
         published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
@@ -209,10 +214,31 @@ def _running_time(tables: events.EventTables) -> pl.DataFrame:
     return changes.with_columns(used=ran.fill_null(0).cum_sum().over("tid"))
 
 
+def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+    """``callback_id, observed, pid, tid, time`` of timers' calls, where `rcl_timer_call` is there.
+
+    The thread need not be the one that runs the callback: rclcpp's events executor has one for it.
+    """
+    added = events.table(tables, "rclcpp_timer_callback_added")
+    added = added.select("pid", "timer_handle", handle="callback", valid_from="time")
+    timers = objects.callbacks.filter(pl.col("kind") == "timer")
+    timers = timers.join(added, on=["pid", "handle", "valid_from"], how="left").select(
+        *("pid", "valid_from", "callback_id", "observed"),
+        timer_handle=pl.coalesce("timer_handle", "handle"),
+    )
+    calls = events.table(tables, "rcl_timer_call")
+    found = latest_before(calls, timers, ["pid", "timer_handle"], "time", "valid_from")
+    return found.drop_nulls("callback_id").select("callback_id", "observed", "pid", "tid", "time")
+
+
 def _with_assumed_readers(
-    instances: pl.DataFrame, taken: pl.DataFrame, objects: Objects, tables: events.EventTables
+    instances: pl.DataFrame,
+    taken: pl.DataFrame,
+    calls: pl.DataFrame,
+    objects: Objects,
+    tables: events.EventTables,
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
-    """Add an instance for every take of what has no callback events.
+    """Add an instance for every take, or timer's call, of what has no callback events.
 
     Of services, clients and actions it ends when the thread's executor looks for work again.
     Returns the instances, renumbered in order of start, and the takes with ``assumed_instance``.
@@ -227,6 +253,9 @@ def _with_assumed_readers(
         start="time",
         assumed=pl.lit(True),
     )
+    called = calls.filter(~pl.col("observed")).drop("observed").rename({"time": "start"})
+    called = called.with_columns(intra_process=pl.lit(False), assumed=pl.lit(True))
+    assumed = pl.concat([assumed, called], how="diagonal")
     if assumed.is_empty():
         return instances, taken.with_columns(assumed_instance=pl.lit(None, dtype=pl.UInt32))
     if assumed["by_executor"].any():
@@ -315,6 +344,20 @@ def _published_in(
     return published.with_columns(
         by_number(every, "publication", column, published.height) for column in columns[1:]
     )
+
+
+def _begun_outside(published: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
+    """The publications, of which those of rclpy's timers are in no instance of a subscription.
+
+    Where nothing tells of timers, a topic that was published before anything was taken is one's:
+    what came behind takes later is no output of theirs.
+    """
+    inside = pl.lit(instances["assumed"]).gather("instance")
+    published = published.with_columns(assumed=inside)
+    first = pl.col("instance").first().is_null()
+    own = (first & pl.col("assumed").fill_null(True).all()).over("publisher")
+    columns = (pl.when(~own).then(column).alias(column) for column in ("instance", "callback_id"))
+    return published.with_columns(columns).drop("assumed")
 
 
 def _with_assumed_writers(

@@ -107,8 +107,8 @@ def _with_feedback(callback: Callback, published: set[str]) -> Callback:
 def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[str]]:
     """Which topics each callback writes in turns with others of its node, as their synchroniser.
 
-    Between two publications each of them has run, the publishing instances included: callbacks that
-    publish independently of each other do not keep to that.
+    Between the starts of two instances that publish each of them has run, the latter included:
+    callbacks that publish independently of each other do not keep to that.
     """
     found = defaultdict[int, set[str]](set)
     for callbacks in nodes:
@@ -119,13 +119,16 @@ def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[
                 continue  # one alone; or a timer publishes it too, or two callbacks of one topic do
             ids = [one.id for one in writers]
             own = pl.col("callback_id").is_in(ids) & (pl.col("topic") == topic)
-            sent = flow.publications.filter(own)["time"].sort()
-            if len(sent) < 2:
+            # Not when it was published: on another thread the next inputs may have come by then.
+            begun = (
+                flow.publications.filter(own).join(flow.instances, on="instance")["start"].sort()
+            )
+            if len(begun) < 2:
                 continue  # nothing lies between
             ran = flow.instances.filter(pl.col("callback_id").is_in(ids))
             ran = ran.sort("start").select("callback_id", "start")
             counts = (
-                ran.filter(callback_id=one)["start"].search_sorted(sent, side="right").diff()
+                ran.filter(callback_id=one)["start"].search_sorted(begun, side="right").diff()
                 for one in ids
             )
             if all((count.drop_nulls() > 0).all() for count in counts):

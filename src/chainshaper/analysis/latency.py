@@ -10,7 +10,7 @@ import polars as pl
 
 from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.disturbance import Due, disturbed, stalled_after, with_punctuality
-from chainshaper.analysis.flow import DataFlow, data_flow
+from chainshaper.analysis.flow import DataFlow, data_flow, timer_calls
 from chainshaper.analysis.graph import graph_of
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
@@ -118,12 +118,21 @@ class Executor(NamedTuple):
 def executors(flow: DataFlow) -> list[Executor]:
     """Which callbacks have an executor of their own (paper, section 6): they share no thread.
 
-    What one thread was seen to run is one executor's, and so is what several take turns with.
+    What one thread was seen to run is one executor's, and so is what several take turns with. A
+    thread that calls the timers for it belongs to it (rclcpp's events executor), and of several of
+    Python the main thread, which gives them their work.
     """
     found: list[Executor] = []
-    columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids")
-    for row in callback_statistics(flow).drop_nulls("node").select(*columns).iter_rows():
-        number, node, kind, topic, period_ns, pid, tids = row
+    calls = timer_calls(flow.events, flow.objects).select("callback_id", "tid")
+    ran = pl.concat([flow.instances.select("callback_id", "tid"), calls]).unique()
+    about = flow.objects.callbacks.filter((pl.col("kind") != "unknown") | pl.col("observed"))
+    about = about.unique("callback_id").join(
+        ran.group_by("callback_id").agg(tids=pl.col("tid").sort()), on="callback_id"
+    )
+    columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids", "observed")
+    for row in about.sort("callback_id").select(*columns).iter_rows():
+        number, node, kind, topic, period_ns, pid, tids, observed = row
+        tids = tids if observed else {pid, *tids}
         threads: dict[int, tuple[str, ...]] = dict.fromkeys(tids, (node,))
         callbacks, names = frozenset((number,)), tuple[tuple[str, str], ...]()
         if kind in ("timer", "subscription") and topic not in INTERNAL_TOPICS:

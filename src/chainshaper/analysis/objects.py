@@ -44,8 +44,8 @@ class Objects:
       (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
       registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0
       (:func:`numbered`). ``topic`` is the topic or the service's name. ``observed`` is false for
-      what emits no callback events: subscriptions and services of rclpy, those of actions, and
-      all clients.
+      what emits no callback events: subscriptions, services and timers of rclpy, services of
+      actions, and all clients.
     * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
     * ``activity``: ``time, pid, node, active``: when lifecycle nodes became active, or inactive.
     * ``notes``: what cannot be known from this recording, in plain words.
@@ -76,6 +76,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     others = [
         _unregistered(tables, registered),
         _callbackless(tables, subscriptions, listening),
+        _timers_of_python(tables, nodes),
         clients,
     ]
     callbacks = pl.concat([registered, *others], how="diagonal_relaxed")
@@ -281,6 +282,27 @@ def _callbackless(
         *("pid", "handle", "valid_from", "node", "subscription"),
         topic=pl.col("topic").str.strip_suffix(REQUEST),
         kind=pl.when(serves).then(pl.lit("service")).otherwise(pl.lit("subscription")),
+        observed=pl.lit(False),
+    )
+
+
+def _timers_of_python(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Timers that are called, but have no callback in the trace: rclpy.
+
+    No event says whose they are: it is taken to be the node that their process created last before.
+    """
+    timer = ["pid", "timer_handle"]
+    called = events.table(tables, "rcl_timer_call").select(timer).unique()
+    created = events.table(tables, "rcl_timer_init").join(called, on=timer, how="semi")
+    added = events.table(tables, "rclcpp_timer_callback_added")
+    bare = created.join(added, on=timer, how="anti")
+    owned = latest_before(bare, nodes.drop("handle"), ["pid"], "time", "valid_from")
+    return owned.select(
+        *("pid", "node"),
+        handle="timer_handle",
+        valid_from="time",
+        period_ns="period",
+        kind=pl.lit("timer"),
         observed=pl.lit(False),
     )
 

@@ -6,8 +6,9 @@ source timestamp, and ends with the publication of the chain's last topic: the l
 
 **Which publication a message goes into.** Those made on the hop's topic inside the instance that
 read it. If there is none, and other callbacks of the node publish this topic too (synchronising
-callbacks, stored messages: :mod:`~chainshaper.analysis.graph`), the first publication of the
-topic by the node after the instance's start. For message_filters that is the soonest set
+callbacks, stored messages: :mod:`~chainshaper.analysis.graph`), that of the node's first instance
+which starts after it and publishes the topic; what several threads publish in instances that run
+already has got its inputs before. For message_filters that is the soonest set
 that the message can be in. An approximate-time synchroniser may hold messages back; outputs into
 which no new input went give that away, and ``notes`` says that L is a lower bound.
 
@@ -144,7 +145,7 @@ def _publish(
 def _publish_by_sibling(
     flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback, topic: str
 ) -> tuple[pl.DataFrame, list[str]]:
-    """Fill in the first publication by the node after the instance's start.
+    """Fill in what the node's first instance after this one's start publishes.
 
     A node that was created anew in between knows nothing of the messages of the one before it.
     Also returns a note if outputs of a synchroniser got no input that came since the one before.
@@ -153,12 +154,13 @@ def _publish_by_sibling(
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
     of_node = (pl.col("pid") == callback.pid) & (pl.col("node") == callback.node)
     here = flow.publications.filter((pl.col("topic") == topic) & of_node)
-    here = here.select("publisher", later="publication", sent="time")
+    began = _looked_up(flow.instances, "start", "instance")
+    here = here.select("publisher", later="publication", began=pl.coalesce(began, "time"))
     here = here.join(publishers, on="publisher", how="left", maintain_order="left")
     waiting = pl.col(publication).is_null() & pl.col(f"instance_{hop}").is_not_null()
     start = _looked_up(flow.instances, "start", f"instance_{hop}")
     rows = state.with_row_index("row").filter(waiting).select("row", start=start)
-    found = first_after(rows, here, [], "start", "sent", strictly=True)
+    found = first_after(rows, here, [], "start", "began", strictly=True)
     found = found.filter(pl.col("created") <= pl.col("start"))
     later = by_number(found, "row", "later", state.height)
     state = state.with_columns(

@@ -218,6 +218,9 @@ def release(
     run: str | None = opt.argument(
         "[RUN]", "The run, as `chainshaper status` names it. Default: all of them."
     ),
+    crashed: bool = opt.option(
+        "--crashed", "Only of runs that have crashed: plans in force stay so.", False
+    ),
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed."""
     from chainshaper.enforcement.freezer import groups_of, run_of
@@ -230,6 +233,7 @@ def release(
     if run is not None and not chosen:
         known = ", ".join(journal.path.parent.name for journal in runs) or "there are none"
         raise InputError(f"no run {run!r}: {known}")
+    chosen = [journal for journal in chosen if not crashed or journal.owner is None]
     problems: list[str] = []
     strangers: list[str] = []
     for journal in chosen:

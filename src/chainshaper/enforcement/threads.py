@@ -69,7 +69,7 @@ _COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
 
 @dataclass(frozen=True)
 class RecordedThread:
-    """A thread in a recording, by its id in its own pid namespace, and whose callbacks it ran.
+    """A thread in a recording, by its id there, and whose callbacks it ran.
 
     ``callbacks`` are those of its executor, by node and trigger, where the process has several.
     """
@@ -83,12 +83,16 @@ class RecordedThread:
 
 @dataclass(frozen=True)
 class RecordedProcess:
-    """A process in a recording, seen last at ``seen_ns`` (ns of CLOCK_MONOTONIC)."""
+    """A process in a recording, seen last at ``seen_ns`` (ns of CLOCK_MONOTONIC).
+
+    ``numbered_here``: it and its threads have the numbers that they have here, not their own.
+    """
 
     pid: int
     nodes: tuple[str, ...]
     threads: tuple[RecordedThread, ...]
     seen_ns: int
+    numbered_here: bool = False
 
 
 @dataclass(frozen=True)
@@ -233,6 +237,9 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
     nodes, known_by = _own_words(process)
     if match is not None:
         known = {thread.tid: thread for thread in match.threads}
+        if match.numbered_here:
+            inner = {one.tid: one.inner_tid for one in process.threads}
+            known = {inner[tid]: one for tid, one in known.items() if tid in inner}
         nodes, known_by = (match.nodes, "recording") if match.nodes else (nodes, known_by)
         main = all(thread.role != "executor" for thread in match.threads)
         return _Identified(process, nodes, known_by, known, main_executes=main)
@@ -301,7 +308,8 @@ def _own_words(process: Process) -> tuple[tuple[str, ...], str]:
 
 def _is_same(process: Process, named: tuple[str, ...], seen: RecordedProcess) -> bool:
     """Whether a process is the one that was recorded: its id, alive by then, no other name."""
-    if seen.pid != process.inner_pid or not process.threads:
+    pid = process.pid if seen.numbered_here else process.inner_pid
+    if seen.pid != pid or not process.threads:
         return False
     asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
     if process.threads[0].started * TICK_NS - asleep_ns > seen.seen_ns + TICK_NS:

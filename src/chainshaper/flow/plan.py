@@ -36,8 +36,8 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import chain_of, longest_stall
-from chainshaper.workload.description import Application
-from chainshaper.workload.live import Enforcement, Progress, node_name, run_application, timing_of
+from chainshaper.workload.description import Application, node_name
+from chainshaper.workload.live import Enforcement, Progress, run_application, timing_of
 
 __all__ = ["plan_recording", "profile_chains", "shape_application"]
 
@@ -427,8 +427,16 @@ def _steps(
 
 
 def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:
-    """Finished instances, with their response time, that began in none of these traversals."""
-    seen = flow.instances.filter(pl.col("end").is_not_null() & ~pl.col("assumed"))
+    """Finished instances, with their response time, that began in none of these traversals.
+
+    Where no event says that one ended (rclpy), it did with its last publication.
+    """
+    left = flow.publications.drop_nulls("instance").group_by("instance")
+    ended = flow.instances.join(
+        left.agg(left=pl.col("time").max()), on="instance", how="left", maintain_order="left"
+    )
+    until = pl.coalesce("end", pl.when("assumed").then("left"))
+    seen = ended.with_columns(end=until).drop_nulls("end")
     began = seen["start"].to_numpy()
     # An instance that begins just as a traversal ends is hit by it as well.
     hit = overlapping(began, began, disturbed["start"].to_numpy(), disturbed["end"].to_numpy() + 1)

@@ -42,6 +42,7 @@ from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources import Tracer
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
 from chainshaper.sources.ros import Environment, ask_graph, environment_of
+from chainshaper.sources.system import own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import (
@@ -385,13 +386,14 @@ def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tup
     """
     recorded, _ = recorded_processes(recording)
     pids = {seen.pid for seen in recorded}
-    nodes = [one for one in processes if one.inner_pid in pids]
+    here = recording.info.pid_namespace == own_pid_namespace()
+    number = {one.pid: one.pid if here else one.inner_pid for one in processes}
+    nodes = [one for one in processes if number[one.pid] in pids]
     nodes = nodes or [one for one in processes if one.participates]
-    inner_pids = {process.pid: process.inner_pid for process in nodes}
     return tuple(
         ThreadInfo(
-            tid=found.thread.inner_tid,
-            pid=inner_pids[found.thread.pid],
+            tid=found.thread.tid if here else found.thread.inner_tid,
+            pid=number[found.thread.pid],
             comm=found.thread.comm,
             node=found.nodes[0] if len(found.nodes) == 1 else "",
             role=found.thread.role,

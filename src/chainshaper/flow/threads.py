@@ -2,7 +2,7 @@
 
 The functions behind `chainshaper threads` and `chainshaper apply --dry-run`; nothing is changed.
 What /proc shows is joined with what a recording of the same processes saw, as far as they are still
-the same. Tracers number processes and threads as these do themselves, in their own pid namespace.
+the same. LTTng numbers processes and threads as these do themselves, in their own pid namespace.
 Which nodes a process has, its creation events say; which threads execute, the callbacks they ran.
 """
 
@@ -153,6 +153,7 @@ def recorded_processes(
     import polars as pl  # only who has a recording pays for this
 
     from chainshaper.analysis import data_flow, executors
+    from chainshaper.sources.system import own_pid_namespace
     from chainshaper.values import events
 
     info, tables = recording.info, recording.events
@@ -187,8 +188,9 @@ def recorded_processes(
         for tid, ran_of in executor.threads.items():
             comm = comms.get((executor.pid, tid), "")
             threads[executor.pid][tid] = RecordedThread(tid, "executor", ran_of, comm, apart)
+    here = info.pid_namespace == own_pid_namespace()
     found = (
-        RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid])
+        RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid], here)
         for pid, own in nodes.items()
         if pid in last_seen
     )

@@ -130,9 +130,12 @@ class Page:
     def __init__(
         self, folder: str, name: str, topic: str | None = None, flags: int = os.O_RDONLY
     ) -> None:
-        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at."""
+        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at.
+
+        The folder may be a process's of its open files, in `/proc`, all of which are links.
+        """
         self.path = f"{folder}/{name}"
-        flags |= os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        flags |= os.O_CLOEXEC | os.O_NONBLOCK | (not folder.startswith("/proc/")) * os.O_NOFOLLOW
         self._file = os.open(self.path, flags, 0o600)
         try:
             found = os.fstat(self._file)

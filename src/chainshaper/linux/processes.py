@@ -128,7 +128,16 @@ def user_in(folder: int) -> int | None:
     started_by = next((value for kind, value in entries if kind == _AT_UID), None)
     if started_by is None:
         return None if user == 0 and os.geteuid() == 0 else user
-    return user if started_by in (user, 0) else None
+    return user if {started_by, _outside(started_by, folder)} & {user, 0} else None
+
+
+def _outside(user: int, folder: int) -> int | None:
+    """The user whom a process calls so in its user namespace (``/proc/PID/uid_map``)."""
+    for line in read_proc("uid_map", folder).splitlines():
+        inside, outside, count = map(int, line.split())
+        if inside <= user < inside + count:
+            return outside + user - inside
+    return None
 
 
 @dataclass(frozen=True)

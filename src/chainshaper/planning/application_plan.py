@@ -20,7 +20,7 @@ from pydantic import Field, model_validator
 
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
-from chainshaper.planning.overruns import slots_without, with_output_moved
+from chainshaper.planning.overruns import slots_without, united, with_output_moved
 from chainshaper.planning.plan import (
     Plan,
     Server,
@@ -121,7 +121,7 @@ class ApplicationPlan(Part):
                     name="+".join(together),
                     core=own[0][0].core,
                     priority=min(server.priority for server, _ in own),
-                    slots=tuple(_united(slots)),
+                    slots=united(slots),
                     threads=tuple(threads),
                     best_effort=all(server.best_effort for server, _ in own),
                 )
@@ -290,16 +290,6 @@ def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
     if "publish" in (chain.overrun, chain.modes and chain.modes.late):
         slots[-1] = slots[-1][0], max(slots[-1][1], chain.cycle_ns)
     return [(start, min(end, start + chain.cycle_ns)) for start, end in slots]
-
-
-def _united(slots: list[Slot]) -> list[Slot]:
-    united: list[Slot] = []
-    for start, end in sorted(slots):
-        if united and start <= united[-1][1]:
-            united[-1] = united[-1][0], max(end, united[-1][1])
-        else:
-            united.append((start, end))
-    return united
 
 
 # The rules: each yields what is wrong, and where below `chains` ----------------------------------

@@ -150,15 +150,11 @@ def check_latencies(latencies: object) -> _Latencies:
 
 @dataclass(frozen=True)
 class TailFit:
-    """A generalised Pareto tail, the latency exceeded with ``probability``, its 95 % confidence
-    interval, and the p-value of the Anderson–Darling test of the fit.
+    """The shape of a generalised Pareto tail, the p-value of the Anderson–Darling test of the fit,
+    the latency that is exceeded with the probability asked for, and its 95 % confidence interval.
     """
 
-    probability: float
-    threshold_ns: int
-    excesses: int
     shape: float
-    scale_ns: float
     goodness: float
     latency_ns: int
     interval_ns: tuple[int, int]
@@ -301,11 +297,7 @@ def _fit_above(
     quantiles = _quantile(shapes, scales, shares, probability)
     low, high = np.quantile(quantiles, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
     return TailFit(
-        probability=probability,
-        threshold_ns=threshold,
-        excesses=excesses.size,
         shape=float(shape[0]),
-        scale_ns=float(scale[0]),
         goodness=float((1 + np.sum(distances >= distance)) / (1 + BOOTSTRAPS)),
         latency_ns=threshold + round(float(_quantile(shape, scale, share, probability)[0])),
         interval_ns=(threshold + round(low), threshold + round(high)),

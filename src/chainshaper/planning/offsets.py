@@ -23,12 +23,13 @@ import random
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
-from itertools import chain, combinations
+from itertools import combinations
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.planning.overruns import slots_without
 from chainshaper.planning.plan import Plan, Slot, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import format_duration
@@ -185,20 +186,23 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
     for j, k in combinations(range(len(tables)), 2):
         common, forbidden = _collisions(tables[j], tables[k])
         if forbidden:
-            intervals = _between(forbidden, common)
+            taken = [(first, last + 1) for first, last in forbidden]
+            free = slots_without([(0, common)], taken)
+            intervals = [(first, end - 1) for first, end in free]
             if not intervals:
                 raise OperationError(_pair_too_long(tables[j], tables[k], common))
             allowed[j, k] = common, intervals
             allowed[k, j] = common, [(-end % common, -start % common) for start, end in intervals]
     for (core, priority), load in _loads(tables).items():
         if load > 1 + 1e-9:
+            names = ", ".join(one.name for one in tables if (core, priority) in one.slots)
             raise OperationError(
-                f"the slots of {_names_on(tables, core, priority)} on core {core} at priority"
-                f" {priority} fill {load:.1%} of its time, {load - 1:.1%} too much: move a chain to"
-                " another core, or give servers different priorities"
+                f"the slots of {names} on core {core} at priority {priority} fill {load:.1%} of its"
+                f" time, {load - 1:.1%} too much: move a chain to another core, or give servers"
+                " different priorities"
             )
     offsets = dict.fromkeys(range(len(tables)), 0)
-    for group in _joined(len(tables), allowed):
+    for group in linked(len(tables), allowed):
         if len(group) == 1:
             continue
         if len(group) <= MOST_SEARCHED:
@@ -218,10 +222,6 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
     return offsets
 
 
-def _slots_of(table: Timetable) -> Iterator[Slot]:
-    return chain.from_iterable(table.slots.values())
-
-
 def _collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
     """g, and the differences of offsets modulo g at which slots collide."""
     common = math.gcd(one.cycle_ns, two.cycle_ns)
@@ -238,22 +238,13 @@ def _collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
     return common, forbidden
 
 
-def _between(forbidden: _Intervals, common: int) -> _Intervals:
-    allowed, free = [], 0
-    for first, last in sorted([*forbidden, (common, common)]):
-        if first > free:
-            allowed.append((free, first - 1))
-        free = max(free, last + 1)
-    return allowed
-
-
-def _joined(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
+def linked(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
     """The numbers below ``count``, together where pairs link them, directly or through others."""
-    groups = [{k} for k in range(count)]
-    for pair in pairs:
-        merged = set().union(*(group for group in groups if group.intersection(pair)))
-        groups = [group for group in groups if not group & merged] + [merged]
-    return sorted(sorted(group) for group in groups)
+    of = {number: {number} for number in range(count)}
+    for one, two in pairs:
+        joined = of[one] | of[two]
+        of.update(dict.fromkeys(joined, joined))
+    return sorted(sorted(group) for group in {id(group): group for group in of.values()}.values())
 
 
 def _search(
@@ -310,7 +301,7 @@ def _fitted(
     hard ones come to stay and the others move around them (guided ejection: Nagata and Bräysy,
     Operations Research Letters 37, 2009).
     """
-    busy = [sum(end - start for start, end in _slots_of(table)) for table in tables]
+    busy = [sum(b - a for slots in one.slots.values() for a, b in slots) for one in tables]
     waiting = sorted(group, key=lambda k: (-tables[k].cycle_ns, busy[k]))
     weight = dict.fromkeys(group, 1)
     placed: dict[int, int] = {}
@@ -425,10 +416,6 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
         f" {format_duration(needed)}{excess}). Move one to another core, give their servers"
         " different priorities, or use periods with a larger common divisor"
     )
-
-
-def _names_on(tables: Sequence[Timetable], core: int, priority: int) -> str:
-    return ", ".join(table.name for table in tables if (core, priority) in table.slots)
 
 
 def chain_name(plan: Plan) -> str:

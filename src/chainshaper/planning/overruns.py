@@ -196,6 +196,15 @@ def why_not_followed(plan: Plan) -> str | None:
     return None
 
 
+def united(slots: Sequence[Slot]) -> tuple[Slot, ...]:
+    """Slots ascending; those that overlap or touch are one."""
+    found: list[Slot] = []
+    for start, end in sorted(slots):
+        first, before = found.pop() if found and start <= found[-1][1] else (start, end)
+        found.append((first, max(end, before)))
+    return tuple(found)
+
+
 def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, ...]:
     """Slots but for what is taken of them."""
     left = []

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from chainshaper.planning.bands import predict_bands
 from chainshaper.planning.margins import EPSILON_NS, check_latencies
+from chainshaper.planning.overruns import united
 from chainshaper.planning.plan import (
     SHORTEST_SLOT_NS,
     ChainOfPlan,
@@ -477,12 +478,13 @@ def _server_of_node(node: str, own: list[tuple[int, Slot]]) -> Server:
     cores = {core for core, _ in own}
     if len(cores) > 1:
         raise InputError(f"{node} runs on one core, not on {sorted(cores)}: correct it")
-    joined: list[Slot] = []
-    for _, (start, end) in own:
-        adjacent = bool(joined) and joined[-1][1] == start
-        joined.append((joined.pop()[0] if adjacent else start, end))
-    server = _publishing(node.strip("/"), cores.pop(), joined[0], (Thread(node=node),))
-    return server.model_copy(update={"slots": tuple(joined)})
+    return Server(
+        name=node.strip("/"),
+        core=cores.pop(),
+        priority=OUTPUT_PRIORITY,
+        slots=united([slot for _, slot in own]),
+        threads=(Thread(node=node),),
+    )
 
 
 def let_per_chain(plan: Plan) -> Plan:

@@ -26,6 +26,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from chainshaper.analysis.graph import ApplicationDescription
+from chainshaper.planning.offsets import linked
 from chainshaper.reporting.tables import Column, ResultTable, words
 from chainshaper.values.application import INTERNAL_SERVICES, INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import format_duration
@@ -407,9 +408,11 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
     corners = [(0.0, 0.0)] * len(boxes)
     routes: list[list[Point]] = [[] for _ in edges]
     top, width = 0.0, 0.0
-    for members in _components(len(boxes), edges):
-        own = {number: edge for number, edge in enumerate(edges) if edge.source in members}
-        part = _layered(sorted(members), boxes, own)
+    parts = linked(len(boxes), [(edge.source, edge.target) for edge in edges])
+    for members in sorted(parts, key=len, reverse=True):
+        chosen = set(members)
+        own = {number: edge for number, edge in enumerate(edges) if edge.source in chosen}
+        part = _layered(members, boxes, own)
         _sort_columns(part)
         _choose_heights(part)
         sides, left = [], 0.0  # left and right side of every column
@@ -435,16 +438,6 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
         width = max(width, sides[-1][1])
         top = max(y[vertex] + part.height[vertex] for vertex in y) + 2 * ROW_GAP
     return Layout(corners, routes, width, max(top - 2 * ROW_GAP, 0.0))
-
-
-def _components(count: int, edges: Sequence[Edge]) -> list[set[int]]:
-    """Connected components, the largest first."""
-    of = {vertex: {vertex} for vertex in range(count)}
-    for edge in edges:
-        joined = of[edge.source] | of[edge.target]
-        of.update(dict.fromkeys(joined, joined))
-    found = {id(members): members for members in of.values()}.values()
-    return sorted(found, key=lambda members: (-len(members), min(members)))
 
 
 def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge]) -> _Part:

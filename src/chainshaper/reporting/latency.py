@@ -1,7 +1,7 @@
 """A chain's latency, as tables and as plain data: its figures, recordings beside each other, a
 prediction beside its measurement, where the time goes, and what has no latency."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -51,26 +51,21 @@ CONVENTION = (
 
 def _rows(columns: Sequence[LatencyStatistics | None]) -> dict[str, list[str]]:
     """Every figure by its title, a cell for each column's statistics."""
-    rows = {
-        title: [ABSENT if one is None else ms(getattr(one, field)) for one in columns]
-        for title, field in (
-            ("average", "mean_ns"),
-            ("minimum", "min_ns"),
-            ("maximum", "max_ns"),
-            ("jitter (max − min)", "jitter_ns"),
-            ("spread p0.5–p99.5", "spread_ns"),
-        )
+    cells: dict[str, Callable[[LatencyStatistics], str]] = {
+        "average": lambda one: ms(one.mean_ns),
+        "minimum": lambda one: ms(one.min_ns),
+        "maximum": lambda one: ms(one.max_ns),
+        "jitter (max − min)": lambda one: ms(one.jitter_ns),
+        "spread p0.5–p99.5": lambda one: ms(one.spread_ns),
+        "median": lambda one: ms(one.percentiles_ns.get("50")),
+        "99th percentile": lambda one: ms(one.percentiles_ns.get("99")),
+        "cycles": lambda one: str(one.count),
+        "came late": lambda one: ABSENT if one.late is None else f"{one.late} of {one.count}",
     }
-    for title, key in (("median", "50"), ("99th percentile", "99")):
-        rows[title] = [
-            ABSENT if one is None else ms(one.percentiles_ns.get(key)) for one in columns
-        ]
-    rows["cycles"] = [ABSENT if one is None else str(one.count) for one in columns]
-    rows["came late"] = [
-        ABSENT if one is None or one.late is None else f"{one.late} of {one.count}"
-        for one in columns
-    ]
-    return rows
+    return {
+        title: [ABSENT if one is None else cell(one) for one in columns]
+        for title, cell in cells.items()
+    }
 
 
 def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[str, Any]:

@@ -38,8 +38,6 @@ from chainshaper.values.files import new_file, write_whole
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown
 from chainshaper.verify.overruns import moves_in, moves_text, next_cycles, overruns_text
 
-__all__ = ["ENDINGS", "report_page", "write_report"]
-
 ENDINGS = (".html", ".htm")
 LISTED = 50
 """Rows of a list that may be endless."""

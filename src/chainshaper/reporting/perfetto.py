@@ -31,9 +31,6 @@ from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement
 
-__all__ = ["ENDINGS", "Slice", "Track", "Value", "encode_trace", "export_mcap"]
-__all__ += ["export_perfetto"]
-
 ENDINGS = (".pftrace", ".perfetto-trace")
 
 BEGIN, END, INSTANT = 1, 2, 3  # TrackEvent.Type

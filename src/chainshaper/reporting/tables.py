@@ -17,8 +17,6 @@ from rich.text import Text
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import escape, shown
 
-__all__ = ["ABSENT", "Column", "ResultTable", "figures", "plain", "words"]
-
 ABSENT = "–"
 YES_NO: dict[bool | None, str] = {True: "yes", False: "no"}
 

@@ -26,8 +26,6 @@ from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement
 from chainshaper.verify.predictions import due_of
 
-__all__ = ["Timeline", "timeline_data", "timeline_of"]
-
 CYCLES = 500
 SLICES = 20_000
 """How many cycles, and callbacks in them, the page's timeline of one recording has."""

@@ -19,10 +19,15 @@ from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, Int64s, M, 
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
-from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
+from chainshaper.workload.description import (
+    Application,
+    CallbackDescription,
+    ExecutionTime,
+    node_name,
+)
 from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.execution import BLOCK, blocks
-from chainshaper.workload.live import WARM_UP_CYCLES, Timing, node_name
+from chainshaper.workload.live import WARM_UP_CYCLES, Timing
 
 FIRST_PID, FIRST_TID = 1000, 100_000
 """Of processes, whose number the main thread has, and of threads beside it that execute."""

@@ -29,8 +29,6 @@ from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, C, E, H, M, P, T, X
 from chainshaper.values.compiled.memory import compiled, table_at
 
-__all__ = ["run"]
-
 
 @compiled()
 def advance(m, thread):

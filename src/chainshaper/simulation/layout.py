@@ -20,8 +20,6 @@ import numpy.typing as npt
 
 from chainshaper.gate.decision import CHANGES
 
-__all__ = ["Int64s"]
-
 Int64s = npt.NDArray[np.int64]
 
 NONE = -1

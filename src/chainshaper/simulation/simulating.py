@@ -38,11 +38,13 @@ from chainshaper.values.recording import (
     write_recording,
 )
 from chainshaper.workload import live
-from chainshaper.workload.description import Application, ExecutionTime, application_as_written
+from chainshaper.workload.description import (
+    Application,
+    ExecutionTime,
+    application_as_written,
+    node_name,
+)
 from chainshaper.workload.event_log import LAYOUT, EventLog
-from chainshaper.workload.live import node_name
-
-__all__ = ["samples", "simulate", "simulate_latencies", "with_recorded_times"]
 
 _run_engine = kernel("chainshaper.simulation.engine", "run")
 

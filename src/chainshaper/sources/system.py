@@ -5,10 +5,21 @@ Upstream: changelogs of tracetools; https://www.dds-foundation.org/dds-rtps-vend
 
 import re
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 
 from chainshaper.values.events import NODE_NAME, EventTables
 
-__all__ = ["distribution_of", "processes_of", "rmw_of_gids", "rmw_of_threads"]
+__all__ = [
+    "NEXT_HOST",
+    "distribution_of",
+    "own_pid_namespace",
+    "processes_of",
+    "rmw_of_gids",
+    "rmw_of_threads",
+]
+
+NEXT_HOST = 10_000_000
+"""Added to numbers of processes and threads that others may have; Linux goes up to 4,194,304."""
 
 _RELEASES = {  # Versions of tracetools below these belong to the distribution.
     **{"eloquent": (1, 0), "foxy": (2, 0), "galactic": (3, 0), "humble": (5, 0), "iron": (7, 0)},
@@ -27,6 +38,11 @@ _THREADS = {
     "rmw_connextdds": re.compile(r"rCo\d{5}"),
     "rmw_zenoh_cpp": re.compile(r"net-\d+$"),
 }
+
+
+def own_pid_namespace() -> int:
+    """The pid namespace whose numbers we see processes under (its inode)."""
+    return Path("/proc/self/ns/pid").stat().st_ino
 
 
 def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]) -> str | None:

@@ -5,8 +5,9 @@ Shaping nodes and their standbys share a page of memory for each output
 """
 
 import os
+import re
 import time
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,13 +16,22 @@ from typing import Literal, TypeAlias
 from pydantic import TypeAdapter, ValidationError
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import MEASURED, MOVING, STANDING_BY, Page, page_folders
+from chainshaper.gate.handover import (
+    MEASURED,
+    MOVING,
+    STANDING_BY,
+    VERSION,
+    Page,
+    page_folders,
+)
+from chainshaper.linux.threads import innermost_id, parents, read_proc
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import OperationError
 from chainshaper.values.yaml_file import FullName
 
 OutputState: TypeAlias = Literal["shaped", "in process", "bypassed", "silent", "no standby"]
 _TOPIC: TypeAdapter[str] = TypeAdapter(FullName)
+_PAGE = re.compile(rf"/(?:chainshaper/outputs|chainshaper-\d+)/[^/]+\.v{VERSION}$")
 
 
 @dataclass(frozen=True)
@@ -48,27 +58,52 @@ class ShapedOutput:
 
 
 def find_outputs(folders: Iterable[str] | None = None) -> tuple[ShapedOutput, ...]:
-    """The outputs that this user may see, root those of all users; one whose processes have both
-    ended is none any more.
+    """The outputs that this user may see, root those of all users, and in containers; one whose
+    processes have both ended is none any more.
     """
+    inside: dict[str, dict[str, dict[int, int]]] = {}
     if folders is None:
         folders = [*page_folders()]
         if os.geteuid() == 0:
             others = {str(path) for path in Path("/run/user").glob("*/chainshaper/outputs")}
             others |= {str(path) for path in Path("/dev/shm").glob("chainshaper-*")}  # noqa: S108
             folders += sorted(others - {*folders})
-    found = []
+        inside = _in_containers()
+    places: dict[str, Mapping[str, Mapping[int, int]]] = {**inside}
     for folder in folders:
-        names: list[str] = []
         with suppress(OSError):
-            names = sorted(os.listdir(folder))  # noqa: PTH208 - of names, not of paths
-        for name in names:
+            places[folder] = {name: {} for name in sorted(os.listdir(folder))}  # noqa: PTH208
+    found = []
+    for folder, pages in places.items():
+        for name, pid_of in pages.items():
             with (
                 suppress(OSError, ValueError, ValidationError),
                 closing(Page(folder, name)) as page,
             ):
-                found += _looked_at(page)
+                found += _looked_at(page, pid_of)
     return tuple(found)
+
+
+def _in_containers() -> dict[str, dict[str, dict[int, int]]]:
+    """Pages that processes have open whose files are others than ours, by folder and name in /proc.
+
+    With each are its processes, by what they call themselves: a page has them so.
+    """
+    own = Path("/proc/self/ns/mnt").stat().st_ino
+    pages: dict[tuple[int, int], tuple[str, str]] = {}
+    found: dict[str, dict[str, dict[int, int]]] = {}
+    for pid in parents():
+        folder = f"/proc/{pid}/fd"
+        with suppress(OSError):  # it has ended, or is another user's
+            if os.stat(f"/proc/{pid}/ns/mnt").st_ino == own:  # noqa: PTH116
+                continue
+            inner = innermost_id(read_proc(f"/proc/{pid}/status")) or pid
+            for name in os.listdir(folder):  # noqa: PTH208
+                if _PAGE.search(os.readlink(f"{folder}/{name}")):  # noqa: PTH115
+                    file = os.stat(f"{folder}/{name}")  # noqa: PTH116
+                    at, known = pages.setdefault((file.st_dev, file.st_ino), (folder, name))
+                    found.setdefault(at, {}).setdefault(known, {})[inner] = pid
+    return found
 
 
 def output_text(output: ShapedOutput) -> str:
@@ -163,9 +198,10 @@ class FollowedOutput:
         self._page.close()
 
 
-def _looked_at(page: Page) -> list[ShapedOutput]:
+def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
     holder = page["holder"] if page.is_locked() else 0
     standby = page["standby"] if page.is_locked(STANDING_BY) else 0
+    holder, standby = pid_of.get(holder, holder), pid_of.get(standby, standby)
     if not holder and not standby:
         return []
     since = page["bypassing_since_ns"] if standby else 0

@@ -128,6 +128,9 @@ FIELDS: dict[str, dict[str, pl.DataType]] = {
         "prev_comm": _NAME, "prev_tid": _NUMBER, "prev_prio": _NUMBER, "prev_state": pl.Int64(),
         "next_comm": _NAME, "next_tid": _NUMBER, "next_prio": _NUMBER,
     },
+    # Ours, by the library in front of ROS 2: a timer was called, and its callback comes next; of
+    # rclpy's no other event tells.
+    "rcl_timer_call": {"timer_handle": _HANDLE},
     # Ours: what the shaping node decided, when a message of an asynchronous publisher really
     # left, and what the machine did to everybody.
     "gate_release": {  # `time` is the instant at which the gate let the message go

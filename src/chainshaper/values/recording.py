@@ -95,6 +95,7 @@ class RecordingInfo(BaseModel, frozen=True):
     that are known to be missing, by reason. ``realtime`` says whether SCHED_FIFO was in force
     for every thread that was to have it, ``notes`` what a reader of the figures must know.
     ``trace_events`` counts all events of the trace that it was converted from, by full name.
+    Processes and threads have the numbers of ``pid_namespace`` (its inode); None: each its own.
     """
 
     format: Integer = FORMAT
@@ -106,6 +107,7 @@ class RecordingInfo(BaseModel, frozen=True):
     clock_offset_ns: Integer
     command: tuple[str, ...] = ()
     processes: dict[Integer, str] = {}  # pid → the node or command it runs
+    pid_namespace: Integer | None = None
     threads: tuple[ThreadInfo, ...] = ()
     endpoints: tuple[EndpointInfo, ...] = ()
     realtime: bool | None = None  # None: unknown

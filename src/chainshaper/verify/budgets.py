@@ -15,7 +15,7 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Protocol
+from typing import TYPE_CHECKING, Annotated, Literal
 from xml.etree import ElementTree
 
 import polars as pl
@@ -42,22 +42,8 @@ from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_m
 from chainshaper.verify.measure import chain_of, hop_breakdown, measure_latency
 
 if TYPE_CHECKING:
+    from chainshaper.verify.slowdowns import Compared
     from chainshaper.verify.watch import Seen
-
-__all__ = [
-    "Budget",
-    "Judged",
-    "Verdict",
-    "broken_limits",
-    "check_budget",
-    "check_budgets",
-    "junit_report",
-    "load_budget",
-    "markdown_report",
-    "named_callbacks",
-    "propose_budget",
-    "save_budget",
-]
 
 ROOM = 0.1
 """A proposal leaves as much room beyond what was measured."""
@@ -376,22 +362,7 @@ def _most(times: dict[str, float] | None) -> float | None:
     return None if times is None else times["max"]
 
 
-class Verdict(Protocol):
-    """A limit, or a callback beside a baseline: what reports have of it."""
-
-    @property
-    def recording(self) -> str: ...
-    @property
-    def where(self) -> str: ...
-    @property
-    def what(self) -> str: ...
-    @property
-    def met(self) -> bool: ...
-    @property
-    def text(self) -> str: ...
-
-
-def junit_report(judged: Sequence[Verdict]) -> str:
+def junit_report(judged: "Sequence[Judged | Compared]") -> str:
     """JUnit XML: a suite for each recording, a test case for each limit or callback."""
     root = ElementTree.Element("testsuites", name="chainshaper check")
     for recording in dict.fromkeys(one.recording for one in judged):
@@ -409,7 +380,8 @@ def junit_report(judged: Sequence[Verdict]) -> str:
 
 
 def markdown_report(
-    judged: Sequence[Verdict], words: tuple[str, str, str] = ("limits", "broken", "met")
+    judged: "Sequence[Judged | Compared]",
+    words: tuple[str, str, str] = ("limits", "broken", "met"),
 ) -> str:
     """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met.
 

@@ -43,8 +43,6 @@ from chainshaper.values.recording import Recording
 from chainshaper.verify.budgets import named_callbacks
 from chainshaper.verify.measure import measure_latency
 
-__all__ = ["Compared", "Sample", "find_slowdowns", "sample_of", "slowdowns_in"]
-
 LEVEL = 1 / 200
 LEAST = log1p(0.005)
 """Less is no slowdown: another build of the same program differs by as much."""

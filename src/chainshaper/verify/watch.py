@@ -53,8 +53,6 @@ from chainshaper.values.recording import (
 )
 from chainshaper.verify.predictions import due_of
 
-__all__ = ["SPANS", "ChainNow", "Hop", "Seen", "Watch", "exporting"]
-
 SECOND = 1_000_000_000
 SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
 RECORDER_NS = 10 * SECOND
@@ -139,16 +137,18 @@ class Seen:
         return statuses
 
 
+_CYCLE = pl.Schema(
+    {"start": pl.Int64, "latency_ns": pl.Int64, "late": pl.Boolean, "place_ns": pl.Int64}
+)
+
+
 @dataclass
 class _Chain:
-    """What is known of a chain: arrays by cycle, in the order of beginning, for an hour."""
+    """What is known of a chain: a row for each cycle, in the order of beginning, for an hour."""
 
     text: str
     slots: tuple[tuple[int, int], ...]
-    begun: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-    latency: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
-    late: NDArray[np.int8] = field(default_factory=lambda: np.empty(0, np.int8))
-    place: NDArray[np.int64] = field(default_factory=lambda: np.empty(0, np.int64))
+    cycles: pl.DataFrame = field(default_factory=lambda: pl.DataFrame(schema=_CYCLE))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
     counted: Counter[str] = field(
@@ -157,17 +157,9 @@ class _Chain:
     problem: str | None = None
 
     def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
-        """Cycles that are over; −1 stands for what is not known."""
-        keep = self.begun > now_ns - SPANS["hour"]
-        for name, column in (
-            ("begun", "start"),
-            ("latency", "latency_ns"),
-            ("late", "late"),
-            ("place", "place_ns"),
-        ):
-            old = getattr(self, name)
-            new = traversals[column].cast(pl.Int64).fill_null(-1).to_numpy().astype(old.dtype)
-            setattr(self, name, np.concatenate([old[keep], new]))
+        """Cycles that are over."""
+        recent = self.cycles.filter(pl.col("start") > now_ns - SPANS["hour"])
+        self.cycles = pl.concat([recent, traversals.select(_CYCLE.names()).cast(_CYCLE)])
         whole = int(traversals["complete"].sum())
         self.counted["complete"] += whole
         self.counted["incomplete"] += traversals.height - whole
@@ -180,19 +172,15 @@ class _Chain:
             self.hops.popleft()
 
     def statistics(self, since_ns: int) -> LatencyStatistics:
-        within = self.begun >= since_ns
-        whole = within & (self.latency >= 0)
-        late = self.late[whole]
-        known = bool((late >= 0).all())
-        return latency_statistics(
-            self.latency[whole],
-            incomplete=int(np.count_nonzero(within & ~whole)),
-            late=int(np.count_nonzero(late > 0)) if known else None,
-        )
+        begun = self.cycles.filter(pl.col("start") >= since_ns)
+        whole = begun.drop_nulls("latency_ns")
+        late = None if whole["late"].null_count() else int(whole["late"].sum())
+        gone = begun.height - whole.height
+        return latency_statistics(whole["latency_ns"].to_numpy(), incomplete=gone, late=late)
 
     def shares(self) -> tuple[float, ...]:
         """Of the outputs by slot: each counts for the last slot that had opened as it left."""
-        places = self.place[self.latency >= 0]
+        places = self.cycles.drop_nulls("latency_ns")["place_ns"].fill_null(-1).to_numpy()
         if not self.slots or not places.size:
             return ()
         opens = [start for start, _ in self.slots]
@@ -323,13 +311,12 @@ class Watch:
 
     def _now(self, one: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
         moved_ns = moved.get(one.text.rpartition("..")[2], 0)
-        within = one.begun > over_ns - SPANS["minute"]
-        begun = one.begun[within]
-        lasted = int(begun[-1] - begun[0]) if begun.size > 1 else 0
+        begun = one.cycles["start"].filter(one.cycles["start"] > over_ns - SPANS["minute"])
+        lasted = begun[-1] - begun[0] if len(begun) > 1 else 0
         return ChainNow(
             chain=one.text,
             spans={name: one.statistics(over_ns - span) for name, span in SPANS.items()},
-            rate_hz=(begun.size - 1) * SECOND / lasted if lasted else 0.0,
+            rate_hz=(len(begun) - 1) * SECOND / lasted if lasted else 0.0,
             hops=tuple(_hops(one)),
             shares=one.shares(),
             promised_ns=one.slots[-1][1] + moved_ns if one.slots else None,

@@ -348,7 +348,7 @@ class Application(Part):
             if topic not in published:
                 raise wrong_value("is published by no node: remove it", "topics", topic)
         # A run takes its time: a chain that cannot be found in it is refused before.
-        known = {*published, *("/" + name.strip("/") for name in self.nodes)}
+        known = {*published, *map(node_name, self.nodes)}
         for way_point in map(str.strip, self.chain.split("..")):
             if "/" + way_point.removeprefix("/") not in known:
                 raise wrong_value(
@@ -422,6 +422,11 @@ class Application(Part):
         """Every core the application uses, with who asks for it."""
         executors = {core: f"node {node}" for node in self.nodes for core in self.cores_of(node)}
         return {self.scheduling.dds.core: "scheduling.dds", **executors}
+
+
+def node_name(name: str) -> str:
+    """A node's full name: with a leading slash."""
+    return "/" + name.strip("/")
 
 
 def origin_timer(

@@ -16,8 +16,6 @@ from typing import Any
 
 from chainshaper.gate.decision import ANCHORS, DROPPED, LATE, MESSAGES
 
-__all__ = ["ABSENT", "LAYOUT", "WIDTH", "WORDS", "EventLog", "number_of"]
-
 _RELEASE = "callback source_timestamp arrival origin release slot cycles_waited anchor overrun mode"
 LAYOUT: dict[str, tuple[str, ...]] = {
     "callback_start": ("callback", "thread_time", "is_intra_process"),

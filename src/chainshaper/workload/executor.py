@@ -54,7 +54,7 @@ from chainshaper.linux.scheduling import set_thread_name
 from chainshaper.values.files import why_distrusted
 from chainshaper.workload import dds
 from chainshaper.workload.dds import Message, Subscription
-from chainshaper.workload.event_log import EventLog, number_of
+from chainshaper.workload.event_log import EventLog
 from chainshaper.workload.execution import ExecutionTimes, spend
 
 
@@ -292,16 +292,6 @@ class PublisherThread:
         set_thread_name(THREAD_NAME)
         while True:
             self._waiting.get().send_next()
-
-
-def noting_sends(record: Callable[..., None], rmw_handle: int) -> Note:
-    """What records the sends of one publisher, whichever thread they happen in."""
-
-    def note(time_ns: int, source_timestamp: int, outcome: str, duration_ns: int) -> None:
-        number = number_of("outcome", outcome)
-        record(time_ns, rmw_handle, source_timestamp, number, duration_ns)
-
-    return note
 
 
 Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]

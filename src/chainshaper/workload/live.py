@@ -36,6 +36,7 @@ from chainshaper.values.recording import (
 from chainshaper.workload.description import (
     Application,
     application_as_written,
+    node_name,
     origin_timer,
 )
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
@@ -185,11 +186,6 @@ def _permitted(wanted: bool | None) -> bool:
             "root, give your user an rtprio limit of 98 in /etc/security/limits.conf, or do without"
         )
     return permitted
-
-
-def node_name(name: str) -> str:
-    """A node's full name: with a leading slash."""
-    return "/" + name.strip("/")
 
 
 @dataclass(frozen=True)

@@ -149,10 +149,15 @@ class NodeProcess:
         handle, rmw_handle = self.log.publisher(topic, qos["depth"], asynchronous)
         if asynchronous:  # the process's publisher thread does the writing
             self.publisher_thread = self.publisher_thread or executor.PublisherThread()
-            note = executor.noting_sends(self._point["asynchronous_send"], rmw_handle)
-            writer = executor.AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], note)
+            sent = partial(self._note_send, rmw_handle)
+            writer = executor.AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], sent)
             write = partial(self.publisher_thread.publish, writer)
         return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, self._point)
+
+    def _note_send(self, handle: int, at_ns: int, stamp: int, outcome: str, lasted: int) -> None:
+        """Record what became of a message, in whichever thread."""
+        number = number_of("outcome", outcome)
+        self._point["asynchronous_send"](at_ns, handle, stamp, number, lasted)
 
     def _working_body(
         self,

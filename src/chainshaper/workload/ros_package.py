@@ -21,6 +21,7 @@ from chainshaper.workload.description import (
     CallbackDescription,
     ExecutionTime,
     NodeDescription,
+    node_name,
 )
 
 _TEMPLATES = Path(__file__).parent / "ros_nodes"
@@ -89,8 +90,8 @@ def _files(application: Application, package: str) -> dict[str, str]:
         "DESCRIPTION": escape(" ".join(application.name.split())),
         "APPLICATION": ",\n".join(_node(application, name) for name in application.nodes),
         "LEAD_NS": str(_LEAD_NS + max(cb.timer_ns or 0 for _, cb in application.callbacks())),
-        "NODES": repr([_full(name) for name in application.nodes]),
-        "ASYNCHRONOUS": repr(sorted(map(_full, publishing))),
+        "NODES": repr([node_name(name) for name in application.nodes]),
+        "ASYNCHRONOUS": repr(sorted(map(node_name, publishing))),
         "SEED": str(application.seed),
     }
     files = {}
@@ -129,19 +130,15 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
             raise InputError(f"{place}: `{field}` cannot be generated for ROS 2: it is {reason}")
 
 
-def _full(name: str) -> str:
-    return "/" + name.strip("/")
-
-
 # The table in C++ --------------------------------------------------------------------------------
 
 
 def _node(application: Application, name: str) -> str:
     node, own = application.nodes[name], application.scheduling_of(name)
     both = [_list([one.core, one.priority]) for one in (own, application.dds_scheduling_of(name))]
-    threads = ", ".join([*both, _list(application.cores_of(name))])
-    callbacks = [_callback(application, node, one) for one in node.callbacks]
-    return f"  {{{_text(_full(name))}, {threads}, {{\n    {f',{chr(10)}    '.join(callbacks)}}}}}"
+    about = ", ".join([_text(node_name(name)), *both, _list(application.cores_of(name))])
+    callbacks = ",\n    ".join(_callback(application, node, one) for one in node.callbacks)
+    return f"  {{{about}, {{\n    {callbacks}}}}}"
 
 
 def _callback(

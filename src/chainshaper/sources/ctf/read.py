@@ -23,8 +23,6 @@ from chainshaper.sources.ctf.layout import Layout, Table, Wanted, lay_out
 from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scratch
 from chainshaper.values.compiled import kernel
 
-__all__ = ["Events", "count_events", "read_events"]
-
 _walk_events = kernel("chainshaper.sources.ctf.kernels", "walk_events")
 _fill_columns = kernel("chainshaper.sources.ctf.kernels", "fill_columns")
 _CHUNK_BYTES = 128 << 20

@@ -16,8 +16,6 @@ from chainshaper.sources.ctf.layout import Layout, Wanted, lay_out
 from chainshaper.sources.ctf.tsdl import CtfError, CtfFolder, TraceClass, TsdlError, parse_tsdl
 from chainshaper.values.compiled import kernel
 
-__all__ = ["METADATA_MAGIC", "CtfStream", "CtfTrace", "open_trace", "read_metadata"]
-
 _scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
 _rehash = kernel("chainshaper.sources.ctf.interpreter", "rehash")
 _REASONS = {

@@ -29,7 +29,12 @@ from chainshaper.linux.threads import parents, read_proc, read_stat, status_fiel
 from chainshaper.sources.ebpf import trace_points as tp
 from chainshaper.sources.ebpf.functions import callback_functions, open_regular
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
-from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+from chainshaper.sources.system import (
+    distribution_of,
+    own_pid_namespace,
+    processes_of,
+    rmw_of_gids,
+)
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
@@ -54,7 +59,7 @@ _SHORTEST_SUSPENSION_NS = 1_000_000
 _START_S, _READ_S, _STOP_S = 120.0, 10.0, 60.0
 _LOOK_S = 0.02
 _CAP_SYS_ADMIN, _CAP_PERFMON, _CAP_BPF = 21, 38, 39
-_FIRST_PID_NAMESPACE = "pid:[4026531836]"  # linux/proc_ns.h: PROC_PID_INIT_INO
+_FIRST_PID_NAMESPACE = 4026531836  # linux/proc_ns.h: PROC_PID_INIT_INO
 
 
 class EbpfTracer:
@@ -198,6 +203,7 @@ class EbpfTracer:
             rmw=printed.rmw or rmw_of_gids(tables),
             clock_offset_ns=self._clock_offset_ns,
             processes=processes_of(tables, commands),
+            pid_namespace=_FIRST_PID_NAMESPACE,
             lost={"lost_events": lost},
             notes=tuple(notes),
         )
@@ -248,7 +254,7 @@ class EbpfTracer:
         """The processes that events are limited to, with all that they start; empty: to none."""
         if self._attached and not self._pids:
             return ()
-        if Path("/proc/self/ns/pid").readlink() != Path(_FIRST_PID_NAMESPACE):
+        if own_pid_namespace() != _FIRST_PID_NAMESPACE:
             self._notes.append(
                 "inside a container bpftrace cannot tell which process is which: everything of "
                 "the same users on this machine that uses the same libraries was recorded, under "

@@ -7,11 +7,13 @@ column of nulls, and a note says so unless that is how a distribution is.
 
 Tables are decoded in groups that are used together, because one pass over a trace costs nearly the
 same for one table as for twenty. Containers number their processes independently of each other:
-folders of several hosts are read host by host, and where two of them use the same number, the later
-host's are moved (:data:`NEXT_HOST`). CARET emits the events of an application's start again when
+folders of several hosts are read host by host, and of one host (`--network host` has its name) path
+by path as they are given; where two use the same number, the later one's are moved
+(:data:`NEXT_HOST`). CARET emits the events of an application's start again when
 tracing begins; those carry ``init_timestamp``, when they really happened, and are put there.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -23,7 +25,13 @@ import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
 from chainshaper.sources.ctf import tsdl as ctf
-from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids, rmw_of_threads
+from chainshaper.sources.system import (
+    NEXT_HOST,
+    distribution_of,
+    processes_of,
+    rmw_of_gids,
+    rmw_of_threads,
+)
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import CREATION
@@ -33,9 +41,6 @@ __all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace", "table_na
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Gets the share of the work that is done, from 0 to 1, and what is being done."""
-
-NEXT_HOST = 10_000_000
-"""Added to the process and thread numbers of the next host; Linux goes up to 4,194,304."""
 
 _CARET_INIT = "caret_init"
 """An event that is read with the creation, but is no table of ours."""
@@ -69,7 +74,7 @@ def open_lttng_trace(
                 "another boot of this one): their times cannot be compared; give the folders of "
                 "one recording"
             )
-    tables = TraceTables(trace, progress, overview)
+    tables = TraceTables(_by_host(trace, paths), progress, overview)
     creation = tables.creation()
     hosts = sorted({_fact(folder.declared.env, "hostname") for folder in trace.folders})
     kernels = (_fact(folder.declared.env, "kernel_release") for folder in trace.folders)
@@ -110,8 +115,8 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     ``counts`` are the events per full name, provider included.
     """
 
-    def __init__(self, trace: CtfTrace, progress: Progress, overview: bool) -> None:
-        self._hosts = _by_host(trace)
+    def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress, overview: bool) -> None:
+        self._hosts, trace = hosts, next(iter(hosts.values()))
         self._fields = _declared_fields(trace)
         self._progress = progress
         self._read: dict[str, pl.DataFrame] = {}
@@ -273,13 +278,20 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._names |= {pid + self._moved[host]: name for pid, name in names.items()}
 
 
-def _by_host(trace: CtfTrace) -> dict[str, CtfTrace]:
-    """The trace in parts, one per host whose processes were traced.
+def _by_host(trace: CtfTrace, paths: Sequence[str | Path]) -> dict[str, CtfTrace]:
+    """The trace in parts, one per host whose processes were traced, or per path of that host.
 
     The kernel's folder goes with its own host, or with the first one.
     """
     hosts = [_fact(folder.declared.env, "hostname") for folder in trace.folders]
     kernel = [folder.declared.env.get("domain") == "kernel" for folder in trace.folders]
+    given = [next(p for p in paths if f.path.is_relative_to(p)) for f in trace.folders]
+    user = {(h, p) for h, p, k in zip(hosts, given, kernel, strict=True) if not k}
+    several = {host for host, count in Counter(host for host, _ in user).items() if count > 1}
+    hosts = [
+        f"{host} in {path}" if host in several and (host, path) in user else host
+        for host, path in zip(hosts, given, strict=True)
+    ]
     traced = list(dict.fromkeys(h for h, k in zip(hosts, kernel, strict=True) if not k))
     if len(traced) < 2:
         return {"": trace}

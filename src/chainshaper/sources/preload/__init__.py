@@ -37,9 +37,15 @@ from numpy.typing import NDArray
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import descendants, run_users
-from chainshaper.linux.threads import innermost_id, parents, read_proc
+from chainshaper.linux.threads import innermost_id, list_threads, parents, read_proc
 from chainshaper.sources.ebpf.trace_points import Argument, TracePoint, TracingLibrary, version_of
-from chainshaper.sources.system import distribution_of, processes_of, rmw_of_gids
+from chainshaper.sources.system import (
+    NEXT_HOST,
+    distribution_of,
+    own_pid_namespace,
+    processes_of,
+    rmw_of_gids,
+)
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
@@ -85,7 +91,7 @@ _HEADER = np.dtype(
     ]
 )
 _RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
-_MAGIC, _FORMAT = 0x63687368, 1
+_MAGIC, _FORMAT = 0x63687368, 2
 _TEXT, _LIBRARY, _FIRST_EVENT = 1, 2, 3
 _TEXT_BYTES, _PLACES = 40, 16
 _LARGEST = 1 << 30
@@ -104,12 +110,15 @@ def event_names() -> tuple[str, ...]:
 
 
 class TracedProcess:
-    """The memory of one process; ``pid`` is what it calls itself, ``lost`` what was overwritten.
+    """The memory of one process; ``lost`` counts what was overwritten.
+
+    ``pid`` is the process's number here, ``inner_pid`` what it calls itself: another one in a
+    container, whose threads get their numbers here, too.
 
     Raises InputError: the descriptor is of no such memory, or of one that may shrink.
     """
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, pid: int = 0) -> None:
         size = os.fstat(descriptor).st_size
         try:
             is_sealed = fcntl.fcntl(descriptor, _F_GET_SEALS) & _F_SEAL_SHRINK
@@ -125,7 +134,9 @@ class TracedProcess:
         wanted = of_rings + (objects + rings * records) * RECORD.itemsize
         if (one["magic"], one["format"]) != (_MAGIC, _FORMAT) or size < wanted or not records:
             raise InputError("what was sent is the memory of another version of chainshaper")
-        self.pid = one["pid"]
+        self.inner_pid = one["pid"]
+        self.pid = pid or self.inner_pid
+        self._tids: dict[int, int] = {}
         self._rings = np.frombuffer(memory, _RING, count=rings, offset=_HEADER.itemsize)
         self._objects = np.frombuffer(memory, RECORD, count=objects, offset=of_rings)
         behind = of_rings + objects * RECORD.itemsize
@@ -153,8 +164,19 @@ class TracedProcess:
             self.lost += min(whole, written) - read
             self._read[number] = written
             if whole < written:
-                found.append(copied[whole - oldest :])
+                found.append(self._numbered(copied[whole - oldest :]))
         return found
+
+    def _numbered(self, records: NDArray[Any]) -> NDArray[Any]:
+        """Records with the numbers that their threads have here, as long as they run."""
+        if self.pid == self.inner_pid:
+            return records
+        inner, places = np.unique(records["tid"], return_inverse=True)
+        if not self._tids.keys() >= set(inner.tolist()):
+            self._tids |= {one.inner_tid: one.tid for one in list_threads(self.pid)}
+        numbers = [self._tids.setdefault(tid, tid + NEXT_HOST) for tid in inner.tolist()]
+        records["tid"] = np.array(numbers, np.uint32)[places]
+        return records
 
     def objects(self) -> tuple[NDArray[Any], dict[int, dict[int, str]]]:
         """The events of creation so far, and by the number of one of these the texts of it.
@@ -179,7 +201,7 @@ class TracedProcess:
             }
             for number, of_event in texts.items()
         }
-        return records[own], read
+        return self._numbered(records[own]), read
 
 
 def creation_tables(process: TracedProcess) -> tuple[dict[str, pl.DataFrame], TracingLibrary]:
@@ -229,6 +251,7 @@ def info_of(
         rmw=rmw_of_gids(tables),
         clock_offset_ns=clock_offset_ns,
         processes=processes_of(tables, names),
+        pid_namespace=own_pid_namespace(),
         lost={"lost_events": lost},
     )
 
@@ -407,8 +430,8 @@ def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[i
             for descriptor in (process / "fd").iterdir():
                 if _MEMORY.match(str(descriptor.readlink())):
                     with suppress(InputError), descriptor.open("rb") as file:
-                        memory = TracedProcess(file.fileno())
-                        if memory.pid == own:  # else it is one that reads it, as we do
+                        memory = TracedProcess(file.fileno(), int(process.name))
+                        if memory.inner_pid == own:  # else it is one that reads it, as we do
                             yield int(process.name), memory
                             break
 
@@ -548,7 +571,7 @@ class PreloadTracer:
         for descriptor in descriptors:
             with suppress(InputError):
                 if user in self._users:
-                    process = TracedProcess(descriptor)
+                    process = TracedProcess(descriptor, pid)
                     self._processes.append(process)
                     with suppress(OSError):
                         self._names[process.pid] = Path(f"/proc/{pid}/comm").read_text().strip()

@@ -42,7 +42,7 @@
 #include <unistd.h>
 
 #define NAME "chainshaper-trace"
-#define FORMAT 1
+#define FORMAT 2
 #define RINGS 64u
 #define RING_RECORDS (1u << 14)  // 0.8 s of 20,000 events a second, of each thread
 #define OBJECT_RECORDS (1u << 15)
@@ -89,6 +89,7 @@ static __thread struct {
   uint32_t tid;
   struct rseq_area *rseq;             // NULL: a switch cannot be noticed
   uint64_t used, used_at, last_used;  // CPU time as read, when that was, and as last written
+  bool calls_timer;
 } own;
 
 static inline uint64_t now(clockid_t clock) {
@@ -346,6 +347,8 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
 // EVENT: name, arguments that are values. TIMED: the same, CPU time behind them. CREATION: name, the
 // places of texts as bits, that of a gid (0: none). CALL: handle, message, gid, sequence number and
 // source timestamp of a service's call. A record's number is the place in this list.
+// Not in it: rclcpp_executor_get_next_ready and _wait_for_work. Executors of several threads emit
+// some 100,000 a second while a callback group with waiting messages is busy.
 #define ALL_EVENTS \
   CREATION(rcl_init, 0, 0) \
   CREATION(rcl_node_init, BIT(2) | BIT(3), 0) \
@@ -379,9 +382,8 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
   EVENT(rclcpp_ring_buffer_enqueue, 4) \
   EVENT(rclcpp_ring_buffer_dequeue, 3) \
   EVENT(rclcpp_ring_buffer_clear, 1) \
-  EVENT(rclcpp_executor_get_next_ready, 0) \
-  EVENT(rclcpp_executor_wait_for_work, 1) \
   EVENT(rclcpp_executor_execute, 1) \
+  EVENT(rcl_timer_call, 1) \
   CALL(rmw_send_request) \
   CALL(rmw_take_request) \
   CALL(rmw_send_response) \
@@ -480,3 +482,20 @@ int rmw_send_response(const void *service, struct request_id *id, void *response
   }
 TAKE(rmw_take_request)
 TAKE(rmw_take_response)
+
+// Functions of rcl, of which ros2_tracing has no event. Since Jazzy the one may call the other.
+typedef int (*timer_function)(uint64_t timer, uint64_t information);
+#define TIMER_CALL(name) \
+  int name(uint64_t timer, uint64_t information) { \
+    static _Atomic(timer_function) behind; \
+    bool outer = !own.calls_timer; \
+    if (!behind) behind = (timer_function)next_one(#name); \
+    own.calls_timer = true; \
+    int result = behind(timer, information); \
+    if (!outer) return result; \
+    own.calls_timer = false; \
+    if (!result) write_record(number_rcl_timer_call, 0, 1, (uint64_t[6]){timer}, false); \
+    return result; \
+  }
+TIMER_CALL(rcl_timer_call)
+TIMER_CALL(rcl_timer_call_with_info)

@@ -60,11 +60,14 @@ void require(bool done, const std::string &what) {
   }
 }
 
-void stay_on(pid_t thread, int core) {
+void stay_on(pid_t thread, const std::vector<int> &wanted) {
   std::vector<cpu_set_t> cores(8);  // of 1024 each
-  CPU_SET_S(core, cores.size() * sizeof(cpu_set_t), cores.data());
-  require(sched_setaffinity(thread, cores.size() * sizeof(cpu_set_t), cores.data()) == 0,
-          "core " + std::to_string(core));
+  std::string said = "core";
+  for (const int core : wanted) {
+    CPU_SET_S(core, cores.size() * sizeof(cpu_set_t), cores.data());
+    said += " " + std::to_string(core);
+  }
+  require(sched_setaffinity(thread, cores.size() * sizeof(cpu_set_t), cores.data()) == 0, said);
 }
 
 std::vector<int> cores_in_turn;  // for threads of the executor, each at its first callback
@@ -74,7 +77,7 @@ void take_core() {
   thread_local bool taken = false;
   if (taken || cores_in_turn.empty()) return;
   taken = true;
-  stay_on(0, cores_in_turn[next++ % cores_in_turn.size()]);
+  stay_on(0, {cores_in_turn[next++ % cores_in_turn.size()]});
 }
 
 // What a callback does: spend its time, and pass a stamp on to all its topics. Several threads may
@@ -245,11 +248,14 @@ void schedule(const Described &described) {
     std::ifstream{task.path() / "comm"} >> name;
     if (name.find("-ust") != std::string::npos) continue;
     const pid_t thread = std::stoi(task.path().filename());
-    const Threads &wanted = thread == getpid() ? described.executor : described.dds;
+    const bool executes = thread == getpid();
+    const Threads &wanted = executes ? described.executor : described.dds;
     sched_param parameters{};
     parameters.sched_priority = wanted.priority;
     require(sched_setscheduler(thread, SCHED_FIFO, &parameters) == 0, "SCHED_FIFO");
-    stay_on(thread, wanted.core);
+    // Several share their cores at first: behind one that computes, none could get to a callback.
+    const bool several = executes && described.cores.size() > 1;
+    stay_on(thread, several ? described.cores : std::vector<int>{wanted.core});
   }
   cores_in_turn = described.cores;
 }

@@ -1,0 +1,66 @@
+"""Processes in namespaces of their own, as containers have them, without a container engine."""
+
+import os
+import shutil
+import signal
+import subprocess
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+
+import pytest
+from processes import children_of, wait_for
+
+from chainshaper.linux.processes import Process, read_process
+
+__all__ = ["contained", "in_container", "needs_namespaces"]
+
+_OPTIONS = ("--pid", "--mount", "--ipc", "--fork", "--kill-child", "--mount-proc")
+_AS_USER = ("--user", "--map-root-user")
+_OWN_MEMORY = 'mount -t tmpfs none /dev/shm && mkdir -p /run && mount -t tmpfs none /run; exec "$@"'
+needs_namespaces = pytest.mark.skipif(
+    os.geteuid() != 0 or shutil.which("unshare") is None,
+    reason="namespaces of processes need root and unshare",
+)
+
+
+def in_container(command: Sequence[str], *, user: bool = False) -> list[str]:
+    """The command with pids, mounts and memory of its own; ``user``: where it is root as well."""
+    return [
+        "unshare",
+        *_OPTIONS,
+        *(_AS_USER if user else ()),
+        "sh",
+        "-c",
+        _OWN_MEMORY,
+        "sh",
+        *command,
+    ]
+
+
+@contextmanager
+def contained(
+    command: Sequence[str], environment: Mapping[str, str] | None = None, *, user: bool = False
+) -> Iterator[tuple["subprocess.Popen[str]", Process]]:
+    """A container with a command, until it is left: `unshare`, and the process as seen here."""
+    started = subprocess.Popen(
+        in_container(command, user=user),
+        env={**os.environ, **(environment or {})},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        found: list[Process] = []
+
+        def runs() -> bool:
+            assert started.poll() is None, "no such namespaces can be made here"
+            inside = [read_process(pid) for pid in children_of(started.pid)]
+            found[:] = [one for one in inside if one and one.command == tuple(command)]
+            return bool(found)
+
+        wait_for(runs, "the command in its container")
+        yield started, found[0]
+    finally:
+        for pid in children_of(started.pid):  # process 1 in there: all others end with it
+            os.kill(pid, signal.SIGKILL)
+        started.communicate()

@@ -1,0 +1,65 @@
+"""A plan in force, from here, on nodes in containers that call themselves alike."""
+
+import json
+import signal
+import time
+from contextlib import ExitStack
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from applied_plans import (
+    FREEZER,
+    MS,
+    applied,
+    leftovers,
+    needs_fifo,
+    node_command,
+    plan_for,
+    scheduling,
+    server,
+)
+from command_line import called
+from containers import contained, needs_namespaces
+from gated import needs_cgroups
+from processes import wait_for
+
+from chainshaper.linux.threads import list_threads
+
+pytestmark = [needs_fifo, needs_cgroups, needs_namespaces, pytest.mark.timed]
+PLAN = plan_for(server("first", "origin", (0, 30)), server("second", "other", (40, 70)))
+
+
+def _has_lines(output: Path) -> bool:
+    return output.exists() and output.stat().st_size > 0
+
+
+def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> None:
+    """Each is process 1 in its container; one is governed in each slot, both are as before."""
+    with ExitStack() as both:
+        pids = {}
+        for name, busy in (("origin", MS), ("other", 2 * MS)):
+            output = tmp_path / name
+            command = node_command(name, output, period=10 * MS, busy=busy)
+            _, process = both.enter_context(contained(command, user=name == "other"))
+            assert process.inner_pid == 1
+            wait_for(partial(_has_lines, output), name)
+            pids[name] = process.pid
+        before = {name: scheduling(pid) for name, pid in pids.items()}
+        with applied(PLAN, tmp_path, *FREEZER, "--json") as run:
+            time.sleep(1.5)
+            policies = {name: list_threads(pid)[0].policy for name, pid in pids.items()}
+            assert policies == dict.fromkeys(pids, "SCHED_FIFO")
+            released = called("release", "--crashed")
+            assert (released.code, run.poll()) == (0, None), "what is in force stays so"
+            (status,) = json.loads(called("status", "--json").out)
+            run.send_signal(signal.SIGINT)
+            run.communicate(timeout=30)
+            assert run.returncode == 0
+        assert status["state"]["servers"][1]["counters"]["slots"] > 8
+        lines = [line.split() for line in (tmp_path / "other").read_text().splitlines()[:-1]]
+        pauses = [int(after[0]) - int(before[1]) for before, after in pairwise(lines)]
+        assert sum(pause > 60 * MS for pause in pauses) > 8, "closed for 70 ms in every cycle"
+        assert {name: scheduling(pid) for name, pid in pids.items()} == before
+    wait_for(lambda: not leftovers(), "runs and cgroups to be removed")

@@ -1,0 +1,227 @@
+"""Every executor of rclcpp and rclpy: what is recorded of it is what its messages say themselves.
+
+The nodes of `executing.cpp` and `executing.py` note for each callback instance which origin it
+handled, on which thread and when. ``CHAINSHAPER_SHAPED=FOLDER`` has the recordings written there.
+"""
+
+import json
+import os
+import subprocess
+import sys
+from collections import defaultdict
+from collections.abc import Callable
+from itertools import accumulate
+from pathlib import Path
+from typing import Any, NamedTuple, TypeAlias
+
+import polars as pl
+import pytest
+from ros2 import ros2_environment
+
+from chainshaper import load_plan, open_recording
+from chainshaper.analysis import analyse_latency, data_flow, executors
+from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.values.recording import Recording
+
+pytestmark = [pytest.mark.ros2, pytest.mark.timeout(600)]
+
+HERE = Path(__file__).parent
+LAUNCH = """
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+def generate_launch_description():
+    return LaunchDescription([
+        Node(executable=program, name=name, arguments=words)
+        for program, name, *words in {nodes!r}
+    ])
+"""
+
+
+class Noted(NamedTuple):
+    """A callback instance as it was noted; without a publication `before` and `behind` are 0."""
+
+    callback: str
+    tid: int
+    origin: int
+    began: int
+    before: int
+    behind: int
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The node of C++, which is built first."""
+    folder = tmp_path_factory.mktemp("executing")
+    for step in (["-S", str(HERE), "-B", str(folder)], ["--build", str(folder)]):
+        words = ["env", "cmake", *step, *(["--target", "executing"] if "--build" in step else [])]
+        run = subprocess.run(
+            words, env=ros2_environment(), capture_output=True, text=True, check=False
+        )
+        if "No rule to make target" in run.stdout + run.stderr or "unknown target" in run.stderr:
+            pytest.skip("this rclcpp has no events executor")
+        assert run.returncode == 0, run.stdout + run.stderr
+    return folder / "executing"
+
+
+Ran: TypeAlias = Callable[..., tuple[Path, Any]]
+
+
+@pytest.fixture
+def ran(program: Path, tmp_path: Path) -> Ran:
+    def ran(verb: str, language: str, words: str, *options: str) -> tuple[Path, Any]:
+        worker = tmp_path / "worker"
+        worker.unlink(missing_ok=True)
+        worker.write_text(f'#!/bin/sh\nexec python3 "{HERE / "executing.py"}" "$@"\n')
+        worker.chmod(0o755)
+        executable = str(program if language == "C++" else worker)
+        nodes = [
+            (executable, "worker", str(tmp_path / "notes"), *words.split()),
+            (str(program), "actuator", str(tmp_path / "sink"), "single", "sink"),
+        ]
+        launch = tmp_path / "robot.launch.py"
+        launch.write_text(LAUNCH.replace("{nodes!r}", repr(nodes)))
+        folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / "-".join(
+            [verb, language, *words.split()[:2]]
+        )
+        known = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
+        known["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+        command = [sys.executable, "-m", "chainshaper", verb, "-o", str(folder), *options, "--json"]
+        run = subprocess.run(
+            [*command, "--", "ros2", "launch", str(launch)],
+            env={**ros2_environment(), **known},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert run.returncode == 0, run.stderr[-3000:]
+        return folder, json.loads(run.stdout)
+
+    return ran
+
+
+def noted(file: Path) -> list[Noted]:
+    lines = (line.split() for line in file.read_text().splitlines())
+    return [Noted(name, *map(int, rest)) for name, *rest in lines]
+
+
+def at_once(notes: list[Noted], *callbacks: str) -> int:
+    """How many instances ran beside each other at most."""
+    steps = [(one.began, 1) for one in notes if one.callback in callbacks]
+    steps += [(one.behind or one.began, -1) for one in notes if one.callback in callbacks]
+    return max(accumulate(step for _, step in sorted(steps)))
+
+
+def check_traversals(recording: Recording, chain: str, names: tuple[str, ...], file: Path) -> int:
+    """Every traversal is that of one origin, as the callbacks noted it, and none is missing.
+
+    Returns how many there are.
+    """
+    notes, of_thread = noted(file), defaultdict[tuple[str, int], list[Noted]](list)
+    for one in sorted(notes, key=lambda one: one.began):
+        of_thread[one.callback, one.tid].append(one)
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    found, tids = analyse_latency(flow, chain), flow.instances["tid"].to_list()
+    hops = found.hops.sort("traversal", "hop").partition_by("traversal", as_dict=True)
+    origins = set()
+    for row in found.traversals.filter("complete").iter_rows(named=True):
+        seen = []
+        for name, hop in zip(
+            names, hops[row["traversal"],].head(len(names)).iter_rows(named=True), strict=True
+        ):
+            own = of_thread[name, tids[hop["instance"]]]
+            begun_outside = (
+                name == "timer" and flow.instances["start"][hop["instance"]] == hop["publish"]
+            )
+            started = [
+                one
+                for one in own
+                if (
+                    one.before <= hop["publish"] <= one.behind
+                    if begun_outside
+                    else one.began >= hop["start"]
+                )
+            ]
+            seen.append(started[0].origin)
+        assert len(set(seen)) == 1, f"one traversal of the origins {seen}"
+        end = hops[row["traversal"],]["publish"][len(names) - 1]
+        assert any(one.before <= end <= one.behind for one in notes if one.origin == seen[0])
+        origins.add(seen[0])
+    until = flow.publications.select(pl.col("time").max()).item()
+    outputs = {one.origin for one in notes if one.callback in OUTPUTS and 0 < one.behind < until}
+    since = min(origins)
+    assert {one for one in outputs if one >= since} <= origins
+    return len(origins)
+
+
+OUTPUTS = ("last", "left", "right")
+
+
+@pytest.mark.parametrize(
+    ("language", "executor_and_source", "threads"),
+    [
+        ("C++", "multi preload", [4]),
+        ("C++", "multi lttng", [4]),
+        ("C++", "static preload", [1]),
+        ("C++", "events preload", [2]),
+        ("C++", "events-timers preload", [1, 1]),
+        ("C++", "groups preload", [1, 1, 1]),
+        ("Python", "single preload", [1]),
+        ("Python", "single lttng", [1]),
+        ("Python", "multi preload", [5]),
+    ],
+)
+def test_traversals_and_threads_are_what_the_callbacks_say(
+    ran: Ran, tmp_path: Path, language: str, executor_and_source: str, threads: list[int]
+) -> None:
+    executor, source = executor_and_source.split()
+    several = executor == "multi"
+    words = f"{executor} line 60 {30 if several else 5} {150 if several else 30} sleep"
+    folder, _ = ran("record", language, words, "--source", source, "--duration", "8s")
+    recording, names = open_recording(folder), ("timer", "work", "last")
+    assert check_traversals(recording, "/begun../done", names, tmp_path / "notes") > 40
+    if several:
+        assert at_once(noted(tmp_path / "notes"), "work") > 1
+    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    (worker,) = recording.events["rcl_node_init"].filter(node_name="worker")["pid"]
+    own = [one for one in executors(flow) if one.pid == worker]
+    assert sorted(len(one.threads) for one in own) == threads
+    ran_by = {one.tid for one in noted(tmp_path / "notes")}
+    assert ran_by <= {tid for one in own for tid in one.threads}
+
+
+@pytest.mark.parametrize("first", ["left", "right"])
+def test_sets_that_several_threads_complete(ran: Ran, tmp_path: Path, first: str) -> None:
+    folder, _ = ran("record", "C++", "multi join 20 10 50 sleep", "--duration", "8s")
+    notes = noted(tmp_path / "notes")
+    assert at_once(notes, "left", "right") > 1
+    names, by = ("timer", first), {one.callback for one in notes if one.before} - {"timer"}
+    assert by == {"left", "right"}, "which comes last changes"
+    found = check_traversals(open_recording(folder), f"/{first}../done", names, tmp_path / "notes")
+    assert found > 100
+
+
+@pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
+@pytest.mark.parametrize(
+    ("language", "executor", "threads"),
+    [("C++", "multi", 4), ("C++", "static", 1), ("C++", "events", 2), ("Python", "multi", 5)],
+)
+def test_one_command_shapes_a_chain_on_this_executor(
+    ran: Ran, tmp_path: Path, language: str, executor: str, threads: int
+) -> None:
+    options = ["--chain", "/begun../done", "--epsilon", "5ms", "--duration", "15s"]
+    folder, values = ran("shape", language, f"{executor} line 100 5 30 compute", *options)
+    before, after = values["recordings"]
+    assert after["count"] > 80
+    assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 10
+    servers = {one.name: one for one in load_plan(folder / "plan.yaml").servers}
+    assert [one.node for one in servers["chain"].threads] == ["/worker"]
+    names, recording = ("timer", "work", "last"), open_recording(folder / "after")
+    raised = {
+        one.tid
+        for one in recording.info.threads
+        if one.node == "/worker" and one.role == "executor"
+    }
+    assert len(raised) == threads
+    assert {one.tid for one in noted(tmp_path / "notes")} <= raised
+    assert check_traversals(recording, "/begun../done", names, tmp_path / "notes") > 80

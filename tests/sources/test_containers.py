@@ -1,0 +1,93 @@
+"""Nodes in containers: two of them call themselves alike, and stay apart in a recording."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+
+from command_line import called, json_of
+from containers import contained, in_container, needs_namespaces
+from known import known
+from traced_program import built, skip_without_bpftrace
+
+import chainshaper as cs
+from chainshaper.flow.threads import recorded_processes
+from chainshaper.linux.processes import Process, user_of
+from chainshaper.sources.preload import build_library
+from chainshaper.sources.system import NEXT_HOST
+
+pytestmark = needs_namespaces
+
+
+def _running(
+    stack: ExitStack,
+    command: Sequence[str],
+    environment: Mapping[str, str] | None = None,
+    *,
+    user: bool = False,
+) -> Process:
+    """The program in a container, once its objects are there."""
+    started, process = stack.enter_context(contained(command, environment, user=user))
+    assert known(started.stdout).readline() == "ready\n"
+    known(started.stdin).write("\n")
+    known(started.stdin).flush()
+    return process
+
+
+def _recorded(output: Path, source: str, processes: Sequence[Process]) -> set[int]:
+    """Record processes for a second; their ids."""
+    words = [word for one in processes for word in ("--pid", str(one.pid))]
+    made = called("record", "--source", source, "-o", output, "--duration", "600ms", *words)
+    assert made.code == 0, made.err
+    return {one.pid for one in processes}
+
+
+def _assert_apart(recording: Path, pids: set[int]) -> None:
+    """Both have the numbers that they have here."""
+    tables = cs.open_recording(recording).events
+    started = tables["callback_start"]
+    assert set(started["pid"]) == pids
+    assert set(started["tid"]) == pids, "their main threads"
+    for pid in pids:
+        own = [one for one in json_of("callbacks", recording, "--json") if one["pid"] == pid]
+        assert [one["tids"] for one in own] == [[pid], [pid]]
+
+
+def test_two_containers_are_recorded_by_the_library_in_front(tmp_path: Path) -> None:
+    """In one of them root is another user than here."""
+    environment = {"LD_PRELOAD": str(build_library(tmp_path))}
+    command = built().command("chain", "60", "--ros-args")
+    with ExitStack() as both:
+        inside = [_running(both, command, environment, user=user) for user in (False, True)]
+        assert [one.inner_pid for one in inside] == [1, 1]
+        assert {user_of(one.pid) for one in inside} == {0}
+        pids = _recorded(tmp_path / "rec", "preload", inside)
+        _assert_apart(tmp_path / "rec", pids)
+        recording = cs.open_recording(tmp_path / "rec")
+        recorded, _ = recorded_processes(recording)
+        assert {one.pid for one in recorded if one.numbered_here} == pids
+        threads = cs.find_threads(recording=recording).threads
+        roles = {(t.thread.pid, t.thread.tid, t.thread.role, t.known_by) for t in threads}
+        assert {one for one in roles if one[0] in pids} == {
+            (pid, pid, "executor", "recording") for pid in pids
+        }
+
+
+def test_a_command_that_starts_a_container_is_recorded(tmp_path: Path) -> None:
+    command = in_container(built().command("chain", "5"))
+    made = called("record", "--source", "preload", "-o", tmp_path / "rec", "--", *command)
+    assert made.code == 0, made.err
+    started = cs.open_recording(tmp_path / "rec").events["callback_start"]
+    assert set(started["pid"]) != {1}
+    assert set(started["pid"]) == set(started["tid"].unique()) or (started["tid"] > NEXT_HOST).all()
+
+
+def test_two_containers_are_recorded_by_ebpf(tmp_path: Path) -> None:
+    skip_without_bpftrace()
+    command = built().command("chain", "400", "--ros-args", "-r", "__node:=both")
+    with ExitStack() as both:
+        inside = [_running(both, command) for _ in range(2)]
+        pids = _recorded(tmp_path / "rec", "ebpf", inside)
+        assert set(cs.open_recording(tmp_path / "rec").events["callback_start"]["pid"]) == pids
+        recording = cs.open_recording(tmp_path / "rec")
+        threads = cs.find_threads(recording=recording).threads
+        assert {t.thread.pid for t in threads if t.known_by == "recording"} == pids
