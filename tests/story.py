@@ -107,6 +107,37 @@ class Story:
             self.event("rclcpp_callback_register", *at, callback=callback.handle, symbol=symbol)
         return callback
 
+    def client(self, node: Node, service: str, gid: int | None = None) -> Callback:
+        """A client of a service; its gid is known where tracetools has `rmw_client_init`."""
+        end = Callback(node.pid, self.handle(), self.handle())
+        about: dict[str, Any] = {"node_handle": node.handle, "service_name": service}
+        if gid is not None:
+            named: dict[str, Any] = {"rmw_client_handle": end.rmw_subscription, "gid": [gid] * 16}
+            self.event("rmw_client_init", 0, node.pid, **named)
+        about |= {"client_handle": end.handle, "rmw_client_handle": end.rmw_subscription}
+        self.event("rcl_client_init", 0, node.pid, **about)
+        return end
+
+    def service(self, node: Node, service: str, *, callbackless: bool = False) -> Callback:
+        rcl, end = self.handle(), Callback(node.pid, self.handle(), self.handle())
+        about: dict[str, Any] = {"node_handle": node.handle, "service_name": service}
+        about |= {"service_handle": rcl, "rmw_service_handle": end.rmw_subscription}
+        self.event("rcl_service_init", 0, node.pid, **about)
+        if not callbackless:
+            added = {"service_handle": rcl, "callback": end.handle}
+            self.event("rclcpp_service_callback_added", 0, node.pid, **added)
+        return end
+
+    def call(
+        self, what: str, end: Callback, time: int, number: int, tid: int | None = None, **more: Any
+    ) -> None:
+        """``what``: send_request, take_request, send_response or take_response."""
+        role = "client" if what in ("send_request", "take_response") else "service"
+        about = {f"rmw_{role}_handle": end.rmw_subscription, "sequence_number": number, **more}
+        if role == "service":
+            about["client_gid"] = [about["client_gid"]] * 16
+        self.event(f"rmw_{what}", time, end.pid, tid, **about)
+
     def start(self, callback: Callback, time: int, tid: int | None = None, intra: int = 0) -> None:
         about = {"callback": callback.handle, "is_intra_process": intra}
         self.event("callback_start", time, callback.pid, tid, **about)

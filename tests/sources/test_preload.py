@@ -281,6 +281,58 @@ def test_the_library_has_the_arguments_that_trace_points_have() -> None:
             assert int(rest) == max((one.place + 1 for one in arguments), default=0), name
 
 
+RMW = """
+#include <stdbool.h>
+#include <stdint.h>
+#include <string.h>
+struct info { int64_t sent, received; uint8_t writer[16]; int64_t number; };
+int rmw_send_request(const void *c, const void *r, int64_t *number) { *number = 41; return c == r; }
+int rmw_send_response(const void *s, void *id, void *r) { return 0; }
+int rmw_take_request(const void *s, struct info *info, void *r, bool *taken)
+{
+    info->sent = 1234, info->number = 42, memset(info->writer, 7, 16), *taken = r != 0;
+    return 0;
+}
+int rmw_take_response(const void *c, struct info *info, void *r, bool *taken)
+{
+    info->sent = 5678, info->number = 43, *taken = true;
+    return 0;
+}
+"""
+"""An rmw that stands behind the library: what fails, and what takes nothing, is no call."""
+CALLS = """
+address, number, taken = ctypes.c_void_p, ctypes.c_int64(), ctypes.c_bool()
+info = ctypes.create_string_buffer(40)
+for client in (1, 2): library.rmw_send_request(address(client), address(2), ctypes.byref(number))
+for request in (0, 3):
+    library.rmw_take_request(address(4), info, address(request), ctypes.byref(taken))
+library.rmw_send_response(address(4), ctypes.byref(info, 16), address(5))
+library.rmw_take_response(address(1), info, address(6), ctypes.byref(taken))
+assert number.value == 41 and taken.value
+"""
+
+
+def test_calls_of_services_are_seen_between_rcl_and_rmw(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "rmw.c").write_text(RMW)
+    library = tmp_path / "librmw.so"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "rmw.c"], check=True)
+    monkeypatch.setenv("LD_PRELOAD", str(library))
+    tables = traced(tracer_of(tmp_path), lambda: python(CALLS)).tables
+    seen = {
+        name: tables[f"rmw_{name}"].drop("time", "pid", "tid", "cpu").rows()
+        for name in ("send_request", "take_request", "send_response", "take_response")
+    }
+    gid = [7] * 16
+    assert seen == {
+        "send_request": [(1, 2, 41)],
+        "take_request": [(4, 3, gid, 42, 1234)],
+        "send_response": [(4, 5, gid, 42)],
+        "take_response": [(1, 6, 43, 5678)],
+    }
+
+
 def test_what_comes_faster_than_it_is_read_is_counted(tmp_path: Path) -> None:
     count = 40 * RING
     run = traced(

@@ -1,9 +1,10 @@
 """Computation chains: finding the one that a person means, and listing those there are.
 
-A chain is written ``FIRST..LAST``, with more way points (topics or nodes) where several paths
-match. One that begins with a topic starts at the callback that publishes it, and every chain ends
-with the publication of its last topic (paper, section 2.3): of a last node that is the topic it
-publishes, or, if it publishes nothing, the one it subscribes to.
+A chain is written ``FIRST..LAST``, with more way points (topics, services or nodes) where several
+paths match. One that begins with a topic starts at the callback that publishes it, and every chain
+ends with the publication of its last topic (paper, section 2.3): of a last node that is the topic
+it publishes, or, if it publishes nothing, the one it subscribes to. A service is its request as
+long as the chain goes on behind it, and its response where the chain ends.
 
 The number of simple paths grows exponentially with cycles and fan-in, and counting them is #P-hard.
 Without cycles every step forward leads to an end, so listing needs no search. With cycles the
@@ -19,13 +20,19 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from itertools import count as counting
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import TypeAlias
 
 from pydantic import BaseModel, Field, ValidationError
 
-from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain
+from chainshaper.values.application import (
+    INTERNAL_TOPICS,
+    REQUEST,
+    RESPONSE,
+    ApplicationGraph,
+    Chain,
+)
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import PlainData, compose, read_text
 
@@ -143,7 +150,7 @@ def enumerate_chains(
         chains=chains,
         complete=complete,
         count=len(chains) if complete else max(count, met),
-        exact=complete or not search.cyclic,
+        exact=complete or not (search.cyclic or search.calls),
         heaviest=heaviest,
         heaviest_ns=heaviest_ns if heaviest else None,
     )
@@ -200,15 +207,19 @@ class _Search:
         self.graph, self.spec, self.any_end = graph, spec, any_end
         self.callbacks = {callback.id: callback for callback in graph.callbacks}
         self.stages = [self._stage(name) for name in waypoints]
+        for place, (name, vertices) in enumerate(self.stages):
+            if {name + REQUEST, name + RESPONSE} == vertices:  # a service ends with its response
+                ending = RESPONSE if 0 < place == len(waypoints) - 1 else REQUEST
+                self.stages[place] = name, frozenset[Vertex]((name + ending,))
         starts = self._sources() if any_start else self._starts(*self.stages[0])
         if any_start:  # every source is as good as a first way point
             self.stages.insert(0, ("any source", frozenset[Vertex](starts)))
-        listening = [c for c in graph.callbacks if c.kind == "subscription"]
-        self.going_on = {c.topic for c in listening if set(c.publishes) - INTERNAL_TOPICS}
+        listening = [c for c in graph.callbacks if c.trigger is not None]
+        self.calls = any(c.kind == "client" and c.publishes for c in listening)
+        self.going_on = {c.trigger for c in listening if set(c.publishes) - INTERNAL_TOPICS}
         self.subscribers: dict[Vertex, list[int]] = {}
         for callback in listening:
-            if callback.topic is not None:
-                self.subscribers.setdefault(callback.topic, []).append(callback.id)
+            self.subscribers.setdefault(callback.trigger or "", []).append(callback.id)
         self.ignored = INTERNAL_TOPICS.difference(*(vertices for _, vertices in self.stages))
         roots = [self._enter(start, 0) for start in sorted(starts)]
         reached: dict[State, tuple[State, ...]] = {}
@@ -235,10 +246,12 @@ class _Search:
         )
 
     def _stage(self, name: str) -> tuple[str, frozenset[Vertex]]:
-        """What a way point stands for: a topic, or all callbacks of a node."""
+        """What a way point stands for: a topic, a service's messages, or a node's callbacks."""
         nodes: dict[str, set[int]] = {node.name: set() for node in self.graph.nodes}
-        topics = set(self.graph.topics)
+        topics, services = set(self.graph.topics), set[str | None]()
         for callback in self.graph.callbacks:
+            if callback.kind in ("service", "client"):
+                services.add(callback.topic)
             nodes.setdefault(callback.node, set()).add(callback.id)
             topics.update(callback.publishes)
         for candidate in (name, f"/{name}"):
@@ -246,6 +259,14 @@ class _Search:
                 return candidate, frozenset[Vertex]((candidate,))
             if candidate in nodes:
                 return candidate, frozenset[Vertex](nodes[candidate])
+            if calls := topics & {candidate + REQUEST, candidate + RESPONSE}:
+                return candidate, frozenset[Vertex](calls)
+            if candidate in services:
+                raise InputError(
+                    f"chain {self.spec!r}: no call of the service {candidate} was recorded; before "
+                    "Kilted (tracetools 8.5), calls have no trace points: `record --source "
+                    "preload` sees them on all distributions"
+                )
         if not topics:
             raise InputError(
                 f"chain {self.spec!r}: the recording shows no topics at all; tracing has to start "
@@ -262,7 +283,9 @@ class _Search:
 
     def _starts(self, name: str, vertices: frozenset[Vertex]) -> set[int]:
         if not any(isinstance(vertex, str) for vertex in vertices):
-            return {vertex for vertex in vertices if isinstance(vertex, int)}
+            own = {vertex for vertex in vertices if isinstance(vertex, int)}
+            # What a node does with a response, it began with the request.
+            return {one for one in own if self.callbacks[one].kind != "client"} or own
         starts = {
             one.id
             for one in self.graph.callbacks
@@ -282,8 +305,7 @@ class _Search:
         return {
             callback.id
             for callback in self.graph.callbacks
-            if set(callback.publishes) - INTERNAL_TOPICS
-            and not (callback.kind == "subscription" and callback.topic in published)
+            if set(callback.publishes) - INTERNAL_TOPICS and callback.trigger not in published
         }
 
     def _is_end(self, state: State) -> bool:
@@ -319,6 +341,11 @@ class _Search:
 
     def why_no_path(self) -> str:
         """Why there is no path, for a message."""
+        if self.roots and not self.cyclic:
+            return (
+                f"chain {self.spec!r}: it leads through a service to a node that did not call it; "
+                "responses go back to the node that sent the request"
+            )
         if self.roots:
             return (
                 f"chain {self.spec!r}: it can only be closed by passing the same callback or topic "
@@ -328,7 +355,7 @@ class _Search:
         met = self.furthest
         from_name = self.stages[max(met - 1, 0)][0]
         topics = sorted(vertex for vertex in self.reached if isinstance(vertex, str))
-        heard = {c.topic for c in self.graph.callbacks if c.kind == "subscription" and c.publishes}
+        heard = {c.trigger for c in self.graph.callbacks if c.publishes}
         stops = [topic for topic in topics if topic not in heard] or topics
         if not met or not stops:
             return f"chain {self.spec!r}: no callback of {from_name} publishes anything"
@@ -367,10 +394,24 @@ class _Search:
                     if path:
                         path.popitem()
                 elif state in self.ends:
-                    yield (*path, state[0])
+                    if self._returns((*path, state[0])):
+                        yield (*path, state[0])
                 else:
                     path[state[0]] = None
                     stack.append(iter(onward(self.successors[state], path)))
+
+    def _returns(self, path: GraphPath) -> bool:
+        """Whether responses go to the nodes that sent their requests."""
+        callers: dict[Vertex, tuple[int, str]] = {}
+        for vertex, after in pairwise((*path, "")):
+            if not isinstance(vertex, int):
+                continue
+            one = self.callbacks[vertex]
+            here = one.pid, one.node
+            if one.kind == "client" and callers.get(f"{one.topic}{REQUEST}", here) != here:
+                return False
+            callers[after] = here
+        return True
 
     def _by_length(self, limit: int) -> tuple[list[GraphPath], int, bool]:
         """The shortest paths: up to ``limit`` of them, how many were met, whether that is all.
@@ -434,7 +475,8 @@ class _Search:
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
 
-        If ``cyclic``, of those that never step back in one order of the vertices: the depth-first
+        Paths on which a response goes to another node than the request's count as well. If
+        ``cyclic``, of those that never step back in one order of the vertices: the depth-first
         one, or the greedy one if more paths agree with it.
         """
         results = [self._counted_in(self.order, weights)]
@@ -452,7 +494,7 @@ class _Search:
         roots = [vertex for vertex, _ in self.roots]
         between: dict[Vertex, list[Vertex]] = {}
         for vertex, onward in self.edges.items():
-            topic = self.callbacks[vertex].topic if isinstance(vertex, int) else None
+            topic = self.callbacks[vertex].trigger if isinstance(vertex, int) else None
             if topic is not None and vertex not in roots:
                 between.setdefault(topic, []).extend(onward)
         rank: dict[Vertex, int] = {}

@@ -11,10 +11,13 @@ are assumed (``assumed``, no ``end``, no response time):
 * A Python node (rclpy), or one that takes from a wait set, has no callback events. An instance of
   its subscription begins with each take, one of its timer with each `rcl_timer_call`. What its
   thread publishes for the same node until the next of these counts as that instance's output.
-* A driver's own thread, a player of recorded data, the callback of a service's client, or a Python
-  timer without such events publishes outside all callbacks that events show. A topic that its node
-  publishes only like this gets a callback of kind ``unknown``, with the handle 0 and one instance
-  per publication, so that chains can begin there.
+* The callback of a service's client, and what an action's client and server do, begin with the
+  take as well. They end when the thread's executor looks for work again, where events tell that
+  (then they are not ``assumed``).
+* A driver's own thread, a player of recorded data or a Python timer without such events publishes
+  outside all callbacks that events show. A topic that its node publishes only like this gets a
+  callback of kind ``unknown``, with the handle 0 and one instance per publication, so that chains
+  can begin there.
 """
 
 from collections.abc import Collection
@@ -23,11 +26,20 @@ from dataclasses import dataclass, replace
 
 import polars as pl
 
-from chainshaper.analysis.matching import by_number, ends_of_starts, latest_before
-from chainshaper.analysis.messages import link_takes, publications, takes, with_departures
+from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
+from chainshaper.analysis.messages import (
+    link_takes,
+    publications,
+    service_calls,
+    takes,
+    with_departures,
+)
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objects
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS
+from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
+
+_ACTION = "/_action/"
+_LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
 
 
 @dataclass(frozen=True)
@@ -65,17 +77,20 @@ def data_flow(
     objects = objects or resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
         running = beside.submit(callback_instances, tables, objects.callbacks)
-        taken = takes(tables, objects)
-        published = publications(tables, objects)
+        sent, received = service_calls(tables, objects, clock_offset_ns)
+        taken = takes(tables, objects, received)
+        published = publications(tables, objects, sent)
         taken = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
     instances, taken = _with_assumed_readers(
-        instances, taken, timer_calls(tables, objects), objects
+        instances, taken, timer_calls(tables, objects), objects, tables
     )
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
         published = _begun_outside(published, instances)
+    if sent.height:
+        published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
     notes = list(objects.notes)
@@ -217,15 +232,24 @@ def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
 
 
 def _with_assumed_readers(
-    instances: pl.DataFrame, taken: pl.DataFrame, calls: pl.DataFrame, objects: Objects
+    instances: pl.DataFrame,
+    taken: pl.DataFrame,
+    calls: pl.DataFrame,
+    objects: Objects,
+    tables: events.EventTables,
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Add an instance for every take, or timer's call, of what has no callback events.
 
+    Of services, clients and actions it ends when the thread's executor looks for work again.
     Returns the instances, renumbered in order of start, and the takes with ``assumed_instance``.
     """
-    silent = objects.callbacks.filter(~pl.col("observed")).select("callback_id").unique()
-    assumed = taken.join(silent, on="callback_id", how="semi").select(
-        *("callback_id", "pid", "tid", "take", "intra_process"),
+    by_executor = (pl.col("kind") != "subscription") | pl.col("topic").str.contains(
+        _ACTION, literal=True
+    )
+    silent = objects.callbacks.filter(~pl.col("observed")).unique("callback_id")
+    silent = silent.select("callback_id", by_executor=by_executor)
+    assumed = taken.join(silent, on="callback_id", maintain_order="left").select(
+        *("callback_id", "pid", "tid", "take", "intra_process", "by_executor"),
         start="time",
         assumed=pl.lit(True),
     )
@@ -234,6 +258,14 @@ def _with_assumed_readers(
     assumed = pl.concat([assumed, called], how="diagonal")
     if assumed.is_empty():
         return instances, taken.with_columns(assumed_instance=pl.lit(None, dtype=pl.UInt32))
+    if assumed["by_executor"].any():
+        looks = pl.concat(
+            events.table(tables, name).select("pid", "tid", end="time") for name in _LOOKS
+        )
+        assumed = first_after(assumed, looks.sort("end"), ["pid", "tid"], "start", "end")
+        end = pl.when("by_executor").then("end")
+        assumed = assumed.with_columns(end=end, assumed=end.is_null())
+    assumed = assumed.drop("by_executor")
     every = pl.concat([instances.drop("instance"), assumed], how="diagonal_relaxed")
     every = every.sort("start", maintain_order=True).with_row_index("instance")
     of_take = by_number(every.drop_nulls("take"), "take", "instance", taken.height)
@@ -258,6 +290,20 @@ def _consumed(taken: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
             of_take = by_number(read.reverse(), "take", "instance", taken.height)
             taken = taken.with_columns(assumed_instance=pl.coalesce("assumed_instance", of_take))
     return taken.rename({"assumed_instance": "instance"})
+
+
+def _answered(published: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:
+    """Responses belong to the instance that took the request: rclcpp sends them behind its end."""
+    calls = taken.filter(pl.col("source_timestamp") < 0, pl.col("instance").is_not_null())
+    calls = calls.filter(pl.col("topic").cast(pl.String).str.ends_with(REQUEST))
+    own = published.filter(pl.col("source_timestamp") < 0)
+    own = own.filter(pl.col("topic").cast(pl.String).str.ends_with(RESPONSE))
+    columns = ["instance", "callback_id"]
+    rows = own.drop(columns).join(calls.select("source_timestamp", *columns), on="source_timestamp")
+    return published.with_columns(
+        pl.coalesce(by_number(rows, "publication", column, published.height), column)
+        for column in columns
+    )
 
 
 def _published_in(

@@ -11,6 +11,7 @@ callback and published in another of the same node:
   of whichever comes last. Several subscription callbacks of a node that publish topic X are taken
   to be its inputs when each of them ran between any two publications of X. Such topics stand in
   ``Callback.in_turns``.
+* **An action's goal** leads to the feedback that its server's node publishes next.
 * **Stored messages**: a subscription callback in a node whose subscription callbacks publish
   nothing at all, but whose timers do, is taken to store the message for the timers.
 
@@ -55,8 +56,10 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
         Callback(**row, publishes=tuple(sorted(writes[row["id"]])))
         for row in known.iter_rows(named=True)
     ]
+    everything = defaultdict[tuple[int, str], set[str]](set)
     of_node = defaultdict[tuple[int, str], list[Callback]](list)
     for callback in callbacks:
+        everything[callback.pid, callback.node].update(callback.publishes)
         if callback.kind != "unknown":
             of_node[callback.pid, callback.node].append(callback)
     turns = _in_turns(flow, of_node.values())
@@ -65,7 +68,9 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
         nodes=tuple(Node(name, pid) for name, pid in nodes.iter_rows()),
         callbacks=tuple(
             replace(
-                _with_passed_on(one, of_node[one.pid, one.node]),
+                _with_feedback(one, everything[one.pid, one.node])
+                if one.kind == "service"
+                else _with_passed_on(one, of_node[one.pid, one.node]),
                 in_turns=tuple(sorted(turns[one.id])),
             )
             for one in callbacks
@@ -87,6 +92,14 @@ def _with_passed_on(callback: Callback, siblings: list[Callback]) -> Callback:
     elif filtered or not own:  # no callback synchronises a topic with itself
         others = [one for one in siblings if one.topic != callback.topic]
         passed = _outputs(others, "subscription") - own
+    publishes = tuple(sorted({*callback.publishes, *passed}))
+    return replace(callback, publishes=publishes, passes_on=tuple(sorted(passed)))
+
+
+def _with_feedback(callback: Callback, published: set[str]) -> Callback:
+    """An action's server with the feedback, which a thread of the goal publishes as a rule."""
+    action, goal, _ = (callback.topic or "").partition("/_action/send_goal")
+    passed = {f"{action}/_action/feedback"} & published - set(callback.publishes) if goal else set()
     publishes = tuple(sorted({*callback.publishes, *passed}))
     return replace(callback, publishes=publishes, passes_on=tuple(sorted(passed)))
 

@@ -24,7 +24,8 @@ PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
 class LatencyStatistics:
     """Statistics of a sample of latencies, in whole nanoseconds; None where there is no sample.
 
-    ``count`` latencies were measured; ``incomplete`` traversals have none; ``disturbed`` of
+    ``count`` latencies were measured; ``incomplete`` traversals have none, those apart that came to
+    a lifecycle node while it was not active; ``disturbed`` of
     ``count`` were hit by a stall of the machine; ``late`` of them came behind the slot or cycle
     they were due in (None: when they were due is not known). ``jitter_ns`` is max − min (paper: J),
     ``spread_ns`` p99.5 − p0.5. ``percentiles_ns`` has :data:`PERCENTILES` as text for keys; they
@@ -247,6 +248,6 @@ def _statistics(frame: pl.DataFrame, column: str) -> LatencyStatistics:
     return latency_statistics(
         measured[column].to_numpy(),
         measured[hit].to_numpy(),
-        incomplete=frame.height - measured.height,
+        incomplete=frame.height - measured.height - frame.filter(reason="inactive").height,
         late=int(measured["late"].sum()) if known else None,
     )

@@ -15,6 +15,10 @@ of ROS 2 show different halves of that:
   before a ring buffer's enqueue on the same thread, the take is the dequeue of the same place in
   the same buffer.
 
+Requests and responses of services are messages, too: a client publishes ``SERVICE:request``, which
+the server takes, and takes ``SERVICE:response``. In place of a source timestamp they have the
+number of their call, which is below 0 (:func:`service_calls`).
+
 Publishing and leaving are two things where a thread of its own sends for the executor: the
 `rmw_publish` of an asynchronous publisher is recorded when the message is handed over;
 `asynchronous_send` says when, and whether, it was sent. A gate's decision about a message
@@ -22,17 +26,92 @@ Publishing and leaving are two things where a thread of its own sends for the ex
 without DDS, and so has none, by the instance that ran on the gate's thread then.
 """
 
+from collections.abc import Mapping
+
 import polars as pl
 
 from chainshaper.analysis.matching import by_number, first_after, grows, in_order, latest_before
 from chainshaper.analysis.objects import Objects
 from chainshaper.values import events
+from chainshaper.values.application import REQUEST
 
 _PUBLISHER = ["publisher", "node", "topic"]
 _NO_TIME = pl.lit(None, dtype=pl.Int64)
 
 
-def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+_CALLS = {"rmw_send_request": "client", "rmw_take_request": "service"}
+_CALLS |= {"rmw_send_response": "service", "rmw_take_response": "client"}
+_CALL_BITS = 40
+_GID = 16  # bytes that mean anything
+
+
+def service_calls(
+    tables: events.EventTables, objects: Objects, clock_offset_ns: int
+) -> tuple[pl.DataFrame, pl.DataFrame]:
+    """Requests and responses that were sent, and those taken: ``time, pid, tid, rmw_handle, call``.
+
+    A call is a client's, which numbers its own. Servers know clients by their gids.
+    """
+    found = {}
+    for name, role in _CALLS.items():
+        optional = [column for column in ("taken", "source_timestamp") if "take" in name]
+        rows = events.table(tables, name, optional).rename({f"rmw_{role}_handle": "rmw_handle"})
+        if "taken" in rows.columns:
+            rows = rows.filter(pl.col("taken").fill_null(1) != 0)
+        found[name] = rows
+    requests = objects.publishers.filter(pl.col("topic").cast(pl.String).str.ends_with(REQUEST))
+    clients = requests.select(
+        "pid", "rmw_handle", "topic", client="publisher", created="valid_from"
+    )
+    for name in ("rmw_send_request", "rmw_take_response"):
+        key = ["pid", "rmw_handle"]
+        found[name] = latest_before(found[name], clients, key, "time", "created")
+    owners = _gid_owners(tables, objects, found, clients, clock_offset_ns)
+    for name in ("rmw_take_request", "rmw_send_response"):
+        rows = found[name].with_columns(gid=_gid_text("client_gid"))
+        found[name] = rows.join(owners, on="gid", how="left", maintain_order="left")
+    number = pl.col("client").cast(pl.Int64) * (1 << _CALL_BITS) + pl.col("sequence_number")
+    columns = ["time", "pid", "tid", "rmw_handle"]
+    calls = {name: rows.select(*columns, call=-1 - number) for name, rows in found.items()}
+    send_request, take_request, send_response, take_response = (calls[name] for name in _CALLS)
+    return pl.concat([send_request, send_response]), pl.concat([take_request, take_response])
+
+
+def _gid_owners(
+    tables: events.EventTables,
+    objects: Objects,
+    found: Mapping[str, pl.DataFrame],
+    clients: pl.DataFrame,
+    clock_offset_ns: int,
+) -> pl.DataFrame:
+    """``client, gid``: which client has which gid.
+
+    `rmw_client_init` says so. Else it is the client that sent the latest request of the same number
+    to the service before the source timestamp of the one taken, in most of the gid's calls.
+    """
+    created = events.table(tables, "rmw_client_init").rename({"rmw_client_handle": "rmw_handle"})
+    created = first_after(created, clients, ["pid", "rmw_handle"], "time", "created")
+    servers = objects.subscriptions.select("pid", "rmw_handle", "topic", created="valid_from")
+    came = found["rmw_take_request"]
+    came = latest_before(came, servers, ["pid", "rmw_handle"], "time", "created")
+    came = came.with_columns(at=pl.col("source_timestamp") - clock_offset_ns)
+    sent = found["rmw_send_request"].select("topic", "sequence_number", "client", sent="time")
+    came = latest_before(came, sent, ["topic", "sequence_number"], "at", "sent")
+    votes = came.group_by("client", "client_gid").len().sort("len", descending=True)
+    named = created.select("client", gid=_gid_text("gid"))
+    voted = votes.select("client", gid=_gid_text("client_gid"))
+    owners = pl.concat([named, voted]).drop_nulls()
+    return owners.unique("gid", keep="first", maintain_order=True)
+
+
+def _gid_text(column: str) -> pl.Expr:
+    """A gid as a text, which can be a key."""
+    return pl.col(column).list.head(_GID).cast(pl.List(pl.String)).list.join(".")
+
+
+def publications(
+    tables: events.EventTables, objects: Objects, calls: pl.DataFrame | None = None
+) -> pl.DataFrame:
     """All publications of known publishers, sorted by time.
 
     Columns: ``publication`` (numbered from 0), ``time`` (of `rmw_publish`, the write to DDS; of
@@ -40,7 +119,7 @@ def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     ``node``, ``topic``, ``source_timestamp`` (CLOCK_REALTIME, null if unknown) and ``intra_time``
     (when it was handed to ring buffers of the same process, null if it was not).
     """
-    written = _written(tables, objects)
+    written = _written(tables, objects, calls)
     handed = _handed_over(tables, objects)
     if not handed.height:
         every = written.with_columns(intra_time=_NO_TIME)
@@ -58,9 +137,14 @@ def publications(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     return in_order(every, "time", "pid", "tid").with_row_index("publication")
 
 
-def _written(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+def _written(
+    tables: events.EventTables, objects: Objects, calls: pl.DataFrame | None
+) -> pl.DataFrame:
     """Messages given to DDS: ``time, pid, tid, publisher, node, topic, source_timestamp``."""
     writes = _writes(tables)
+    if calls is not None and calls.height:
+        names = {"rmw_handle": "rmw_publisher_handle", "call": "source_timestamp"}
+        writes = pl.concat([writes, calls.rename(names)], how="diagonal")
     by_rmw = objects.publishers.select(
         "pid", *_PUBLISHER, rmw_publisher_handle="rmw_handle", created="valid_from"
     )
@@ -127,7 +211,9 @@ def _handed_over(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     return found.select("handed", "intra_time", "pid", "tid", *_PUBLISHER)
 
 
-def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
+def takes(
+    tables: events.EventTables, objects: Objects, calls: pl.DataFrame | None = None
+) -> pl.DataFrame:
     """All messages taken by known subscriptions, sorted by time.
 
     Columns: ``take`` (numbered from 0), ``time``, ``pid``, ``tid``, ``callback_id`` (null if the
@@ -148,6 +234,9 @@ def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     key = ["pid", "rmw_subscription_handle"]
     from_dds = subscriptions.select(*key, *columns, "created")
     parts = [latest_before(taken, from_dds, key, "time", "created")]
+    if calls is not None and calls.height:
+        calls = calls.rename({"rmw_handle": "rmw_subscription_handle", "call": "source_timestamp"})
+        parts.append(latest_before(calls, from_dds, key, "time", "created"))
     if taken.is_empty():
         owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
         dispatched = events.table(tables, "dispatch_subscription_callback")
@@ -162,7 +251,7 @@ def takes(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     parts = [
         part.select(
             *("time", "pid", "tid", *columns),
-            pl.when(pl.col("source_timestamp") > 0).then("source_timestamp"),
+            pl.when(pl.col("source_timestamp") != 0).then("source_timestamp"),
             *(pl.col(n) if n in part.columns else nowhere.alias(n) for n in ("buffer", "index")),
         )
         for part in parts

@@ -13,6 +13,7 @@ import polars as pl
 
 from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
+from chainshaper.values.application import INTERNAL_SERVICES, REQUEST, RESPONSE
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),
@@ -37,13 +38,16 @@ class Objects:
     * ``nodes``: ``pid, handle, valid_from, node`` (name with namespace, ``/front/filter``).
     * ``publishers``: ``publisher, pid, handle, rmw_handle, valid_from, node, topic``, and
       ``subscriptions`` likewise. In these two, and in everything joined from them, names are of
-      type ``Enum``: millions of rows carry them as numbers.
+      type ``Enum``: millions of rows carry them as numbers. Clients and servers whose calls were
+      seen are in both, with the topics ``SERVICE:request`` and ``SERVICE:response``.
     * ``callbacks``: :data:`CALLBACK_SCHEMA`, one row per *registration*, the address
       (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
       registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0
       (:func:`numbered`). ``topic`` is the topic or the service's name. ``observed`` is false for
-      what emits no callback events: subscriptions and timers of rclpy, and all clients.
+      what emits no callback events: subscriptions, services and timers of rclpy, services of
+      actions, and all clients.
     * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
+    * ``activity``: ``time, pid, node, active``: when lifecycle nodes became active, or inactive.
     * ``notes``: what cannot be known from this recording, in plain words.
     """
 
@@ -52,6 +56,7 @@ class Objects:
     subscriptions: pl.DataFrame
     callbacks: pl.DataFrame
     buffers: pl.DataFrame
+    activity: pl.DataFrame
     notes: tuple[str, ...]
 
 
@@ -63,14 +68,16 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     found = [
         _subscription_callbacks(tables, subscriptions),
         _timer_callbacks(tables, nodes),
-        _service_callbacks(tables, nodes),
+        _service_callbacks(tables, nodes, subscriptions),
     ]
     registered = _with_symbols(tables, pl.concat(found, how="diagonal_relaxed"))
+    clients = _client_callbacks(tables, nodes, subscriptions)
+    listening = pl.concat([registered, clients], how="diagonal_relaxed")
     others = [
         _unregistered(tables, registered),
-        _callbackless(tables, subscriptions, registered),
+        _callbackless(tables, subscriptions, listening),
         _timers_of_python(tables, nodes),
-        _client_callbacks(tables, nodes),
+        clients,
     ]
     callbacks = pl.concat([registered, *others], how="diagonal_relaxed")
     callbacks = numbered(tables, callbacks)
@@ -84,6 +91,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         subscriptions=subscriptions.with_columns(names),
         callbacks=callbacks.select(pl.col(name).cast(t) for name, t in CALLBACK_SCHEMA.items()),
         buffers=_buffers(tables, callbacks),
+        activity=_activity(tables, nodes),
         notes=_notes(tables, callbacks),
     )
 
@@ -116,7 +124,23 @@ def _endpoints(tables: events.EventTables, nodes: pl.DataFrame, kind: str) -> pl
         topic="topic_name",
     )
     columns = [kind, "pid", "handle", "rmw_handle", "valid_from", "node", "topic"]
+    ends = (_service_ends(tables, role, kind) for role in ("client", "service"))
+    created = pl.concat([created, *ends])
     return _with_node(created.with_row_index(kind), nodes, "valid_from").select(columns)
+
+
+def _service_ends(tables: events.EventTables, role: str, kind: str) -> pl.DataFrame:
+    """Clients or servers whose calls were seen, as publishers or subscriptions of messages."""
+    sends, takes = ("request", "response") if role == "client" else ("response", "request")
+    calls = [events.table(tables, f"rmw_{one}") for one in (f"send_{sends}", f"take_{takes}")]
+    handle = f"rmw_{role}_handle"
+    seen = pl.concat(one.select("pid", rmw_handle=handle) for one in calls).unique()
+    created = events.table(tables, f"rcl_{role}_init").select(
+        "pid", "node_handle", handle=f"{role}_handle", rmw_handle=handle, valid_from="time",
+        topic=pl.col("service_name") + f":{sends if kind == 'publisher' else takes}",
+    )  # fmt: skip
+    own = pl.col("topic").str.extract("([^/:]*):").is_in(INTERNAL_SERVICES)
+    return created.filter(~own).join(seen, on=["pid", "rmw_handle"], how="semi")
 
 
 def _added(tables: events.EventTables, kind: str, owner: str) -> pl.DataFrame:
@@ -173,7 +197,9 @@ def _timer_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Data
     return joined.select("pid", "handle", "valid_from", "node", "period_ns", kind=pl.lit("timer"))
 
 
-def _service_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+def _service_callbacks(
+    tables: events.EventTables, nodes: pl.DataFrame, subscriptions: pl.DataFrame
+) -> pl.DataFrame:
     service = ["pid", "service_handle"]
     created = events.table(tables, "rcl_service_init").select(
         *service, "node_handle", topic="service_name", created="time"
@@ -181,18 +207,32 @@ def _service_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Da
     added = _added(tables, "service", "service_handle")
     joined = latest_before(added, created, service, "valid_from", "created")
     joined = _with_node(joined, nodes, "valid_from")
-    return joined.select("pid", "handle", "valid_from", "node", "topic", kind=pl.lit("service"))
+    joined = _listening(joined.rename({"service_handle": "end"}), subscriptions, REQUEST)
+    columns = ["pid", "handle", "valid_from", "node", "topic", "subscription"]
+    return joined.select(*columns, kind=pl.lit("service"))
 
 
-def _client_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+def _client_callbacks(
+    tables: events.EventTables, nodes: pl.DataFrame, subscriptions: pl.DataFrame
+) -> pl.DataFrame:
     """Clients of services: they exist, but no version of rclcpp says when their callback runs."""
     created = events.table(tables, "rcl_client_init").select(
         "pid", "node_handle", handle="client_handle", valid_from="time", topic="service_name"
     )
+    created = _listening(created.with_columns(end="handle"), subscriptions, RESPONSE)
     return _with_node(created, nodes, "valid_from").select(
-        *("pid", "handle", "valid_from", "node", "topic"),
+        *("pid", "handle", "valid_from", "node", "topic", "subscription"),
         kind=pl.lit("client"),
         observed=pl.lit(False),
+    )
+
+
+def _listening(ends: pl.DataFrame, subscriptions: pl.DataFrame, to: str) -> pl.DataFrame:
+    """Add the ``subscription`` as which an end of a service is listed, if its calls were seen."""
+    own = subscriptions.filter(pl.col("topic").str.ends_with(to))
+    own = own.select("pid", "subscription", end="handle", created="valid_from")
+    return latest_before(
+        ends.drop("created", strict=False), own, ["pid", "end"], "valid_from", "created"
     )
 
 
@@ -231,13 +271,17 @@ def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
 def _callbackless(
     tables: events.EventTables, subscriptions: pl.DataFrame, registered: pl.DataFrame
 ) -> pl.DataFrame:
-    """Subscriptions that take messages but have no callback in the trace: rclpy, wait sets."""
+    """What takes messages but has no callback in the trace: rclpy, wait sets, action servers."""
     bare = subscriptions.join(registered.drop_nulls("subscription"), on="subscription", how="anti")
     takes = events.table(tables, "rmw_take").lazy()
     takes = takes.select("pid", rmw_handle="rmw_subscription_handle").unique()
-    return bare.join(takes.collect(), on=["pid", "rmw_handle"], how="semi").select(
-        *("pid", "handle", "valid_from", "node", "topic", "subscription"),
-        kind=pl.lit("subscription"),
+    takes_messages = bare.join(takes.collect(), on=["pid", "rmw_handle"], how="semi")
+    serves = pl.col("topic").str.ends_with(REQUEST)
+    found = pl.concat([takes_messages.filter(~serves), bare.filter(serves)])
+    return found.select(
+        *("pid", "handle", "valid_from", "node", "subscription"),
+        topic=pl.col("topic").str.strip_suffix(REQUEST),
+        kind=pl.when(serves).then(pl.lit("service")).otherwise(pl.lit("subscription")),
         observed=pl.lit(False),
     )
 
@@ -279,6 +323,19 @@ def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     return joined.select("pid", "buffer", "valid_from", "callback_id").sort("valid_from")
 
 
+def _activity(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
+    """Changes between active and not, of lifecycle nodes: in none of their states at first."""
+    machine = ["pid", "state_machine"]
+    created = events.table(tables, "rcl_lifecycle_state_machine_init")
+    created = _with_node(created.select("time", *machine, "node_handle"), nodes, "time")
+    changed = events.table(tables, "rcl_lifecycle_transition")
+    changed = changed.with_columns(active=pl.col("goal_label") == "active")
+    created = created.rename({"time": "created"}).select(*machine, "created", "node")
+    changed = latest_before(changed, created, machine, "time", "created")
+    first = created.select(time="created", pid="pid", node="node", active=pl.lit(False))
+    return pl.concat([first, changed.select(first.columns)]).sort("time")
+
+
 def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ...]:
     notes: list[str] = []
     unknown = callbacks.filter(pl.col("kind") == "unknown")
@@ -304,6 +361,7 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
                 "no node was created during the recording: names of nodes cannot be known."
             )
     silent = callbacks.filter(~pl.col("observed") & (pl.col("kind") == "subscription"))
+    silent = silent.filter(~pl.col("topic").str.contains("/_action/", literal=True))
     notes += [
         f"{node} takes {topic} without callback events (a Python node, or a wait set): its "
         "response times cannot be known; what its thread publishes until its next take is "

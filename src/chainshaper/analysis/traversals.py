@@ -26,7 +26,7 @@ import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
-from chainshaper.analysis.matching import by_number, first_after, in_order
+from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
 from chainshaper.analysis.messages import discarded_instances, overwritten_in, why_not_sent
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 
@@ -36,6 +36,7 @@ REASONS: dict[str, str] = {
     "not taken": "published, but not taken by the time the recording ended",
     "not executed": "taken, but no callback instance got it",
     "not published": "its callback instance ended without publishing",
+    "inactive": "its node is a lifecycle node, which was not active then",
     "discarded": "withheld on purpose: it had overrun its slot or outlived its lifespan, or newer "
     "messages had filled its asynchronous publisher's history",
     "not sent": "handed to an asynchronous publisher, whose thread had not sent it by the time the "
@@ -45,7 +46,7 @@ REASONS: dict[str, str] = {
 }
 """Why a traversal is incomplete."""
 
-_IN_NODE = ["not published", "discarded", "not sent", "still running"]
+_IN_NODE = ["not published", "inactive", "discarded", "not sent", "still running"]
 _REASON = pl.Enum(list(REASONS))
 _VIA = pl.Enum(["instance", "sibling"])
 
@@ -99,8 +100,9 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
             state, note = _publish_by_sibling(flow, state, hop, callback, topic)
             notes += note
         state = _unless_published(flow, state, hop)
+        state = _unless_active(flow, state, hop, callback)
         if hop == 0:
-            quiet = (pl.col("reason") == "not published").fill_null(False)
+            quiet = pl.col("reason").is_in(["not published", "inactive"]).fill_null(False)
             silent = int(state.select(quiet.sum()).item())
             state = state.filter(~quiet)
     frame = _described(flow, chain, state)
@@ -164,7 +166,7 @@ def _publish_by_sibling(
     state = state.with_columns(
         pl.coalesce(publication, later), (pl.col(sibling) | later.is_not_null()).alias(sibling)
     )
-    if callback.symbol is not None and MESSAGE_FILTER not in callback.symbol:
+    if callback.kind == "service" or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER):
         return state, []  # a callback that stores its latest message: old values are its purpose
     reached = state[publication].drop_nulls()
     between = here.filter(pl.col("later").is_between(reached.min(), reached.max())).height
@@ -194,6 +196,28 @@ def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataF
     waits = pl.lit(unsent).gather(publication).fill_null(False)
     reasons = pl.lit(why_not_sent(flow.publications, flow.events, flow.objects))
     return _broken(state, waits, hop, reasons.gather(publication))
+
+
+def _unless_active(
+    flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback
+) -> pl.DataFrame:
+    """Say so of traversals that stopped at this hop because its lifecycle node was not active.
+
+    They stop in the node, also where its subscription did not even exist.
+    """
+    changes = flow.objects.activity.filter(pid=callback.pid, node=callback.node)
+    stopped = pl.col("reason").is_in(["not published", "lost", "not taken", "not executed"])
+    stopped &= pl.col("broken_hop") == hop
+    if changes.is_empty() or state.filter(stopped).is_empty():
+        return state
+    came = _looked_up(flow.instances, "start", f"instance_{hop}")
+    if hop:
+        came = pl.coalesce(came, _looked_up(flow.publications, "time", f"publication_{hop - 1}"))
+    rows = state.with_row_index("row").select("row", came=came)
+    found = latest_before(rows, changes.select("time", "active"), [], "came", "time")
+    active = by_number(found, "row", "active", state.height).fill_null(False)
+    idle = pl.lit("inactive", dtype=_REASON)
+    return state.with_columns(reason=pl.when(stopped & ~active).then(idle).otherwise("reason"))
 
 
 def _take(flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback) -> pl.DataFrame:
@@ -304,7 +328,7 @@ def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -
     candidates = [
         callback.id
         for callback in graph.callbacks
-        if callback.kind == "subscription" and callback.topic == traversals.chain.topics[-1]
+        if callback.trigger == traversals.chain.topics[-1]
     ]
     taken = flow.takes.filter(pl.col("callback_id").is_in(candidates))
     taken = taken.drop_nulls(["publication", "instance"])

@@ -109,8 +109,8 @@ def apply_plan(
 
     Raises:
         InputError: the plan names no threads, or has offsets, which priorities alone cannot carry
-            out; or a publisher does not publish as it asks; or no slot can follow its latencies;
-            or there is no such user.
+            out; or a publisher does not publish as it asks, or follows `/clock` where slots count
+            from stamps; or no slot can follow its latencies; or there is no such user.
         PlatformError: the machine lacks a core or the back end, or we a privilege.
         OperationError: another run governs a core or node, a node does not appear or is ambiguous,
             the chain has no regular beginning, the kernel refuses something, the servers failed,
@@ -140,6 +140,7 @@ def apply_plan(
             run.command = start_command(command, stdout=command_stdout)
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
         run.guardians.await_ready(run.go_on)
+        threads.refuse_simulated(given, run.found)
         said = threads.check_publishers(given, run.found, recording)
         run.schedule()
         run.begin_state(command, plan_path)

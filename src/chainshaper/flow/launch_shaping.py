@@ -46,7 +46,11 @@ from chainshaper.planning import (
     save_application_plan,
 )
 from chainshaper.planning.application_plan import whole
-from chainshaper.planning.request import refuse_contradictions, refuse_entangled
+from chainshaper.planning.request import (
+    refuse_contradictions,
+    refuse_entangled,
+    refuse_simulated,
+)
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
@@ -243,6 +247,7 @@ def _refuse_early(
 def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanRequest) -> None:
     """What is not to be had of these chains, however long they take."""
     refuse_entangled(seen, request.policy, sinks=len(seen) > chains)
+    refuse_simulated(seen, request)
     if seen and request.policy != "shaped":
         with suppress(OperationError):
             _planned(seen, chains, request)

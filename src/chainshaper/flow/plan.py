@@ -45,6 +45,8 @@ __all__ = ["plan_recording", "profile_chains", "shape_application"]
 DEFAULT_PRIORITY = 80
 _STANDARD = PlanRequest()
 
+_SAME_SPEED = 0.02  # so far may /clock be from the speed of time
+
 
 def profile_chains(
     recording: Recording | str | Path,
@@ -134,6 +136,7 @@ def _profile_of(
     all_disturbed = calm.height < 2
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
     period = _period(analysis, period_ns)
+    simulated = _simulated(flow, analysis)
     nodes = dict.fromkeys(stage.node for stage in stages)
     running, named = _running(flow, stages)
     cores, priority = _executors(recording, graph, running)
@@ -162,7 +165,7 @@ def _profile_of(
         every_step_ns=steps[every["traversal"].to_numpy()],
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=analysis.traversals.height - every.height,
+        incomplete=analysis.statistics.incomplete,
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),
@@ -173,6 +176,7 @@ def _profile_of(
         asynchronous=_publishes_asynchronously(recording, stages[-1].node),
         intra_process=_goes_without_dds(flow, stages[-1].node, chain.topics[-1]),
         output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
+        simulated=simulated,
         all_disturbed=all_disturbed or None,
     )
 
@@ -226,6 +230,24 @@ def _period(analysis: LatencyAnalysis, given: int | None) -> int:
     )
 
 
+def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
+    """The nodes of a chain that follow `/clock`, which is to run at the speed of time."""
+    callbacks = [analysis.graph.callbacks[number] for number in analysis.chain.callbacks]
+    follow = set(flow.takes.filter(topic="/clock")["node"])
+    found = tuple(dict.fromkeys(one.node for one in callbacks if one.node in follow))
+    first, starts = callbacks[0], analysis.traversals["start"].unique().sort().to_numpy()
+    if first.node in found and first.period_ns is not None and len(starts) > 1:
+        apart = float(np.median(np.diff(starts)))
+        if not 1 - _SAME_SPEED < (speed := first.period_ns / apart) < 1 + _SAME_SPEED:
+            raise InputError(
+                f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
+                f" timer of {format_duration(first.period_ns)} expires every"
+                f" {format_duration(round(apart / 1e5) * 100_000)}. Replay at that speed (`ros2 bag"
+                " play --rate 1.0`), or start the nodes with use_sim_time:=false"
+            )
+    return found
+
+
 @dataclass(frozen=True)
 class _Stage:
     """One step of the graph: a callback, or the inputs of a synchronising one, as one.
@@ -267,7 +289,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
         needs[key] = set()
         for number in key[0]:
             on_chain = key in along and number in before
-            read = graph.callbacks[number].topic
+            read = graph.callbacks[number].trigger
             for one in before[number] if on_chain else writers_of(read):
                 if one not in above:  # what feeds back comes from a cycle before
                     needs[key].add(one)
@@ -298,7 +320,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
 def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> frozenset[str]:
     """The topics that the chain's output waits for, those before its first callback included."""
     found = {stage.topic for stage in stages}
-    first = graph.callbacks[chain.callbacks[0]].topic
+    first = graph.callbacks[chain.callbacks[0]].trigger
     ahead = set() if first is None else {first}
     while ahead:
         found |= ahead
@@ -308,7 +330,7 @@ def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> fr
             for topic in ahead.intersection(callback.publishes)
         ]
         inputs = [number for one, topic in writers for number in inputs_of(graph, one, topic)]
-        read = {graph.callbacks[number].topic for number in inputs}
+        read = {graph.callbacks[number].trigger for number in inputs}
         ahead = {topic for topic in read if topic is not None} - found
     return frozenset(found - {chain.topics[-1]})
 
@@ -318,9 +340,9 @@ def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
     first = graph.callbacks[chain.callbacks[0]]
     own = {graph.callbacks[number].node for number in chain.callbacks}
     found: set[str] = set()
-    fed = set() if first.topic is None else {first.node}
+    fed = set() if first.trigger is None else {first.node}
     while fed:
-        topics = {callback.topic for callback in graph.callbacks if callback.node in fed}
+        topics = {callback.trigger for callback in graph.callbacks if callback.node in fed}
         fed = {writer.node for writer in graph.callbacks if topics.intersection(writer.publishes)}
         fed -= found | own
         found |= fed

@@ -7,12 +7,14 @@ Which nodes a process has, its creation events say; which threads execute, the c
 """
 
 import platform
+import re
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, cast
 from xml.etree import ElementTree
@@ -37,7 +39,7 @@ from chainshaper.linux.processes import (
     run_users,
 )
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.linux.threads import Thread, ThreadRole
+from chainshaper.linux.threads import Thread, ThreadRole, read_proc
 from chainshaper.planning.application_plan import (
     ApplicationPlan,
     combined,
@@ -55,7 +57,9 @@ from chainshaper.planning.plan import (
     ShapingNode,
     publisher_servers,
     revised,
+    shaping_nodes,
 )
+from chainshaper.planning.request import simulated_stamps
 from chainshaper.values.errors import InputError, OperationError
 
 if TYPE_CHECKING:
@@ -193,6 +197,30 @@ def recorded_processes(
     return tuple(found), ()
 
 
+def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
+    """Refuse slots that count from stamps of nodes that follow `/clock`, as their commands say.
+
+    Raises InputError: there is such a node.
+    """
+    stamped = [one for one in plan.chains if one.anchor == "stamp" and shaping_nodes(one)]
+    servers = [server for one in stamped for server in one.servers]
+    nodes = {thread.node for server in servers for thread in server.threads}
+    for one in found.threads:
+        for node in nodes.intersection(one.nodes):
+            if _follows_clock(one.thread.pid):
+                raise InputError(simulated_stamps(node))
+
+
+def _follows_clock(pid: int) -> bool:
+    words = read_proc(f"/proc/{pid}/cmdline").decode(errors="replace").split("\0")
+    texts = [one for one in words if one.startswith("use_sim_time")]
+    for option, file in pairwise(words):
+        if option == "--params-file":  # as `ros2 launch` writes one for each node
+            with suppress(OSError):
+                texts.append(Path(f"/proc/{pid}/cwd", file).read_text(errors="replace"))
+    return any(re.search(r"\buse_sim_time\W+true\b", one, re.IGNORECASE) for one in texts)
+
+
 def check_publishers(
     plan: ApplicationPlan, found: Allocation, recording: "Recording | None" = None
 ) -> list[str]:
@@ -279,6 +307,7 @@ def planned_changes(
     if back_end != "litmus":
         choice = choose_back_end(back_end)
         refuse_unfit(plan, choice.name)
+        refuse_simulated(plan, found)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         return Changes(choice.name, choice.reason, threads, (), found.notes)

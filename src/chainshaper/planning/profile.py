@@ -61,7 +61,7 @@ class Profile:
     :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
     ``asynchronous`` whether its process has a thread that publishes (None: not known),
     ``intra_process`` whether subscribers of the output get it without DDS, ``together``
-    are nodes that share a process,
+    are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
     ``of_modes`` has what was measured in each mode of the system. The rest is
     :class:`~chainshaper.planning.plan.Evidence`.
     """
@@ -96,6 +96,7 @@ class Profile:
     longest_publication_ns: int | None = None
     asynchronous: bool | None = None
     intra_process: Literal[True] | None = None
+    simulated: tuple[str, ...] = ()
     lost_events: int | None = None
     all_disturbed: bool | None = None
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)

@@ -119,6 +119,7 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     else:
         (profile, *sinks), _ = on_cores((profile, *sinks), request)
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
+    refuse_simulated((profile, *sinks), request)
     every, together = (profile, *sinks), [range(1 + len(sinks))]
     profile, *sinks = with_interference(every, together, request, at_once=False)
     if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
@@ -558,6 +559,22 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
                 f" {format_duration(one.period_ns)}: a plan has one cycle. Plan one of the two"
                 " alone"
             )
+
+
+def refuse_simulated(profiles: Sequence[Profile], request: PlanRequest) -> None:
+    """Refuse to count slots from stamps that are not of the clock of gates and servers."""
+    for one in profiles:
+        if one.simulated and request.anchor == "stamp" and request.policy not in UNSHAPED:
+            raise InputError(simulated_stamps(one.simulated[0]))
+
+
+def simulated_stamps(node: str) -> str:
+    """Why no slot counts from the stamps of a node that follows `/clock`, and what to do."""
+    return (
+        f"{node} follows /clock (use_sim_time): its stamps are of simulated time, from which no"
+        " slot can count. Start it with use_sim_time:=false; or, where /clock runs at the speed of"
+        " time, plan with --anchor cycle"
+    )
 
 
 def _waited_for(one: Profile, two: Profile) -> frozenset[str]:

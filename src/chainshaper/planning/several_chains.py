@@ -36,6 +36,7 @@ from chainshaper.planning.request import (
     on_cores,
     plan_chain,
     refuse_entangled,
+    refuse_simulated,
 )
 from chainshaper.planning.shaping import with_best_effort
 from chainshaper.values.durations import format_duration
@@ -64,6 +65,7 @@ def plan_application(
     if request.policy != "pipelined":
         request = replace(request, cores=None)
     refuse_entangled(profiles, request.policy)
+    refuse_simulated(profiles, request)
     try:
         plan, remarks = _planned(profiles, request, time_limit_s)
         return plan, [*doubts, *remarks]

@@ -28,7 +28,7 @@ import numpy as np
 from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.planning.offsets import linked
 from chainshaper.reporting.tables import Column, ResultTable, words
-from chainshaper.values.application import INTERNAL_TOPICS, Callback
+from chainshaper.values.application import INTERNAL_SERVICES, INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import escape, shown
 from chainshaper.values.files import new_file, write_whole
@@ -37,8 +37,6 @@ from chainshaper.values.recording import lost_text
 ENDINGS = (".svg", ".dot", ".json")
 
 _OWN_TOPICS = INTERNAL_TOPICS - {"/clock"}
-_OWN_SERVICES = {"describe_parameters", "get_parameter_types", "get_parameters", "list_parameters"}
-_OWN_SERVICES |= {"get_type_description", "set_parameters", "set_parameters_atomically"}
 _LAMBDA = re.compile(r"\{lambda\(.*?\)#(\d+)\}$")
 _BIND = re.compile(r"std::_Bind<.*?\((\w[\w:]*)::\*")
 
@@ -79,7 +77,9 @@ Point: TypeAlias = tuple[float, float]
 
 def is_internal(name: str | None) -> bool:
     """Whether a topic or service is one that every node has for itself."""
-    return name is not None and (name in _OWN_TOPICS or name.rpartition("/")[2] in _OWN_SERVICES)
+    return name is not None and (
+        name in _OWN_TOPICS or name.rpartition("/")[2] in INTERNAL_SERVICES
+    )
 
 
 def without_internals(application: ApplicationDescription) -> ApplicationDescription:
@@ -265,9 +265,9 @@ def _arrows(
         reads: set[str | None] = set()
         for row, callback in enumerate(node.callbacks):
             height = TITLE + ROW * (row + 0.5)
-            if callback.kind == "subscription" and callback.topic in place:
-                yield Edge(place[callback.topic], index, PILL / 2, height), "arrow"
-                reads.add(callback.topic)
+            if callback.trigger in place:
+                yield Edge(place[callback.trigger], index, PILL / 2, height), "arrow"
+                reads.add(callback.trigger)
             for topic in filter(place.__contains__, callback.publishes):
                 style = "arrow passes" if topic in callback.passes_on else "arrow"
                 yield Edge(index, place[topic], height, PILL / 2), style
@@ -314,9 +314,10 @@ def application_dot(application: ApplicationDescription) -> str:
     lines += [f"  {_quoted(topic)} [shape=ellipse];" for topic in graph.topics]
     for one in graph.callbacks:
         vertex = f"callback_{one.id}"
-        if one.topic is not None and one.kind in {"subscription", "service", "client"}:
-            if one.kind != "subscription":
-                lines.append(f"  {_quoted(one.topic)} [shape=cds];")
+        if one.trigger in graph.topics:
+            lines.append(f"  {_quoted(one.trigger)} -> {vertex};")
+        elif one.topic is not None:  # of whose calls there are no events
+            lines.append(f"  {_quoted(one.topic)} [shape=cds];")
             lines.append(f"  {_quoted(one.topic)} -> {vertex};")
         for topic in one.publishes:
             style = " [style=dashed]" if topic in one.passes_on else ""

@@ -9,11 +9,21 @@ from typing import Literal, TypeAlias
 
 from chainshaper.values.durations import format_duration
 
-__all__ = ["INTERNAL_TOPICS", "ApplicationGraph", "Callback", "CallbackKind", "Chain", "Node"]
-__all__ += ["trigger_text"]
+__all__ = ["INTERNAL_SERVICES", "INTERNAL_TOPICS", "REQUEST", "RESPONSE", "ApplicationGraph"]
+__all__ += ["Callback", "CallbackKind", "Chain", "Node", "trigger_text"]
 
 INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
 """Topics that every node has for itself, or every shaping node: they connect no computation."""
+
+_PARAMETERS = ("describe_parameters", "get_parameter_types", "get_parameters", "list_parameters")
+_STATES = ("change_state", "get_state", "get_available_states", "get_available_transitions")
+INTERNAL_SERVICES = frozenset((*_PARAMETERS, *_STATES)) | {
+    *("get_type_description", "set_parameters", "set_parameters_atomically", "get_transition_graph")
+}
+"""The last parts of the names of services that every node, or lifecycle node, has for itself."""
+
+REQUEST, RESPONSE = ":request", ":response"
+"""Behind a service's name: what its clients publish, and what its server does, as if on topics."""
 
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
 """``unknown``: it was seen to run, but not to be created (tracing started after it), or only its
@@ -54,6 +64,12 @@ class Callback:
     publishes: tuple[str, ...] = ()  # topics written by its instances (and, synchronised, for it)
     passes_on: tuple[str, ...] = ()  # those of `publishes` that another callback writes for it
     in_turns: tuple[str, ...] = ()  # those that it or another writes, whichever has the last input
+
+    @property
+    def trigger(self) -> str | None:
+        """The topic whose messages it takes: of a service its requests, of a client responses."""
+        ending = {"subscription": "", "service": REQUEST, "client": RESPONSE}.get(self.kind)
+        return None if ending is None or self.topic is None else self.topic + ending
 
     @property
     def label(self) -> str:

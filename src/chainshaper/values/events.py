@@ -62,10 +62,15 @@ FIELDS: dict[str, dict[str, pl.DataType]] = {
         "client_handle": _HANDLE, "node_handle": _HANDLE, "rmw_client_handle": _HANDLE,
         "service_name": _NAME,
     },
+    "rmw_client_init": {"rmw_client_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
     "rcl_timer_init": {"timer_handle": _HANDLE, "period": _NANOSECONDS},
     "rclcpp_timer_callback_added": {"timer_handle": _HANDLE, "callback": _HANDLE},
     "rclcpp_timer_link_node": {"timer_handle": _HANDLE, "node_handle": _HANDLE},
     "rclcpp_callback_register": {"callback": _HANDLE, "symbol": _NAME},
+    "rcl_lifecycle_state_machine_init": {"node_handle": _HANDLE, "state_machine": _HANDLE},
+    "rcl_lifecycle_transition": {
+        "state_machine": _HANDLE, "start_label": _NAME, "goal_label": _NAME,
+    },
     # What happens, again and again. Timestamps of messages are DDS source timestamps:
     # CLOCK_REALTIME, as the publisher wrote them.
     "callback_start": {"callback": _HANDLE, "is_intra_process": _NUMBER},
@@ -82,6 +87,23 @@ FIELDS: dict[str, dict[str, pl.DataType]] = {
     },
     "rcl_take": {"message": _HANDLE},
     "rclcpp_take": {"message": _HANDLE},
+    # Calls of services, from tracetools 8.5 (Kilted) on; of all before only by our own library. A
+    # call is known by its client and its number.
+    "rmw_send_request": {
+        "rmw_client_handle": _HANDLE, "request": _HANDLE, "sequence_number": pl.Int64(),
+    },
+    "rmw_take_request": {
+        "rmw_service_handle": _HANDLE, "request": _HANDLE, "client_gid": pl.List(pl.UInt8),
+        "sequence_number": pl.Int64(), "taken": _NUMBER,
+    },
+    "rmw_send_response": {
+        "rmw_service_handle": _HANDLE, "response": _HANDLE, "client_gid": pl.List(pl.UInt8),
+        "sequence_number": pl.Int64(), "timestamp": _NANOSECONDS,
+    },
+    "rmw_take_response": {
+        "rmw_client_handle": _HANDLE, "response": _HANDLE, "sequence_number": pl.Int64(),
+        "source_timestamp": _NANOSECONDS, "taken": _NUMBER,
+    },
     # CARET (before Humble) instead of rmw_publish and rmw_take: the message that was written, the
     # DDS source timestamp it got, and the callback that the message with this stamp went to.
     "dds_write": {"message": _HANDLE},
@@ -143,6 +165,7 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
     # sched_switch.
     "callback_start": {"thread_time": _NANOSECONDS},
     "callback_end": {"thread_time": _NANOSECONDS},
+    "rmw_take_request": {"source_timestamp": _NANOSECONDS},  # of the request; of our own library
     # Not 0: a thread of its own sends what this publisher gets (`asynchronous_send`).
     "rcl_publisher_init": {"asynchronous": _NUMBER},
     "gate_release": {
@@ -175,6 +198,9 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
 VERSION_FIELDS = {
     "rmw_publish": {"rmw_publisher_handle", "timestamp"},  # since Jazzy
     "rmw_take": {"taken"},
+    "rmw_take_request": {"taken"},  # nor has our own library, which sees no others
+    "rmw_take_response": {"taken"},
+    "rmw_send_response": {"timestamp"},
     "callback_start": {"is_intra_process"},
     "rclcpp_ring_buffer_enqueue": {"overwritten"},
     "dispatch_subscription_callback": {"source_stamp"},
@@ -183,9 +209,9 @@ VERSION_FIELDS = {
 
 _CREATION_ENDINGS = ("_init", "_added", "_register", "_link_node", "_to_ipb", "_to_subscription")
 CREATION = frozenset(name for name in FIELDS if name.endswith(_CREATION_ENDINGS)) | {
-    *("rmw_implementation", "rclcpp_construct_ring_buffer")
+    *("rmw_implementation", "rclcpp_construct_ring_buffer", "rcl_lifecycle_transition")
 }
-"""The events of objects' creation, which say what all others are about."""
+"""The events of objects' creation, and changes of their state, which all others depend on."""
 NODE_NAME = pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + pl.col("node_name")
 """The full name of the node that a row of `rcl_node_init` is about: ``/front/filter``."""
 

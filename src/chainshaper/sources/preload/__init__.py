@@ -38,7 +38,7 @@ from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import descendants, run_users
 from chainshaper.linux.threads import innermost_id, list_threads, parents, read_proc
-from chainshaper.sources.ebpf.trace_points import TracePoint, TracingLibrary, version_of
+from chainshaper.sources.ebpf.trace_points import Argument, TracePoint, TracingLibrary, version_of
 from chainshaper.sources.system import (
     NEXT_HOST,
     distribution_of,
@@ -97,8 +97,10 @@ _TEXT_BYTES, _PLACES = 40, 16
 _LARGEST = 1 << 30
 _F_GET_SEALS, _F_SEAL_SHRINK = 1034, 2  # linux/fcntl.h
 _THREAD_TIME = 2  # the value of callback_start and callback_end that is no argument
+_CALL = {"rmw_client_handle": 0, "rmw_service_handle": 0, "request": 1, "response": 1}
+_CALL |= {"client_gid": 2, "sequence_number": 4, "source_timestamp": 5}  # places of CALL's values
 
-_NAME = re.compile(r"^  (?:EVENT|TIMED|CREATION)\((\w+),", re.MULTILINE)
+_NAME = re.compile(r"^  (?:EVENT|TIMED|CREATION|CALL)\((\w+)", re.MULTILINE)
 
 
 @functools.cache
@@ -276,7 +278,14 @@ def _columns(
     point: TracePoint, records: NDArray[Any], texts: Sequence[Mapping[int, str]]
 ) -> Iterator[tuple[str, Any]]:
     values = records["values"]
-    for argument in point.arguments:
+    arguments = point.arguments
+    if "sequence_number" in events.FIELDS[point.event]:
+        arguments = tuple(
+            Argument(column, _CALL[column], "gid" if column == "client_gid" else "number")
+            for column in events.column_types(point.event)
+            if column in _CALL
+        )
+    for argument in arguments:
         if argument.kind == "text":
             yield argument.column, [one.get(argument.place) for one in texts]
         elif argument.kind == "gid":

@@ -16,8 +16,12 @@
 // are in registers (of a bool the lowest byte counts). The third one of callback_start and
 // callback_end is the CPU time of the thread. Texts follow their event in records of their own.
 //
+// The calls of services have trace points from Kilted on only: we see them as librcl calls rmw, on
+// all distributions alike.
+//
 // Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1: all arguments are
 // integers or pointers, at most five, so that any of its versions can be called, and answered, alike.
+// rmw, `rmw/types.h` and `rmw/rmw.h`, Humble to Rolling: `rmw_service_info_t`, `rmw_request_id_t`.
 #define _GNU_SOURCE
 #include <dlfcn.h>
 #include <errno.h>
@@ -269,7 +273,9 @@ static bool has_ring(void) {
   return false;
 }
 
-static inline __attribute__((always_inline)) void write_record(uint16_t event, unsigned count,
+// `time` 0: now.
+static inline __attribute__((always_inline)) void write_record(uint16_t event, uint64_t time,
+                                                               unsigned count,
                                                                const uint64_t *values,
                                                                bool timed) {
   if (__builtin_expect(!own.ring, 0) && !has_ring()) return;
@@ -277,7 +283,7 @@ static inline __attribute__((always_inline)) void write_record(uint16_t event, u
   struct record *record = &own.records[number & (RING_RECORDS - 1)];
   // Who sees any of this record sees the count of those before, and that its room is taken again.
   atomic_thread_fence(memory_order_release);
-  uint64_t time = now(CLOCK_MONOTONIC);
+  if (!time) time = now(CLOCK_MONOTONIC);
   stamp(record, time);
   atomic_store_explicit(&record->event, event, memory_order_relaxed);
   for (unsigned place = 0; place < count; place++) record->values[place] = values[place];
@@ -339,7 +345,8 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
 
 #define BIT(place) (1u << (place))
 // EVENT: name, arguments that are values. TIMED: the same, CPU time behind them. CREATION: name, the
-// places of texts as bits, that of a gid (0: none). A record's number is the place in this list.
+// places of texts as bits, that of a gid (0: none). CALL: handle, message, gid, sequence number and
+// source timestamp of a service's call. A record's number is the place in this list.
 // Not in it: rclcpp_executor_get_next_ready and _wait_for_work. Executors of several threads emit
 // some 100,000 a second while a callback group with waiting messages is busy.
 #define ALL_EVENTS \
@@ -361,6 +368,8 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
   CREATION(rclcpp_construct_ring_buffer, 0, 0) \
   CREATION(rclcpp_buffer_to_ipb, 0, 0) \
   CREATION(rclcpp_ipb_to_subscription, 0, 0) \
+  CREATION(rcl_lifecycle_state_machine_init, 0, 0) \
+  CREATION(rcl_lifecycle_transition, BIT(1) | BIT(2), 0) \
   TIMED(callback_start, 2) \
   TIMED(callback_end, 1) \
   EVENT(rclcpp_publish, 2) \
@@ -374,15 +383,21 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
   EVENT(rclcpp_ring_buffer_dequeue, 3) \
   EVENT(rclcpp_ring_buffer_clear, 1) \
   EVENT(rclcpp_executor_execute, 1) \
-  EVENT(rcl_timer_call, 1)
+  EVENT(rcl_timer_call, 1) \
+  CALL(rmw_send_request) \
+  CALL(rmw_take_request) \
+  CALL(rmw_send_response) \
+  CALL(rmw_take_response)
 
 #define EVENT(name, ...) number_##name,
 #define TIMED EVENT
 #define CREATION EVENT
+#define CALL EVENT
 enum { before_first = FIRST_EVENT - 1, ALL_EVENTS };
 #undef EVENT
 #undef TIMED
 #undef CREATION
+#undef CALL
 
 #define ARGUMENTS uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e
 typedef void (*function)(ARGUMENTS);
@@ -411,12 +426,62 @@ typedef bool (*question)(void);
   bool ros_trace_enabled_##name(void) { return true; }
 
 #define EVENT(name, count) \
-  HOOK(name, write_record(number_##name, count, ((uint64_t[6]){a, b, c, d, e}), false))
+  HOOK(name, write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), false))
 #define TIMED(name, count) \
-  HOOK(name, write_record(number_##name, count, ((uint64_t[6]){a, b, c, d, e}), true))
+  HOOK(name, write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), true))
 #define CREATION(name, texts, gid) \
   HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
+#define CALL(name)
 ALL_EVENTS
+
+struct request_id {
+  uint8_t writer[16];
+  int64_t number;
+};
+
+struct service_info {
+  int64_t sent, received;
+  struct request_id id;
+};
+
+static void write_call(uint16_t event, uint64_t time, const void *handle, const void *message,
+                       const struct request_id *id, int64_t sent) {
+  uint64_t values[6] = {(uintptr_t)handle, (uintptr_t)message, 0, 0, (uint64_t)id->number,
+                        (uint64_t)sent};
+  memcpy(&values[2], id->writer, sizeof id->writer);
+  write_record(event, time, 6, values, false);
+}
+
+#define BEHIND(name, ...) \
+  static int (*_Atomic behind)(__VA_ARGS__); \
+  if (!behind) behind = (int (*)(__VA_ARGS__))next_one(#name)
+
+int rmw_send_request(const void *client, const void *request, int64_t *number) {
+  BEHIND(rmw_send_request, const void *, const void *, int64_t *);
+  uint64_t began = now(CLOCK_MONOTONIC);  // it may be taken before its number is known
+  int result = behind(client, request, number);
+  if (result == 0)
+    write_call(number_rmw_send_request, began, client, request,
+               &(struct request_id){.number = *number}, 0);
+  return result;
+}
+
+int rmw_send_response(const void *service, struct request_id *id, void *response) {
+  BEHIND(rmw_send_response, const void *, struct request_id *, void *);
+  write_call(number_rmw_send_response, 0, service, response, id, 0);
+  return behind(service, id, response);
+}
+
+#define TAKE(name) \
+  int name(const void *handle, struct service_info *info, void *message, bool *taken) { \
+    BEHIND(name, const void *, struct service_info *, void *, bool *); \
+    int result = behind(handle, info, message, taken); \
+    if (result == 0 && *taken) \
+      write_call(number_##name, 0, handle, message, &info->id, info->sent); \
+    return result; \
+  }
+TAKE(rmw_take_request)
+TAKE(rmw_take_response)
 
 // Functions of rcl, of which ros2_tracing has no event. Since Jazzy the one may call the other.
 typedef int (*timer_function)(uint64_t timer, uint64_t information);
@@ -429,7 +494,7 @@ typedef int (*timer_function)(uint64_t timer, uint64_t information);
     int result = behind(timer, information); \
     if (!outer) return result; \
     own.calls_timer = false; \
-    if (!result) write_record(number_rcl_timer_call, 1, (uint64_t[6]){timer}, false); \
+    if (!result) write_record(number_rcl_timer_call, 0, 1, (uint64_t[6]){timer}, false); \
     return result; \
   }
 TIMER_CALL(rcl_timer_call)
