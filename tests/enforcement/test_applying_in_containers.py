@@ -2,7 +2,6 @@
 
 import json
 import signal
-import time
 from contextlib import ExitStack
 from functools import partial
 from itertools import pairwise
@@ -35,6 +34,12 @@ def _has_lines(output: Path) -> bool:
     return output.exists() and output.stat().st_size > 0
 
 
+def _slots() -> int:
+    """How many slots the second container's server has had."""
+    (status,) = json.loads(called("status", "--json").out)
+    return int(status["state"]["servers"][1]["counters"]["slots"])
+
+
 def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> None:
     """Each is process 1 in its container; one is governed in each slot, both are as before."""
     with ExitStack() as both:
@@ -48,16 +53,14 @@ def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> 
             pids[name] = process.pid
         before = {name: scheduling(pid) for name, pid in pids.items()}
         with applied(PLAN, tmp_path, *FREEZER, "--json") as run:
-            time.sleep(1.5)
+            wait_for(lambda: _slots() > 8, "nine slots")
             policies = {name: list_threads(pid)[0].policy for name, pid in pids.items()}
             assert policies == dict.fromkeys(pids, "SCHED_FIFO")
             released = called("release", "--crashed")
             assert (released.code, run.poll()) == (0, None), "what is in force stays so"
-            (status,) = json.loads(called("status", "--json").out)
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=30)
             assert run.returncode == 0
-        assert status["state"]["servers"][1]["counters"]["slots"] > 8
         lines = [line.split() for line in (tmp_path / "other").read_text().splitlines()[:-1]]
         pauses = [int(after[0]) - int(before[1]) for before, after in pairwise(lines)]
         assert sum(pause > 60 * MS for pause in pauses) > 8, "closed for 70 ms in every cycle"

@@ -81,9 +81,7 @@ def ran(program: Path, tmp_path: Path) -> Ran:
         ]
         launch = tmp_path / "robot.launch.py"
         launch.write_text(LAUNCH.replace("{nodes!r}", repr(nodes)))
-        folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / "-".join(
-            [verb, language, *words.split()[:2]]
-        )
+        folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / f"{tmp_path.name}-{verb}"
         known = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
         known["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         command = [sys.executable, "-m", "chainshaper", verb, "-o", str(folder), *options, "--json"]
