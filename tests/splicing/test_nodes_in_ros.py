@@ -24,12 +24,12 @@ from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.sources.ros import script as ros_script
 from chainshaper.splicing.shaping_process import (
-    NodeKind,
     ShapingProcess,
     build_package,
     write_shaping_process,
     write_throttler,
 )
+from chainshaper.values.plan_choices import NodeKind
 
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(600)]
 

@@ -27,13 +27,13 @@ from chainshaper.planning import Plan, ShapingNode, let_per_callback
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
-    NodeKind,
     ShapingProcess,
     gate_of,
     write_shaping_process,
     write_throttler,
 )
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import NodeKind
 
 MS = 1_000_000
 LATENCY = Path("/dev/cpu_dma_latency")

@@ -24,8 +24,9 @@ from ros2 import ros2_environment
 from chainshaper import splice_launch_files
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
-from chainshaper.splicing.shaping_process import NodeKind, build_package
+from chainshaper.splicing.shaping_process import build_package
 from chainshaper.splicing.spliced_launch import NODES
+from chainshaper.values.plan_choices import NodeKind
 
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(1200)]
 

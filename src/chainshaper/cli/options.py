@@ -17,7 +17,7 @@ import chainshaper as cs
 from chainshaper.gate.decision import Late
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
-from chainshaper.values.plan_choices import BANDS, Wishes
+from chainshaper.values.plan_choices import BANDS, NodeKind, Wishes
 
 if TYPE_CHECKING:
     from chainshaper.planning import Modes
@@ -26,9 +26,6 @@ Source: TypeAlias = Literal["lttng", "preload", "ebpf"]
 
 DESCRIPTIONS = (".yaml", ".yml")
 """What files that people write end with: applications and plans."""
-
-NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
-"""How a shaping node is made."""
 
 
 def _duration(text: str) -> int:

@@ -17,7 +17,7 @@ from chainshaper.values.errors import OperationError, shown
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from chainshaper.splicing.shaping_process import NodeKind
+    from chainshaper.values.plan_choices import NodeKind
 
 Progress: TypeAlias = Callable[[float, str], None]
 """Gets the share that is done, and what is done now."""

@@ -10,7 +10,7 @@ from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.cli.applying import recording_of
 from chainshaper.values.errors import InputError
-from chainshaper.values.plan_choices import Fallback
+from chainshaper.values.plan_choices import Fallback, NodeKind
 
 
 @opt.takes_wishes(*opt.PLAN_WISHES)
@@ -253,7 +253,7 @@ def splice(
         "NODE or whoever subscribes in the recording (may be repeated). RULE: newest, at fixed "
         "instants (default), or first, as it comes.",
     ),
-    node: opt.NodeKind = opt.NODE,
+    node: NodeKind = opt.NODE,
     message_type: str | None = opt.option(
         "--type PKG/msg/TYPE",
         "Of the output, for --node typed and component. Default: what the recording says.",

@@ -17,6 +17,7 @@ from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables, judge
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.plan_choices import NodeKind
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -503,7 +504,7 @@ def shape(
     since: int = opt.SINCE,
     until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,
-    node: opt.NodeKind = opt.NODE,
+    node: NodeKind = opt.NODE,
     backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     adapt: bool = opt.ADAPT,
     max_latency: int | None = opt.MAX_LATENCY,

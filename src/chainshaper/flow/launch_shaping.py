@@ -52,10 +52,11 @@ from chainshaper.planning.request import (
     refuse_simulated,
 )
 from chainshaper.reporting.figures import write_comparison
-from chainshaper.splicing.shaping_process import NodeKind, build_package, check_build_tools
+from chainshaper.splicing.shaping_process import build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import NodeKind
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 

@@ -27,7 +27,6 @@ from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (
     GATES,
     STANDBY,
-    NodeKind,
     ShapingProcess,
     delivery_settings,
     gate_library,
@@ -47,7 +46,7 @@ from chainshaper.splicing.spliced_launch import (
     usable,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
-from chainshaper.values.plan_choices import Fallback
+from chainshaper.values.plan_choices import Fallback, NodeKind
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
 if TYPE_CHECKING:

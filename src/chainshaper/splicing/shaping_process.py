@@ -16,7 +16,7 @@ import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
 import yaml
 
@@ -30,8 +30,8 @@ from chainshaper.planning.plan import Plan, ShapingNode, server_of
 from chainshaper.sources.preload import compile_library, in_cache
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.files import write_whole
+from chainshaper.values.plan_choices import NodeKind
 
-NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
 OF_ONE_TYPE = ("typed", "component")
 _SOURCES = Path(__file__).parents[2]
 _NODES = Path(__file__).parent / "nodes"

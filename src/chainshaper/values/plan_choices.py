@@ -31,6 +31,9 @@ ShapingThread: TypeAlias = Literal["free", "in-slots"]
 EqualPriorities: TypeAlias = Literal["apart", "round-robin"]
 """What servers of one core and one priority do: their slots are apart, or they take turns."""
 
+NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
+"""How a shaping node is made (:mod:`chainshaper.splicing.shaping_process`)."""
+
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
 
