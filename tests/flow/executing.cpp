@@ -40,15 +40,11 @@ struct Notes {
   explicit Notes(const std::string& file) : out{file} {}
   void add(const char* callback, const std::string& origin, long long began, long long before, long long behind) {
     const std::lock_guard<std::mutex> alone{mutex};
-    lines.push_back(std::string{callback} + " " + std::to_string(syscall(SYS_gettid)) + " " + origin + " " +
-                    std::to_string(began) + " " + std::to_string(before) + " " + std::to_string(behind));
-  }
-  ~Notes() {
-    for (const auto& line : lines) out << line << "\n";
+    out << callback << " " << syscall(SYS_gettid) << " " << origin << " " << began << " " << before << " " << behind
+        << std::endl;  // at once: a process that dies as it ends has noted all
   }
   std::ofstream out;
   std::mutex mutex;
-  std::vector<std::string> lines;
 };
 
 class Worker : public rclcpp::Node {
