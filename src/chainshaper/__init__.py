@@ -14,12 +14,15 @@ A name is imported when it is first used, so that importing the package costs no
 below are for type checkers; at run time they are the table of what is public, and where it is.
 """
 
-from functools import cache
-from importlib import import_module
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from __future__ import annotations
 
+from functools import cache
+
+# Nothing slower is imported here: until chainshaper.__main__ begins, Ctrl-C shows a traceback.
+TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from typing import Any
+
     from chainshaper.analysis import LatencyAnalysis as LatencyAnalysis
     from chainshaper.analysis import analyse_latency as analyse_latency
     from chainshaper.analysis import application_graph as application_graph
@@ -98,6 +101,7 @@ if TYPE_CHECKING:
 def _homes() -> dict[str, str | None]:
     """Public name → its module, by the imports above."""
     import ast
+    from pathlib import Path
 
     imports = ast.walk(ast.parse(Path(__file__).read_text(encoding="utf-8")))
     found = [node for node in imports if isinstance(node, ast.ImportFrom)]
@@ -107,6 +111,8 @@ def _homes() -> dict[str, str | None]:
 def __getattr__(name: str) -> Any:
     if name == "__all__":
         return sorted(_homes())
+    from importlib import import_module
+
     home = _homes().get(name)
     if home is None:
         raise AttributeError(f"module 'chainshaper' has no attribute {name!r}")
