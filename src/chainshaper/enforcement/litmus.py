@@ -37,7 +37,7 @@ from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import SchedulingClass, set_state, state_of
 from chainshaper.linux.threads import find_thread
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 NOTE = "litmus-plugin"
@@ -257,7 +257,7 @@ def create_command(
     for start, end in server.slots:
         if end - start < _SHORTEST_NS:
             raise InputError(
-                f"server {server.name}: the slot at {format_duration(start)} is shorter than "
+                f"server {server.name}: the slot at {duration_text(start)} is shorter than "
                 f"{_SHORTEST_NS} ns, the least that LITMUS^RT takes: make it longer"
             )
     return (

@@ -30,7 +30,7 @@ from chainshaper.linux import cgroups, runs
 from chainshaper.linux.runs import Journal, find_journals, locked, process_of
 from chainshaper.linux.scheduling import state_of, state_text
 from chainshaper.linux.threads import find_thread, open_process
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError, PlatformError
 
 CLAIMS = "claims"
@@ -65,7 +65,7 @@ class SlotMove:
 
     @property
     def text(self) -> str:
-        start = format_duration(self.start_ns)
+        start = duration_text(self.start_ns)
         return f"the last slot of {self.chain} begins at {start} now: {self.why}"
 
 

@@ -52,7 +52,7 @@ from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
@@ -339,7 +339,7 @@ class _Run:
             if phase.spread_ns > LEAD_NS:
                 self.note(
                     f"the beginning of {chain_name(chain)} varies by"
-                    f" {format_duration(phase.spread_ns)} from cycle to cycle: it is started by"
+                    f" {duration_text(phase.spread_ns)} from cycle to cycle: it is started by"
                     " something less regular than a timer"
                 )
         return phases
@@ -472,7 +472,7 @@ class _Run:
                 others = [note for note in self.state.notes if note not in said]
                 said = tuple(
                     f"the beginning of {chain_name(self.plan.chains[place])} has moved by"
-                    f" {format_duration(ns)} since the plan was put in force; shaping nodes get it,"
+                    f" {duration_text(ns)} since the plan was put in force; shaping nodes get it,"
                     " and outputs without a stamp follow from the next cycle"
                     for place, ns in sent.items()
                 )

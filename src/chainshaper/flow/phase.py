@@ -28,7 +28,7 @@ from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.planning.plan import ShapingNode
 from chainshaper.splicing.shaped_outputs import ask_phase
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
@@ -73,8 +73,8 @@ def measure_phase(
         if (phase := find_phase(found, cycle_ns, cycles)) is not None:
             return phase
     raise OperationError(
-        f"thread {tid} of process {pid} was watched for {format_duration(cycles * cycle_ns)} "
-        f"and does not wake up once in every {format_duration(cycle_ns)} ({len(found)} "
+        f"thread {tid} of process {pid} was watched for {duration_text(cycles * cycle_ns)} "
+        f"and does not wake up once in every {duration_text(cycle_ns)} ({len(found)} "
         "wake-ups): is the chain running, with the period of the plan? Its phase can also be "
         "given (--phase)"
     )

@@ -32,7 +32,7 @@ from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
@@ -222,7 +222,7 @@ def _period(analysis: LatencyAnalysis, given: int | None) -> int:
     if period is not None:
         return period
     starts = analysis.traversals["start"].unique().sort().to_numpy()
-    seen = f" (starts are {format_duration(int(np.median(np.diff(starts))))} apart, mostly)"
+    seen = f" (starts are {duration_text(int(np.median(np.diff(starts))))} apart, mostly)"
     raise InputError(
         f"chain {analysis.chain.spec} starts at {first.label}, which is no timer, so its period is"
         f" not known{seen if len(starts) > 1 else ''}: add --period, or begin the chain at the"
@@ -241,8 +241,8 @@ def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
         if not 1 - _SAME_SPEED < (speed := first.period_ns / apart) < 1 + _SAME_SPEED:
             raise InputError(
                 f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
-                f" timer of {format_duration(first.period_ns)} expires every"
-                f" {format_duration(round(apart / 1e5) * 100_000)}. Replay at that speed (`ros2 bag"
+                f" timer of {duration_text(first.period_ns)} expires every"
+                f" {duration_text(round(apart / 1e5) * 100_000)}. Replay at that speed (`ros2 bag"
                 " play --rate 1.0`), or start the nodes with use_sim_time:=false"
             )
     return found

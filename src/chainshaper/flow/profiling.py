@@ -30,7 +30,7 @@ from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together
 from chainshaper.values.application import ApplicationGraph
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording
 
@@ -77,7 +77,7 @@ def profiling_condition(
                 missing, running = (", ".join(sorted(n)) for n in (wanted - there, there))
                 raise OperationError(
                     f"{f'node {missing}' if missing else 'a node'} has not appeared within"
-                    f" {format_duration(START_NS)}; running: {running or 'no node'}"
+                    f" {duration_text(START_NS)}; running: {running or 'no node'}"
                 )
             return False
         homes = {

@@ -44,7 +44,7 @@ from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
 from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.sources.system import own_pid_namespace
 from chainshaper.values import events
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import (
     ChainshaperError,
     InputError,
@@ -258,7 +258,7 @@ def _trace(
         run.progress(1.0, "ending")
         run.tracer.stop()
         if run.exit_code:
-            lasted = format_duration(round(run.ended_ns - run.begun_ns, -8))
+            lasted = duration_text(round(run.ended_ns - run.begun_ns, -8))
             run.notes += (f"the command {end_in_words(run.exit_code)} after {lasted}.",)
         if run.exit_code is not None:  # types and QoS of all topics are asked of what still runs
             run.no_qos_because = "the application had ended by itself"
@@ -353,7 +353,7 @@ def _written(
                 "the run was over before the threads had the scheduling it was to be recorded with"
             )
         tables = events.happened(tables, since_ns)
-        lasted = format_duration(round(since_ns - run.begun_ns, -8))
+        lasted = duration_text(round(since_ns - run.begun_ns, -8))
         notes.append(f"the first {lasted} were left out: the scheduling was not in force yet.")
     policies = {thread.policy for thread in threads if thread.role == "executor"}
     in_real_time = policies <= {"SCHED_FIFO", "SCHED_RR"} if policies else None

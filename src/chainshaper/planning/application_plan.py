@@ -32,7 +32,7 @@ from chainshaper.planning.plan import (
     slot_text,
     with_slots,
 )
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
 
@@ -360,9 +360,9 @@ def _slot_count(plan: ApplicationPlan) -> _Wrong:
     slots = [sum(len(server.slots) for server in chain.servers) for chain in chains]
     counts = [plan.cycle_ns // one.cycle_ns * own for one, own in zip(chains, slots, strict=True)]
     if len(chains) > 1 and sum(counts) > MOST_SLOTS:
-        cycles = ", ".join(format_duration(chain.cycle_ns) for chain in chains)
+        cycles = ", ".join(duration_text(chain.cycle_ns) for chain in chains)
         yield (
-            f"the cycles {cycles} repeat together after {format_duration(plan.cycle_ns)} only, with"
+            f"the cycles {cycles} repeat together after {duration_text(plan.cycle_ns)} only, with"
             f" {sum(counts)} slots; {MOST_SLOTS} is the most that is carried out: use periods with"
             " a larger common divisor",
             len(chains) - 1,

@@ -47,7 +47,7 @@ from chainshaper.planning.plan import (
     revised,
     with_slots,
 )
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.plan_choices import Goal, Solver
 
@@ -102,8 +102,8 @@ def predict_bands(
 def _refuse_before_longest(latest_ns: int, longest_ns: int) -> None:
     if latest_ns < longest_ns:
         raise InputError(
-            f"the last slot takes outputs until {format_duration(latest_ns)}, before the longest"
-            f" latency {format_duration(longest_ns)}: move it behind"
+            f"the last slot takes outputs until {duration_text(latest_ns)}, before the longest"
+            f" latency {duration_text(longest_ns)}: move it behind"
         )
 
 
@@ -131,12 +131,12 @@ class BandProblem:
         latencies = np.sort(check_latencies(self.latencies_ns))
         object.__setattr__(self, "latencies_ns", latencies)
         if slot <= 0 or self.grid_ns <= 0:
-            raise InputError("the publish slot and the grid must be longer than 0ms")
+            raise InputError("the publish slot and the grid must be longer than 0 ms")
         _refuse_before_longest(self.last_end_ns - self.at_start_ns, int(latencies[-1]))
         if gap is not None and gap <= slot:
             raise InputError(
-                f"a largest gap of {format_duration(gap)} is not longer than the publish slot"
-                f" {format_duration(slot)}, so no two slots could follow each other: allow a"
+                f"a largest gap of {duration_text(gap)} is not longer than the publish slot"
+                f" {duration_text(slot)}, so no two slots could follow each other: allow a"
                 " longer gap or use a shorter slot"
             )
         if share is not None and not 0 < share <= 1:
@@ -269,8 +269,8 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
     start, end = _last_publish_slot(plan)
     if not 0 <= slot_start_ns <= start:
         raise InputError(
-            f"a long publish slot may start from 0ms to {format_duration(start)}, where the plan's"
-            f" own does; {format_duration(slot_start_ns)} does not"
+            f"a long publish slot may start from 0 ms to {duration_text(start)}, where the plan's"
+            f" own does; {duration_text(slot_start_ns)} does not"
         )
     published = np.maximum(check_latencies(latencies_ns), slot_start_ns)
     # Published at once, the output is late by the publication itself, which the slot's end bounds.
@@ -325,8 +325,8 @@ def place_bands(
         raise OperationError(_why_none(problem, bands))
     if mean_at_most_ns is not None and best.mean_ns > mean_at_most_ns:
         raise OperationError(
-            f"no placement of {bands} bands has an average of {format_duration(mean_at_most_ns)}"
-            f" or less; the best is {format_duration(round(best.mean_ns))}: allow that, or more"
+            f"no placement of {bands} bands has an average of {duration_text(mean_at_most_ns)}"
+            f" or less; the best is {duration_text(round(best.mean_ns))}: allow that, or more"
             " bands"
         )
     if minimise == "gap":
@@ -363,9 +363,9 @@ def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
     if bands > problem.room:
         raise InputError(
             f"{bands} bands cannot be placed: between the shortest latency"
-            f" {format_duration(int(problem.latencies_ns[0]))} and the last slot's end"
-            f" {format_duration(problem.last_end_ns)} there is room for {problem.room} publish"
-            f" slots of {format_duration(problem.publish_slot_ns)}; use fewer bands or a shorter"
+            f" {duration_text(int(problem.latencies_ns[0]))} and the last slot's end"
+            f" {duration_text(problem.last_end_ns)} there is room for {problem.room} publish"
+            f" slots of {duration_text(problem.publish_slot_ns)}; use fewer bands or a shorter"
             " slot"
         )
 
@@ -418,7 +418,7 @@ def _solve(problem: BandProblem, bands: int) -> _Tables:
     if size * layers > MOST_CELLS:
         raise InputError(
             f"{size} positions for {layers} bands are too many to search: use a grid coarser than"
-            f" {format_duration(grid)}"
+            f" {duration_text(grid)}"
         )
     ends = (first + np.arange(size, dtype=np.int64)) * grid
     counts = np.searchsorted(problem.ready_ns, ends, side="right").astype(np.int64)
@@ -468,7 +468,7 @@ def _why_none(problem: BandProblem, bands: int) -> str:
         ("max_share",): f"no placement has every band at {problem.max_share or 1:.1%} of the"
         " executions; allow a larger share or more bands",
         ("max_gap_ns",): "no placement has neighbours within"
-        f" {format_duration(problem.max_gap_ns or 0)}; allow a larger gap",
+        f" {duration_text(problem.max_gap_ns or 0)}; allow a larger gap",
         ("max_share", "max_gap_ns"): "the largest gap and the largest share exclude each other;"
         " relax one",
     }
@@ -481,8 +481,8 @@ def _why_none(problem: BandProblem, bands: int) -> str:
 
 def _too_coarse(problem: BandProblem, bands: int) -> str:
     return (
-        f"{bands} bands cannot be placed: the grid of {format_duration(problem.grid_ns)} is too"
-        f" coarse for slots of {format_duration(problem.publish_slot_ns)}; use a finer one"
+        f"{bands} bands cannot be placed: the grid of {duration_text(problem.grid_ns)} is too"
+        f" coarse for slots of {duration_text(problem.publish_slot_ns)}; use a finer one"
     )
 
 
@@ -499,12 +499,12 @@ def _broken(
     slot, shortest = problem.publish_slot_ns, int(problem.latencies_ns[0])
     gaps = np.diff(ends, axis=-1)
     if ends.shape[-1] > 1:
-        words = f"the first slot must begin after the shortest latency {format_duration(shortest)}"
+        words = f"the first slot must begin after the shortest latency {duration_text(shortest)}"
         yield words, np.clip(shortest + slot + 1 - ends[..., 0], 0, None)
-    words = f"slot ends must be more than the publish slot {format_duration(slot)} apart"
+    words = f"slot ends must be more than the publish slot {duration_text(slot)} apart"
     yield words, np.clip(slot + 1 - gaps, 0, None).sum(axis=-1)
     if problem.max_gap_ns is not None:
-        words = f"slot ends must be at most {format_duration(problem.max_gap_ns)} apart"
+        words = f"slot ends must be at most {duration_text(problem.max_gap_ns)} apart"
         yield words, np.clip(gaps - problem.max_gap_ns, 0, None).sum(axis=-1)
     if problem.max_share is not None:
         counts, _ = counts_and_mean(problem.ready_ns, ends)

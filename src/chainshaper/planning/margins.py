@@ -40,7 +40,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.plan import Adaptation, Margin
-from chainshaper.values.durations import format_duration, parse_duration
+from chainshaper.values.durations import duration_text, parse_duration
 from chainshaper.values.errors import InputError, OperationError
 
 LONGEST_NS = 24 * 3_600 * 1_000_000_000  # beyond a day it is a wrong unit, not a latency
@@ -99,7 +99,7 @@ def read_latencies(path: str | Path) -> _Latencies:
         named = str(error).startswith(str(path))
         raise InputError(str(error) if named else f"{path}: {error}") from error
     if not latencies.any():
-        raise InputError(f"{path}: every latency is 0ms: check the unit, and what was measured")
+        raise InputError(f"{path}: every latency is 0 ms: check the unit, and what was measured")
     return latencies
 
 
@@ -116,7 +116,7 @@ def _read_lines(path: Path) -> _Latencies:
             raise InputError(f"{path}:{number}: {error}") from error
         if not 0 <= found[-1] <= LONGEST_NS:
             raise InputError(
-                f"{path}:{number}: {content} is no latency: write 0ms or more, up to a day"
+                f"{path}:{number}: {content} is no latency: write 0 ms or more, up to a day"
             )
     return np.array(found, dtype=np.int64)
 
@@ -140,7 +140,7 @@ def check_latencies(latencies: object) -> _Latencies:
         (~np.isfinite(array), "is not a number: remove it"),
         (array != np.floor(array), "is not a whole number of nanoseconds: convert it"),
         (array < 0, "is negative: a latency is not; check the clocks"),
-        (array > LONGEST_NS, f"is longer than {format_duration(LONGEST_NS)}: check the unit"),
+        (array > LONGEST_NS, f"is longer than {duration_text(LONGEST_NS)}: check the unit"),
     ):
         if wrong.any():
             place = int(np.argmax(wrong))
@@ -267,8 +267,8 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
                 return fit
             raise OperationError(
                 f"{latencies.size} latencies are too few for an overrun probability of"
-                f" {probability:g}: the latency it asks for lies between {format_duration(low)}"
-                f" and {format_duration(high)}. Measure more cycles, or ask for less"
+                f" {probability:g}: the latency it asks for lies between {duration_text(low)}"
+                f" and {duration_text(high)}. Measure more cycles, or ask for less"
             )
     raise OperationError(
         "the longest latencies do not follow a generalised Pareto distribution above any of"

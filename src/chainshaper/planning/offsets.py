@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from chainshaper.planning.overruns import slots_without
 from chainshaper.planning.plan import Plan, Slot, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 
 MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
@@ -407,13 +407,13 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
         for place, slots in one.slots.items()
     }
     (core, priority), needed = max(longest.items(), key=lambda item: (item[1], item[0]))
-    excess = f", {format_duration(needed - common)} too long" if needed > common else ""
+    excess = f", {duration_text(needed - common)} too long" if needed > common else ""
     return (
         f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide at"
-        f" every offset: with cycles of {format_duration(one.cycle_ns)} and"
-        f" {format_duration(two.cycle_ns)} they meet in every distance modulo"
-        f" {format_duration(common)}, which leaves no room for both (their longest take"
-        f" {format_duration(needed)}{excess}). Move one to another core, give their servers"
+        f" every offset: with cycles of {duration_text(one.cycle_ns)} and"
+        f" {duration_text(two.cycle_ns)} they meet in every distance modulo"
+        f" {duration_text(common)}, which leaves no room for both (their longest take"
+        f" {duration_text(needed)}{excess}). Move one to another core, give their servers"
         " different priorities, or use periods with a larger common divisor"
     )
 

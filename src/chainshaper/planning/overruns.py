@@ -29,7 +29,7 @@ from chainshaper.planning.plan import (
     server_of,
     with_slots,
 )
-from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError
 
 IDLE_BAND = 0.02  # of the cycles: a band that has less does next to nothing for the average
@@ -305,9 +305,9 @@ def publication_warnings(plan: Plan) -> list[str]:
         shortest = min(end - start for start, end in server.slots)
         if shortest < ROOMY_SLOT_NS:
             warnings.append(
-                f"a slot of {format_duration(shortest)} that opens late may end while {names}"
+                f"a slot of {duration_text(shortest)} that opens late may end while {names}"
                 " sends, which blocks the whole process until the next one; it costs nothing to"
-                f" give it {format_duration(ROOMY_SLOT_NS)} (--publish-slot), since outputs leave"
+                f" give it {duration_text(ROOMY_SLOT_NS)} (--publish-slot), since outputs leave"
                 " when it opens."
             )
         depth, mine = plan.chain.output_depth, plan.chain.publisher in nodes
@@ -323,7 +323,7 @@ def publication_warnings(plan: Plan) -> list[str]:
             " their age: none will be discarded."
             if lifespan is None
             else f"outputs that overran are discarded by DDS if {topic} has a lifespan of"
-            f" {format_duration(lifespan)}: give it one."
+            f" {duration_text(lifespan)}: give it one."
         )
     return warnings
 
@@ -460,20 +460,20 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
             " latencies, which may be the longest, are not in the plan."
         )
     if margin.confidence_interval_ns:
-        low, high = map(format_duration, margin.confidence_interval_ns)
+        low, high = map(duration_text, margin.confidence_interval_ns)
         yield (
-            f"the margin {format_duration(margin.epsilon_ns)} is an estimate; with 95 % confidence"
+            f"the margin {duration_text(margin.epsilon_ns)} is an estimate; with 95 % confidence"
             f" it lies between {low} and {high}."
         )
     if NEARLY_FULL * cycle < last <= cycle:
         yield (
-            f"the plan fills {last / cycle:.1%} of the cycle {format_duration(cycle)}: an execution"
+            f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}: an execution"
             " a little longer than any measured delays the next one."
         )
     if longest >= cycle and plan.policy != "pipelined":
         yield (
-            f"the longest latency {format_duration(longest)} is not shorter than the cycle"
-            f" {format_duration(cycle)}: executions of the chain overlapped while they were"
+            f"the longest latency {duration_text(longest)} is not shorter than the cycle"
+            f" {duration_text(cycle)}: executions of the chain overlapped while they were"
             " measured, and response times have each other's interference in them."
         )
     if NEARLY_FULL * cycle < longest < cycle:

@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from chainshaper.planning.plan import Plan, Prediction, Server, Slot, Thread, publish_slots, revised
 from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.yaml_file import wrong_values_refused
 
@@ -313,11 +313,11 @@ def _refuse_too_long(
             several = ", ".join(dict.fromkeys(nodes[first:end]))
             why = "" if end == first + 1 else " together, which one thread has to run,"
             raise OperationError(
-                f"the work of {several}{why} takes up to {format_duration(longest[first][end])},"
-                f" with the margin {format_duration(margin_ns)} that is"
-                f" {format_duration(needed - cycle_ns)} longer than the cycle of"
-                f" {format_duration(cycle_ns)}, and no cut makes it shorter. What helps: a period"
-                f" of {format_duration(needed)} or more, or parts of it in nodes of their own"
+                f"the work of {several}{why} takes up to {duration_text(longest[first][end])},"
+                f" with the margin {duration_text(margin_ns)} that is"
+                f" {duration_text(needed - cycle_ns)} longer than the cycle of"
+                f" {duration_text(cycle_ns)}, and no cut makes it shorter. What helps: a period"
+                f" of {duration_text(needed)} or more, or parts of it in nodes of their own"
             )
 
 
@@ -328,8 +328,8 @@ def _no_room(
     most = range(len(cores) + 1, len(cuts))
     enough = next(n for n in most if shortest_cut(longest, cuts, margin_ns, cycle_ns, n))
     return (
-        f"no cut of the chain fits on the cores {named}: it takes {format_duration(total)},"
-        f" {total / cycle_ns:.2f} times the cycle of {format_duration(cycle_ns)}, and each stage"
-        f" {format_duration(margin_ns)} more for the margin. What helps: {enough} cores"
+        f"no cut of the chain fits on the cores {named}: it takes {duration_text(total)},"
+        f" {total / cycle_ns:.2f} times the cycle of {duration_text(cycle_ns)}, and each stage"
+        f" {duration_text(margin_ns)} more for the margin. What helps: {enough} cores"
         f" (--cores {named},…), a longer period, or a smaller margin (--epsilon)"
     )

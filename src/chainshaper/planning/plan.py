@@ -20,7 +20,7 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias
 from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.gate.decision import Anchor, IntoOpenSlot, Late, Messages, Overrun
-from chainshaper.values.durations import format_duration, parse_duration
+from chainshaper.values.durations import duration_text, format_duration, parse_duration
 from chainshaper.values.plan_choices import EqualPriorities, Fallback, Policy, ShapingThread
 from chainshaper.values.yaml_file import (
     Duration,
@@ -306,7 +306,7 @@ class BandPrediction(NamedTuple):
 
 def slot_text(slot: Slot) -> str:
     """A slot as people write it: ``[86ms, 87ms)``."""
-    return f"[{format_duration(slot[0])}, {format_duration(slot[1])})"
+    return f"[{duration_text(slot[0])}, {duration_text(slot[1])})"
 
 
 class Plan(Part):
@@ -444,14 +444,14 @@ def _cycle(plan: Plan) -> _Wrong:
     cycle, period, longest = plan.cycle_ns, plan.chain.period_ns, plan.evidence.max_latency_ns
     if cycle % period:
         yield (
-            f"the cycle {format_duration(cycle)} is no multiple of the chain's period"
-            f" {format_duration(period)}: make it the period, or a whole multiple",
+            f"the cycle {duration_text(cycle)} is no multiple of the chain's period"
+            f" {duration_text(period)}: make it the period, or a whole multiple",
             "cycle",
         )
     if cycle <= longest and plan.policy not in PER_CALLBACK:
         yield (
-            f"the cycle {format_duration(cycle)} is not longer than the longest latency measured,"
-            f" {format_duration(longest)}: plan with a longer period or a shorter chain",
+            f"the cycle {duration_text(cycle)} is not longer than the longest latency measured,"
+            f" {duration_text(longest)}: plan with a longer period or a shorter chain",
             "cycle",
         )
     if plan.policy == "pipelined" and plan.anchor == "cycle":
@@ -474,7 +474,7 @@ def _servers(plan: Plan) -> _Wrong:
             if slot[1] > plan.cycle_ns:
                 reason = (
                     f"the slot {slot_text(slot)} ends after the cycle"
-                    f" {format_duration(plan.cycle_ns)}: move it, or split it in two slots"
+                    f" {duration_text(plan.cycle_ns)}: move it, or split it in two slots"
                 )
                 yield reason, "servers", place, "slots", number
         for number, thread in enumerate(server.threads):
@@ -576,11 +576,11 @@ def _publisher_threads(plan: Plan) -> _Wrong:
     for place, server, nodes in publisher_servers(plan):
         for number, slot in enumerate(server.slots):
             if slot[1] - slot[0] < shortest:
-                took = f" (the longest took {format_duration(measured)})" if measured else ""
+                took = f" (the longest took {duration_text(measured)})" if measured else ""
                 reason = (
                     f"the slot {slot_text(slot)} is too short for an asynchronous publisher:"
                     f" stopped in the midst of a send{took}, its thread would block the whole"
-                    f" process; make it {format_duration(shortest)} or longer (--publish-slot)"
+                    f" process; make it {duration_text(shortest)} or longer (--publish-slot)"
                 )
                 yield reason, "servers", place, "slots", number
         for node, other in product(nodes, plan.servers):
@@ -626,7 +626,7 @@ def _adaptation(plan: Plan) -> _Wrong:
     for slot in publish_slots(plan)[-1:]:
         if latest is not None and slot[1] > latest:
             yield (
-                f"{format_duration(latest)}, but the slot {slot_text(slot)} ends behind it: write"
+                f"{duration_text(latest)}, but the slot {slot_text(slot)} ends behind it: write"
                 " more, or plan a shorter latency",
                 *("adaptation", "max_latency"),
             )

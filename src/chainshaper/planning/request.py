@@ -66,7 +66,7 @@ from chainshaper.planning.shaping import (
     with_sink,
     with_turns,
 )
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy, Wishes
 
@@ -132,8 +132,8 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
         raise OperationError(
-            f"the longest latency {format_duration(longest)} is not shorter than the period"
-            f" {format_duration(period)}, in which LET per chain has to be done: plan LET per"
+            f"the longest latency {duration_text(longest)} is not shorter than the period"
+            f" {duration_text(period)}, in which LET per chain has to be done: plan LET per"
             " callback, or a longer period"
         )
     measured = profile
@@ -427,7 +427,7 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
     every, longest, probability = profile.every, profile.longest_ns, request.overrun_probability
     if request.epsilon_ns is not None:
         if request.epsilon_ns < 0:
-            raise InputError("epsilon must be 0ms or more")
+            raise InputError("epsilon must be 0 ms or more")
         late = late_share(every, longest + request.epsilon_ns)
         return Margin(epsilon_ns=request.epsilon_ns, overrun_probability=late)
     covered = profile.latencies_ns if request.ideal_machine else every
@@ -555,8 +555,8 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
     for one, two in combinations(profiles, 2):
         if sinks and one.period_ns != two.period_ns:
             raise InputError(
-                f"{two.name} has the period {format_duration(two.period_ns)}, {one.name}"
-                f" {format_duration(one.period_ns)}: a plan has one cycle. Plan one of the two"
+                f"{two.name} has the period {duration_text(two.period_ns)}, {one.name}"
+                f" {duration_text(one.period_ns)}: a plan has one cycle. Plan one of the two"
                 " alone"
             )
 

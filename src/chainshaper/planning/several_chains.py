@@ -39,7 +39,7 @@ from chainshaper.planning.request import (
     refuse_simulated,
 )
 from chainshaper.planning.shaping import with_best_effort
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 
 _STANDARD = PlanRequest()
@@ -128,7 +128,7 @@ def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequ
         if core is None or not profile.interference_ns:
             raise
         raise OperationError(
-            f"{profile.name} on core {core}, {format_duration(profile.interference_ns)} behind"
+            f"{profile.name} on core {core}, {duration_text(profile.interference_ns)} behind"
             f" {' and '.join(others)}: {str(error).rstrip('.')}"
         ) from error
 
@@ -197,9 +197,9 @@ def _behind(plan: Plan, taken: Sequence[tuple[int, Slot]]) -> Plan:
     end = later_ns + max(slot[1] for _, slot in own)
     if end > plan.cycle_ns:
         raise OperationError(
-            f"{chain_name(plan)} would be published until {format_duration(end)}, behind the other"
-            f" outputs of core {own[0][0]} and {format_duration(end - plan.cycle_ns)} after its"
-            f" cycle of {format_duration(plan.cycle_ns)}: use a shorter publish slot, or another"
+            f"{chain_name(plan)} would be published until {duration_text(end)}, behind the other"
+            f" outputs of core {own[0][0]} and {duration_text(end - plan.cycle_ns)} after its"
+            f" cycle of {duration_text(plan.cycle_ns)}: use a shorter publish slot, or another"
             " core for one of the outputs"
         )
     slots = {s.name: [(a + later_ns, b + later_ns) for a, b in s.slots] for s in gates}

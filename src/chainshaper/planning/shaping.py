@@ -40,7 +40,7 @@ from chainshaper.planning.plan import (
     until,
     with_slots,
 )
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import EqualPriorities, Wishes
 from chainshaper.values.yaml_file import wrong_values_refused
@@ -89,8 +89,8 @@ def plan_shaping(
     epsilon = given if margin is None else margin.epsilon_ns
     if epsilon < 0 or length <= 0 or period_ns <= 0:
         raise InputError(
-            "epsilon must be 0ms or more, the publish slot and the period longer than 0ms; found"
-            f" {format_duration(epsilon)}, {format_duration(length)}, {format_duration(period_ns)}"
+            "epsilon must be 0 ms or more, the publish slot and the period longer than 0 ms; found"
+            f" {duration_text(epsilon)}, {duration_text(length)}, {duration_text(period_ns)}"
         )
     _refuse_too_long(longest, epsilon, length, period_ns)
     start, end = longest + epsilon, longest + epsilon + length
@@ -185,15 +185,15 @@ def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int)
         return
     remedies = ["a longer period", "a shorter chain"]
     if longest + epsilon < period:
-        remedies.insert(0, f"a publish slot of {format_duration(period - longest - epsilon)}")
+        remedies.insert(0, f"a publish slot of {duration_text(period - longest - epsilon)}")
     if longest + publish_slot <= period:
-        remedies.insert(0, f"a margin of {format_duration(period - longest - publish_slot)}")
+        remedies.insert(0, f"a margin of {duration_text(period - longest - publish_slot)}")
     if longest >= period:
         remedies.append("a pipeline of stages, each shorter than the cycle (--policy pipelined)")
     raise OperationError(
-        f"the longest latency {format_duration(longest)}, the margin {format_duration(epsilon)} and"
-        f" the publish slot {format_duration(publish_slot)} do not fit into the cycle of"
-        f" {format_duration(period)}: {format_duration(missing)} too long. What helps:"
+        f"the longest latency {duration_text(longest)}, the margin {duration_text(epsilon)} and"
+        f" the publish slot {duration_text(publish_slot)} do not fit into the cycle of"
+        f" {duration_text(period)}: {duration_text(missing)} too long. What helps:"
         f" {', or '.join(remedies)}."
     )
 
@@ -239,9 +239,9 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
         raise InputError(f"{node} is no node of the chain's server: name its first node")
     if not start < slot_end_ns < end:
         raise InputError(
-            f"the first node's slot must end after {format_duration(start)} and before"
-            f" {format_duration(end)}, where the chain's does: not at"
-            f" {format_duration(slot_end_ns)}"
+            f"the first node's slot must end after {duration_text(start)} and before"
+            f" {duration_text(end)}, where the chain's does: not at"
+            f" {duration_text(slot_end_ns)}"
         )
     alone = {"name": "first", "slots": ((start, slot_end_ns),), "threads": (thread,)}
     rest = tuple(other for other in chain.threads if other != thread)
@@ -352,8 +352,8 @@ def with_sink(
     slot = (start, start + length)
     if slot[1] > plan.cycle_ns:
         raise OperationError(
-            f"the sink {output} would be published until {format_duration(slot[1])}, after the"
-            f" cycle of {format_duration(plan.cycle_ns)}: plan with a longer period, a shorter"
+            f"the sink {output} would be published until {duration_text(slot[1])}, after the"
+            f" cycle of {duration_text(plan.cycle_ns)}: plan with a longer period, a shorter"
             " slot, or another core for one of the outputs"
         )
     # Servers that run the graph to its end stay open until the slowest sink is done.
@@ -428,8 +428,8 @@ def server_per_callback(
     end = max(slot[1] for slot in slots)
     if end > plan.cycle_ns:
         raise OperationError(
-            f"one slot per callback takes {format_duration(end)}, the cycle is"
-            f" {format_duration(plan.cycle_ns)}: shape the chain instead, plan with a smaller"
+            f"one slot per callback takes {duration_text(end)}, the cycle is"
+            f" {duration_text(plan.cycle_ns)}: shape the chain instead, plan with a smaller"
             " margin (--epsilon), or move callbacks to another core"
         )
     last, (start, _) = callbacks[-1], slots[-1]
@@ -454,8 +454,8 @@ def _slots_in_sequence(
 ) -> list[Slot]:
     if not callbacks or margin_ns < 0 or boundary_ns <= 0:
         raise InputError(
-            "slots per callback need callbacks, a margin of 0ms or more and a boundary longer"
-            " than 0ms"
+            "slots per callback need callbacks, a margin of 0 ms or more and a boundary longer"
+            " than 0 ms"
         )
     slots: list[Slot] = []
     busy_until: dict[int, int] = {}
@@ -497,8 +497,8 @@ def let_per_chain(plan: Plan) -> Plan:
     publishing, length = _one_slot(plan)
     if plan.evidence.min_latency_ns <= length:
         raise InputError(
-            f"the shortest latency {format_duration(plan.evidence.min_latency_ns)} is not longer"
-            f" than the publish slot {format_duration(length)}, so an output could leave in its"
+            f"the shortest latency {duration_text(plan.evidence.min_latency_ns)} is not longer"
+            f" than the publish slot {duration_text(length)}, so an output could leave in its"
             " own cycle: use a shorter slot"
         )
     ends = {s.name: length if s is publishing else plan.cycle_ns for s in plan.servers}
@@ -530,8 +530,8 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
         )
     if length * len(given) > plan.cycle_ns:
         raise OperationError(
-            f"{len(given)} publish slots of {format_duration(length)} do not fit into the cycle"
-            f" {format_duration(plan.cycle_ns)}: use shorter slots"
+            f"{len(given)} publish slots of {duration_text(length)} do not fit into the cycle"
+            f" {duration_text(plan.cycle_ns)}: use shorter slots"
         )
     others = [server for server in plan.servers if server is not publishing]
     chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})

@@ -35,7 +35,7 @@ from chainshaper.reporting.tables import (
     words,
 )
 from chainshaper.values.application import ApplicationGraph, Chain, trigger_text
-from chainshaper.values.durations import format_duration, milliseconds
+from chainshaper.values.durations import duration_text, format_duration, milliseconds
 from chainshaper.values.recording import (
     INFO_FILE,
     MachineReport,
@@ -260,9 +260,9 @@ def machine_tables(report: MachineReport) -> tuple[ResultTable, ResultTable]:
     for check in report.checks:
         found = plain(check.found, COLOURS[check.state])
         abilities.add(check.name, found, check.needed_for, check.remedy)
-    threshold = format_duration(report.stall_meter.threshold_ns)
+    threshold = duration_text(report.stall_meter.threshold_ns)
     stalls = stall_table(report.stall_meter, report.stalls)
-    stalls.title = f"Stalls longer than {threshold} in {format_duration(report.watched_ns)}"
+    stalls.title = f"Stalls longer than {threshold} in {duration_text(report.watched_ns)}"
     if not report.stall_meter.realtime:
         stalls.caption = "taken without SCHED_FIFO: ordinary scheduling is among these stalls"
     return abilities, stalls
@@ -435,7 +435,7 @@ def servers_table(state: RunState) -> ResultTable:
     columns += figures("slots opened", "late", "worst", "overruns")
     table = ResultTable(f"{state.plan or 'plan'} in force with {state.back_end}", columns)
     if state.anchor_ns is not None:
-        table.caption = f"cycles of {format_duration(state.cycle_ns)}"
+        table.caption = f"cycles of {duration_text(state.cycle_ns)}"
         if state.drift_ns is not None:
             table.caption += f"; the chain's start has drifted by {state.drift_ns / 1e6:+.3f} ms"
         for move in {one.chain: one for one in state.moves}.values():
@@ -466,7 +466,7 @@ def _counted(server: ServerState) -> dict[str, str]:
     values = {
         "slots": counters.slots,
         "late": counters.late_entries,
-        "worst": None if lateness is None else format_duration(lateness),
+        "worst": None if lateness is None else f"{milliseconds(lateness)} ms",
         "overruns": counters.overruns,
     }
     return {name: "-" if value is None else str(value) for name, value in values.items()}

@@ -32,7 +32,7 @@ from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting import overviews
 from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
 from chainshaper.reporting.timeline import Timeline, timeline_data, timeline_of
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, escape, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown
@@ -345,7 +345,7 @@ def _stalls(part: _Part) -> str:
     stalls = part.timeline.stalls.select(cpu="core", duration=pl.col("end") - pl.col("start"))
     statistics = part.measurement.analysis.statistics
     about = (
-        f"{part.name}: stalls of the machine from {format_duration(meter.threshold_ns)} in "
+        f"{part.name}: stalls of the machine from {duration_text(meter.threshold_ns)} in "
         f"{meter.wakeups:,} wake-ups of a sleeper at the highest priority; they disturbed "
         f"{statistics.disturbed} of {statistics.count} cycles."
     )

@@ -28,7 +28,7 @@ from chainshaper.simulation.layout import Int64s, X
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import check_periods, splice_application
 from chainshaper.values.compiled import kernel
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import (
     InForceInfo,
@@ -150,7 +150,7 @@ def _checked(
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
             f"{cycles} cycles with the durations of {application.name!r} would end in"
-            f" {format_duration(timing.stop_ns + slowest)}: simulate {format_duration(LONGEST_NS)}"
+            f" {duration_text(timing.stop_ns + slowest)}: simulate {duration_text(LONGEST_NS)}"
             " at the most"
         )
     return application, timing

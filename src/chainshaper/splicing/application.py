@@ -14,7 +14,7 @@ from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers, publishing_servers
 from chainshaper.splicing.shaping_process import gate_of
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.workload.description import (
@@ -64,9 +64,9 @@ def check_periods(application: Application, joint: ApplicationPlan) -> None:
         if timer.timer_ns != chain.chain.period_ns:
             raise InputError(
                 "the plan is for a chain with the period"
-                f" {format_duration(chain.chain.period_ns)}, but"
+                f" {duration_text(chain.chain.period_ns)}, but"
                 f" {chain.chain.spec or application.chain} of {application.name!r} has"
-                f" {format_duration(timer.timer_ns or 0)}: plan again from a recording of this"
+                f" {duration_text(timer.timer_ns or 0)}: plan again from a recording of this"
                 " application"
             )
 

@@ -25,7 +25,7 @@ from chainshaper.gate.handover import (
     page_folders,
 )
 from chainshaper.linux.threads import innermost_id, parents, read_proc
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 from chainshaper.values.yaml_file import FullName
 
@@ -110,7 +110,7 @@ def output_text(output: ShapedOutput) -> str:
     """The state of an output in a line, with what the gate has counted."""
     shaped = f"{output.topic} is shaped by process {output.shaping_node}"
     since_ns = 0 if output.since_ns is None else time.monotonic_ns() - output.since_ns
-    gone = f"for {format_duration(since_ns // 1_000_000 * 1_000_000)}, {output.messages} messages"
+    gone = f"for {duration_text(since_ns // 1_000_000 * 1_000_000)}, {output.messages} messages"
     text = {
         "shaped": shaped,
         "in process": f"{shaped}, which publishes it",
@@ -128,7 +128,7 @@ def output_text(output: ShapedOutput) -> str:
 
 def moved_text(moved_ns: int) -> str:
     """``are moved by +2ms``."""
-    return f"are moved by {'-' if moved_ns < 0 else '+'}{format_duration(abs(moved_ns))}"
+    return f"are moved by {'-' if moved_ns < 0 else '+'}{duration_text(abs(moved_ns))}"
 
 
 def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:

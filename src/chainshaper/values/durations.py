@@ -9,7 +9,7 @@ from decimal import Decimal
 
 from chainshaper.values.errors import InputError
 
-__all__ = ["format_duration", "milliseconds", "parse_duration"]
+__all__ = ["duration_text", "format_duration", "milliseconds", "parse_duration"]
 
 NS_PER_UNIT = {"ns": 1, "us": 1_000, "µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 _DURATION = re.compile(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*(ns|us|µs|ms|s)\s*")
@@ -36,14 +36,20 @@ def parse_duration(text: str) -> int:
 
 
 def format_duration(nanoseconds: int) -> str:
-    """The shortest exact text of a duration; :func:`parse_duration` reads it back unchanged."""
-    if nanoseconds == 0:
-        return "0ms"
+    """The shortest exact text of a duration, for files and options: ``59ms``.
+
+    :func:`parse_duration` reads it back unchanged.
+    """
+    return duration_text(nanoseconds).replace(" ", "")
+
+
+def duration_text(nanoseconds: int) -> str:
+    """The same in a sentence: ``59 ms``."""
     for unit in ("s", "ms", "us"):
         if abs(nanoseconds) >= NS_PER_UNIT[unit]:
             value = Decimal(nanoseconds) / NS_PER_UNIT[unit]
-            return f"{value.normalize():f}{unit}"
-    return f"{nanoseconds}ns"
+            return f"{value.normalize():f} {unit}"
+    return f"{nanoseconds} ns" if nanoseconds else "0 ms"
 
 
 def milliseconds(nanoseconds: float, digits: int = 3) -> str:

@@ -25,7 +25,7 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 
-from chainshaper.values.durations import format_duration, parse_duration
+from chainshaper.values.durations import duration_text, format_duration, parse_duration
 from chainshaper.values.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -60,7 +60,7 @@ def _duration_in(value: object, info: ValidationInfo) -> object:
     elif info.context == AS_YAML and value != 0:
         raise ValueError(f"{value!r} is not a duration: write a number and a unit, such as 59ms")
     if isinstance(value, int) and value < 0:
-        raise ValueError(f"{format_duration(value)} is negative: a duration here is 0ms or more")
+        raise ValueError(f"{duration_text(value)} is negative: a duration here is 0 ms or more")
     if isinstance(value, int) and value > LONGEST_DURATION_NS:
         raise ValueError("longer than 292 years, which no clock here counts: write a shorter one")
     return value
@@ -72,7 +72,7 @@ def _duration_out(value: int, info: SerializationInfo) -> int | str:
 
 def _above_zero(value: int) -> int:
     if value == 0:
-        raise ValueError("is zero: write a duration longer than 0ms")
+        raise ValueError("is zero: write a duration longer than 0 ms")
     return value
 
 

@@ -34,7 +34,7 @@ from chainshaper.analysis.latency import (
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
@@ -141,7 +141,7 @@ class Judged:
         return line if self.because is None else f"{line}; {self.because}"
 
     def _value(self, value: float) -> str:
-        return f"{value:.2%}" if self.what == "missing" else format_duration(round(value))
+        return f"{value:.2%}" if self.what == "missing" else duration_text(round(value))
 
 
 def load_budget(path: str | Path) -> Budget:
@@ -341,7 +341,7 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
         return None
     parts = parts.sort("computation_share", descending=True, nulls_last=True)
     longest = parts.row(0, named=True)
-    mean = format_duration(round(longest["computation_ns"]["mean"]))
+    mean = duration_text(round(longest["computation_ns"]["mean"]))
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
 
 

@@ -28,7 +28,7 @@ from chainshaper.planning.plan import publisher_servers
 from chainshaper.planning.plan_file import plan_in
 from chainshaper.sources import open_source
 from chainshaper.values import events
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
@@ -54,7 +54,7 @@ class LeftOut:
     def text(self) -> str | None:
         """In words; None where it is nothing."""
         parts = [
-            f"the {which} {format_duration(round(lasted, -6))}, {when}"
+            f"the {which} {duration_text(round(lasted, -6))}, {when}"
             for which, lasted, when in (
                 ("first", self.before_ns, "before the plan came into force"),
                 ("last", self.after_ns, "after it was released"),

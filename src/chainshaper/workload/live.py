@@ -23,7 +23,7 @@ from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import Scheduling, apply_scheduling, check_cores, may_use_fifo
 from chainshaper.linux.threads import Thread, foreign_realtime_processes, list_threads
 from chainshaper.values import events
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import (
     InForceInfo,
@@ -283,7 +283,7 @@ def _await_ready(children: Sequence[Child]) -> bool:
     missing = [f"{child.name}: {text}" for child, answer in answers for text in answer["missing"]]
     if missing:
         raise OperationError(
-            f"DDS discovery was not complete after {format_duration(DISCOVERY_NS)} "
+            f"DDS discovery was not complete after {duration_text(DISCOVERY_NS)} "
             f"({'; '.join(missing)}); is UDP on 127.0.0.1 permitted here?"
         )
     return all(answer["memory_locked"] for _, answer in answers)
@@ -447,6 +447,6 @@ def _notes(
     if not memory_locked:
         yield "memory was not locked: page faults may have cost time"
     if abs(clock_moved_ns) > 1_000_000:
-        yield f"the wall clock moved by {format_duration(clock_moved_ns)} against CLOCK_MONOTONIC"
+        yield f"the wall clock moved by {duration_text(clock_moved_ns)} against CLOCK_MONOTONIC"
     if others := foreign_realtime_processes():
         yield f"other real-time processes were running: {', '.join(others)}"

@@ -34,7 +34,7 @@ from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.processes import descendants, process_folder, run_users, user_in
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents, read_proc
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
@@ -367,7 +367,7 @@ class LttngSession:
         self._notes.append(
             f"events were lost, so the buffers were enlarged from {before >> 10} KiB to "
             f"{larger >> 10} KiB a core while the application ran; nothing was recorded for "
-            f"{format_duration(round(gap, -6))} meanwhile."
+            f"{duration_text(round(gap, -6))} meanwhile."
         )
 
 
