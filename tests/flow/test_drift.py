@@ -191,4 +191,4 @@ def test_servers_and_gate_move_with_the_same_cycle(
     )
     assert run.state.notes[-1] == "slots are as planned, and do not follow any more: gone"
     assert not run.followers
-    assert "begins at 24ms now: its promise did not hold" in str(servers_table(run.state).caption)
+    assert "begins at 24 ms now: its promise did not hold" in str(servers_table(run.state).caption)

@@ -149,7 +149,7 @@ def test_a_front_filter_is_planned_for_a_core_of_its_own() -> None:
 def test_a_chain_that_no_timer_starts_needs_its_period_and_leaves_out_what_feeds_it() -> None:
     """The throttler feeds the rear filter, and the front filter's branch is followed so far."""
     chain = "/rear_filtered../fused../pose"
-    with pytest.raises(InputError, match=r"starts are 100ms apart, mostly\): add --period"):
+    with pytest.raises(InputError, match=r"starts are 100 ms apart, mostly\): add --period"):
         profile_chains(_recorded(), [chain])
     (profile,) = profile_chains(_recorded(), [chain], period_ns=100 * MS)
     assert profile.period_ns == 100 * MS

@@ -164,7 +164,7 @@ def test_slots_do_not_move_into_another_chains() -> None:
     other = revised(other, chain=bare, servers=(chain,), shaping_node=None)
     both = combined([one, other])
     assert reach(both, 0)[1] == 9 * MS
-    with pytest.raises(InputError, match=r"meets \[0ms, 30\.001ms\)"):
+    with pytest.raises(InputError, match=r"meets \[0 ms, 30\.001 ms\)"):
         with_slots_moved(both, {0: 9_001_000})
 
 

@@ -142,9 +142,9 @@ def test_plans_of_one_chain_are_read_and_written_as_ever(
         ("  - chain\n", "  - chian\n", "no chain before this one has a server 'chian'"),
         ("output: /b", "output: /a", "/a is the output of an earlier chain too"),
         ("name: out_b", "name: out_a", "an earlier chain has another server 'out_a': rename one"),
-        ("offset: 20ms", "offset: 15ms", "'chain_2' meets [0ms, 20ms) of server 'chain' of /a.."),
+        ("offset: 20ms", "offset: 15ms", "'chain_2' meets [0 ms, 20 ms) of server 'chain' of /a.."),
         # 100 and 50 ms meet modulo 50: where c begins 65 ms late it runs 15 ms late as well.
-        ("offset: 20ms", "offset: 65ms", "'chain_2' meets [0ms, 20ms) of server 'chain' of /a.."),
+        ("offset: 20ms", "offset: 65ms", "'chain_2' meets [0 ms, 20 ms) of server 'chain' of /a.."),
         ("offset: 20ms", "ofset: 20ms", "offset"),
         ("  - chain\n", "  - {name: chain}\n", "slots"),
     ],

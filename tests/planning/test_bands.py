@@ -154,8 +154,8 @@ EVEN = np.linspace(10 * MS, 50 * MS, 100).astype(np.int64)
 @pytest.mark.parametrize(
     ("limits", "bands", "words"),
     [
-        ({"grid_ns": 30 * MS}, 4, "grid of 30ms is too coarse"),
-        ({"max_gap_ns": 1_000_001}, 3, "within 1.000001ms"),
+        ({"grid_ns": 30 * MS}, 4, "grid of 30 ms is too coarse"),
+        ({"max_gap_ns": 1_000_001}, 3, "within 1.000001 ms"),
         ({"max_share": 0.1}, 3, r"10\.0% of the executions"),
         ({"max_share": 0.5}, 1, r"50\.0% of the executions"),
         ({"max_share": 0.34, "max_gap_ns": 5 * MS}, 3, "exclude each other|34.0%"),
@@ -171,7 +171,7 @@ THREE = np.array([10, 20, 30]) * MS
 
 @pytest.mark.parametrize("goal", ["mean", "jitter", "gap"])
 def test_an_average_out_of_reach_is_said(goal: Goal) -> None:
-    with pytest.raises(OperationError, match="the best is 24ms"):
+    with pytest.raises(OperationError, match="the best is 24 ms"):
         place_bands(
             BandProblem(THREE, 32 * MS, grid_ns=MS), 2, minimise=goal, mean_at_most_ns=20 * MS
         )
@@ -180,8 +180,8 @@ def test_an_average_out_of_reach_is_said(goal: Goal) -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        ({"publish_slot_ns": 0}, "longer than 0ms"),
-        ({"grid_ns": 0}, "longer than 0ms"),
+        ({"publish_slot_ns": 0}, "longer than 0 ms"),
+        ({"grid_ns": 0}, "longer than 0 ms"),
         ({"max_gap_ns": MS}, "not longer than the publish slot"),
         ({"max_share": 0.0}, "above 0"),
         ({"max_share": float("nan")}, "above 0"),
@@ -205,7 +205,7 @@ def test_senseless_requests_are_refused() -> None:
         assert place(problem, 1).slot_ends_ns == (32 * MS,)
     with pytest.raises(InputError, match="which average"):
         place_bands(problem, 2, minimise="jitter")
-    with pytest.raises(InputError, match="coarser than 1ns"):
+    with pytest.raises(InputError, match="coarser than 1 ns"):
         place_bands(replace(problem, grid_ns=1, last_end_ns=2000 * MS), 2)
 
 
@@ -293,7 +293,7 @@ def test_one_long_slot_trades_jitter_for_the_average() -> None:
     assert long.predicted.mean_ns == (62 + 62 + 70 + 85) * MS // 4
     assert long.predicted.jitter_ns == 25 * MS  # as the paper's three bands, earlier on average
     for start in (-1, 86 * MS + 1):
-        with pytest.raises(InputError, match="may start from 0ms to 86ms"):
+        with pytest.raises(InputError, match="may start from 0 ms to 86 ms"):
             with_long_slot(plan, latencies, start)
     with pytest.raises(InputError, match="server-per-chain has no publish slot"):
         with_bands(server_per_chain(plan), latencies, 2)
@@ -345,5 +345,5 @@ def test_random_placements_keep_the_constraints_and_reach_everywhere() -> None:
     assert place_randomly(_problem(1), 3, 8) == place_randomly(_problem(1), 3, 8)
     with pytest.raises(OperationError, match="last random draw ended"):
         place_randomly(_problem(1, max_gap_ns=1_001_000), 3)
-    with pytest.raises(OperationError, match="grid of 20ms is too coarse"):
+    with pytest.raises(OperationError, match="grid of 20 ms is too coarse"):
         place_randomly(replace(_problem(1), grid_ns=20 * MS), 10)

@@ -115,9 +115,9 @@ def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = 
 
 def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:
     # At once, /a takes 60 ms and, behind /b, 62 more; 24 ms too much with margin and slot.
-    with pytest.raises(OperationError, match=r"24ms too long") as refused:
+    with pytest.raises(OperationError, match=r"24 ms too long") as refused:
         plan_application([_profile("a", 60), _profile("b", 60)])
-    assert "core 1, 62ms behind /a1../a2" in str(refused.value)
+    assert "core 1, 62 ms behind /a1../a2" in str(refused.value)
     assert "It fits with /a1../a2 on a core of its own (its nodes' `core`)" in str(refused.value)
     # What passes one node has to take turns, for which stalls of 20 ms leave no room.
     both = [_profile(name, 40, 20, last="/filter") for name in "ab"]

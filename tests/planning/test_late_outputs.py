@@ -72,18 +72,18 @@ LAST = (59 * MS, 60 * MS)
 def test_a_slot_in_which_a_send_may_be_cut_off_is_refused() -> None:
     assert slots(asynchronous()) == {"chain": ((0, 59),), "output": ((59, 60),)}
     for length in (1, 250_000, MS - 1):
-        with pytest.raises(InputError, match=r"too short .* block the whole process; make it 1ms"):
+        with pytest.raises(InputError, match=r"too short .* block the whole process; make it 1 ms"):
             asynchronous(publish_slot_ns=length)
     # Sends that were measured count four times.
     assert asynchronous(longest_send_ns=250_000).evidence.longest_send_ns == 250_000
-    with pytest.raises(InputError, match=r"the longest took 251us.*make it 1\.004ms or longer"):
+    with pytest.raises(InputError, match=r"the longest took 251 us.*make it 1\.004 ms or longer"):
         asynchronous(longest_send_ns=251_000)
     asynchronous(longest_send_ns=2_500_000, publish_slot_ns=10 * MS)
 
 
 def test_a_publisher_that_out_ranks_its_executor_is_refused() -> None:
     inside = (40 * MS, 41 * MS)
-    said = r"out-rank its executor.*'chain' runs at priority 2 .* \[40ms, 41ms\).*above 2"
+    said = r"out-rank its executor.*'chain' runs at priority 2 .* \[40 ms, 41 ms\).*above 2"
     with pytest.raises(InputError, match=said):
         _moved(asynchronous(), inside, LAST)
     _moved(asynchronous(), inside, LAST, priority=3)
@@ -135,7 +135,7 @@ def test_under_let_a_gated_thread_cannot_publish_at_once() -> None:
 @pytest.mark.parametrize(
     ("right", "wrong", "said"),
     [
-        ("59ms, 60ms", "59ms, 59.2ms", r"servers\[1\].slots\[0\]: the slot \[59ms, 59.2ms\)"),
+        ("59ms, 60ms", "59ms, 59.2ms", r"servers\[1\].slots\[0\]: the slot \[59 ms, 59.2 ms\)"),
         ("59ms, 60ms", "30ms, 60ms", r"servers\[1\].priority: the publisher thread of /n5"),
         ("overrun: wait", "overrun: drop", r"overrun: .*'wait', 'discard' or 'publish'"),
         ("output_depth: 10", "output_depth: 0", r"chain.output_depth: "),
@@ -190,13 +190,13 @@ def test_the_plan_itself_warns_of_what_it_cannot_see() -> None:
     assert "/rosout" in warning
     narrow = publication_warnings(asynchronous())
     assert narrow[0] == warning
-    assert narrow[1].startswith("a slot of 1ms that opens late")
+    assert narrow[1].startswith("a slot of 1 ms that opens late")
     assert publication_warnings(asynchronous(overrun="publish")) == [warning], "it stays open"
     assert set(narrow) <= set(plan_warnings(asynchronous()))
     let = revised(let_per_chain(asynchronous()), overrun="discard")
     for plan, said in (
         (asynchronous(output_depth=1), "no room for an output that overran"),
-        (asynchronous(overrun="discard"), "if /t5 has a lifespan of 60ms"),
+        (asynchronous(overrun="discard"), "if /t5 has a lifespan of 60 ms"),
         (let, "none will be discarded"),
     ):
         assert said in publication_warnings(plan)[-1]

@@ -208,7 +208,7 @@ def test_whole_nanoseconds_of_any_type(tmp_path: Path, dtype: type) -> None:
         ("1ms\n999999999s\n", ":2: 999999999s is no latency"),
         ("", "0 latencies are too few"),
         ("1ms\n", "1 latencies are too few"),
-        ("0ms\n0ms\n", "every latency is 0ms"),
+        ("0ms\n0ms\n", "every latency is 0 ms"),
     ],
 )
 def test_wrong_lines_are_named(tmp_path: Path, text: str, words: str) -> None:

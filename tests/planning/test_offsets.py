@@ -190,9 +190,9 @@ def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:
     [
         (
             [_chain("a", 100, 60), _chain("b", 100, 50)],
-            "slots of a and b on core 1 at priority 2 collide at every offset.*10ms too long",
+            "slots of a and b on core 1 at priority 2 collide at every offset.*10 ms too long",
         ),
-        ([_chain("a", 100, 6), _chain("b", 70, 5)], "modulo 10ms"),
+        ([_chain("a", 100, 6), _chain("b", 70, 5)], "modulo 10 ms"),
         (
             [_chain("a", 100, 40), _chain("b", 100, 40), _chain("c", 100, 40)],
             "core 1 at priority 2 fill 120.0% of its time",

@@ -216,10 +216,10 @@ def test_a_core_that_is_named_twice_has_two_stages_at_a_time() -> None:
 @pytest.mark.parametrize(
     ("rows", "nodes", "wishes", "words"),
     [
-        ([[30, 120, 30]], None, {}, r"work of /n2 takes up to 120ms.*21ms longer.*of 121ms"),
+        ([[30, 120, 30]], None, {}, r"work of /n2 takes up to 120 ms.*21 ms longer.*of 121 ms"),
         ([[60, 20, 60]], ["/a", "/b", "/a"], {}, "work of /a, /b together, which one thread"),
-        ([[60, 60, 60]], None, {}, r"on the cores 0,1: it takes 180ms, 1.80 .* 3 cores "),
-        ([[60, 60, 60]], None, {"cores": None}, "on the cores 1: it takes 180ms.* 3 cores"),
+        ([[60, 60, 60]], None, {}, r"on the cores 0,1: it takes 180 ms, 1.80 .* 3 cores "),
+        ([[60, 60, 60]], None, {"cores": None}, "on the cores 1: it takes 180 ms.* 3 cores"),
         ([[80, 80]], None, {"cores": (-1, 0)}, "core: .* greater than or equal to 0"),
         ([[80, 80]], None, {"anchor": "cycle"}, "anchor: an output of a pipeline is whole cycles"),
         ([[80, 80]], None, {"publication": "asynchronous"}, "needs a shaping node"),

@@ -55,8 +55,8 @@ def test_brackets_are_shown_and_not_taken_for_markup(comparison: Comparison, pla
     ("since", "until", "starts", "text"),
     [
         (0, None, [0, 1, 2, 3], None),
-        (PERIOD_NS, None, [1, 2, 3], "the first 99ms, before the plan came into force"),
-        (PERIOD_NS, 3 * PERIOD_NS, [1, 2], "the first 99ms, before the plan came into "),
+        (PERIOD_NS, None, [1, 2, 3], "the first 99 ms, before the plan came into force"),
+        (PERIOD_NS, 3 * PERIOD_NS, [1, 2], "the first 99 ms, before the plan came into "),
         (0, 3 * PERIOD_NS, [0, 1, 2], "the last "),
         (9_000 * MS, None, [], "the first "),
     ],

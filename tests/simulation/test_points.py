@@ -105,7 +105,7 @@ def test_a_chain_is_profiled_in_front_of_all_others() -> None:
 @pytest.mark.parametrize(
     ("execution", "axes", "reason"),
     [
-        ({"constant": "49ms"}, {"bands": (1,)}, "do not fit into the cycle of 50ms"),
+        ({"constant": "49ms"}, {"bands": (1,)}, "do not fit into the cycle of 50 ms"),
         (VARYING, {"bands": (40,), "grid": ("1ms",)}, "slots"),
         (VARYING, {"bands": (2,), "policy": ("server-per-chain",)}, "places latency bands"),
     ],

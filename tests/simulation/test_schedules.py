@@ -78,7 +78,7 @@ def test_a_schedule_is_the_one_worked_out_by_hand(tmp_path: Path, case: dict[str
     ("governed", "reason"),
     [
         (plan(server(1, ["nobody"], [[0, 5]])), "'s1' of the plan .* the executor of /nobody"),
-        (plan(server(1, [], [[0, 5]]), cycle_ms=30), "period 30ms, but a of 'by hand' has 20ms"),
+        (plan(server(1, [], [[0, 5]]), cycle_ms=30), "period 30 ms, but a of 'by hand' has 20 ms"),
     ],
 )
 def test_a_plan_for_another_application_is_refused(

@@ -161,6 +161,6 @@ def test_a_plan_for_another_period_is_refused_before_anything_starts(
     slower = revised(
         plan, chain=plan.chain.model_copy(update={"period_ns": 60_000_000}), cycle_ns=60_000_000
     )
-    with pytest.raises(InputError, match=r"period 60ms, but /t1../t3 of 'small chain' has 50ms"):
+    with pytest.raises(InputError, match=r"period 60 ms, but /t1../t3 of 'small chain' has 50 ms"):
         shape_application(application, slower, tmp_path / "rec")
     assert not (tmp_path / "rec").exists()

@@ -302,7 +302,7 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         shown.send_signal(signal.SIGINT)
         text, said = shown.communicate(timeout=20)
     assert f"{CHAIN}: maximum" in said, "the limit that is broken, once"
-    assert said.count("budget 1us") == 1
+    assert said.count("budget 1 us") == 1
     (broken,) = (tmp_path / "broken").glob("watch-*")
     assert open_recording(broken).info.chain == CHAIN
     assert re.search(rf"{CHAIN}: \d\d\.\d\d cycles a second", text)
