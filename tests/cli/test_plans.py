@@ -79,8 +79,8 @@ def test_options_reach_the_planner(common: Words, file: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "code", "message"),
     [
-        (["--bands", "11"], 2, "there is room for 10 publish slots of 3us"),
-        (["--bands", "1000000000"], 2, "there is room for 10 publish slots of 3us"),
+        (["--bands", "11"], 2, "there is room for 10 publish slots of 3 us"),
+        (["--bands", "1000000000"], 2, "there is room for 10 publish slots of 3 us"),
         (["--bands", "2", "--max-share", "30%"], 1, "at 30.0% of the executions"),
         (["--bands", "5", "--grid", "20us"], 1, "too coarse"),
         (["--bands", "2", "--max-gap", "3us"], 2, "no two slots could follow each other"),

@@ -178,7 +178,7 @@ def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
     plan = plan_chain(slower, PlanRequest(policy="server-per-callback", epsilon_ns=MS // 2))
     assert _slots_ms(plan)["throttler"] == [(0, 4)], "two callbacks, each rounded up to whole ms"
     assert _slots_ms(plan)["rear_filter"] == [(4, 25)]
-    with pytest.raises(OperationError, match=r"takes \d+ms, .* plan with a smaller margin"):
+    with pytest.raises(OperationError, match=r"takes \d+ ms, .* plan with a smaller margin"):
         plan_chain(_profile(), PlanRequest(policy="server-per-callback", epsilon_ns=2 * MS))
 
 

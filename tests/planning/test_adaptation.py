@@ -232,7 +232,7 @@ def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> N
     assert asked == [move.moved_ns]
     assert 4 * MS <= move.moved_ns <= 8 * MS
     (output,) = find_outputs([str(pages)])
-    assert f"its slots are moved by +{move.moved_ns / MS:g}ms" in output_text(output)
+    assert f"its slots are moved by +{move.moved_ns / MS:g} ms" in output_text(output)
     assert json.loads(json.dumps(move.__dict__))["why"] == "its promise did not hold any more"
     follower.end()
     back = turn.moved()
