@@ -134,7 +134,10 @@ class ResultTable:
         return table
 
     def html(self) -> str:
-        """The rows as an HTML table, whose first column names them."""
+        """The rows as an HTML table, whose first column names them.
+
+        On a narrow screen each row of a wide table is a paragraph, its cells beside their titles.
+        """
         titles = "".join(
             f'<th scope="col"{_kind(column.words or not number)}>{escape(column.title)}</th>'
             for number, column in enumerate(self.columns)
@@ -144,9 +147,14 @@ class ResultTable:
             rows.append(_Row(tuple(column.footer for column in self.columns)))
         body = "\n".join(map(self._row_html, rows))
         return (
-            f'<div class="scroll"><table>\n<thead><tr>{titles}</tr></thead>\n'
+            f'<div class="scroll"><table{" class=wide" * self._wide}>\n'
+            f"<thead><tr>{titles}</tr></thead>\n"
             f"<tbody>\n{body}\n</tbody></table></div>"
         )
+
+    @property
+    def _wide(self) -> bool:
+        return len(self.columns) > 4
 
     def _row_html(self, row: _Row) -> str:
         first, *others = (escape(str(cell)) for cell in row.cells)
@@ -154,10 +162,13 @@ class ResultTable:
             width = len(self.columns)
             return f'<tr class="group"><th scope="colgroup" colspan="{width}">{first}</th></tr>'
         cells = "".join(
-            f"<td{_kind(column.words)}>{cell}</td>"
+            f"<td{_kind(column.words)}{self._titled(column)}>{cell}</td>"
             for column, cell in zip(self.columns[1:], others, strict=True)
         )
         return f'<tr><th scope="row">{first}</th>{cells}</tr>'
+
+    def _titled(self, column: Column) -> str:
+        return f' data-title="{escape(column.title)}"' if self._wide else ""
 
 
 def _kind(words: bool) -> str:
