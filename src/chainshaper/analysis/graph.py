@@ -9,7 +9,7 @@ callback and published in another of the same node:
   topic, and it either is registered by message_filters (its symbol says so) or publishes nothing.
 * **A synchroniser of the application's own** keeps its latest inputs, and publishes in the callback
   of whichever comes last. Several subscription callbacks of a node that publish topic X are taken
-  to be its inputs when each of them ran between any two publications of X. Such topics stand in
+  to be its inputs when each of them ran as often as X was published. Such topics stand in
   ``Callback.in_turns``.
 * **An action's goal** leads to the feedback that its server's node publishes next.
 * **Stored messages**: a subscription callback in a node whose subscription callbacks publish
@@ -23,6 +23,7 @@ from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
+import numpy as np
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow, data_flow
@@ -107,8 +108,9 @@ def _with_feedback(callback: Callback, published: set[str]) -> Callback:
 def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[str]]:
     """Which topics each callback writes in turns with others of its node, as their synchroniser.
 
-    Between the starts of two instances that publish each of them has run, the latter included:
-    callbacks that publish independently of each other do not keep to that.
+    By the k-th publication since the first each of them has run k times: callbacks that publish
+    independently of each other do not keep to that. An instance that begins while the set is being
+    published may be part of it: of two that begin at once on two threads, either completes it.
     """
     found = defaultdict[int, set[str]](set)
     for callbacks in nodes:
@@ -119,19 +121,17 @@ def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[
                 continue  # one alone; or a timer publishes it too, or two callbacks of one topic do
             ids = [one.id for one in writers]
             own = pl.col("callback_id").is_in(ids) & (pl.col("topic") == topic)
-            # Not when it was published: on another thread the next inputs may have come by then.
-            begun = (
-                flow.publications.filter(own).join(flow.instances, on="instance")["start"].sort()
+            written = (
+                flow.publications.filter(own).join(flow.instances, on="instance").sort("start")
             )
-            if len(begun) < 2:
+            if len(written) < 2:
                 continue  # nothing lies between
             ran = flow.instances.filter(pl.col("callback_id").is_in(ids))
             ran = ran.sort("start").select("callback_id", "start")
-            counts = (
-                ran.filter(callback_id=one)["start"].search_sorted(begun, side="right").diff()
-                for one in ids
-            )
-            if all((count.drop_nulls() > 0).all() for count in counts):
+            since, until = written["start"][0], written["time"][1:]
+            places = np.arange(1, len(written))
+            starts = (ran.filter(pl.col("start") > since, callback_id=one)["start"] for one in ids)
+            if all((own.search_sorted(until).to_numpy() >= places).all() for own in starts):
                 for one in ids:
                     found[one].add(topic)
     return found

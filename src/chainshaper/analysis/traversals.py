@@ -8,9 +8,10 @@ source timestamp, and ends with the publication of the chain's last topic: the l
 read it. If there is none, and other callbacks of the node publish this topic too (synchronising
 callbacks, stored messages: :mod:`~chainshaper.analysis.graph`), that of the node's first instance
 which starts after it and publishes the topic; what several threads publish in instances that run
-already has got its inputs before. For message_filters that is the soonest set
-that the message can be in. An approximate-time synchroniser may hold messages back; outputs into
-which no new input went give that away, and ``notes`` says that L is a lower bound.
+already has got its inputs before, but for a set's inputs that start at once, of which any may
+complete it. For message_filters that is the soonest set that the message can be in. An
+approximate-time synchroniser may hold messages back; outputs into which no new input went give that
+away, and ``notes`` says that L is a lower bound.
 
 **One row per data flow.** An instance that publishes a topic twice makes two traversals, with
 the same start; two messages that go into one publication are two traversals with the same end.
@@ -22,6 +23,7 @@ data had arrived, an instance that publishes nothing leaves its traversal incomp
 
 from dataclasses import dataclass
 
+import numpy as np
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow
@@ -155,11 +157,14 @@ def _publish_by_sibling(
     of_node = (pl.col("pid") == callback.pid) & (pl.col("node") == callback.node)
     here = flow.publications.filter((pl.col("topic") == topic) & of_node)
     began = _looked_up(flow.instances, "start", "instance")
-    here = here.select("publisher", later="publication", began=pl.coalesce(began, "time"))
+    began = pl.coalesce(began, "time")
+    here = here.select("publisher", "callback_id", "time", later="publication", began=began)
     here = here.join(publishers, on="publisher", how="left", maintain_order="left")
     waiting = pl.col(publication).is_null() & pl.col(f"instance_{hop}").is_not_null()
     start = _looked_up(flow.instances, "start", f"instance_{hop}")
     rows = state.with_row_index("row").filter(waiting).select("row", start=start)
+    if topic in callback.in_turns:
+        here = _begun_with_last_input(here.sort("began"), rows["start"].sort(), callback.id)
     found = first_after(rows, here, [], "start", "began", strictly=True)
     found = found.filter(pl.col("created") <= pl.col("start"))
     later = by_number(found, "row", "later", state.height)
@@ -177,6 +182,19 @@ def _publish_by_sibling(
         "long the events do not show; latencies through it are lower bounds."
     )
     return state, [note] if missed > 0 else []
+
+
+def _begun_with_last_input(here: pl.DataFrame, stored: pl.Series, callback: int) -> pl.DataFrame:
+    """Outputs whose ``began`` lies behind each input that ``callback`` stored for them.
+
+    Of inputs that start at once on several threads the lock of the set makes one the last: where
+    none was ``stored`` since the output before, the first that started while this one ran was.
+    """
+    before = stored.search_sorted(here["began"]).to_numpy()
+    following = pl.Series(np.append(stored.to_numpy(), np.iinfo(np.int64).max)[before])
+    none = pl.Series(np.diff(before, prepend=0) == 0) & (here["callback_id"] != callback)
+    late = none & (following < here["time"])
+    return here.with_columns(began=pl.when(late).then(following + 1).otherwise("began"))
 
 
 def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataFrame:
