@@ -220,6 +220,7 @@ def test_one_command_shapes_a_chain_on_this_executor(
         for one in recording.info.threads
         if one.node == "/worker" and one.role == "executor"
     }
-    assert len(raised) == threads
+    # rclpy's pool begins a thread only when a callback comes while no other is idle.
+    assert len(raised) == threads or (language == "Python" and 1 < len(raised) < threads)
     assert {one.tid for one in noted(tmp_path / "notes")} <= raised
     assert check_traversals(recording, "/begun../done", names, tmp_path / "notes") > 80
