@@ -238,7 +238,7 @@ def open_recording(path: str | Path) -> Recording:
         if path.is_file():
             what = "a file, where the folder of a recording is wanted"
         raise InputError(
-            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {path}`, a "
+            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o REC`, a "
             "trace, which is accepted as well, with `ros2 trace`"
         )
     try:
