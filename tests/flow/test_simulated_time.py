@@ -63,7 +63,7 @@ def test_stamps_of_nodes_that_follow_clock_are_no_anchor() -> None:
     assert plan_chain(profile_at(1.0, simulated=False)).anchor == "stamp"
 
 
-@pytest.mark.parametrize(("speed", "said"), [(0.5, r"0\.50 .* every 200ms"), (3, r"3\.00 .* 33")])
+@pytest.mark.parametrize(("speed", "said"), [(0.5, r"0\.50 .* every 200 ms"), (3, r"3\.00 .* 33")])
 def test_a_clock_of_another_speed_is_no_period(speed: float, said: str) -> None:
     with pytest.raises(InputError, match=r"/clock, which runs at " + said) as refused:
         profile_at(speed)
