@@ -88,7 +88,7 @@ def test_a_mistake_in_the_application(
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (("50ms", "15 ms"), "15ms"),  # shorter than the longest latency
+        (("50ms", "15ms"), "15 ms"),  # shorter than the longest latency
         (("50ms", "60ms"), "plan again from a recording of this application"),
         (
             ("node: /second", "node: /secnod"),
