@@ -133,7 +133,7 @@ def offsets(
     """Find when each chain's cycles start, so that no slots of one core collide.
 
     Where chains cannot take turns on a core, they run at the same time at different priorities, and
-    only their publish slots are kept apart.
+    only their publish slots are separate.
     """
     placed, remarks = cs.place_chains(
         [chain for path in plans for chain in cs.load_application_plan(path).chains],

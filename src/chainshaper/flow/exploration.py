@@ -90,7 +90,7 @@ def with_trace_events(recording: Recording) -> RecordingInfo:
     notes = info.notes
     if left:
         count = sum(counts[name] for name in left)
-        note = f"{count} events of kinds that chainshaper makes no use of were not kept: "
+        note = f"{count} events of kinds that chainshaper makes no use of were left out: "
         notes += (f"{note}{', '.join(left)}.",)
     return info.model_copy(update={"trace_events": counts, "notes": notes})
 

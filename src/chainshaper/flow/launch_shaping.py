@@ -122,7 +122,7 @@ def shape_launch(
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
             does not fit: no such chain, a launch file with a mistake …
         PlatformError: there is no such core. PlatformError, OperationError: a step failed; what the
-            steps before it left is kept.
+            steps before it left stays.
     """
     launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
@@ -150,7 +150,7 @@ def shape_launch(
             how_it_ended = "was stopped" if done.exit_code is None else "ended by itself"
             raise OperationError(
                 f"the application {how_it_ended} during the recording {done.recording.path}, "
-                "which is kept; nothing was shaped"
+                "which stays; nothing was shaped"
             )
         return done.recording
 

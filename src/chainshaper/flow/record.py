@@ -151,7 +151,7 @@ def record_command(
         InputError: ``output`` exists, there is no such command or process, or no such source.
         PlatformError: the tracer is not installed, or a privilege is missing.
         OperationError: tracing does not start, nothing was traced, or it cannot be read or
-            written; what the tracer wrote is then kept beside ``output``, and named.
+            written; what the tracer wrote then stays beside ``output``, and named.
     """
     output, taken = refuse_existing(output), run_users(users)
     if command:
@@ -441,5 +441,5 @@ def _what_is_left(run: _Run, output: Path) -> str:
     if any(run.folder.iterdir()):
         kept = output.with_name(run.folder.name.lstrip("."))
         run.folder.rename(kept)
-        said += f"; what was traced is kept in {kept}"
+        said += f"; what was traced stays in {kept}"
     return said

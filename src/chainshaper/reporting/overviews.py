@@ -431,7 +431,7 @@ def choice_json(choice: BandChoice) -> dict[str, Any]:
 
 def servers_table(state: RunState) -> ResultTable:
     """The servers of a run, a row each, with what they have done since they were armed."""
-    columns = words("server", "core", "priority", "slots", "threads", "kept by")
+    columns = words("server", "core", "priority", "slots", "threads", "enforced by")
     columns += figures("slots opened", "late", "worst", "overruns")
     table = ResultTable(f"{state.plan or 'plan'} in force with {state.back_end}", columns)
     if state.anchor_ns is not None:

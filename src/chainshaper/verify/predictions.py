@@ -6,7 +6,7 @@ leaves later. So every figure is predicted twice: as if each output left at the 
 slot, and at its end. A measurement should lie between the two, near the first.
 
 With **modes** an output leaves in the slot of its cycle's mode, and what comes behind that slot is
-late for it although there are others. Each mode is then held by itself against the share of
+late for it although there are others. Each mode is then compared by itself with the share of
 latencies that fit; the whole depends on how long each was in force, which no plan knows.
 
 **What is promised.** With the anchor `stamp` a gate promises the latency. With the anchor `cycle`,
