@@ -14,7 +14,7 @@ from chainshaper.enforcement import litmus
 from chainshaper.enforcement.freezer import Freezer
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.scx import back_end as scx
-from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable, server_named
+from chainshaper.enforcement.servers import BackEnd, ServerTable, server_named
 from chainshaper.linux import cgroups
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import may_use_fifo
@@ -76,9 +76,8 @@ def make_back_end(
 ) -> BackEnd:
     """Make a back end for a table; no application notices anything yet.
 
-    ``journal`` remembers what was there before. Where processes have to start, ``go_on`` is called
-    again and again meanwhile, and may raise. Raises InputError: the table is not one, or more than
-    the back end can do. OperationError, PlatformError: see the back end.
+    Where processes have to start, ``go_on`` is called again and again meanwhile, and may raise.
+    Raises InputError: the table is more than the back end can do. And as the back end.
     """
     match name:
         case "scx":
@@ -91,35 +90,22 @@ def make_back_end(
             return Fifo(table, journal)
 
 
-class Fifo:
+class Fifo(BackEnd):
     """Servers as SCHED_FIFO priorities, on any kernel, without slots; see :class:`BackEnd`.
 
-    Each server's threads have its core and a real-time priority in the order of the servers from
-    whoever carries out the plan (:func:`.threads.plan_scheduling`), so nothing is left to do. That
-    isolates a chain from what is less important; a shaping node's gate has to do the rest.
+    Threads have their core and priority already (:func:`.threads.plan_scheduling`), which isolates
+    a chain from what is less important; a shaping node's gate has to do the rest.
     """
 
-    name = "fifo"
-
     def __init__(self, table: ServerTable, journal: Journal) -> None:
-        self._table = table
+        super().__init__(table)
         self._journal = journal
-        self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:  # noqa: ARG002 - it has its priority
         server_named(self._table, server)
 
     def arm(self, anchor_ns: int) -> None:  # noqa: ARG002 - priorities know no cycle
         self._since_ns = time.monotonic_ns()
-
-    def in_force_from(self) -> int | None:
-        return self._since_ns
-
-    def counters(self) -> dict[str, ServerCounters]:
-        return {server.name: ServerCounters() for server in self._table.servers}
-
-    def failure(self) -> str | None:
-        return None
 
     def release(self) -> None:
         release_threads(self._journal)
@@ -131,10 +117,7 @@ def _missing_for_freezer() -> str | None:
     except PlatformError as error:
         return str(error)
     if not any(os.access(one, os.W_OK, effective_ids=True) for one in (folder, own)):
-        return (
-            f"{folder} is not writable: run as root, with CAP_DAC_OVERRIDE, or in a unit with "
-            "Delegate=yes"
-        )
+        return f"{folder} is not writable: run as root, with CAP_DAC_OVERRIDE, or Delegate=yes"
     return _missing_for_fifo()
 
 

@@ -5,9 +5,8 @@ and closes these by freezing them (DESIGN section 6). A thread sees nothing of i
 except that ``epoll_wait``, ``recvmsg`` with a timeout, ``sigtimedwait`` and ``semtimedop`` return
 EINTR. What a gated thread creates is born in its server, and put back with it.
 
-The journal says, before anything is changed, which servers there will be and how the hierarchy was
-mounted. Groups need no line each: their names say which process made them and for which server. A
-group is made directly beneath the one from which its threads came: their way back is its parent.
+Groups need no line each in the journal: their names say which process made them and for which
+server; and they are made directly beneath those from which threads came, where these go back to.
 
 Dispatchers write their numbers to memory of the owner, reached through its descriptors. Not to a
 file on a disk: a store to a mapped page that is being written back waits for 0.1 s and more.
@@ -28,6 +27,7 @@ from typing import Any
 
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import (
+    BackEnd,
     ReservationServer,
     ServerCounters,
     ServerTable,
@@ -45,6 +45,7 @@ _NAME = re.compile(rf"{_PREFIX}(\d+)(?:\.(\d+)\.(\d+))?-(\d+)-")
 """The owner's id; its start and which of its runs (older ones: without); the server's place."""
 # Dispatchers listen every 20 ms at the latest, every 200 ms where boundaries leave no room.
 _HEARD_WITHIN_NS = 300_000_000
+_AGAIN = "release, and apply again"
 _ANSWER_S = 5.0
 _START_S = 10.0
 _LOOK_S = 0.002
@@ -52,10 +53,8 @@ _LOOK_S = 0.002
 
 @dataclass(frozen=True)
 class FreezerRun:
-    """The servers that are enforced, and by whom: id and start of the owner.
-
-    ``page`` is where the counters are for as long as the owner lives. ``mount_options`` are those
-    that the hierarchy had, where we have it mounted differently.
+    """The servers that are enforced, id and start of the owner, the path of its counters while it
+    lives, and the mount options that the hierarchy had, where we have it mounted differently.
     """
 
     owner: tuple[int, int]
@@ -94,17 +93,14 @@ def groups_of(run: FreezerRun | None, core: int | None = None) -> tuple[Path, ..
 
 
 def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
-    """Groups of ours of none of these journals, and whose owner has ended.
-
-    Not those with threads that cannot be seen from here: their owner is outside of this container.
-    """
+    """Groups of ours of none of these journals, whose owner has ended."""
     known = {run.owner for journal in journals if (run := run_of(journal)) is not None}
     strays = []
     for folder, name in _all_groups():
         pid = int(name[1])
         started = start_of(pid, pid) if name[2] is None else int(name[2])
         owned = (pid, started) in known or not (started is None or has_ended(pid, started))
-        if not owned and not cgroups.has_unseen_threads(folder):
+        if not owned and not cgroups.has_unseen_threads(folder):  # else another container's
             strays.append(folder)
     return tuple(strays)
 
@@ -129,11 +125,7 @@ def thaw(groups: Iterable[Path]) -> None:
 
 
 def restore(run: FreezerRun | None) -> tuple[str, ...]:
-    """Put every thread back, remove the groups, mount as before; what could not be, in sentences.
-
-    Of several runs at a time, the one that has it mounted differently changes that back; that
-    another has it so again at once is no failure.
-    """
+    """Put every thread back, remove the groups, mount as before; what could not be, in words."""
     groups = groups_of(run)
     thaw(groups)
     left = tuple(why for folder in groups if (why := cgroups.dissolve(folder)) is not None)
@@ -157,26 +149,15 @@ def _numbers(*names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
 
 class CoreNumbers(ctypes.Structure):
     """``beats`` move as long as the dispatcher does; ``acknowledged`` is its last command.
-
-    Guardians write ``let_go``, when they thawed the threads of one that was still for a moment
-    (ns), and ``silent``: it was still for too long.
+    Guardians write ``let_go``, when (ns) they thawed the threads of one that hangs, and ``silent``.
     """
 
-    beats: int
-    acknowledged: int
-    let_go: int
-    silent: int
     _fields_ = _numbers("beats", "acknowledged", "let_go", "silent")
 
 
 class ServerNumbers(ctypes.Structure):
     """Slots, late entries, longest lateness (ns), overruns (-1: unknown), groups lost."""
 
-    slots: int
-    late: int
-    longest: int
-    overruns: int
-    lost: int
     _fields_ = _numbers("slots", "late", "longest", "overruns", "lost")
 
 
@@ -187,23 +168,19 @@ class CounterPage:
         """Map them. Raises OSError: their owner has ended, or is another user's."""
         with path.open("r+b") as file:
             memory = mmap.mmap(file.fileno(), 0)
+        names, cores = [one.name for one in table.servers], {one.core for one in table.servers}
         self.released = ctypes.c_int64.from_buffer(memory)
-        place = ctypes.sizeof(ctypes.c_int64)
-        self.cores: dict[int, CoreNumbers] = {}
-        for core in sorted({server.core for server in table.servers}):
-            self.cores[core] = CoreNumbers.from_buffer(memory, place)
-            place += ctypes.sizeof(CoreNumbers)
-        self.servers: dict[str, ServerNumbers] = {}
-        for server in table.servers:
-            self.servers[server.name] = ServerNumbers.from_buffer(memory, place)
-            place += ctypes.sizeof(ServerNumbers)
+        place = ctypes.sizeof(self.released)
+        own = (CoreNumbers * len(cores)).from_buffer(memory, place)
+        self.cores = dict(zip(sorted(cores), own, strict=True))
+        theirs = (ServerNumbers * len(names)).from_buffer(memory, place + ctypes.sizeof(own))
+        self.servers = dict(zip(names, theirs, strict=True))
 
 
 @dataclass(frozen=True)
 class Anchoring:
-    """Cycles start at ``begin_ns`` and every cycle time thereafter; the old ones end at ``end_ns``.
-
-    Both are instants of CLOCK_MONOTONIC. The earlier of the two is when the old cycles are left.
+    """Cycles start at ``begin_ns`` and every cycle time thereafter; the old ones end at ``end_ns``,
+    or earlier, where the new ones begin.
     """
 
     begin_ns: int
@@ -238,22 +215,19 @@ def next_anchoring(
     return Anchoring(end + shift, end)
 
 
-class Freezer:
+class Freezer(BackEnd):
     """A table of servers in force by freezing; see :class:`BackEnd` for what each method does.
 
     Making one starts a dispatcher per core; ``go_on`` is called again and again while something is
-    waited for, and may raise. The run's guardians watch over all of them: whichever is lost, no
-    thread stays stopped. Raises OperationError: a dispatcher does not start. PlatformError: no
+    waited for, and may raise. Raises OperationError: a dispatcher does not start. PlatformError: no
     cgroup v2 here, or a core is missing.
     """
-
-    name = "freezer"
 
     def __init__(
         self, table: ServerTable, journal: Journal, go_on: Callable[[], None] = lambda: None
     ) -> None:
         mounts, pid = cgroups.options_before_ours(), os.getpid()
-        self.table = table
+        super().__init__(table)
         self._journal = journal
         self._go_on = go_on
         self._groups: dict[Path, str] = {}
@@ -262,7 +236,6 @@ class Freezer:
         self._command = 0
         self._sent: dict[int, int] = {}
         self._released = False
-        self._pipes: dict[int, int] = {}
         self._dispatchers: dict[int, subprocess.Popen[str]] = {}
         self._ends: dict[int, str] = {}
         self._memory = os.memfd_create("counters")
@@ -274,7 +247,7 @@ class Freezer:
             journal.note(FREEZER, **{**asdict(self._run), "page": str(page)})
             for core in sorted({server.core for server in table.servers}):
                 self._dispatchers[core] = self._start_dispatcher(core)
-            self._wait_until_running()
+            self._await(_START_S, "start", lambda core: self._page.cores[core].beats > 0)
             if mounts is not None:
                 cgroups.make_moves_quick(mounts)
         except BaseException:
@@ -284,11 +257,10 @@ class Freezer:
     def assign(self, tid: int, server: str) -> None:
         """See :meth:`BackEnd.assign`. While armed, a thread whose server is closed stops at once.
 
-        Raises InputError: there is no such server. OperationError: it belongs to another run, or
-        the servers are no longer in force. PlatformError: its cgroup or our privileges do not allow
-        it.
+        Raises OperationError: it belongs to another run, or the servers are no longer in force.
+        PlatformError: its cgroup or our privileges do not allow it.
         """
-        number = self.table.servers.index(server_named(self.table, server))
+        number = self._table.servers.index(server_named(self._table, server))
         self._check_in_force()
         born = start_of(tid, tid)
         if born is None:
@@ -298,17 +270,14 @@ class Freezer:
             if parent in self._groups:
                 parent = parent.parent
             elif parent.name.startswith(_PREFIX):
-                raise OperationError(
-                    f"thread {tid} is in the cgroup {parent} of another run: end that run first "
-                    "(`chainshaper release`)"
-                )
+                raise OperationError(f"thread {tid} is in {parent} of another run: end that first")
             readable = re.sub(r"[^A-Za-z0-9_.-]+", "_", server)[:64]
             (pid, started), page = self._run.owner, self._run.page.name
             folder = parent / f"{_PREFIX}{pid}.{started}.{page}-{number}-{readable}"
             if folder not in self._groups:
                 cgroups.make_threaded_child(parent, folder.name)
                 self._groups[folder] = server
-                self._send(self.table.servers[number].core, server=server, folder=str(folder))
+                self._send(self._table.servers[number].core, server=server, folder=str(folder))
                 if self._anchoring is not None:
                     self._await_answers()
             if cgroups.move_thread(tid, folder):
@@ -319,33 +288,24 @@ class Freezer:
 
     def change(self, table: ServerTable, anchor_ns: int) -> None:
         """Other slots for the same servers, on all cores from the same end of a cycle on."""
-        self.table = table
+        self._table = table
         self.arm(anchor_ns)
 
     def arm(self, anchor_ns: int) -> None:
-        """See :meth:`BackEnd.arm`; returns when all dispatchers have heard of it.
-
-        In force from the first start of a cycle after that on; once more, from the end of a cycle
-        on (:func:`next_anchoring`).
-        """
+        """See :meth:`BackEnd.arm`; returns when all dispatchers have heard of it."""
         self._check_in_force()
-        earliest = time.monotonic_ns() + _HEARD_WITHIN_NS
-        if self._anchoring is None:
-            anchoring = first_anchoring(anchor_ns, self.table.cycle_ns, earliest)
-        else:
-            anchoring = next_anchoring(self._anchoring, anchor_ns, self.table.cycle_ns, earliest)
-        for core in self._pipes:
-            slots = [server.slots for server in self.table.servers if server.core == core]
+        when = (anchor_ns, self._table.cycle_ns, time.monotonic_ns() + _HEARD_WITHIN_NS)
+        old = self._anchoring
+        anchoring = first_anchoring(*when) if old is None else next_anchoring(old, *when)
+        for core in self._dispatchers:
+            slots = [server.slots for server in self._table.servers if server.core == core]
             self._send(core, **asdict(anchoring), slots=slots)
-        self._anchoring = anchoring
+        self._anchoring, self._since_ns = anchoring, anchoring.begin_ns
         self._await_answers()
-
-    def in_force_from(self) -> int | None:
-        return None if self._anchoring is None else self._anchoring.begin_ns
 
     def members(self) -> dict[str, tuple[int, ...]]:
         """The living threads of every server, those that were born there included."""
-        found: dict[str, tuple[int, ...]] = {server.name: () for server in self.table.servers}
+        found: dict[str, tuple[int, ...]] = {server.name: () for server in self._table.servers}
         for folder, server in self._groups.items():
             found[server] += cgroups.threads_in(folder)
         return found
@@ -386,35 +346,29 @@ class Freezer:
             raise OperationError("; ".join(left))
 
     def _start_dispatcher(self, core: int) -> "subprocess.Popen[str]":
-        reading, self._pipes[core] = os.pipe()
         command = module_command("chainshaper.enforcement.slot_dispatcher")
-        try:
-            process = subprocess.Popen(
-                [*command, str(self._journal.path), str(os.getpid()), str(core), str(reading)],
-                pass_fds=(reading,),
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                start_new_session=True,
-            )
-        finally:
-            os.close(reading)
+        process = subprocess.Popen(
+            [*command, str(self._journal.path), str(core)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
         note_process(self._journal, DISPATCHER, process.pid, core)
         return process
 
-    def _wait_until_running(self) -> None:
-        deadline = time.monotonic() + _START_S
-        for core, process in self._dispatchers.items():
-            while self._page.cores[core].beats == 0:
+    def _await(self, within_s: float, what: str, done: Callable[[int], bool]) -> None:
+        """Wait until all cores' dispatchers have done something; ``what`` is for messages."""
+        deadline = time.monotonic() + within_s
+        for core in self._dispatchers:
+            while not done(core):
                 self._go_on()
-                if (code := process.poll()) is not None:
-                    kind = PlatformError if code == PlatformError.exit_code else OperationError
-                    raise kind(self._end_of_dispatcher(core))
+                self._check_in_force()
                 if time.monotonic() > deadline:
                     raise OperationError(
-                        f"the dispatcher of core {core} did not start within {_START_S:g} s: is a "
-                        "real-time process keeping that core from everybody?"
+                        f"the dispatcher of core {core} did not {what} within {within_s:g} s: has "
+                        "a real-time process that core for itself?"
                     )
                 time.sleep(_LOOK_S)
 
@@ -429,51 +383,39 @@ class Freezer:
         process = self._dispatchers[core]
         if self._page.cores[core].silent:
             return f"the dispatcher of core {core} hung, or was stopped"
-        said = process.stderr.read().splitlines() if process.stderr else []
+        said = "; ".join(process.stderr.read().splitlines()) if process.stderr else ""
         ended = f"the dispatcher of core {core} {end_in_words(process.returncode)}"
-        return ": ".join(filter(None, (ended, "; ".join(said))))
+        return f"{ended}: {said}" if said else ended
 
     def _lost(self) -> str | None:
         for name, numbers in self._page.servers.items():
             if numbers.lost:
-                return (
-                    f"a cgroup of server {name} was removed: the threads that were "
-                    "in it run freely; release, and apply again"
-                )
+                return f"a cgroup of server {name} was removed: its threads run freely; {_AGAIN}"
         inside = {tid for tids in self.members().values() for tid in tids}
-        for tid, born in list(self._born.items()):
-            if tid not in inside:
-                if not has_ended(tid, born):
-                    return (
-                        f"thread {tid} was moved out of its server's cgroup: it runs freely; "
-                        "release, and apply again"
-                    )
-                del self._born[tid]
+        for tid in self._born.keys() - inside:
+            if not has_ended(tid, self._born[tid]):
+                return f"thread {tid} was moved out of its cgroup, and runs freely; {_AGAIN}"
+            del self._born[tid]
         return None
 
     def _check_in_force(self) -> None:
         reason = "they were released" if self._released else self._dispatcher_failure()
         if reason is not None:
-            raise OperationError(f"the servers are no longer in force: {reason}")
+            codes = [process.returncode for process in self._dispatchers.values()]
+            kind = PlatformError if PlatformError.exit_code in codes else OperationError
+            raise kind(f"the servers are no longer in force: {reason}")
 
     def _send(self, core: int, **fields: object) -> None:
         self._command += 1
         self._sent[core] = self._command
         line = json.dumps({"number": self._command, **fields}) + "\n"
-        with contextlib.suppress(BrokenPipeError):  # `failure` will say what has become of it
-            os.write(self._pipes[core], line.encode())
+        if (commands := self._dispatchers[core].stdin) is not None:
+            with contextlib.suppress(BrokenPipeError):  # `failure` will say what has become of it
+                os.write(commands.fileno(), line.encode())
 
     def _await_answers(self) -> None:
-        deadline = time.monotonic() + _ANSWER_S
-        for core, number in self._sent.items():
-            while self._page.cores[core].acknowledged < number:
-                self._go_on()
-                self._check_in_force()
-                if time.monotonic() > deadline:
-                    raise OperationError(
-                        f"the dispatcher of core {core} has not answered for {_ANSWER_S:g} s"
-                    )
-                time.sleep(_LOOK_S)
+        numbers, sent = self._page.cores, self._sent
+        self._await(_ANSWER_S, "answer", lambda c: numbers[c].acknowledged >= sent.get(c, 0))
 
     def _end(self) -> tuple[str, ...]:
         """Put threads and groups back, and end the dispatchers; what is left, in sentences.
@@ -485,6 +427,5 @@ class Freezer:
         for process in self._dispatchers.values():
             process.kill()  # one that was stopped hears nothing else
             process.communicate()
-        for file in [*self._pipes.values(), self._memory]:
-            os.close(file)
+        os.close(self._memory)
         return left

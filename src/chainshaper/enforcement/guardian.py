@@ -1,16 +1,17 @@
 """A guardian: a process that outlives the owner of a run, and undoes what it leaves behind.
 
-    python -m chainshaper.enforcement.guardian OWNER FOLDER READY_FD
+    python -m chainshaper.enforcement.guardian FOLDER
 
 Every run has two, which do the same: each is there should the other be killed or stopped at the
 same instant as what they watch over. They learn of a death from a pidfd, at once, and of a
 dispatcher that hangs from its sign of life; then they undo all that the journal says. Each has a
-session and a cgroup of its own, and a priority above the dispatchers'.
+session and a cgroup of its own, and a priority above the dispatchers'. On its standard output it
+says when it watches.
 
 A dispatcher without a sign of life for a tenth of a second may hang, or its core may have been
-taken from the machine for a moment. So its threads are let go first: one that comes back closes
-what has to be closed; one that stays away for half a second has failed. The sign must stand still
-over several looks, rather than for some time: that a machine stalls as a whole is no fault.
+taken from the machine for a moment. So its threads are let go first; one that stays away for half a
+second has failed. The sign must stand still over several looks, rather than for some time: that a
+machine stalls as a whole is no fault.
 """
 
 import contextlib
@@ -20,11 +21,11 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
 from chainshaper.enforcement.freezer import CounterPage, groups_of, run_of, thaw
-from chainshaper.enforcement.undoing import claim_run, undo_run
+from chainshaper.enforcement.undoing import claim_run, strange_lines, undo_run
 from chainshaper.linux import cgroups, runs
 from chainshaper.linux.own_processes import module_command, what_happened
 from chainshaper.linux.runs import Journal
@@ -50,59 +51,40 @@ class Guardians:
     def __init__(self, journal: Journal) -> None:
         self.journal = journal
         self.processes: list[subprocess.Popen[bytes]] = []
-        self.ready: dict[int, int] = {}  # by process: the pipe by which it says that it watches
         self.renew()
 
     def renew(self) -> None:
         """Start anew those that are lost."""
         for lost in [one for one in self.processes if what_happened(one) is not None]:
             lost.kill()
-            lost.wait()
+            lost.communicate()
             self.processes.remove(lost)
         while len(self.processes) < _HOW_MANY:
-            reading, writing = os.pipe()
-            own = (str(os.getpid()), str(self.journal.path.parent), str(writing))
-            try:
-                process = subprocess.Popen(
-                    [*module_command(__name__), *own],
-                    pass_fds=(writing,),
-                    stdin=subprocess.DEVNULL,
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,
-                    start_new_session=True,
-                )
-            finally:
-                os.close(writing)
+            process = subprocess.Popen(
+                [*module_command(__name__), str(self.journal.path.parent)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
             self.processes.append(process)
-            self.ready[process.pid] = reading
 
     def await_ready(self, go_on: Callable[[], None] = lambda: None) -> None:
         """Until they watch; ``go_on`` may raise. Raises OperationError: one does not start."""
-        while self.ready:
-            _, reading = self.ready.popitem()
-            try:
-                for _ in range(int(_START_S / _LOOK_S)):
-                    go_on()
-                    if select.select([reading], [], [], _LOOK_S)[0]:  # it says so, or ends
-                        break
-                said = os.read(reading, 1) if select.select([reading], [], [], 0)[0] else b""
-            finally:
-                os.close(reading)
-            if not said:
-                raise OperationError(
-                    "a process that undoes our changes should we be killed does not start: is the "
-                    "machine overloaded, or are our processes being ended?"
-                )
+        for pipe in [one.stdout for one in self.processes if one.stdout is not None]:
+            looks = int(_START_S / _LOOK_S)
+            while looks and not select.select([pipe], [], [], _LOOK_S)[0]:  # it says so, or ends
+                go_on()
+                looks -= 1
+            if not looks or not pipe.read(1):
+                raise OperationError("a guardian does not start: is the machine overloaded?")
 
     def end(self) -> None:
         """Kill them, when there is nothing left to undo."""
         for process in self.processes:
             process.kill()
         for process in self.processes:
-            process.wait()
-        for reading in self.ready.values():
-            os.close(reading)
-        self.ready.clear()
+            process.communicate()
         cgroups.remove_own_group(GROUP)
 
 
@@ -112,8 +94,7 @@ def run_claimed(
 ) -> Iterator[Journal]:
     """A run that governs these, watched over: all in its journal is as before when it is over.
 
-    Raises OperationError, PlatformError: see :func:`.claim_run` and :meth:`Guardians.await_ready`;
-    or not all could be put back.
+    Raises: as :func:`.claim_run` and :meth:`Guardians.await_ready`; or not all could be put back.
     """
     journal = claim_run(cores, nodes, folder)
     guardians = None
@@ -122,14 +103,19 @@ def run_claimed(
         guardians.await_ready()
         yield journal
     finally:
-        left = undo_run(journal, by_owner=True)
-        if guardians is not None:
-            guardians.end()
-        if left:
-            raise OperationError(
-                f"not everything could be put back: {'; '.join(left)}; {journal.path} says what "
-                "was there, `chainshaper release` tries again"
-            )
+        put_back(journal, guardians)
+
+
+def put_back(journal: Journal, guardians: Guardians | None, problems: Iterable[str] = ()) -> None:
+    """End a run of ours. Raises OperationError: not all could be put back, or ``problems``."""
+    left = (*problems, *undo_run(journal, by_owner=True), *strange_lines(journal))
+    if guardians is not None:
+        guardians.end()
+    if left:
+        raise OperationError(
+            f"not everything could be put back: {'; '.join(left)}; {journal.path} says what was "
+            "there, `chainshaper release` tries again"
+        )
 
 
 class _Watch:
@@ -216,41 +202,32 @@ class _Watch:
 
 
 def let_go(journal: Journal, page: CounterPage, core: int) -> None:
-    """Thaw the threads of all servers of a core; they stay in their groups.
-
-    The dispatcher may be back by then, and have closed them: it has to know.
-    """
+    """Thaw the threads of all servers of a core; a dispatcher that is back by then sees it."""
     thaw(groups_of(run_of(journal), core))
     page.cores[core].let_go = time.monotonic_ns()
 
 
 def main() -> None:
-    owner_pid, folder, ready = int(sys.argv[1]), Path(sys.argv[2]), int(sys.argv[3])
     for ignored in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
     set_thread_name("guardian")
     try:
-        journal = runs.remembered_journal(folder / runs.FILE)
+        journal = runs.remembered_journal(Path(sys.argv[1], runs.FILE))
     except OSError:
         return  # the run is over already
     with contextlib.suppress(OperationError):  # a full disk: it watches all the same
         runs.note_process(journal, runs.GUARDIAN, os.getpid())
     cgroups.enter_own_group(GROUP)
     try:
-        owner = os.pidfd_open(owner_pid)
-        if os.getppid() != owner_pid:
-            raise ProcessLookupError(owner_pid)
+        owner = journal.open_owner()
         become_fifo(_PRIORITY)
         with contextlib.suppress(BrokenPipeError):
-            os.write(ready, b"!")
-        os.close(ready)
-        watch = _Watch(owner, journal)
-        while watch.run():
+            os.write(1, b"!")
+        watch = None if owner is None else _Watch(owner, journal)
+        while watch is None or watch.run():
             undo_run(journal)
             if journal.owner is None:
                 break
-    except ProcessLookupError:
-        undo_run(journal)
     finally:
         cgroups.leave_own_group(GROUP)
 

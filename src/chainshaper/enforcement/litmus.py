@@ -6,36 +6,31 @@ tools that come with LITMUS^RT, with commands that can be printed instead.
 A reservation cannot be changed, listed or deleted by itself: all go when the plugin is changed,
 which the kernel refuses while a thread is under SCHED_LITMUS. Another anchor makes new
 reservations, and each thread moves by itself: for the two milliseconds that a command takes, it
-runs freely. Threads that are created by one in a reservation run in it as well, so threads are
-attached one by one, after those of DDS exist, and detached by giving them another class.
+runs freely. Threads are attached one by one, after those of DDS exist, since what a thread creates
+runs in its reservation, too; they are detached by giving them another class.
 
-Intervals are written half-open, `[2,86)`: `resctl` refuses a closed interval that ends with the
-major cycle, and takes `[2,86] [86,87]` for overlapping. They must ascend. A table counts from time
-zero of CLOCK_MONOTONIC; another anchor is reached by turning the slots.
+Intervals are written half-open, `[2,86)`, since `resctl` takes `[2,86] [86,87]` for overlapping.
+They must ascend. A table counts from time zero of CLOCK_MONOTONIC; another anchor is reached by
+turning the slots.
 
 Upstream: liblitmus, `bin/resctl.c`, `doc/howto-use-resctl.md`, `doc/table-driven-scheduling.md`;
 LITMUS^RT, `litmus/reservations/alloc.c`.
 """
 
-import contextlib
 import os
 import subprocess
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from chainshaper.enforcement.scheduling_memory import note_scheduling, release_threads
-from chainshaper.enforcement.servers import (
-    ReservationServer,
-    ServerCounters,
-    ServerTable,
-    server_named,
-)
+from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable, server_named
 from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.runs import Journal
-from chainshaper.linux.scheduling import SchedulingClass, set_state, state_of
+from chainshaper.linux.scheduling import Scheduling, SchedulingClass, apply_scheduling
 from chainshaper.linux.threads import find_thread
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -57,44 +52,36 @@ def missing(proc: Path = _PROC) -> str | None:
         return None
     return (
         f"this kernel ({os.uname().release}) is not LITMUS^RT, there is no {proc}: boot one "
-        "(https://litmus-rt.org), or use another back end (`--backend auto`); `--dry-run` prints "
-        "the commands"
+        "(https://litmus-rt.org), or use `--backend auto`; `--dry-run` prints the commands"
     )
 
 
-class Litmus:
+class Litmus(BackEnd):
     """A table of servers in force as reservations; see :class:`.servers.BackEnd`.
 
-    Nothing is changed before :meth:`arm`. ``proc`` is where LITMUS^RT shows itself. Raises
-    PlatformError: the kernel is not LITMUS^RT, or its tools are not installed. OperationError:
-    others use the plugin. InputError: the table has what LITMUS^RT cannot do.
+    Nothing is changed before :meth:`arm`. Raises PlatformError: the kernel is not LITMUS^RT, or its
+    tools are not installed. OperationError: others use the plugin. InputError: the table has what
+    LITMUS^RT cannot do.
     """
-
-    name = "litmus"
 
     def __init__(self, table: ServerTable, journal: Journal, proc: Path = _PROC) -> None:
         if (reason := missing(proc)) is not None:
             raise PlatformError(reason)
         for tool in ("setsched", "resctl"):
             if not is_installed(tool):
-                raise PlatformError(
-                    f"{tool} is not on $PATH: build liblitmus (github.com/LITMUS-RT/liblitmus) and "
-                    "add its folder"
-                )
+                raise PlatformError(f"{tool} is not on $PATH: build liblitmus, and add its folder")
         if _active_plugin(proc) == _PLUGIN:
             raise OperationError(
-                f"the plugin {_PLUGIN} is active already, and may hold reservations of others, "
-                "which LITMUS^RT cannot tell from ours or delete alone: when they are not needed, "
-                f"`setsched {_NO_PLUGIN}`"
+                f"the plugin {_PLUGIN} is active already, perhaps with others' reservations, which"
+                f" go with ours: when they are not needed, `setsched {_NO_PLUGIN}`"
             )
         litmus_commands(table, {}, anchor_ns=0)
-        self._table = table
+        super().__init__(table)
         self._journal = journal
         self._proc = proc
         self._members: dict[int, ReservationServer] = {}
         self._ids: dict[str, int] = {}
         self._generation = 0
-        self._since_ns: int | None = None
 
     def assign(self, tid: int, server: str) -> None:
         self._members[tid] = server_named(self._table, server)
@@ -111,16 +98,10 @@ class Litmus:
         for server in self._table.servers:
             _run(create_command(ids[server.name], server, self._table.cycle_ns, anchor_ns))
         self._ids = ids
-        for tid in self._members if moving else ():
-            _leave_reservation(tid)
+        for thread in filter(None, map(find_thread, self._members if moving else ())):
+            apply_scheduling(thread, Scheduling(0, None))
         self._attach(*self._members)
         self._since_ns = time.monotonic_ns()
-
-    def in_force_from(self) -> int | None:
-        return self._since_ns
-
-    def counters(self) -> dict[str, ServerCounters]:
-        return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
         if not self._ids or (active := _active_plugin(self._proc)) == _PLUGIN:
@@ -134,15 +115,12 @@ class Litmus:
 
     def _attach(self, *tids: int) -> None:
         reserved = SchedulingClass(SCHED_LITMUS, 0, reset_on_fork=False)
-        targets = []
-        for tid in tids:
-            thread = find_thread(tid)
-            with contextlib.suppress(ProcessLookupError):
-                if thread is not None:
-                    cores = (self._members[tid].core,)
-                    target = replace(state_of(tid), scheduling_class=reserved, cores=cores)
-                    targets.append((thread, target))
-        for thread, _ in note_scheduling(self._journal, targets):
+        changes = [
+            (thread, partial(replace, scheduling_class=reserved, cores=(self._members[tid].core,)))
+            for tid in tids
+            if (thread := find_thread(tid)) is not None
+        ]
+        for thread, _ in note_scheduling(self._journal, changes):
             server = self._members[thread.tid]
             try:
                 _run(_attach_command(thread.tid, self._ids[server.name], server.core))
@@ -157,28 +135,14 @@ def read_note(entry: Mapping[str, Any]) -> tuple[str, Path]:
 
 
 def restore_plugin(journal: Journal) -> None:
-    """Activate the plugin that was active before ours, from any process; harmless when repeated.
-
-    To be called when the threads are restored: the kernel changes no plugin that has threads.
-    Raises OperationError: it refuses.
+    """Activate the plugin that was active before ours, which the kernel refuses before all threads
+    are restored; harmless when repeated. Raises OperationError: it refuses.
     """
     for previous, proc in () if journal.outdated else journal.read(NOTE, read_note)[:1]:
         if _active_plugin(proc) == _PLUGIN:
             _run(("setsched", _NO_PLUGIN))
             if previous != _NO_PLUGIN:
                 _run(("setsched", previous))
-
-
-def _leave_reservation(tid: int) -> None:
-    try:
-        ordinary = SchedulingClass(os.SCHED_OTHER, 0, reset_on_fork=False)
-        set_state(tid, replace(state_of(tid), scheduling_class=ordinary))
-    except ProcessLookupError:
-        return
-    except OSError as error:
-        raise OperationError(
-            f"thread {tid} cannot be taken out of its reservation: {error.strerror}"
-        ) from error
 
 
 def _active_plugin(proc: Path) -> str:
@@ -206,10 +170,7 @@ def _run(command: Command) -> None:
     if done.returncode:
         said = (done.stderr + done.stdout).strip().splitlines()
         reason = said[0] if said else f"exit code {done.returncode}"
-        raise OperationError(
-            f"`{' '.join(command)}`: {reason}; LITMUS^RT's own words are in the kernel's log "
-            "(`dmesg`)"
-        )
+        raise OperationError(f"`{' '.join(command)}`: {reason}; `dmesg` has LITMUS^RT's own words")
 
 
 def litmus_commands(
@@ -220,19 +181,14 @@ def litmus_commands(
     What stands for a thread that does not run yet may be a text. Raises InputError: the table has
     what LITMUS^RT cannot do.
     """
-    ids = _reservation_ids(table)
-    return (
-        ("setsched", _PLUGIN),
-        *(
-            create_command(ids[server.name], server, table.cycle_ns, anchor_ns)
-            for server in table.servers
-        ),
-        *(
-            _attach_command(tid, ids[server.name], server.core)
-            for server in table.servers
-            for tid in members.get(server.name, ())
-        ),
+    ids, servers = _reservation_ids(table), table.servers
+    create = (create_command(ids[s.name], s, table.cycle_ns, anchor_ns) for s in servers)
+    attach = (
+        _attach_command(tid, ids[server.name], server.core)
+        for server in servers
+        for tid in members.get(server.name, ())
     )
+    return (("setsched", _PLUGIN), *create, *attach)
 
 
 def _reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
@@ -244,16 +200,11 @@ def _reservation_ids(table: ServerTable, generation: int = 0) -> dict[str, int]:
 def create_command(
     number: int, server: ReservationServer, cycle_ns: int, anchor_ns: int
 ) -> Command:
-    """The reservation of a server whose cycles start at ``anchor_ns`` (CLOCK_MONOTONIC).
-
-    Raises InputError: it has more slots, or a shorter one, than the kernel takes.
-    """
+    """A reservation with cycles from ``anchor_ns`` on. Raises InputError: it is refused."""
     slots = turned(server.slots, cycle_ns, anchor_ns)
     if len(slots) > _MOST_INTERVALS:
-        raise InputError(
-            f"server {server.name} has {len(slots)} slots, and LITMUS^RT takes {_MOST_INTERVALS} "
-            "in a reservation: use a shorter cycle, or another back end"
-        )
+        most = f"LITMUS^RT takes {_MOST_INTERVALS}: use a shorter cycle, or another back end"
+        raise InputError(f"server {server.name} has {len(slots)} slots, and {most}")
     for start, end in server.slots:
         if end - start < _SHORTEST_NS:
             raise InputError(
@@ -280,8 +231,7 @@ def milliseconds_text(duration_ns: int) -> str:
     '86.5'
     """
     whole, fraction = divmod(duration_ns, 1_000_000)
-    digits = f"{fraction:06d}".rstrip("0")
-    text = f"{whole}.{digits}" if digits else str(whole)
+    text = f"{whole}.{fraction:06d}".rstrip("0").removesuffix(".")
     if int(float(text) * 1_000_000) != duration_ns:
         text = f"{whole}.{fraction:06d}5"  # half a nanosecond more, which is dropped
     return text
@@ -292,8 +242,7 @@ def turned(
 ) -> tuple[tuple[int, int], ...]:
     """Slots that count from an anchor, counted from time zero instead; ascending.
 
-    A slot that then lies across the end of the cycle becomes two. A piece of one nanosecond,
-    which the kernel would refuse, is left out.
+    A slot across the end of the cycle becomes two; a piece that the kernel refuses is left out.
 
         >>> turned([(10, 30)], cycle_ns=100, anchor_ns=1080)
         ((0, 10), (90, 100))

@@ -1,20 +1,19 @@
 """Changing the class and cores of threads that are not ours, and putting them back.
 
-Before a change, the journal learns what was there and what is wanted. Putting back looks at each
-aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself: one that is as we set it goes
-back to what it was; one that another program has changed since is left.
+Putting back looks at each aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself: one
+that is as we set it goes back to what it was; one that another program has changed since is left.
 
 Threads inherit class and cores from those that create them. What an application starts while it is
-changed is put back as well, if it is the application's beyond doubt: a thread of a process in the
-journal, that process being the same (its id *and* its start); a process that descends from one of
-these, or did when it was last looked (:func:`note_descendants`); a thread in a cgroup of the run.
-Of these, what started after the change and has what we gave to its family gets its parent's
-original. All others are strangers, and so is a daemon whose parent ended before a look:
-:func:`look_alikes` names them, and they are left alone.
+changed is put back as well, if it is the application's beyond doubt: in a process of the journal
+(the same id *and* start), or one that descends from these, or did when it was last looked; or in a
+cgroup of the run. What of these started after the change, and has what we gave to its family, gets
+its parent's original. All others are strangers, and so is a daemon whose parent ended before a
+look: :func:`look_alikes` names them, and they are left alone.
 """
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 from time import CLOCK_BOOTTIME, clock_gettime_ns
 from typing import Any
@@ -52,10 +51,7 @@ _GENERATIONS = 5
 
 @dataclass(frozen=True)
 class Change:
-    """A thread of the journal: what it had at first, and all that it was given since.
-
-    ``changed_at`` counts clock ticks since the machine booted.
-    """
+    """A thread of the journal: what it had before ``changed_at`` (ticks), and all it was given."""
 
     tid: int
     started: int
@@ -72,58 +68,56 @@ class Change:
 
 
 def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -> None:
-    """Give threads their class and cores, with what was there in the journal, on disk first.
+    """Give threads their class and cores; one that has ended meanwhile is no error.
 
-    A thread that has ended meanwhile is no error; one that has what we gave it before is not
-    written down again. Raises OperationError: one runs under SCHED_DEADLINE, the journal cannot be
-    written (then nothing is changed), or the kernel refuses. PlatformError: a privilege is missing.
+    Raises OperationError: as :func:`note_scheduling` (then nothing is changed), or the kernel
+    refuses. PlatformError: a privilege is missing.
     """
-    targets = []
-    for thread, wanted in changes:
-        try:
-            targets.append((thread, after_wish(state_of(thread.tid), wanted)))
-        except ProcessLookupError:
-            continue
-    for thread, target in note_scheduling(journal, targets):
-        whose = f"thread {thread.tid} ({thread.comm}) of process {thread.pid}"
+    wishes = [(thread, partial(after_wish, wanted=wanted)) for thread, wanted in changes]
+    for thread, target in note_scheduling(journal, wishes):
         try:
             set_state(thread.tid, target)
         except ProcessLookupError:
             continue
         except PermissionError as error:
             raise PlatformError(
-                f"{whose} may not be given {state_text(target)}: run as root or with CAP_SYS_NICE, "
-                "or as the user of that process with an rtprio limit of 98"
+                f"{_whose(thread)} may not be given {state_text(target)}: run as root or with "
+                "CAP_SYS_NICE, or as the user of that process with an rtprio limit of 98"
             ) from error
         except OSError as error:
-            raise OperationError(
-                f"{whose}: the kernel refuses {state_text(target)}: {error.strerror}"
-            ) from error
+            raise OperationError(_refused(thread, target, error)) from error
+
+
+def _whose(thread: Thread | Change) -> str:
+    return f"thread {thread.tid} ({thread.comm}) of process {thread.pid}"
+
+
+def _refused(thread: Thread | Change, target: SchedulingState, error: OSError) -> str:
+    return f"{_whose(thread)}: the kernel refuses {state_text(target)}: {error.strerror}"
 
 
 def note_scheduling(
-    journal: Journal, changes: Iterable[tuple[Thread, SchedulingState]]
-) -> tuple[tuple[Thread, SchedulingState], ...]:
-    """Write down what threads have before each gets its target; those that are to be changed.
+    journal: Journal, changes: Iterable[tuple[Thread, Callable[[SchedulingState], SchedulingState]]]
+) -> list[tuple[Thread, SchedulingState]]:
+    """Write down what threads have before each changes; those that are to be, with their targets.
 
-    For what is changed by other means than :func:`change_all`. Raises OperationError: one runs
-    under SCHED_DEADLINE, or the journal cannot be written.
+    Raises OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
     """
     known = {one.identity: one for one in remembered_threads(journal)}
     families = _families(journal, list(known.values()))
     noted, entries = [], []
-    for thread, target in changes:
+    for thread, changed in changes:
         try:
             before = state_of(thread.tid)
         except ProcessLookupError:
             continue
+        target = changed(before)
         if start_of(thread.pid, thread.tid) != thread.started:
             continue  # its id belongs to another thread by now
         if before.scheduling_class.policy == SCHED_DEADLINE:
             raise OperationError(
-                f"thread {thread.tid} ({thread.comm}) of process {thread.pid} runs under "
-                "SCHED_DEADLINE, whose reservation is left alone: take it out of the plan, or give "
-                f"it another class first (`chrt --other --pid 0 {thread.tid}`)"
+                f"{_whose(thread)} runs under SCHED_DEADLINE, which is left alone: take it out of "
+                f"the plan, or give it another class first (`chrt --other --pid 0 {thread.tid}`)"
             )
         earlier = known.get(thread.identity)
         if earlier is None:
@@ -133,17 +127,12 @@ def note_scheduling(
         elif before == target and target in earlier.given:
             continue
         noted.append((thread, target))
-        entries.append(
-            {
-                **{name: getattr(thread, name) for name in ("tid", "started", "pid", "comm")},
-                "at": clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS,
-                "before": asdict(before),
-                "given": asdict(target),
-            }
-        )
+        entry = {name: getattr(thread, name) for name in ("tid", "started", "pid", "comm")}
+        entry |= {"before": asdict(before), "given": asdict(target)}
+        entries.append({**entry, "at": clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS})
     if entries:
         journal.note_all(KIND, entries)
-    return tuple(noted)
+    return noted
 
 
 def read_change(entry: Mapping[str, Any]) -> Change:
@@ -173,10 +162,7 @@ def remembered_threads(journal: Journal) -> list[Change]:
 
 
 def note_descendants(journal: Journal) -> None:
-    """Write down processes that the journal's have started meanwhile, as long as that shows.
-
-    Raises OperationError: the journal cannot be written.
-    """
+    """Write down processes that the journal's have started meanwhile. Raises: as ``note_all``."""
     remembered = remembered_threads(journal)
     known = {one.pid for one in remembered}
     known |= {pid for pid, _ in journal.read(DESCENDANTS, process_of)}
@@ -188,9 +174,9 @@ def note_descendants(journal: Journal) -> None:
 def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
     """Put back the class and cores of every thread in the journal, and of what inherited them.
 
-    ``groups`` are the run's cgroups. Works from any process, and as often as one likes. The latest
-    changes are undone first, and inheritance last: until its parent is restored, a new thread
-    inherits. Raises OperationError: the kernel refuses for some threads; the others are as before.
+    ``groups`` are the run's cgroups. Works from any process, and as often as one likes. Inheritance
+    is undone last: until its parent is restored, a new thread inherits. Raises OperationError: the
+    kernel refuses for some threads; the others are as before.
     """
     if journal.outdated:
         return
@@ -204,8 +190,7 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         except ProcessLookupError:
             return False
         except OSError as error:
-            why = f"the kernel refuses {state_text(target)}: {error.strerror}"
-            refused[thread.tid] = f"thread {thread.tid} ({thread.comm}): {why}"
+            refused[thread.tid] = _refused(thread, target, error)
             return False
         return now != target
 
@@ -222,10 +207,8 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
 
 
 def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...]:
-    """Threads with a real-time class and cores as we gave them, not known as ours, in words.
-
-    They are strangers, or daemons that left their family before a look. Ask before the undoing;
-    ``groups`` are the run's cgroups.
+    """Threads with a real-time class and cores as we gave them, not known as ours, in words: to be
+    asked before the undoing. ``groups`` are the run's cgroups.
     """
     remembered = [] if journal.outdated else remembered_threads(journal)
     known = {one.identity for one in remembered}
@@ -240,9 +223,8 @@ def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...
             continue
         if any(now in one.given and thread.started >= one.changed_at for one in remembered):
             found.append(
-                f"thread {thread.tid} ({thread.comm}) is left as it is: {state_text(now)}, as "
-                "the application had it, but nothing shows that it is the application's; if "
-                f"it is, `chrt --other --pid 0 {thread.tid}`"
+                f"thread {thread.tid} ({thread.comm}) is left as it is: {state_text(now)}; if it is"
+                f" the application's, which nothing shows, `chrt --other --pid 0 {thread.tid}`"
             )
     return tuple(found)
 
@@ -251,12 +233,8 @@ def _born_of(
     journal: Journal, remembered: list[Change], groups: Iterable[Path]
 ) -> list[tuple[Thread, list[Change]]]:
     """Threads of the application not in its journal, each with those it may have inherited from."""
-    done = {one.identity for one in remembered}
-    found = [
-        (thread, family)
-        for pid, family in _families(journal, remembered).items()
-        for thread in list_threads(pid)
-    ]
+    done, families = {one.identity for one in remembered}, _families(journal, remembered)
+    found = [(one, family) for pid, family in families.items() for one in list_threads(pid)]
     members = (find_thread(tid) for folder in groups for tid in threads_in(folder))
     found += [(thread, remembered) for thread in members if thread is not None]
     return [
@@ -287,10 +265,8 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
 
 
 def _given_back(state: SchedulingState, family: Iterable[Change]) -> SchedulingState:
-    """A state with every aspect that is one of ours replaced by what was there before.
-
-    The kernel records no parent of a thread: the first of the family with that aspect is taken.
-    Threads that share a class with us there mostly shared one before.
+    """A state with every aspect that is one of ours as it was before; for want of a recorded
+    parent, as the first of the family with that aspect had it.
     """
     for aspect in ASPECTS:
         for one in family:

@@ -1,24 +1,22 @@
 """Reservation servers as the back ends see them, and what every back end can do.
 
-By the time a plan is carried out, its nodes have become threads. What is left is a **table**:
-servers with slots that repeat every cycle (paper, section 2.2.1), and thread ids assigned to them.
-Between slots a server's threads do not run at all (``fifo`` excepted, which isolates only); where
-servers overlap on a core, the better priority runs, a smaller number; threads of one server come
-first come, first served (``scx``, ``litmus``: they take turns); threads of no server run when no
-server's wants to.
+A **table** has servers with slots that repeat every cycle (paper, section 2.2.1); threads are
+assigned to them by their ids. Between slots a server's threads do not run at all (``fifo``
+excepted, which isolates only); where servers overlap on a core, the better priority runs, a smaller
+number; threads of one server come first come, first served (``scx``, ``litmus``: they take turns);
+threads of no server run when no server's wants to.
 """
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Protocol
 
 from chainshaper.values.errors import InputError
 
 
 @dataclass(frozen=True)
 class ReservationServer:
-    """A plan's server without its nodes, which processes read that have Python alone.
-
-    Half-open slots in ns after the start of a cycle, ascending, on one core.
+    """A plan's server without its nodes, which processes read that have Python alone: half-open
+    slots in ns after the start of a cycle, ascending, on one core.
     """
 
     name: str
@@ -48,9 +46,8 @@ def server_named(table: ServerTable, name: str) -> ReservationServer:
 class ServerCounters:
     """What a server has done since it was armed; None: the back end cannot know.
 
-    ``late_entries`` are slots that opened more than 100 us after their start,
-    ``longest_lateness_ns`` the worst of them; ``overruns`` are slots at whose end a thread of the
-    server still wanted to run.
+    Late entries are slots that opened more than 100 us after their start; overruns those at whose
+    end a thread of the server still wanted to run.
     """
 
     slots: int | None = None
@@ -59,21 +56,25 @@ class ServerCounters:
     overruns: int | None = None
 
 
-class BackEnd(Protocol):
+class BackEnd(ABC):
     """A table of servers in force on this machine.
 
     Making one changes nothing yet that an application could notice. Then ``assign`` and ``arm`` in
     any order and number; ``release`` ends it. All raise OperationError where the kernel refuses.
     """
 
-    name: str
+    def __init__(self, table: ServerTable) -> None:
+        self._table = table
+        self._since_ns: int | None = None
 
+    @abstractmethod
     def assign(self, tid: int, server: str) -> None:
         """Put a thread into a server; before ``arm`` it goes on running freely.
 
         One that has ended is passed over: threads come and go. Raises InputError: no such server.
         """
 
+    @abstractmethod
     def arm(self, anchor_ns: int) -> None:
         """Enforce the slots from now on; cycles start at ``anchor_ns`` (CLOCK_MONOTONIC) + k * CT.
 
@@ -83,12 +84,16 @@ class BackEnd(Protocol):
 
     def in_force_from(self) -> int | None:
         """From when on (CLOCK_MONOTONIC, ns) the latest ``arm`` is enforced; None before."""
+        return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
         """Per server's name, since the first ``arm``."""
+        return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:
         """Why the servers are no longer enforced, None while they are."""
+        return None
 
+    @abstractmethod
     def release(self) -> None:
         """Everything as it was before, as far as possible; harmless when repeated."""

@@ -1,13 +1,13 @@
 """The dispatcher: a process that opens and closes the servers of one core, on that core.
 
-    python -m chainshaper.enforcement.slot_dispatcher JOURNAL OWNER CORE COMMANDS_FD
+    python -m chainshaper.enforcement.slot_dispatcher JOURNAL CORE
 
 It sleeps until a boundary, writes ``1`` to the ``cgroup.freeze`` of what closes and then ``0`` to
 that of what opens, and sleeps again. It runs on the core that it gates, above everything there:
 the timer interrupt alone takes the core from a thread whose slot has ended, so a slot is left
-exactly. The price is that the next thread runs only when the dispatcher sleeps again; so between
-waking and sleeping it does nothing that can wait. All else is done at **ticks** between boundaries:
-counting, commands of the owner, the sign of life, and looking for overruns.
+exactly. But the next thread runs only when the dispatcher sleeps again, so between waking and
+sleeping it does nothing that can wait. All else is done at **ticks** between boundaries:
+counting, the owner's commands on the standard input, the sign of life, and looking for overruns.
 
 It thaws its threads however it ends, and ends when the owner is gone. Only SIGKILL and SIGSTOP
 prevent that, which is what guardians are for. Should those be gone together with the owner, it
@@ -23,11 +23,9 @@ import time
 from collections.abc import Iterable, Iterator
 from itertools import chain, takewhile
 from pathlib import Path
-from types import FrameType
 from typing import NamedTuple
 
-from chainshaper.enforcement.freezer import Anchoring, CounterPage, run_of
-from chainshaper.enforcement.servers import ServerTable
+from chainshaper.enforcement.freezer import Anchoring, CounterPage, FreezerRun, run_of
 from chainshaper.gate.decision import sleep_until, watch_until
 from chainshaper.linux.runs import remembered_journal
 from chainshaper.linux.scheduling import (
@@ -50,10 +48,8 @@ _FAR = 1 << 62
 
 
 class Boundary(NamedTuple):
-    """From ``offset_ns`` into the cycle on, exactly the servers in ``open`` are open.
-
-    ``starts`` are those of them of which a slot begins here. Servers are counted by their place
-    in the table.
+    """From ``offset_ns`` into the cycle on, exactly the servers (by their place) in ``open`` are
+    open, of which those in ``starts`` begin a slot here.
     """
 
     offset_ns: int
@@ -84,10 +80,8 @@ def boundaries_of(
 def instants(
     boundaries: tuple[Boundary, ...], cycle_ns: int, begin_ns: int
 ) -> Iterator[tuple[int, Boundary]]:
-    """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on.
-
-    No dispatcher wakes up where nothing changes: from the second cycle on such a boundary (only
-    the one at 0 can be) is left out.
+    """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on. Where
+    nothing changes (only at 0), it is left out from the second cycle on: no dispatcher wakes up.
     """
     first, last = boundaries[0], boundaries[-1]
     idle = len(boundaries) > 1 and first.open == last.open and not first.starts
@@ -115,27 +109,23 @@ def moved(
     yield from instants(boundaries, cycle_ns, anchoring.begin_ns)
 
 
-class OpenGroup(NamedTuple):
-    """Open files of a cgroup: looking up a path takes longer than writing."""
-
-    freeze: int
-    threads: int
-
-
 class Dispatcher:
-    """The servers of one core at work; ``groups`` are, for each of them, its cgroups by folder."""
+    """The servers of one core at work.
 
-    def __init__(
-        self, table: ServerTable, core: int, page: CounterPage, owner: int, commands: int
-    ) -> None:
+    ``groups`` are, for each of them, its cgroups by folder: open files of `cgroup.freeze` and
+    `cgroup.threads`, since looking up a path takes longer than writing.
+    """
+
+    def __init__(self, run: FreezerRun, core: int) -> None:
+        table, page = run.table, CounterPage(run.page, run.table)
         servers = tuple(server for server in table.servers if server.core == core)
         self.cycle_ns = table.cycle_ns
         self.boundaries = boundaries_of(table.cycle_ns, tuple(s.slots for s in servers))
         self.places = {server.name: number for number, server in enumerate(servers)}
         self.counters = [page.servers[server.name] for server in servers]
         self.own = page.cores[core]
-        self.commands, self.heard = commands, b""
-        self.groups: list[dict[str, OpenGroup]] = [{} for _ in servers]
+        self.heard = b""
+        self.groups: list[dict[str, tuple[int, int]]] = [{} for _ in servers]
         self.all = frozenset(range(len(servers)))
         self.open: frozenset[int] | None = None  # None: not armed, all are
         self.upcoming = (_FAR, self.boundaries[0])
@@ -143,7 +133,7 @@ class Dispatcher:
         self.unexamined: set[int] = set()
         self.last_tick = self.last_sign = time.monotonic_ns()
         self.let_go = self.own.let_go
-        self.owner = owner
+        self.owner, _ = run.owner
 
     def run(self) -> None:
         """Until the owner or a signal ends it. Raises OperationError: the owner is gone."""
@@ -180,26 +170,22 @@ class Dispatcher:
             self.upcoming = following
 
     def thaw_all(self) -> None:
-        """Let all threads go."""
         self._write(self.all, b"0")
         self.open = None
 
     def _write(self, servers: Iterable[int], value: bytes) -> None:
         for server in sorted(servers):
-            for folder, group in list(self.groups[server].items()):
+            for folder, files in list(self.groups[server].items()):
                 try:
-                    os.pwrite(group.freeze, value, 0)
+                    os.pwrite(files[0], value, 0)
                 except OSError:  # it was removed, with its threads: the others go on
                     del self.groups[server][folder]
-                    os.close(group.freeze)
-                    os.close(group.threads)
+                    for file in files:
+                        os.close(file)
                     self.counters[server].lost += 1
 
     def _tick_until_boundary(self) -> None:
-        """Tick once, and on and on until the boundary is near.
-
-        Where boundaries are so close that there is never room, ten ticks are let go by at most.
-        """
+        """Tick until the boundary is near. Where there is never room, after ten at the latest."""
         tick_at = time.monotonic_ns()
         if tick_at - self.last_tick > 10 * _TICK_NS:
             self._tick()
@@ -218,11 +204,7 @@ class Dispatcher:
         self._obey()
 
     def _give_sign(self, now: int) -> None:
-        """Show that we live. What a guardian has thawed meanwhile, we close again.
-
-        That is so after long without a sign. Of two guardians the other may thaw after we are back:
-        each says so when it has done it.
-        """
+        """Show that we live, and close again what a guardian, or the other later, has thawed."""
         self.own.beats += 1
         let_go = self.own.let_go
         if self.open is not None and (
@@ -238,7 +220,7 @@ class Dispatcher:
             ran: bool | None = False
             if self.open is not None and server not in self.open:
                 try:
-                    ran = overrun(group.threads for group in self.groups[server].values())
+                    ran = overrun(threads for _, threads in self.groups[server].values())
                 except PermissionError:
                     counters.overruns = -1
             if ran is not None:
@@ -247,7 +229,7 @@ class Dispatcher:
 
     def _obey(self) -> None:
         with contextlib.suppress(BlockingIOError):
-            while received := os.read(self.commands, 65536):
+            while received := os.read(sys.stdin.fileno(), 65536):
                 self.heard += received
             raise OperationError("the owner is gone")
         *lines, self.heard = self.heard.split(b"\n")
@@ -266,7 +248,7 @@ class Dispatcher:
 
     def _add(self, server: int, folder: str) -> None:
         try:
-            self.groups[server][folder] = OpenGroup(
+            self.groups[server][folder] = (
                 os.open(f"{folder}/cgroup.freeze", os.O_WRONLY | os.O_CLOEXEC),
                 os.open(f"{folder}/cgroup.threads", os.O_RDONLY | os.O_CLOEXEC),
             )
@@ -280,9 +262,8 @@ class Dispatcher:
 def overrun(groups: Iterable[int]) -> bool | None:
     """Whether a frozen thread was computing when it was stopped, at the end of its slot.
 
-    ``groups`` are open ``cgroup.threads`` files. The kernel shows where a frozen thread was in
-    ``/proc/TID/syscall``; -1 is user mode. (Its state says nothing any more: freezing wakes
-    sleepers.) One caught inside a system call passes for one that waits. None when a thread has not
+    ``groups`` are open ``cgroup.threads`` files. ``/proc/TID/syscall`` shows where a thread was; -1
+    is user mode. One caught inside a system call passes for one that waits. None when one has not
     reached the freezer yet, for want of the core. Raises PermissionError: not to be seen by us.
     """
     undecided = False
@@ -303,10 +284,9 @@ def overrun(groups: Iterable[int]) -> bool | None:
 
 
 def _become_real_time(core: int) -> None:
-    """Highest class, if it is permitted, then the core, then memory.
+    """Highest class, if it is permitted, then the core. Raises PlatformError: no such core.
 
-    The class goes first: on a core where a SCHED_FIFO thread spins, a process that moves there as
-    SCHED_OTHER would not run again. Raises PlatformError: the core is not available.
+    In this order: where a SCHED_FIFO thread spins, SCHED_OTHER would not run again.
     """
     become_fifo(PRIORITY)
     try:
@@ -320,21 +300,17 @@ def _become_real_time(core: int) -> None:
     stop_garbage_collection()
 
 
-def _end(_number: int, _frame: FrameType | None) -> None:
-    raise SystemExit(0)
-
-
 def main() -> None:
-    path, owner, core, commands = Path(sys.argv[1]), *map(int, sys.argv[2:5])
-    signal.signal(signal.SIGTERM, _end)
+    path, core = Path(sys.argv[1]), int(sys.argv[2])
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     for ignored in (signal.SIGINT, signal.SIGHUP):
         signal.signal(ignored, signal.SIG_IGN)
-    os.set_blocking(commands, False)
+    os.set_blocking(sys.stdin.fileno(), False)
     journal = remembered_journal(path)
     run = run_of(journal)
     if run is None:
         sys.exit(f"{path} speaks of no servers")
-    dispatcher = Dispatcher(run.table, core, CounterPage(run.page, run.table), owner, commands)
+    dispatcher = Dispatcher(run, core)
     set_thread_name(f"dispatcher/{core}")
     try:
         _become_real_time(core)

@@ -1,15 +1,14 @@
 """Which thread does what in an application, and what each shall get for a plan.
 
 The paper's Thread Allocator (section 4.2). Evidence for a thread's role, the stronger first: the
-callbacks that a recording saw it run; its name, which DDS implementations choose; its place, since
-executors spin on the main thread unless the program arranges it otherwise.
+callbacks that a recording saw it run; its name, by DDS; its place: executors spin on the main
+thread unless the program arranges it otherwise.
 
 On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6):
 
 * DDS threads stand above all servers, on other cores where there are any: what they deliver must
   not wait for what it is delivered to. Those that receive stand above the others; where the output
-  is received, they have the first of these cores, which the shaping node leaves clear. Zenoh's
-  router, which may pass a chain's messages on, is treated alike;
+  is received, they have the first of these cores. Zenoh's router is treated alike;
 * servers stand below 88 in the order of their own priority, smaller first; several threads of one
   server share a priority under SCHED_RR, so that they take turns;
 * the thread that begins a chain stands one above the others of its server, if there are any: the
@@ -18,8 +17,7 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
   the writer's lock, and above them would never let them release it;
 * what a plan has in a best-effort server comes behind all these, on the server's core, under the
-  fair class (SCHED_OTHER): it would take the core from everything else otherwise;
-* all others, best effort too, are left alone.
+  fair class (SCHED_OTHER). All others are left alone.
 """
 
 import time
@@ -42,22 +40,13 @@ from chainshaper.linux.processes import (
     user_name,
 )
 from chainshaper.linux.scheduling import Scheduling
-from chainshaper.linux.threads import (
-    TICK_NS,
-    Thread,
-    ThreadRole,
-    gate_thread_name,
-    is_of_zenoh,
-)
+from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole, gate_thread_name, is_of_zenoh
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import Plan, Server, ShapingNode, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
-IN_ORDER = (
-    "its executors are told apart by the order in which it started its threads, as the program did"
-    " when it was recorded"
-)
+IN_ORDER = "its executors are known by the order in which it started its threads, as when recorded"
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
@@ -69,9 +58,8 @@ _COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
 
 @dataclass(frozen=True)
 class RecordedThread:
-    """A thread in a recording, by its id there, and whose callbacks it ran.
-
-    ``callbacks`` are those of its executor, by node and trigger, where the process has several.
+    """A thread in a recording, by its id there, and whose callbacks it ran: those of its executor
+    by node and trigger, where the process has several.
     """
 
     tid: int
@@ -83,9 +71,8 @@ class RecordedThread:
 
 @dataclass(frozen=True)
 class RecordedProcess:
-    """A process in a recording, seen last at ``seen_ns`` (ns of CLOCK_MONOTONIC).
-
-    ``numbered_here``: it and its threads have the numbers that they have here, not their own.
+    """A process in a recording, seen last at ``seen_ns`` (ns of CLOCK_MONOTONIC), by the numbers
+    that it and its threads have here (``numbered_here``), or by their own.
     """
 
     pid: int
@@ -97,11 +84,8 @@ class RecordedProcess:
 
 @dataclass(frozen=True)
 class NodeThread:
-    """A thread of an application, the nodes it works for, and how its role is known.
-
-    ``known_by`` is empty when the role is unknown. ``nodes_known_by`` is ``recording``,
-    ``command line``, or ``program's name``: a guess. ``callbacks`` are as in
-    :class:`RecordedThread`.
+    """A thread of an application, and its nodes. Its role is ``known_by`` something, if at all; its
+    nodes by ``recording``, ``command line``, or, a guess, ``program's name``.
     """
 
     thread: Thread
@@ -113,9 +97,8 @@ class NodeThread:
 
 @dataclass(frozen=True)
 class Allocation:
-    """All threads of an application at one instant, and what is not certain about them.
-
-    ``strangers`` is a line about processes of other users that say they are nodes, if any do.
+    """All threads of an application at one instant, what is not certain about them, and a line
+    about processes of other users that say they are nodes.
     """
 
     threads: tuple[NodeThread, ...]
@@ -124,9 +107,8 @@ class Allocation:
 
 
 class _Identified(NamedTuple):
-    """A process with its nodes, how they are known, and what a recording says of its threads, by
-    their ids in its own pid namespace: of itself, or (``in_order``) of an earlier run. Where others
-    execute, the program keeps its main thread out of it.
+    """A process, its nodes, how they are known, and its threads (by their ids in its pid namespace)
+    in a recording of itself, or (``in_order``) of an earlier run.
     """
 
     process: Process
@@ -146,19 +128,15 @@ def allocate(
     """Find out what each thread of ``processes`` does.
 
     ``among`` are all processes that were looked at, if these are some of them: who started whom
-    tells a node from the commands that run it. Two processes that seem to be one node both get it,
-    with a note. Where ``users`` are given, processes of others have no nodes.
+    tells a node from the commands that run it. Where ``users`` are given, others' have no nodes.
     """
-    identified = _with_unique_names(
-        [
-            _identify(process, recorded)
-            if users is None or process.user in users
-            else _Identified(process)
-            for process in (processes if among is None else among)
-        ]
-    )
+    looked_at = processes if among is None else among
+    identified = [
+        _identify(one, recorded) if users is None or one.user in users else _Identified(one)
+        for one in looked_at
+    ]
     wanted = {process.pid for process in processes}
-    chosen = [one for one in identified if one.process.pid in wanted]
+    chosen = [one for one in _with_unique_names(identified) if one.process.pid in wanted]
     guesses = [
         f"process {one.process.pid} is called {one.nodes[0]} after its program, which is a guess: "
         "name its recording, or start it with `--ros-args -r __node:=NAME`"
@@ -166,15 +144,20 @@ def allocate(
         if one.nodes_known_by == "program's name" and one.nodes and one.nodes[0] not in ROUTERS
     ]
     ambiguities = [
-        f"node {name} is ambiguous: processes "
-        f"{', '.join(str(one.process.pid) for one in claimants)} all have it; give each "
-        "a name or a namespace of its own, or end those that are not meant"
+        _ambiguous(name, [one.process.pid for one in claimants])
         for name, claimants in _claims(chosen).items()
     ]
     in_order = [one for one in chosen if one.in_order]
     notes = (f"process {o.process.pid} of {', '.join(o.nodes)}: {IN_ORDER}" for o in in_order)
     threads = tuple(thread for one in chosen for thread in _threads_of(one))
     return Allocation(threads, (*guesses, *ambiguities, *notes, *_limits(chosen)))
+
+
+def _ambiguous(node: str, pids: Iterable[int]) -> str:
+    return (
+        f"node {node} is ambiguous: processes {', '.join(map(str, pids))} all have it; give each a "
+        "name or a namespace of its own, or end those that are not meant"
+    )
 
 
 def _limits(identified: Iterable[_Identified]) -> Iterator[str]:
@@ -189,9 +172,7 @@ def _limits(identified: Iterable[_Identified]) -> Iterator[str]:
 
 
 def with_gates(found: Allocation, nodes: Iterable[ShapingNode]) -> Allocation:
-    """The threads, of which those that work for gates in publishers' processes are these nodes':
-    of a library in front of rmw, or of a component.
-    """
+    """The threads, of which those that work for gates in publishers' processes are these nodes'."""
     names = {gate_thread_name(one.name): one.thread.node for one in nodes}
     threads = tuple(
         replace(one, thread=replace(one.thread, role="executor"), nodes=(node,), known_by="name")
@@ -206,12 +187,9 @@ def new_and_ended(
     before: Allocation, now: Allocation
 ) -> tuple[tuple[NodeThread, ...], tuple[NodeThread, ...]]:
     """The threads that have appeared and those that are gone since an earlier look."""
-    known = {one.thread.identity for one in before.threads}
-    alive = {one.thread.identity for one in now.threads}
-    return (
-        tuple(one for one in now.threads if one.thread.identity not in known),
-        tuple(one for one in before.threads if one.thread.identity not in alive),
-    )
+    known, alive = ({one.thread.identity for one in found.threads} for found in (before, now))
+    new = tuple(one for one in now.threads if one.thread.identity not in known)
+    return new, tuple(one for one in before.threads if one.thread.identity not in alive)
 
 
 def strangers_text(
@@ -224,12 +202,10 @@ def strangers_text(
         if process.user not in users
         and (names := [n for n in _own_words(process)[0] if nodes is None or n in nodes])
     ]
-    if not found:
-        return None
     more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
+    named = f"{', '.join(found[:_MOST_NAMED])}{more}"
     return (
-        f"{LEFT_ALONE}{', '.join(found[:_MOST_NAMED])}{more}; to take them for nodes, name their "
-        "user (--user)"
+        f"{LEFT_ALONE}{named}; to take them for nodes, name their user (--user)" if found else None
     )
 
 
@@ -262,10 +238,7 @@ def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identif
 def _same_program(
     guess: Sequence[str], named: Sequence[str], recorded: Sequence[RecordedProcess]
 ) -> RecordedProcess | None:
-    """The earlier run of a program that names its nodes in its code, known by its main thread.
-
-    None where its command line names nodes, or where several programs had that name.
-    """
+    """The one earlier run of a program that names its nodes in its code, by its main thread."""
     if named or not guess:
         return None
     comm = guess[0][1:][:_COMM_LENGTH]
@@ -329,20 +302,16 @@ def _claims(identified: Iterable[_Identified]) -> dict[str, list[_Identified]]:
 
 
 def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
-    """Take a node's name from processes that carry it in their command line for another.
-
-    Those that take part in DDS are the node, if any does. Of others, `ros2 run` and the like,
-    the innermost is.
+    """Take a node's name from processes that carry it for another: the node takes part in DDS or,
+    if none does, is the innermost (`ros2 run` and the like start it).
     """
     parent_of = {one.process.pid: one.process.parent for one in identified}
-    carried = set()
+    carried = set[tuple[int, str]]()
     for name, claimants in _claims(identified).items():
         pids = {one.process.pid for one in claimants}
-        some_participate = any(one.process.participates for one in claimants)
-        for pid, participates in ((one.process.pid, one.process.participates) for one in claimants):
-            below = (descendants(parent_of, pid) - {pid}) & pids
-            if not participates if some_participate else below:
-                carried.add((pid, name))
+        node = {one.process.pid for one in claimants if one.process.participates}
+        node = node or {pid for pid in pids if not (descendants(parent_of, pid) - {pid}) & pids}
+        carried |= {(pid, name) for pid in pids - node}
     return [
         one._replace(nodes=tuple(n for n in one.nodes if (one.process.pid, n) not in carried))
         for one in identified
@@ -382,28 +351,21 @@ def server_members(
 ) -> dict[str, tuple[NodeThread, ...]]:
     """The threads of each server of a plan, by the server's name.
 
-    Nodes of one process may share an executor: then it is one thread of their server. Raises
-    OperationError: a planned thread is not running, two processes are the same node, or one thread
-    executes nodes of two servers.
+    Raises OperationError: a planned thread is not running, two processes are the same node, or one
+    thread executes nodes of two servers.
     """
     homes: dict[tuple[int, int], str] = {}
     members: dict[str, tuple[NodeThread, ...]] = {}
     for server in plan.servers:
-        found = {
-            one.thread.identity: one
-            for planned in server.threads
-            for one in threads_for(planned, allocation)
-        }
-        for identity, one in found.items():
-            if identity in homes:
+        found = [one for planned in server.threads for one in threads_for(planned, allocation)]
+        for one in found:
+            if (home := homes.setdefault(one.thread.identity, server.name)) != server.name:
                 raise OperationError(
-                    f"thread {one.thread.tid} ({one.thread.comm}) executes "
-                    f"{', '.join(one.nodes)}, which the plan has in the servers "
-                    f"{homes[identity]} and {server.name}: put them into one server, or start "
-                    "them as processes of their own"
+                    f"thread {one.thread.tid} ({one.thread.comm}) executes {', '.join(one.nodes)}, "
+                    f"which the plan has in the servers {home} and {server.name}: put them into "
+                    "one server, or start them as processes of their own"
                 )
-            homes[identity] = server.name
-        members[server.name] = tuple(found.values())
+        members[server.name] = tuple({one.thread.identity: one for one in found}.values())
     return members
 
 
@@ -413,10 +375,7 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
     found = [one for one in owners if one.thread.role == planned.role]
     pids = sorted({one.thread.pid for one in owners})
     if len(pids) > 1:
-        raise OperationError(
-            f"node {planned.node} is ambiguous: processes {', '.join(map(str, pids))} all have it; "
-            "end those that are not meant, or give each a namespace of its own"
-        )
+        raise OperationError(_ambiguous(planned.node, pids))
     if not pids:
         known = sorted({node for one in allocation.threads for node in one.nodes})
         raise OperationError(
@@ -425,16 +384,15 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
             "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
     if not found:
-        what = "executor: name a recording of this very process (--recording), or "
+        what = "executor: name a recording of this very process (--recording)"
         if planned.role == "publisher":
             what = (
-                "asynchronous publisher. Fast DDS has one if RMW_FASTRTPS_PUBLICATION_MODE is "
-                "ASYNCHRONOUS, Cyclone DDS and Zenoh have none: plan with --publication "
-                "synchronous, or "
+                "asynchronous publisher, which Fast DDS alone has, if RMW_FASTRTPS_PUBLICATION_MODE"
+                " is ASYNCHRONOUS: plan with --publication synchronous"
             )
         raise OperationError(
             f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
-            f"{what}see `chainshaper threads {pids[0]}`"
+            f"{what}, or see `chainshaper threads {pids[0]}`"
         )
     if not planned.callbacks:
         return found
@@ -452,16 +410,11 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
 
 
 def server_priorities(priorities: Iterable[int]) -> dict[int, int]:
-    """The real-time priority for each server priority: 87 for the best, 84, 81 …
-
-    Raises InputError: there are more than 29 of them.
-    """
+    """The real-time priority for each server priority: 87, 84, … Raises InputError: too many."""
     ranks = sorted(set(priorities))
     if _BEST_SERVER_PRIORITY - _STEP * (len(ranks) - 1) <= 1:
-        raise InputError(
-            f"{len(ranks)} different server priorities do not fit below {DDS_PRIORITY}: give "
-            "servers that never overlap the same priority"
-        )
+        many = f"{len(ranks)} different server priorities do not fit below {DDS_PRIORITY}"
+        raise InputError(f"{many}: give servers that never overlap the same one")
     return {rank: _BEST_SERVER_PRIORITY - _STEP * place for place, rank in enumerate(ranks)}
 
 
@@ -470,9 +423,8 @@ def plan_scheduling(
 ) -> tuple[WantedScheduling, ...]:
     """What every thread concerned by a plan shall get: servers' threads first, then the others.
 
-    Executors that receive an output and are in no server stand below all of these; those that do
-    not run are left out. Raises OperationError: see :func:`server_members`. InputError: see
-    :func:`server_priorities`.
+    Executors that receive an output and are in no server stand below all of these. Raises: as
+    :func:`server_members` and :func:`scheduling_around`.
     """
     members = server_members(plan, allocation)
     planned = {one.thread.identity for group in members.values() for one in group}
@@ -484,15 +436,11 @@ def plan_scheduling(
         if one.thread.role == "executor" and one.thread.identity not in planned
         for core in [cores[node] for node in one.nodes if node in cores][:1]
     ]
-    clear = {node.core for node in plan.shaping_nodes}
     return scheduling_around(
-        members,
-        plan.servers,
-        allocation,
-        available_cores,
+        *(members, plan.servers, allocation, available_cores),
         receiving=receiving,
         take_turns=plan.takes_turns,
-        clear=clear,
+        clear={node.core for node in plan.shaping_nodes},
         first={begins.node for chain in plan.chains if (begins := first_planned(chain))},
     )
 
@@ -548,13 +496,10 @@ def scheduling_around(
 
     own = [
         WantedScheduling(
-            member,
-            wanted_in(server, member),
-            server.name,
-            f"server priority {server.priority}",
+            member, wanted_in(its, member), its.name, f"server priority {its.priority}"
         )
-        for server in sorted(servers, key=lambda one: one.priority)
-        for member in members[server.name]
+        for its in sorted(servers, key=lambda one: one.priority)
+        for member in members[its.name]
     ]
     planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
@@ -635,10 +580,10 @@ def left_by_back_end(
 ) -> tuple[WantedScheduling, ...]:
     """What threads get from us where a back end schedules its servers' threads itself.
 
-    Under sched_ext and LITMUS^RT servers are scheduling classes of their own: their threads need
-    no priority, and sched_ext's may have none, since the kernel runs real-time threads above it.
-    ``free`` threads, which no back end keeps in their slots, stand above them with what is wanted.
-    A receiver would stand above the servers then, instead of below: it is left as it is.
+    Under sched_ext and LITMUS^RT these need no priority, and under sched_ext may have none, since
+    the kernel runs real-time threads above it. ``free`` threads, which no back end keeps in their
+    slots, stand above them with what is wanted. A receiver would stand there too, instead of
+    below: it is left as it is.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)

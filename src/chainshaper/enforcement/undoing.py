@@ -1,10 +1,9 @@
 """Runs from their claim to their end: which cores and nodes, what they say, and undoing them.
 
-Two plans never govern the same core or node, since their slots contradict each other. So a run
-first writes into its journal which cores and nodes it is for, and looks at what the others claim,
-both under a lock of the folder of all runs. A run that is in force is asked to end; one whose owner
-is gone, or does not react, is undone from its journal, by whichever process is left. Where the
-journal itself is gone, cgroups of ours are found by their names.
+Two plans never govern the same core or node, since their slots contradict each other: each run
+claims its own in its journal, under a lock of the folder of all runs. A run that is in force is
+asked to end; one whose owner is gone, or does not react, is undone from its journal, by whichever
+process is left. Where the journal itself is gone, cgroups of ours are found by their names.
 """
 
 import contextlib
@@ -40,11 +39,7 @@ PATIENCE_S = 20.0
 
 @dataclass(frozen=True)
 class ServerState(ReservationServer):
-    """A server in force, with its threads and counters.
-
-    ``kept_by`` says who restricts its threads to the slots: the back end, or the shaping node's
-    own ``gate``.
-    """
+    """A server in force; a back end, or a node's ``gate``, restricts its threads (``kept_by``)."""
 
     threads: tuple[int, ...]
     kept_by: str
@@ -53,8 +48,8 @@ class ServerState(ReservationServer):
 
 @dataclass(frozen=True)
 class SlotMove:
-    """The slots of a chain's output begin elsewhere from an instant on: ``moved_ns`` behind the
-    plan's, so that the last one begins ``start_ns`` after its origin.
+    """From an instant on a chain's output has its slots ``moved_ns`` behind the plan's, the last
+    one ``start_ns`` after its origin.
     """
 
     from_ns: int
@@ -71,12 +66,10 @@ class SlotMove:
 
 @dataclass(frozen=True)
 class RunState:
-    """A plan in force. Times are ns of CLOCK_MONOTONIC.
+    """A plan in force. Instants are ns of CLOCK_MONOTONIC, None if they are still to come.
 
-    Cycles start at ``anchor_ns`` and every ``cycle_ns`` from there. ``drift_ns`` is how far the
-    chain's beginning has moved since (None: not looked at again yet), ``failure`` why the servers
-    are no longer enforced. The first cycle that was enforced as a whole started at ``in_force_ns``
-    (None: not yet), enforcing ended at ``ended_ns`` (None: it has not).
+    Cycles start at ``anchor_ns`` + k * ``cycle_ns``, the first enforced as a whole ``in_force_ns``;
+    the chain's beginning has moved by ``drift_ns`` since; ``failure``: why it is not enforced.
     """
 
     run: str
@@ -87,22 +80,19 @@ class RunState:
     reason: str
     started_ns: int
     cycle_ns: int
-    anchor_ns: int | None
-    phase_spread_ns: int | None
-    drift_ns: int | None
-    servers: tuple[ServerState, ...]
-    notes: tuple[str, ...]
-    failure: str | None
+    anchor_ns: int | None = None
+    phase_spread_ns: int | None = None
+    drift_ns: int | None = None
+    servers: tuple[ServerState, ...] = ()
+    notes: tuple[str, ...] = ()
+    failure: str | None = None
     in_force_ns: int | None = None
     ended_ns: int | None = None
     moves: tuple[SlotMove, ...] = ()  # the latest, of as many as a chain's gate has had
 
 
 def save_run_state(folder: Path, state: RunState) -> None:
-    """Write `run.json`; a reader sees the old or the new one, whole.
-
-    Raises OSError: it cannot be written; a plan in force needs it for nothing.
-    """
+    """Write `run.json`, whole. Raises OSError; a plan in force needs it for nothing."""
     partial_file = folder / f"{runs.STATE_FILE}.partial"
     try:
         partial_file.write_text(json.dumps(asdict(state)))
@@ -114,33 +104,19 @@ def save_run_state(folder: Path, state: RunState) -> None:
 
 def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | None]]:
     """All runs that are not over, crashed ones included, with what they last said of themselves."""
+    from pydantic import TypeAdapter  # guardians have Python alone
+
     for journal in find_journals(folder):
         state = None
-        with contextlib.suppress(OSError, ValueError, KeyError, TypeError, AttributeError):
-            content = json.loads(journal.path.with_name(runs.STATE_FILE).read_text())
-            servers = tuple(
-                ServerState(
-                    **{
-                        **server,
-                        "slots": tuple((start, end) for start, end in server["slots"]),
-                        "threads": tuple(server["threads"]),
-                        "counters": ServerCounters(**server["counters"]),
-                    }
-                )
-                for server in content["servers"]
-            )
-            texts = {name: tuple(content[name]) for name in ("command", "notes")}
-            moves = tuple(SlotMove(**move) for move in content.get("moves", ()))
-            state = RunState(**{**content, **texts, "servers": servers, "moves": moves})
+        with contextlib.suppress(OSError, ValueError):
+            content = journal.path.with_name(runs.STATE_FILE).read_bytes()
+            state = TypeAdapter(RunState).validate_json(content)
         if journal.path.exists():  # not over meanwhile
             yield journal, state
 
 
 def runs_as_json(folder: Path | None = None) -> list[dict[str, Any]]:
-    """The same as plain data: ``alive`` is whether the owner still is.
-
-    ``unreadable`` are lines of the journal that say nothing.
-    """
+    """The same as plain data; ``unreadable`` are lines of the journal that say nothing."""
     return [
         {
             "run": journal.name,
@@ -161,10 +137,9 @@ def claim_run(
 ) -> Journal:
     """Begin a run that governs these cores and nodes: the journal for all that it changes.
 
-    ``folder`` is where runs have their folders (default: :func:`.journals_folder`). While another
-    run begins, ``go_on`` is called again and again, and may raise. Raises OperationError: a living
-    run governs one of them, a crashed one cannot be undone, or one that begins does not get on with
-    it. PlatformError: nothing may be written to the folder.
+    While another run begins, ``go_on`` is called again and again, and may raise. Raises
+    OperationError: a living run governs one of them, a crashed one cannot be undone, or one that
+    begins does not get on with it. PlatformError: nothing may be written to the folder.
     """
     base = runs.journals_folder() if folder is None else folder
 
@@ -199,10 +174,8 @@ def claim_run(
             owner = other.owner
             if owner is None and (shared or not other.entries(CLAIMS)):
                 if left := undo_run(other):
-                    raise OperationError(
-                        f"the run {other.name} has crashed, and not all of it can be undone: "
-                        f"{'; '.join(left)}"
-                    )
+                    why = "; ".join(left)
+                    raise OperationError(f"the crashed run {other.name} cannot be undone: {why}")
             elif shared:
                 raise OperationError(
                     f"the run {other.name} of process {owner} governs {shared} already: end it "
@@ -241,13 +214,10 @@ def strange_lines(journal: Journal) -> tuple[str, ...]:
 def end_run(journal: Journal) -> tuple[str, ...]:
     """End a run: its owner does it, or we do where it is gone or hangs. What could not be undone.
 
-    An owner that was stopped (Ctrl-Z) is made to go on; one that does not end is killed. A run is
-    over afterwards unless something can be tried again. Raises OperationError: the owner is not
-    ours to end.
+    An owner that was stopped (Ctrl-Z) is made to go on; one that does not end is killed. Raises
+    OperationError: the owner is not ours to end.
     """
-    owner = journal.owner
-    pidfd = None if owner is None else open_process(*journal.read(runs.OPENED, process_of)[0])
-    if pidfd is not None:
+    if (pidfd := journal.open_owner()) is not None:
         try:
             for numbers in ((signal.SIGTERM, signal.SIGCONT), (signal.SIGKILL,)):
                 for number in numbers:
@@ -258,17 +228,14 @@ def end_run(journal: Journal) -> tuple[str, ...]:
             pass
         except PermissionError:
             raise OperationError(
-                f"the run {journal.name} belongs to process {owner} of another user: end it as "
-                "that user, or as root"
+                f"the run {journal.name} is of another user: end it as that user, or as root"
             ) from None
         finally:
             os.close(pidfd)
     left = undo_run(journal)
-    if left or not journal.path.exists():
-        return left
-    strange = strange_lines(journal)
-    remove_run(journal)
-    return strange
+    if not left and (left := strange_lines(journal)):
+        remove_run(journal)  # trying again would not help
+    return left
 
 
 def _wait_for_end(journal: Journal) -> bool:
@@ -284,8 +251,7 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
     """Undo what a run has changed; what could not be undone, in sentences.
 
     The run is removed, if its owner is gone or asks for it. It stays where something is left, so
-    that it can be tried again, and where its journal has lines that say nothing. Who is at it
-    while another process is waits, and finds it done.
+    that it can be tried again, and where its journal has lines that say nothing.
     """
     left: list[str] = []
     with contextlib.ExitStack() as stack:
@@ -357,11 +323,10 @@ def remove_run(journal: Journal) -> None:
 
 
 def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Dissolve cgroups of ours of which none of these journals speaks, and whose owner has ended.
+    """Dissolve :func:`.stray_groups`: their threads run again, and it is mounted as before.
 
-    Their threads run again, where they were, and the hierarchy is mounted as before. Returns the
-    groups that are gone, and what could not be put back, since nothing says any more what was
-    there.
+    Returns the groups that are gone, and what could not be put back, since nothing says any more
+    what was there.
     """
     gone, left = [], []
     for folder in freezer.stray_groups(journals):
@@ -377,9 +342,8 @@ def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple
             with contextlib.suppress(ProcessLookupError):
                 left.append(
                     f"thread {thread.tid} ({thread.comm}) of process {thread.pid} runs on under "
-                    f"{state_text(state_of(thread.tid))}: the journal that says what it had before "
-                    f"is gone; give it back with `chrt --other --pid 0 {thread.tid}` and "
-                    f"`taskset --pid --cpu-list CORES {thread.tid}`"
+                    f"{state_text(state_of(thread.tid))}, and what it had before is not known: "
+                    f"`chrt --other --pid 0 {thread.tid}`, `taskset -pc CORES {thread.tid}`"
                 )
     freezer.restore_stray_mount()
     if left and cgroups.moves_are_quick():

@@ -28,7 +28,7 @@ from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.freezer import Freezer, groups_of, run_of
-from chainshaper.enforcement.guardian import Guardians, run_claimed
+from chainshaper.enforcement.guardian import Guardians, put_back, run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
@@ -269,12 +269,7 @@ class _Run:
             reason=self.choice.reason,
             started_ns=time.monotonic_ns(),
             cycle_ns=self.plan.cycle_ns,
-            anchor_ns=None,
-            phase_spread_ns=None,
-            drift_ns=None,
-            servers=(),
             notes=tuple(note for one in self.plan.chains for note in publication_warnings(one)),
-            failure=None,
         )
         self.name_strangers(self.found)
 
@@ -626,15 +621,7 @@ class _Run:
             telling.end()
         if self.command is not None:
             end_command(self.command)
-        problems += undoing.undo_run(self.journal, by_owner=True)
-        problems += undoing.strange_lines(self.journal)
-        if self.guardians is not None:
-            self.guardians.end()
-        if problems:
-            raise OperationError(
-                f"not everything could be put back: {'; '.join(problems)}; {self.journal.path} "
-                "says what was there, `chainshaper release` tries again"
-            )
+        put_back(self.journal, self.guardians, problems)
 
 
 def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:

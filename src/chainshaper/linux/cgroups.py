@@ -22,13 +22,10 @@ QUICK_MOVES = "favordynmods"
 
 Without it whoever moves a process to another group (a service manager, a container engine) waits
 for a grace period of RCU, 10 to 30 ms, and blocks freezing meanwhile: a slot opens so much later.
-Forks and exits become a little slower with it.
 """
 _BEFORE = "trusted.chainshaper.mount"
-"""Attribute of the hierarchy's root: its mount options before a run of ours changed them.
-
-A journal says the same, but may be lost; the attribute is in the kernel's memory, as the option is.
-"""
+"""Attribute of the hierarchy's root: its mount options before a run of ours, as in the journal, but
+never lost: it is in the kernel's memory, as the option is."""
 _REMOUNT = 32
 _MOUNT_FLAGS = {
     "rw": 0,
@@ -67,8 +64,7 @@ def _mount() -> tuple[Path, str]:
             return Path(folder.encode().decode("unicode_escape")), options
     raise PlatformError(
         "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
-        "`mount -t cgroup2 none /sys/fs/cgroup/unified`, or boot with "
-        "systemd.unified_cgroup_hierarchy=1"
+        "`mount -t cgroup2 none /sys/fs/cgroup/unified`"
     )
 
 
@@ -87,10 +83,7 @@ def remount(options: str) -> None:
 
 
 def options_before_ours() -> str | None:
-    """The mount options that a run which begins now has to restore when it ends.
-
-    Those that a run of ours found, which has not restored them yet. None: another program's stay.
-    """
+    """The mount options that a run which begins now has to restore; None: they stay."""
     if not moves_are_quick():
         return mount_options()
     with contextlib.suppress(OSError):
@@ -114,10 +107,7 @@ def restore_mount(before: str) -> None:
 
 
 def cgroup_of(tid: int) -> Path:
-    """The folder of a thread's group. Raises OperationError: there is no such thread.
-
-    PlatformError: its group cannot be seen from here.
-    """
+    """The folder of a thread's group. Raises OperationError: no thread. PlatformError: hidden."""
     try:
         lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
     except OSError:
@@ -143,10 +133,7 @@ def make_threaded_child(parent: Path, name: str) -> Path:
     try:
         folder.mkdir()
     except FileExistsError:
-        raise OperationError(
-            f"the cgroup {folder} exists already, left by a run that ended badly: "
-            "`chainshaper release` removes it"
-        ) from None
+        raise OperationError(f"{folder} exists already: `chainshaper release` removes it") from None
     except OSError as error:
         raise PlatformError(
             f"no cgroup can be made in {parent} ({error.strerror}): {_REMEDY}"
@@ -165,28 +152,18 @@ def make_threaded_child(parent: Path, name: str) -> Path:
 def _obstacle(parent: Path) -> str | None:
     """What stands in the way of threaded groups: the kernel only says EOPNOTSUPP."""
     controllers = set(_read(parent / "cgroup.subtree_control").split()) - _THREADED_CONTROLLERS
-    if controllers:
-        return (
-            f": it hands the controllers {', '.join(sorted(controllers))} down to its children, "
-            "which rules threaded groups out; run the application in a group that does not (its "
-            "own scope or unit)"
-        )
+    found = [f"it hands the controllers {', '.join(sorted(controllers))} down"] * bool(controllers)
     for child in sorted(parent.iterdir()):
         kind = _read(child / "cgroup.type").strip()
         if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
-            return (
-                f": its child {child.name} holds processes of its own; run the application in a "
-                "group without others beneath it (its own scope or unit)"
-            )
-    return None
+            found.append(f"its child {child.name} holds processes of its own")
+    if not found:
+        return None
+    return f": {found[0]}; run the application in a group of its own (a scope or unit)"
 
 
 def move_thread(tid: int, folder: Path) -> bool:
-    """Put one thread into a group; False when the thread has ended.
-
-    Raises PlatformError: the group is of another process, or the privilege is missing.
-    OperationError: the group is gone, or the kernel refuses for a reason of its own.
-    """
+    """Put a thread into a group; False when it has ended. Raises PlatformError, OperationError."""
     try:
         (folder / "cgroup.threads").write_text(str(tid))
     except ProcessLookupError:
@@ -195,10 +172,7 @@ def move_thread(tid: int, folder: Path) -> bool:
         refused = f"thread {tid} cannot be moved to the cgroup {folder} ({error.strerror})"
         if error.errno in {errno.EACCES, errno.EPERM, errno.EROFS}:
             raise PlatformError(f"{refused}: {_REMEDY}") from error
-        raise OperationError(
-            f"{refused}: is it a thread of the kernel, or has its process been moved to another "
-            "group meanwhile?"
-        ) from error
+        raise OperationError(f"{refused}: is it the kernel's, or has it been moved?") from error
     return True
 
 
@@ -213,10 +187,7 @@ def has_unseen_threads(folder: Path) -> bool:
 
 
 def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
-    """Thaw a group, put its threads back into the parent, remove it; harmless when repeated.
-
-    Returns None, or what is left in a sentence: nothing is raised.
-    """
+    """Have a group's threads run in its parent, and remove it; what is left is said, not raised."""
     with contextlib.suppress(OSError):
         (folder / "cgroup.freeze").write_text("0")
     deadline = time.monotonic() + within_s
@@ -243,9 +214,8 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
 
 
 def enter_own_group(name: str) -> bool:
-    """Put this process into a group of that name, out of reach of what befalls its present one.
-
-    False where it has to stay, as in a container: what ends the container ends it, too.
+    """Put this process into a group of that name, out of reach of what befalls its present one;
+    False where it has to stay, as in a container, whose end ends it, too.
     """
     for folder in _own_groups(name):
         for _ in range(_ATTEMPTS):  # the last to leave may just be removing it
@@ -277,9 +247,8 @@ def remove_own_group(name: str) -> None:
 
 
 def _own_groups(name: str) -> list[Path]:
-    """Where a group of ours may be that is not in reach of our present one, the best first.
-
-    Not beneath a group with processes, which could have no threaded children then.
+    """Where a group of ours may be, the best first: above our present one, and not beneath one with
+    processes, which could have no threaded children then.
     """
     try:
         root, own = mount_point(), cgroup_of(os.getpid())

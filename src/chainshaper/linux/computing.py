@@ -1,8 +1,7 @@
 """Who computes what there is much of: threads of this process, or a Dask cluster.
 
 Threads suffice on one machine, because decoding, Polars and the compiled engine run without the
-interpreter's lock; and they open no port and start no process that other users of the machine could
-reach.
+interpreter's lock; and they open no port that other users of the machine could reach.
 """
 
 import asyncio
@@ -52,8 +51,7 @@ def engine(
 
     ``purpose`` is for messages, and so is what ``stays`` where the cluster fails. Raises
     InputError: that is no address. PlatformError: `distributed` is not installed. OperationError:
-    no scheduler is there, or it is gone; there are no workers, or one has other versions of what
-    results depend on; or a task killed one worker after another.
+    the cluster fails, or has other versions of what results depend on.
     """
     return _threads(workers) if scheduler is None else _cluster(scheduler, purpose, stays)
 
@@ -105,9 +103,7 @@ def _threads(workers: int) -> Iterator[Engine]:
 
 @contextmanager
 def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
-    """A Dask cluster. All of Dask's many errors leave the work where it is, and the user with the
-    same things to look at.
-    """
+    """A Dask cluster; all of Dask's many errors leave the user with the same things to look at."""
     distributed, here = extra_library("distributed", f"{purpose} on a Dask cluster"), _versions()
     if not _ADDRESS.fullmatch(address):
         raise InputError(f"{address!r} is no scheduler's address: write one like tcp://HOST:8786")
@@ -116,7 +112,7 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
     except (OSError, asyncio.TimeoutError) as error:  # from Python 3.11 on they are one
         raise OperationError(
             f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`,"
-            " and give the address that it prints, such as --scheduler tcp://HOST:8786"
+            " and give the address that it prints"
         ) from error
     with connected as client:
         completed = distributed.as_completed(loop=client.loop)
@@ -145,8 +141,7 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
         except Exception as error:
             raise OperationError(
                 f"the Dask cluster at {address} failed ({type(error).__name__}: {error}){stays}."
-                " See that its workers run, that chainshaper is installed on each, and that they"
-                " have memory; then the same command goes on"
+                " See that workers run, with chainshaper and memory; then the same command goes on"
             ) from error
 
 
@@ -160,8 +155,6 @@ def _same_versions(client: dict[str, str], function: Callable[..., Any], *argume
     different = [f"{n} {own[n]}, not {client[n]}" for n in SAME if own[n] != client[n]]
     if different:
         worker = importlib.import_module("distributed").get_worker().address
-        raise OperationError(
-            f"the Dask worker at {worker} has {' and '.join(different)}: install the same versions"
-            " there as here"
-        )
+        versions = " and ".join(different)
+        raise OperationError(f"the Dask worker at {worker} has {versions}: install the same there")
     return function(*arguments)

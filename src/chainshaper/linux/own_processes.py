@@ -1,8 +1,8 @@
 """Processes that we start, ours and the user's: how they start, how they end.
 
 A process of ours often has more rights than whoever fills the folder that it is started in. So its
-Python is isolated (``-I``), and gets back, only if root and we alone can change it, our
-package, and behind all other folders those of the libraries that it needs.
+Python is isolated (``-I``), and gets back our package, and behind all other folders those of the
+libraries that it needs, if root and we alone can change them.
 
 The user's command, such as `ros2 launch …`, gets a session of its own: Ctrl-C then reaches us
 alone. It ends by SIGINT to its whole process group, then by SIGTERM, then by SIGKILL.
@@ -91,10 +91,7 @@ def check_command(command: Sequence[str]) -> None:
         return
     if Path(command[0]).is_file() and os.sep in command[0]:
         raise InputError(f"{command[0]} is not executable: give it the permission (`chmod +x`)")
-    raise InputError(
-        f"{command[0]}: no such command; is its name right, and is the ROS 2 environment sourced "
-        "(`source /opt/ros/…/setup.bash`)?"
-    )
+    raise InputError(f"{command[0]}: no such command; try `source /opt/ros/…/setup.bash` first")
 
 
 def start_command(
@@ -163,7 +160,5 @@ def what_happened(process: "subprocess.Popen[Any]") -> str | None:
         return "ended"
     if state is None:
         return None
-    if state.si_code == os.CLD_EXITED:
-        return f"ended with status {state.si_status}"
-    done = "stopped" if state.si_code == os.CLD_STOPPED else "killed"
-    return f"was {done} by signal {state.si_status}"
+    done = {os.CLD_EXITED: "ended with status", os.CLD_STOPPED: "was stopped by signal"}
+    return f"{done.get(state.si_code, 'was killed by signal')} {state.si_status}"

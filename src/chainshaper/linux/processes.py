@@ -2,11 +2,11 @@
 
 A process takes part in DDS when it has a thread that receives or one for timed events, by the names
 of a DDS implementation; where those do not name theirs (Fast DDS before 2.13), a mapped library
-together with further threads has to do. What only carries a node's command line has neither.
+together with further threads has to do.
 
 A process is a user's when that user both runs it, by all four of its user ids, and has started its
-program: `sudo`, `su` and every other set-user-ID program carry the command line and the environment
-of another user than the one they run as. Root may start programs for all.
+program: `sudo` and every other set-user-ID program carry the command line and the environment of
+another user than the one they run as. Root may start programs for all.
 
 Upstream: proc(5), credentials(7), getauxval(3); rcl, `arguments.c` and `remap.c`.
 """
@@ -63,20 +63,15 @@ MIDDLEWARE_LIMITS = {
 
 
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
-    """The ids of users whose processes a run takes, by their names or numbers.
-
-    By default who has launched us, also by `sudo`, and root. Raises InputError: no such user.
+    """The ids of users, by names or numbers; by default who has launched us, also by `sudo`, and
+    root. Raises InputError: no such user.
     """
     users = set()
-    for name in named:
-        number = isinstance(name, int) or name.isdecimal()
+    for name in map(str, named):
         try:
-            users.add(int(name) if number else pwd.getpwnam(str(name)).pw_uid)
+            users.add(int(name) if name.isdecimal() else pwd.getpwnam(name).pw_uid)
         except KeyError:
-            raise InputError(
-                f"no user is named {name!r} on this machine: give a name of `getent passwd`, or a "
-                "number"
-            ) from None
+            raise InputError(f"no user is named {name!r}: `getent passwd` lists them") from None
     launched = {os.getuid(), os.geteuid(), 0}
     behind_sudo = os.environ.get("SUDO_UID", "")
     if os.geteuid() == 0 and behind_sudo.isdecimal():
@@ -85,7 +80,6 @@ def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
 
 
 def user_name(user: int | None) -> str:
-    """What a user is called here; the number where it has no name."""
     if user is None:
         return "several users"
     with suppress(KeyError):
@@ -95,10 +89,7 @@ def user_name(user: int | None) -> str:
 
 @contextmanager
 def process_folder(pid: int) -> Iterator[int]:
-    """A process's folder in /proc, open: what is read from it is never another process's.
-
-    Raises OSError: there is no such process.
-    """
+    """A process's folder in /proc, open: never another process's. Raises OSError: it has ended."""
     folder = os.open(f"/proc/{pid}", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
         yield folder
@@ -142,9 +133,8 @@ def _outside(user: int, folder: int) -> int | None:
 
 @dataclass(frozen=True)
 class Process:
-    """A process at one instant; ``inner_pid`` is its id in its own pid namespace.
-
-    ``user`` is whose it is, None if no single user's; ``participates``: in DDS.
+    """A process at one instant, its id in its own pid namespace, whether it takes part in DDS, and
+    whose it is (None: no single user's).
     """
 
     pid: int
@@ -205,13 +195,11 @@ def find_applications(processes: Iterable[Process]) -> tuple[Process, ...]:
 def _participates(pid: int, threads: tuple[Thread, ...]) -> bool:
     if any(thread.kind in ("receive", "event") for thread in threads):
         return True
-    if len(threads) == 1:
-        return False
-    try:
-        mapped = read_proc(f"/proc/{pid}/maps")
-    except OSError:
-        return False  # another user's: its threads' names are all there is to see
-    return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS)
+    if len(threads) > 1:
+        with suppress(OSError):  # another user's: its threads' names are all there is to see
+            mapped = read_proc(f"/proc/{pid}/maps")
+            return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS)
+    return False
 
 
 def middleware_limit(process: Process) -> str | None:
@@ -236,10 +224,9 @@ def takes_ros_arguments(command: Sequence[str]) -> bool:
 def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
     """Full names of the nodes that a command line names, in the order of their remap rules.
 
-    ``__node:=NAME`` and ``__ns:=/NAMESPACE`` hold for every node of the process,
-    ``OLD:__node:=NAME`` for its node that would be called OLD only; of rules that apply, the first
-    one counts. A node's own namespace is not known from outside; without a rule it is taken for
-    `/`, which it is unless the program says otherwise.
+    ``__node:=NAME`` and ``__ns:=/NAMESPACE`` apply to every node of the process,
+    ``OLD:__node:=NAME`` to the one that would be called OLD; the first that applies counts. Without
+    a rule a node's namespace is taken for `/`, which it is unless the program says otherwise.
 
         >>> named_nodes(["talker", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/lidar"])
         ('/lidar/front',)

@@ -1,10 +1,9 @@
 """Runs on this machine: the journal of what each has changed, and since when it governs whom.
 
-A run has a folder, `/run/chainshaper/RUN` for root, below `$XDG_RUNTIME_DIR` for others, gone when
-the machine boots again, as is all that was changed. In it are `journal.jsonl`, `run.json`, which
-the run writes anew every second, and `plan.json`. Whatever ends us, SIGKILL included, another
-process must be able to put things back: each change is one line of JSON, on the disk (`fsync`)
-before it is made, and undone by the module that made it.
+A run has a folder (:func:`journals_folder`), gone when the machine boots again, as is all that was
+changed. In it are `journal.jsonl`, `run.json`, which the run writes anew every second, and
+`plan.json`. Whatever ends us, SIGKILL included, another process must be able to put things back:
+each change is one line of JSON, on the disk (`fsync`) before it is made.
 """
 
 import contextlib
@@ -20,7 +19,7 @@ from io import FileIO
 from pathlib import Path
 from typing import Any, TypeVar
 
-from chainshaper.linux.threads import find_thread, has_ended, read_proc, start_of
+from chainshaper.linux.threads import find_thread, has_ended, open_process, read_proc, start_of
 from chainshaper.values.errors import OperationError, PlatformError
 
 _T = TypeVar("_T")
@@ -34,9 +33,8 @@ _LOOK_S = 0.02
 
 @dataclass(frozen=True)
 class Journal:
-    """A journal on disk; what it says is read anew each time, since others may write to it too.
-
-    ``memory`` is the open file, from which it is written again where its folder is removed.
+    """A journal on disk, read anew each time, since others may write to it too; and the open file,
+    from which it is written again where its folder is removed.
     """
 
     path: Path
@@ -46,9 +44,9 @@ class Journal:
         self.note_all(kind, (fields,))
 
     def note_all(self, kind: str, changes: Iterable[Mapping[str, Any]]) -> None:
-        """Write down changes that are about to be made: plain data that says how to undo each.
+        """Write down, with one `fsync`, how to undo changes that are about to be made.
 
-        One `fsync` for all. Raises OperationError: they cannot be written; make no change then.
+        Raises OperationError: they cannot be written; make no change then.
         """
         lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in changes)
         try:
@@ -71,9 +69,8 @@ class Journal:
             ) from error
 
     def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
-        """All that was noted, oldest first; a ``kind`` alone if one is given.
-
-        What a crash cut off was never done, and is left out. Raises OperationError: unreadable.
+        """All that was noted, oldest first; of one ``kind`` if given. What a crash cut off was not
+        done, and is left out. Raises OperationError: unreadable.
         """
         entries = (_entry(line) for line in self._lines())
         return tuple(one for one in entries if one and kind in (None, one["kind"]))
@@ -87,13 +84,13 @@ class Journal:
         self, readers: Mapping[str, Callable[[Mapping[str, Any]], object]]
     ) -> tuple[tuple[int, str], ...]:
         """Lines, with their numbers, that are no entries, or that none of these could read."""
-        strange = []
-        for number, line in enumerate(self._lines(), start=1):
-            entry = _entry(line)
+
+        def is_read(entry: Mapping[str, Any] | None) -> bool:
             reader = readers.get(entry["kind"]) if entry else None
-            if entry is None or reader is None or _value(entry, reader) is None:
-                strange.append((number, line))
-        return tuple(strange)
+            return bool(entry and reader and _value(entry, reader) is not None)
+
+        lines = enumerate(self._lines(), start=1)
+        return tuple((number, line) for number, line in lines if not is_read(_entry(line)))
 
     def keep(self) -> bool:
         """See that the file is there, from ``memory`` if need be; whether it was not discarded."""
@@ -139,15 +136,17 @@ class Journal:
         gone = not opened or self.outdated or has_ended(*opened[0])
         return None if gone else opened[0][0]
 
+    def open_owner(self) -> int | None:
+        """A pidfd of the owner, None when it is gone."""
+        return None if self.owner is None else open_process(*self.read(OPENED, process_of)[0])
+
     def _lines(self) -> list[str]:
         try:
             content = self.path.read_bytes()
         except FileNotFoundError:
             content = self._remembered()
         except OSError as error:
-            raise OperationError(
-                f"{self.path}: the journal cannot be read: {error.strerror}"
-            ) from error
+            raise OperationError(f"{self.path} cannot be read: {error.strerror}") from error
         return content.decode(errors="replace").split("\n")[:-1]
 
     def _remembered(self) -> bytes:
@@ -173,8 +172,7 @@ class OwnProcess:
 
 def note_process(journal: Journal, role: str, pid: int, core: int | None = None) -> None:
     """Write down a process of the run, unless it has ended."""
-    started = start_of(pid, pid)
-    if started is not None:
+    if (started := start_of(pid, pid)) is not None:
         journal.note(PROCESS, role=role, pid=pid, started=started, core=core)
 
 
@@ -204,9 +202,8 @@ def _value(entry: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], _T]) 
 
 
 def open_journal(folder: str | Path | None = None, run: str | None = None) -> Journal:
-    """Begin a journal in ``folder``/``run``; both have defaults.
-
-    Raises OperationError: there is one, or it cannot be written. PlatformError: no folder for it.
+    """Begin a journal in ``folder``/``run``; both have defaults. Raises OperationError: there is
+    one, or it cannot be written. PlatformError: no folder for it.
     """
     base = journals_folder() if folder is None else Path(folder)
     place = base / (run or f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}")
@@ -220,13 +217,11 @@ def open_journal(folder: str | Path | None = None, run: str | None = None) -> Jo
             os.close(descriptor)
     except FileExistsError:
         raise OperationError(
-            f"{path} exists: that run is going on, or has crashed; undo it first "
-            "(`chainshaper release`)"
+            f"{path} exists: that run is going on, or has crashed: `chainshaper release` undoes it"
         ) from None
     except OSError as error:
         raise OperationError(
-            f"{place}: a journal of changes cannot be written there ({error.strerror}): name "
-            "another folder"
+            f"{place}: no journal of changes can be there ({error.strerror}): name another folder"
         ) from error
     journal, pid = remembered_journal(path), os.getpid()
     journal.note(OPENED, format=FORMAT, boot_id=boot_id(), pid=pid, started=start_of(pid, pid))
@@ -246,10 +241,7 @@ def journals_folder() -> Path:
         return Path(unit.split(":")[0])
     if session := os.environ.get("XDG_RUNTIME_DIR"):
         return Path(session) / "chainshaper"
-    raise PlatformError(
-        "$XDG_RUNTIME_DIR is not set, so there is no place for the journal of changes: name "
-        "a folder for it, or run in a login session"
-    )
+    raise PlatformError("$XDG_RUNTIME_DIR is not set: name a folder for the journal of changes")
 
 
 def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
@@ -275,9 +267,8 @@ def boot_id() -> str:
 
 @contextlib.contextmanager
 def locked(folder: Path, waiting: Callable[[float], None]) -> Iterator[None]:
-    """Inside, no other process has this folder locked.
-
-    ``waiting`` is called with the seconds waited so far, again and again; it may raise.
+    """Inside, no other process has this folder locked. ``waiting`` is called again and again, with
+    the seconds waited so far, and may raise.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -307,9 +298,8 @@ def holder_of(folder: Path) -> int | None:
 
 @dataclass(frozen=True)
 class Governed:
-    """A run that governs processes, as it was seen last, at ``seen_ns`` (CLOCK_MONOTONIC).
-
-    In force from its first whole cycle on; ``until_ns``: when it ended (None: not seen to).
+    """A run that governs processes from its first whole cycle on, as it was seen last, at
+    ``seen_ns`` (CLOCK_MONOTONIC); ``until_ns``: when it ended (None: not seen to).
     """
 
     run: str
@@ -325,9 +315,8 @@ def governing(
     before: Collection[Governed] = (),
     folder: Path | None = None,
 ) -> tuple[Governed, ...]:
-    """The runs that govern threads of these processes, those seen ``before`` included.
-
-    To be asked now and then: a run that has gone is over since the last look.
+    """The runs that govern threads of these processes; of those seen ``before``, one that is gone
+    is over since then.
     """
     found = {one.run: one for one in before}
     living = set()
@@ -353,9 +342,8 @@ def governing(
 
 
 def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
-    """All runs as one: while they were in force together, with the plan if there was one alone.
-
-    Of runs that followed each other the last one counts; None: there was none.
+    """All runs as one: while they were in force together (of runs that followed each other, the
+    last), with the plan if there was one alone. None: there was none.
     """
     if not runs:
         return None

@@ -1,7 +1,7 @@
 """How threads are scheduled: what this process may have, and setting and restoring any thread's.
 
-A thread's scheduling has three **aspects**, which the kernel changes apart from each other: its
-class (policy, priority and the flag that children start without it), its nice value, its cores.
+It has three **aspects**, which the kernel changes apart from each other: class (policy, priority
+and the flag that children start without it), nice value, cores.
 """
 
 import ctypes
@@ -27,9 +27,8 @@ _THROTTLE = "/proc/sys/kernel/sched_rt_{}_us"
 
 @dataclass(frozen=True)
 class Scheduling:
-    """What a thread should get; what is None is left alone.
-
-    ``priority`` is that of SCHED_FIFO or, with ``takes_turns``, of SCHED_RR; 0 of SCHED_OTHER.
+    """What a thread should get, or None: a priority of SCHED_FIFO or, if it ``takes_turns``, of
+    SCHED_RR (0: SCHED_OTHER), and cores.
     """
 
     priority: int | None
@@ -63,20 +62,16 @@ class SchedulingState:
 
 def state_of(tid: int) -> SchedulingState:
     """How a thread is scheduled now. Raises ProcessLookupError: it has ended."""
-    policy = os.sched_getscheduler(tid)
-    priority = os.sched_getparam(tid).sched_priority
-    return SchedulingState(
-        SchedulingClass(policy & ~RESET_ON_FORK, priority, bool(policy & RESET_ON_FORK)),
-        nice=os.getpriority(os.PRIO_PROCESS, tid),
-        cores=tuple(sorted(os.sched_getaffinity(tid))),
-    )
+    policy, priority = os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority
+    its = SchedulingClass(policy & ~RESET_ON_FORK, priority, bool(policy & RESET_ON_FORK))
+    nice = os.getpriority(os.PRIO_PROCESS, tid)
+    return SchedulingState(its, nice, tuple(sorted(os.sched_getaffinity(tid))))
 
 
 def set_state(tid: int, target: SchedulingState) -> None:
-    """Give a thread the aspects of a state in which it differs.
-
-    The class goes first: on a core where a FIFO thread spins, a thread moved there as SCHED_OTHER
-    would not run again. Raises ProcessLookupError: it has ended. OSError: the kernel refuses.
+    """Give a thread the aspects of a state in which it differs, the class first: on a core where a
+    FIFO thread spins, it would not run again as SCHED_OTHER. Raises OSError: it has ended
+    (ProcessLookupError), or the kernel refuses.
     """
     for aspect in different_aspects(state_of(tid), target):
         if aspect == "scheduling_class":
@@ -123,19 +118,15 @@ def state_text(state: SchedulingState) -> str:
 
 
 def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
-    """Give a thread of ours its class and cores; one that has ended meanwhile is no error.
-
-    Raises OperationError: the kernel refuses.
-    """
+    """Give a thread, if it runs still, class and cores. Raises OperationError: it is refused."""
     try:
         set_state(thread.tid, after_wish(state_of(thread.tid), wanted))
     except ProcessLookupError:
         return
     except OSError as error:
-        raise OperationError(
-            f"thread {thread.tid} ({thread.comm}) of process {thread.pid}: the kernel refuses "
-            f"priority {wanted.priority} on cores {wanted.cores}: {error.strerror}"
-        ) from error
+        whose = f"thread {thread.tid} ({thread.comm}) of process {thread.pid}"
+        asked = f"priority {wanted.priority} on cores {wanted.cores}"
+        raise OperationError(f"{whose}: the kernel refuses {asked}: {error.strerror}") from error
 
 
 def become_fifo(priority: int) -> bool:

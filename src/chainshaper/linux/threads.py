@@ -1,8 +1,8 @@
 """Threads as the kernel shows them, and what their names say.
 
 A thread is identified by its id *and* its start: ids are used again. Cyclone DDS has always named
-its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); others carry the name of their process.
-Zenoh's names are short words (`rx-0`), so they count only in a process that has several of them.
+its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy). Zenoh's names are short words (`rx-0`), so
+they count only in a process that has several of them.
 
 Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading";
 Zenoh, `commons/zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, User's Manual,
@@ -25,31 +25,16 @@ RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
 TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 """The kernel shows the start of a thread in ticks of 10 ms."""
 
-POLICIES = {
-    os.SCHED_OTHER: "SCHED_OTHER",
-    os.SCHED_FIFO: "SCHED_FIFO",
-    os.SCHED_RR: "SCHED_RR",
-    os.SCHED_BATCH: "SCHED_BATCH",
-    os.SCHED_IDLE: "SCHED_IDLE",
-    SCHED_DEADLINE: "SCHED_DEADLINE",
-    7: "SCHED_LITMUS" if Path("/proc/litmus").is_dir() else "SCHED_EXT",
-}
+_OF_PYTHON = ("SCHED_OTHER", "SCHED_FIFO", "SCHED_RR", "SCHED_BATCH", "SCHED_IDLE")
+POLICIES: dict[int, str] = {getattr(os, name): name for name in _OF_PYTHON}
+POLICIES[SCHED_DEADLINE] = "SCHED_DEADLINE"
+POLICIES[7] = "SCHED_LITMUS" if Path("/proc/litmus").is_dir() else "SCHED_EXT"
 
 ThreadRole: TypeAlias = Literal["executor", "publisher", "dds", "unknown"]
 """``publisher``: sends what executors hand over to it (asynchronous publication, section 2.2)."""
 
-DdsKind: TypeAlias = Literal[
-    "asynchronous publisher",
-    "receive",
-    "delivery",
-    "transmit",
-    "event",
-    "discovery",
-    "lease",
-    "garbage collection",
-    "connection",
-    "housekeeping",
-]
+DdsKind: TypeAlias = str
+"""What a DDS thread does, in the words of the tables below."""
 
 _DDS_NAMES: tuple[tuple[str, DdsKind], ...] = (  # the first that matches a whole name counts
     # Cyclone DDS 0.10 and 11; per channel, `user` unless the configuration defines others.
@@ -100,12 +85,9 @@ def gate_thread_name(node: str) -> str:
 
 
 def role_of(comm: str, is_main: bool) -> ThreadRole:
-    """The role of a thread of a node's process, as far as its name shows.
-
-    Executors spin on the main thread, unless a program arranges it otherwise.
-    """
+    """The role of a thread of a node's process, as far as its name shows."""
     if is_main:
-        return "executor"
+        return "executor"  # executors spin there, unless a program arranges it otherwise
     kind = dds_kind(comm)
     if kind == "asynchronous publisher":
         return "publisher"
@@ -114,10 +96,8 @@ def role_of(comm: str, is_main: bool) -> ThreadRole:
 
 @dataclass(frozen=True)
 class Thread:
-    """A thread as the kernel shows it at one instant.
-
-    ``started`` counts clock ticks (:data:`TICK_NS`) since the machine booted. ``inner_tid`` is
-    its id in its own pid namespace: in a container, tracers record that one.
+    """A thread as the kernel shows it at one instant: started so many ticks (:data:`TICK_NS`) after
+    the machine, with the id that tracers record in a container (``inner_tid``).
     """
 
     tid: int
@@ -155,10 +135,9 @@ def with_zenoh(threads: Iterable[Thread]) -> tuple[Thread, ...]:
     own = {one.tid: match[1] for one in every if (match := _ZENOH_NAME.fullmatch(one.comm))}
     if len(set(own.values())) < _SURELY_ZENOH:
         return every
-    kinds = {tid: _ZENOH_RUNTIMES[runtime] for tid, runtime in own.items()}
     return tuple(
-        replace(one, role="dds", kind=kinds[one.tid])
-        if one.tid in kinds and one.tid != one.pid
+        replace(one, role="dds", kind=_ZENOH_RUNTIMES[own[one.tid]])
+        if one.tid in own and one.tid != one.pid
         else one
         for one in every
     )
@@ -180,10 +159,7 @@ def find_thread(tid: int) -> Thread | None:
 
 
 def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
-    """One thread, None if it has ended; ``inner_pid`` is its process's, None if not known.
-
-    Looked at every second, on machines with thousands of threads: a single file is read.
-    """
+    """A thread, if it runs still, by reading one file: there are thousands, every second."""
     folder = f"/proc/{pid}/task/{tid}"
     try:
         comm, fields = read_stat(folder)
@@ -278,10 +254,7 @@ def open_process(pid: int, started: int) -> int | None:
 
 
 def foreign_realtime_processes() -> tuple[str, ...]:
-    """Other processes with real-time threads, as ``comm (pid)``: they spoil measurements.
-
-    Our own children and what enforces a plan are not among them.
-    """
+    """Others' processes with real-time threads, as ``comm (pid)``: they spoil measurements."""
     found = []
     for pid, parent in parents().items():
         try:

@@ -1,13 +1,11 @@
 """Back end `scx`: the table of servers inside the kernel, as a sched_ext policy.
 
-The policy (`policy/table.bpf.c`, which explains how it works) is compiled ahead. While it is
-in force, *every* thread of the machine's fair class is scheduled by it. Real-time threads stand
-above it, so a thread that shall be governed must not be one. It begins with an empty table, under
-which everything is best effort.
+While the policy (`policy/table.bpf.c`, compiled ahead) is in force, *every* thread of the machine's
+fair class is scheduled by it. Real-time threads stand above it, so a thread that shall be governed
+must not be one. It begins with an empty table, under which everything is best effort.
 
-Nothing has to be put back by hand. The policy hangs on a file descriptor of this process, and
-however it ends, the kernel returns to its fair class. (A fork without exec inherits the
-descriptor, and keeps the policy for as long as it lives.)
+Nothing has to be put back by hand: the policy hangs on a file descriptor of this process, and
+however it ends, the kernel returns to its fair class. (A fork without exec inherits it.)
 
 PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, a process of its own:
 
@@ -25,6 +23,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -37,7 +36,7 @@ from chainshaper.enforcement.scx.libbpf import (
     look_up_element,
     update_element,
 )
-from chainshaper.enforcement.servers import ServerCounters, ServerTable, server_named
+from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable, server_named
 from chainshaper.linux.own_processes import module_command, what_happened
 from chainshaper.linux.scheduling import (
     check_cores,
@@ -70,6 +69,7 @@ WAKE = struct.Struct("<qqqq")
 INSTANT = struct.Struct("<qq")
 _FLAGS = struct.Struct("<Q")
 
+_FREELY = "the policy is gone, and all threads run freely"
 ROTATION_NS = 2_000_000  # one thread of a server runs so long before the next has its turn
 _WATCH_S = 0.02
 _VISIT_NS = 1_000_000
@@ -81,15 +81,9 @@ _CAPABILITIES = {"CAP_IPC_LOCK": 14, "CAP_SYS_ADMIN": 21, "CAP_PERFMON": 38, "CA
 def missing() -> str | None:
     """Why sched_ext servers cannot be had here, with the remedy; None when they can."""
     if not SCHED_EXT.is_dir():
-        return (
-            "this kernel has no sched_ext: use Linux 6.12 or newer built with "
-            "CONFIG_SCHED_CLASS_EXT, such as Debian's from 6.16 on"
-        )
+        return "this kernel has no sched_ext: use Linux 6.12 or newer with CONFIG_SCHED_CLASS_EXT"
     if not KERNEL_TYPES.exists():
-        return (
-            f"this kernel does not describe its types ({KERNEL_TYPES} is absent): use one built "
-            "with CONFIG_DEBUG_INFO_BTF"
-        )
+        return f"this kernel has no {KERNEL_TYPES}: use one with CONFIG_DEBUG_INFO_BTF"
     try:
         load_libbpf()
     except PlatformError as error:
@@ -141,48 +135,36 @@ def _lacking_privileges() -> list[str]:
 
 def check_table(table: ServerTable) -> None:
     """Refuse a table that the policy cannot hold. Raises InputError: a limit is exceeded."""
-    if len(table.servers) >= MAX_SERVERS:
-        raise InputError(
-            f"{len(table.servers)} servers are more than the {MAX_SERVERS - 1} that back end scx "
-            "can hold; join servers that share slots"
-        )
-    cores = [server.core for server in table.servers]
+    crowds = [("", len(table.servers), MAX_SERVERS - 1)]
+    for core, count in Counter(server.core for server in table.servers).items():
+        crowds.append((f" on core {core}", count, MAX_SERVERS_PER_CORE))
+    for where, count, most in crowds:
+        if count > most:
+            raise InputError(
+                f"{count} servers{where} are more than the {most} that back end scx can have; join"
+                " servers that share slots"
+            )
     for server in table.servers:
-        name, core = f"server {server.name}", server.core
-        if core >= MAX_CORES:
-            raise InputError(f"{name} is on core {core}; back end scx knows 0 to {MAX_CORES - 1}")
-        if cores.count(core) > MAX_SERVERS_PER_CORE:
-            raise InputError(
-                f"{cores.count(core)} servers on core {core} are more than the "
-                f"{MAX_SERVERS_PER_CORE} that back end scx can hold there; move some to other cores"
-            )
-        if not 1 <= len(server.slots) <= MAX_SLOTS:
-            raise InputError(
-                f"{name} has {len(server.slots)} slots; back end scx takes 1 to {MAX_SLOTS}"
-            )
+        name, slots = f"server {server.name}", len(server.slots)
+        if server.core >= MAX_CORES:
+            known = f"back end scx knows 0 to {MAX_CORES - 1}"
+            raise InputError(f"{name} is on core {server.core}; {known}")
+        if not 1 <= slots <= MAX_SLOTS:
+            raise InputError(f"{name} has {slots} slots; back end scx takes 1 to {MAX_SLOTS}")
 
 
 def number_servers(table: ServerTable, known: Mapping[str, int]) -> dict[str, int]:
-    """Ids for all servers of a table; those in ``known`` keep theirs, even when no longer used.
-
-    Raises InputError: no id is left.
-    """
+    """Ids for all servers; ``known`` ones stay, used or not. Raises InputError: none is left."""
     ids = dict(known)
     for server in table.servers:
         ids.setdefault(server.name, len(ids) + 1)
     if len(ids) >= MAX_SERVERS:
-        raise InputError(
-            f"back end scx has had {len(ids)} servers of different names by now and cannot hold "
-            f"more than {MAX_SERVERS - 1}; release it and start again"
-        )
+        raise InputError(f"{len(ids)} servers by now are too many; release it and start again")
     return ids
 
 
 def pack_servers(table: ServerTable, ids: Mapping[str, int], anchor_ns: int) -> dict[int, bytes]:
-    """Map `servers` by id: every id below :data:`MAX_SERVERS`, empty where there is no server.
-
-    ``anchor_ns`` must lie in the past.
-    """
+    """Map `servers`: every id, empty where there is no server. The anchor must be in the past."""
     size = SERVER.size + MAX_SLOTS * SLOT.size
     packed = dict.fromkeys(range(MAX_SERVERS), bytes(size))
     for server in table.servers:
@@ -194,10 +176,7 @@ def pack_servers(table: ServerTable, ids: Mapping[str, int], anchor_ns: int) -> 
 
 
 def pack_cores(table: ServerTable, ids: Mapping[str, int], core_count: int) -> dict[int, bytes]:
-    """Map `cpus` by core below ``core_count``: its servers, best priority first.
-
-    Equal priorities are taken in the order of the table.
-    """
+    """Map `cpus` by core below ``core_count``: its servers, best first, equals as in the table."""
     packed = dict.fromkeys(range(core_count), bytes(CORE.size))
     for core in {server.core for server in table.servers}:
         here = sorted((s for s in table.servers if s.core == core), key=lambda s: s.priority)
@@ -207,9 +186,8 @@ def pack_cores(table: ServerTable, ids: Mapping[str, int], core_count: int) -> d
 
 
 def change_word(generation: int, instant_ns: int, *, replaces: bool) -> bytes:
-    """Map `in_force`: this generation from the instant on, the other one before it.
-
-    ``replaces``: that one holds a table; otherwise nothing is governed before the instant.
+    """Map `in_force`: this generation from the instant on, before it the other one, if it
+    ``replaces`` one.
     """
     return (instant_ns << 2 | replaces << 1 | generation).to_bytes(8, "little")
 
@@ -228,10 +206,8 @@ def unpack_exit(value: bytes) -> str | None:
 
 
 def create(table: ServerTable) -> "ScxServers":
-    """Servers for this table; nothing is loaded before :meth:`ScxServers.arm`.
-
-    Raises InputError: the table is wrong or too large for the policy. PlatformError: this machine
-    has no such core, or lacks what :func:`missing` names.
+    """Servers for this table; nothing is loaded before :meth:`ScxServers.arm`. Raises InputError:
+    as :func:`check_table`. PlatformError: there is no such core, or as :func:`missing` says.
     """
     _check(table)
     reason = missing()
@@ -245,13 +221,11 @@ def _check(table: ServerTable) -> None:
     check_cores({server.core: f"server {server.name}" for server in table.servers})
 
 
-class ScxServers:
+class ScxServers(BackEnd):
     """A table of servers in the kernel; see :class:`chainshaper.enforcement.servers.BackEnd`."""
 
-    name = "scx"
-
     def __init__(self, table: ServerTable) -> None:
-        self._table = table
+        super().__init__(table)
         self._ids = number_servers(table, {})
         self._members: dict[int, tuple[int, int]] = {}  # tid -> (thread descriptor, server id)
         self._has_timer = not is_realtime_kernel()
@@ -260,7 +234,6 @@ class ScxServers:
         self._link = 0
         self._kickers: dict[int, subprocess.Popen[bytes]] = {}
         self._generation = 0
-        self._since_ns: int | None = None  # the present table has governed all cores
         self._failure: str | None = None
         self._released = threading.Event()
         self._last_counters: dict[str, ServerCounters] = {}
@@ -285,15 +258,12 @@ class ScxServers:
         """See :meth:`BackEnd.arm`; returns when the slots are in force, on all cores at once."""
         self.change(self._table, anchor_ns)
 
-    def in_force_from(self) -> int | None:
-        return self._since_ns
-
     def change(self, table: ServerTable, anchor_ns: int) -> None:
         """Put another table in force, on all cores at one instant.
 
         Threads stay in the server of the same name; those of a server that is no longer there run
-        as best effort until they are assigned anew. Raises as :func:`create`, and OperationError:
-        the kernel refuses the policy, or it has ended (:meth:`failure`).
+        as best effort. Raises as :func:`create`, and OperationError: the kernel refuses the policy,
+        or it has ended.
         """
         _check(table)
         with self._lock:
@@ -333,10 +303,7 @@ class ScxServers:
             if self._failure is None and self._policy is not None:
                 ended = self._policy.map_descriptor("ended")
                 if reason := unpack_exit(look_up_element(ended, 0, EXIT.size)):
-                    self._failure = (
-                        f"the kernel has ended the scheduling policy ({reason}); all threads run "
-                        "freely"
-                    )
+                    self._failure = f"the kernel has ended the policy ({reason}); {_FREELY}"
             return self._failure
 
     def release(self) -> None:
@@ -358,9 +325,7 @@ class ScxServers:
         try:
             policy = BpfObject(POLICY)
         except OSError as error:
-            raise OperationError(
-                f"the scheduling policy cannot be read: {error.strerror}"
-            ) from error
+            raise OperationError(f"the policy cannot be read: {error.strerror}") from error
         try:
             config = policy.initial_bytes(".rodata.config", CONFIG.size)
             CONFIG.pack_into(config, 0, self._has_timer, self._core_count)
@@ -392,10 +357,9 @@ class ScxServers:
     ) -> int:
         """Write the idle generation and have all cores change over; the instant at which they will.
 
-        It lies a little ahead. Until then each core has to learn that it must decide then. Kickers
-        look by themselves. A timer belongs to the core that starts it, so the calling thread goes
-        round; the policy lets it pass before everything else, because it must not wait for a core
-        that servers keep busy. Raises OperationError: it may not run on one of the cores.
+        It lies a little ahead, for each core to learn of it. Kickers look by themselves. A timer
+        belongs to the core that starts it, so the calling thread goes round; the policy lets it
+        pass before everything else. Raises OperationError: it may not run on one of the cores.
         """
         generation = self._generation = 1 - self._generation
         # Cycles repeat: the anchor lies within the first one after booting.
@@ -437,9 +401,7 @@ class ScxServers:
             os.close(descriptor)
             del self._members[tid]
         except OSError as error:
-            raise OperationError(
-                f"the kernel refuses to put thread {tid} into a server: {error.strerror}"
-            ) from error
+            raise OperationError(f"thread {tid} gets no server: {error.strerror}") from error
 
     def _start_kickers(self, policy: BpfObject, cores: list[int]) -> None:
         for core in () if self._has_timer else cores:
@@ -454,11 +416,8 @@ class ScxServers:
                 for core, kicker in self._kickers.items():
                     what = what_happened(kicker)
                     if self.failure() is None and what is not None:
-                        self._failure = (
-                            f"the kicker of core {core} (process {kicker.pid}) {what}, so its "
-                            "slots are no longer exact; the policy was taken away and all threads "
-                            "run freely"
-                        )
+                        who = f"the kicker of core {core} (process {kicker.pid})"
+                        self._failure = f"{who} {what}, which makes slots inexact; {_FREELY}"
                 if self.failure() is not None:
                     self._end()
                     return
@@ -481,10 +440,7 @@ class ScxServers:
 
 
 def _thread_descriptor(tid: int) -> int:
-    """A file descriptor that stands for a thread, and never for another that gets its id.
-
-    Raises OSError: there is no such thread.
-    """
+    """A file descriptor that stands for a thread. Raises OSError: there is no such thread."""
     return os.pidfd_open(tid, os.O_EXCL)  # PIDFD_THREAD
 
 
@@ -501,15 +457,9 @@ def _examine_thread(tid: int, server: str, core: int) -> int | None:
             f"thread {tid} cannot be put into server {server}: {error.strerror}"
         ) from error
     if policy not in _FAIR_POLICIES:
-        problem = (
-            f"it runs under {POLICIES.get(policy, policy)}, above every server: give it another "
-            f"class first (`chrt --other --pid 0 {tid}`)"
-        )
+        problem = f"it is under {POLICIES.get(policy, policy)}: `chrt --other --pid 0 {tid}` first"
     elif core not in cores:
-        problem = (
-            f"it may not run on core {core}: allow it to first (`taskset --pid --cpu-list {core} "
-            f"{tid}`)"
-        )
+        problem = f"it may not run on core {core}: `taskset --pid --cpu-list {core} {tid}` first"
     else:
         return descriptor
     os.close(descriptor)
@@ -517,11 +467,7 @@ def _examine_thread(tid: int, server: str, core: int) -> int | None:
 
 
 def _start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
-    """Start the kicker of a core; returns when it is at work.
-
-    ``program`` is the file descriptor of `table_boundary`. Raises OperationError: it cannot be
-    started.
-    """
+    """Start a core's kicker, with `table_boundary`'s descriptor. Raises OperationError: it ends."""
     process = subprocess.Popen(
         [*module_command(__name__), str(core), str(program)],
         stdin=subprocess.DEVNULL,

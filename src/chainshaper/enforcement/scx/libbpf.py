@@ -1,9 +1,9 @@
 """The part of libbpf that a struct_ops policy needs, over ctypes.
 
-libbpf.so.1 comes with every distribution that has BPF at all; binding to it saves a compiler, a
-kernel-header package and a Python dependency. An object file is opened, adjusted, loaded, and its
-struct_ops map attached, which gives a link: a file descriptor that the kernel closes when the
-process ends, and takes the policy away. Functions raise OSError with what libbpf said.
+libbpf.so.1 comes with every distribution that has BPF at all. An object file is opened, adjusted,
+loaded, and its struct_ops map attached, which gives a link: a file descriptor that the kernel
+closes when the process ends, and takes the policy away. Functions raise OSError with what libbpf
+said.
 """
 
 import ctypes
@@ -88,11 +88,7 @@ def _failure(step: str) -> OSError:
 
 
 class BpfObject:
-    """An object file: opened first, then adjusted, then loaded into the kernel.
-
-    What takes a name raises KeyError: the object has nothing of this name. The rest raises OSError:
-    libbpf cannot read the file, or the kernel refuses, with the last messages of libbpf.
-    """
+    """An object file: opened, adjusted, loaded. Raises KeyError: it has nothing of a name."""
 
     def __init__(self, path: Path) -> None:
         self._library = load_libbpf()
@@ -123,11 +119,9 @@ class BpfObject:
             raise _failure("loading")
 
     def map_descriptor(self, name: str) -> int:
-        """The file descriptor of a map of a loaded object."""
         return int(self._library.bpf_map__fd(self._find("map", name)))
 
     def program_descriptor(self, name: str) -> int:
-        """The file descriptor of a program of a loaded object."""
         return int(self._library.bpf_program__fd(self._find("program", name)))
 
     def attach_operations(self, map_name: str) -> int:
@@ -138,7 +132,6 @@ class BpfObject:
         return link
 
     def detach(self, link: int) -> None:
-        """End what :meth:`attach_operations` began."""
         self._library.bpf_link__destroy(link)
 
     def close(self) -> None:
@@ -170,10 +163,8 @@ def delete_element(map_descriptor: int, key: int) -> None:
 
 
 class ProgramRun:
-    """A `SEC("syscall")` program, ready to be run on the calling core any number of times.
-
-    ``context`` is what the program reads and writes. Everything is laid out beforehand, so that
-    whoever counts microseconds may run it by ``function(*arguments)``.
+    """A `SEC("syscall")` program, to be run on the calling core any number of times, where
+    microseconds count by ``function(*arguments)``. It reads and writes ``context``.
     """
 
     def __init__(self, descriptor: int, context_size: int) -> None:
