@@ -47,8 +47,8 @@ from chainshaper import (
 )
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.planning import Plan, Slot
-from chainshaper.planning.plan import publisher_servers
+from chainshaper.planning import Plan
+from chainshaper.planning.plan import Slot, publisher_servers
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from results import PICTURES, Column, Line, save
 from table_4 import parse_measured
 
-from chainshaper.planning import BandChoice, choose_bands, plan_shaping
+from chainshaper.planning import BandChoice, plan_shaping
+from chainshaper.planning.bands import choose_bands
 from chainshaper.reporting.figures import draw_curve
 
 PAPER = {1: 86.6, 3: 71.3}

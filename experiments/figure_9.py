@@ -26,7 +26,8 @@ from on_ros import Shaping, ros_runs
 from results import HERE, MS, OURS, PICTURES, Line, Run, earlier_runs, lines_of, save
 
 from chainshaper import load_application
-from chainshaper.planning import Plan, PlanRequest, over_cores, plan_shaping, with_sink
+from chainshaper.planning import Plan, PlanRequest, plan_shaping
+from chainshaper.planning.shaping import over_cores, with_sink
 from chainshaper.workload.description import Application
 
 APPLICATION = HERE / "dag.yaml"

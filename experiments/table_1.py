@@ -26,13 +26,8 @@ from on_ros import Shaping, ros_runs
 from results import MS, OURS, PICTURES, Line, Run, Value, earlier_runs, lines_of, save
 
 from chainshaper import load_application
-from chainshaper.planning import (
-    CallbackTimes,
-    Plan,
-    PlanRequest,
-    plan_shaping,
-    server_per_callback,
-)
+from chainshaper.planning import CallbackTimes, Plan, PlanRequest, plan_shaping
+from chainshaper.planning.shaping import server_per_callback
 from chainshaper.workload.description import Application, ExecutionTime
 
 APPLICATION = Path(__file__).parents[1] / "examples" / "synthetic_chain.yaml"

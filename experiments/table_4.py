@@ -21,15 +21,12 @@ from avp_sample import MS, ORIGIN, PERIOD_NS, avp_sample
 from numpy.typing import NDArray
 from results import RESULTS, Column, Line, Value, save
 
-from chainshaper.planning import (
-    CallbackTimes,
-    Plan,
-    plan_shaping,
+from chainshaper.planning import CallbackTimes, Plan, plan_shaping
+from chainshaper.planning.bands import with_bands, with_long_slot
+from chainshaper.planning.shaping import (
     server_per_callback,
     server_per_chain,
-    with_bands,
     with_first_node_apart,
-    with_long_slot,
 )
 
 __all__ = ["MARGIN_NS", "MWCETS_US", "parse_measured", "plans"]

@@ -42,7 +42,8 @@ from results import (
 )
 
 from chainshaper import load_application, plan_recording, simulate
-from chainshaper.planning import Plan, PlanRequest, let_per_callback, let_per_chain
+from chainshaper.planning import Plan, PlanRequest
+from chainshaper.planning.shaping import let_per_callback, let_per_chain
 from chainshaper.workload.description import Application
 
 SYNTHETIC = HERE.parent / "examples" / "asynchronous_chain.yaml"

@@ -16,7 +16,8 @@ from command_line import called, chainshaper, message_of, refused
 from reference_traces import DATA
 from small_chain import small_chain_plan, small_chain_text
 
-from chainshaper.planning import Plan, save_plan, server_per_chain
+from chainshaper.planning import Plan, save_plan
+from chainshaper.planning.shaping import server_per_chain
 from chainshaper.values.recording import Recording
 
 MISSING_CORE = small_chain_text(executor_core=1023)

@@ -5,11 +5,12 @@ from dataclasses import replace
 from itertools import product
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from chainshaper import load_application
-from chainshaper.planning import CallbackTimes, cores
-from chainshaper.planning.cores import Work, assign_cores
+from chainshaper.planning import CallbackTimes, Profile, cores
+from chainshaper.planning.cores import assign_cores
 
 MS = 1_000_000
 DAG = Path(__file__).parents[2] / "experiments" / "dag.yaml"
@@ -17,7 +18,7 @@ DAG = Path(__file__).parents[2] / "experiments" / "dag.yaml"
 
 def _work(
     *callbacks: tuple[str, int, tuple[int, ...]], begins: str = "", period: int = 100
-) -> Work:
+) -> Profile:
     """A chain of callbacks: node, time in ms, places of those that it waits for."""
     times = [
         CallbackTimes(
@@ -30,10 +31,10 @@ def _work(
         )
         for node, ms, after in callbacks
     ]
-    return Work(begins, period * MS, tuple(times))
+    return Profile(np.zeros(2, np.int64), period * MS, begins=(0, begins), callbacks=tuple(times))
 
 
-def _alone(name: str, ms: int, period: int) -> Work:
+def _alone(name: str, ms: int, period: int) -> Profile:
     return _work((name, ms, ()), begins=name, period=period)
 
 
@@ -61,7 +62,9 @@ def test_what_runs_one_after_the_other_stays_on_one_core() -> None:
 
 
 def test_nodes_of_one_process_stay_together() -> None:
-    assert set(assign_cores([PARKING], [1, 0], together=[("rear", "front")]).values()) == {1}
+    assert set(
+        assign_cores([replace(PARKING, together=(("rear", "front"),))], [1, 0]).values()
+    ) == {1}
 
 
 @pytest.mark.parametrize(("first", "core"), [(12, 1), (13, 0)])
@@ -92,8 +95,8 @@ def test_the_best_of_all_assignments_is_found() -> None:
             work.append(_work(*drawn, begins=begins, period=period))
         found = assign_cores(work, [0, 1])
         graphs = cores._graphs(work, {name: k for k, name in enumerate(found)})
-        best = min(cores._cost(graphs, one) for one in product((0, 1), repeat=len(found)))
-        assert cores._cost(graphs, tuple(found.values()))[:2] == best[:2]
+        best = min(cores._cost(graphs, 0, one) for one in product((0, 1), repeat=len(found)))
+        assert cores._cost(graphs, 0, tuple(found.values()))[:2] == best[:2]
 
 
 def test_the_papers_graph_of_18_callbacks_takes_its_longest_path_on_two_cores() -> None:
@@ -110,4 +113,4 @@ def test_the_papers_graph_of_18_callbacks_takes_its_longest_path_on_two_cores() 
     found = assign_cores([work], [0, 1])
     graphs = cores._graphs([work], {name: k for k, name in enumerate(found)})
     assert len(found) == 18
-    assert round(cores._cost(graphs, tuple(found.values()))[1] * 764) == 560
+    assert round(cores._cost(graphs, 0, tuple(found.values()))[1] * 764) == 560

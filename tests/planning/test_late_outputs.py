@@ -14,19 +14,14 @@ from chainshaper.planning import (
     Plan,
     PlanRequest,
     Profile,
-    let_per_callback,
-    let_per_chain,
     load_plan,
     plan_chain,
     plan_shaping,
     plan_warnings,
     publish_slots,
     save_plan,
-    server_per_chain,
-    with_bands,
-    with_long_slot,
-    with_sink,
 )
+from chainshaper.planning.bands import with_bands, with_long_slot
 from chainshaper.planning.overruns import (
     Writer,
     check_publication,
@@ -36,6 +31,12 @@ from chainshaper.planning.overruns import (
     publication_warnings,
 )
 from chainshaper.planning.plan import messages_waiting, output_server, publisher_servers, revised
+from chainshaper.planning.shaping import (
+    let_per_callback,
+    let_per_chain,
+    server_per_chain,
+    with_sink,
+)
 from chainshaper.values.errors import InputError
 
 MS = 1_000_000

@@ -9,22 +9,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.planning import (
-    Margin,
     Modes,
     Plan,
-    Prediction,
-    Server,
-    ShapingNode,
-    Thread,
     dump_plan,
     load_plan,
     plan_json,
     publish_slots,
     save_plan,
-    server_of,
 )
 from chainshaper.planning.application_plan import whole
-from chainshaper.planning.plan import Adaptation, ChainOfPlan, Evidence
+from chainshaper.planning.plan import (
+    Adaptation,
+    ChainOfPlan,
+    Evidence,
+    Margin,
+    Prediction,
+    Server,
+    ShapingNode,
+    Thread,
+    server_of,
+)
 from chainshaper.values.errors import InputError, OperationError
 
 GOOD = """\

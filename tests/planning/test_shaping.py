@@ -237,7 +237,6 @@ def test_callbacks_of_one_node_share_a_server() -> None:
             r"/a runs on one core, not on \[0, 1\]",
         ),
         (AVP_CALLBACKS, {"margin_ns": -1}, "need callbacks"),
-        (AVP_CALLBACKS, {"boundary_ns": 0}, "need callbacks"),
         ([], {}, "need callbacks"),
         ([_callback("a b", 1)], {}, "full ROS 2 name"),
     ],

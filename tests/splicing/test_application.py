@@ -9,9 +9,10 @@ from known import known
 from small_chain import EXECUTOR_CORE, small_chain
 
 from chainshaper import shape_application
-from chainshaper.planning import Plan, let_per_callback, let_per_chain, plan_shaping, publish_slots
+from chainshaper.planning import Plan, plan_shaping, publish_slots
 from chainshaper.planning.overruns import Writer
 from chainshaper.planning.plan import revised
+from chainshaper.planning.shaping import let_per_callback, let_per_chain
 from chainshaper.splicing.application import splice_application, writers_of
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import Application, TopicDescription

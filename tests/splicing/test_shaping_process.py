@@ -23,8 +23,9 @@ from small_chain import EXECUTOR_CORE
 
 from chainshaper.gate import decision as gate
 from chainshaper.gate.decision import READER_DEPTH, NodeParameters, gate_parameters
-from chainshaper.planning import Plan, ShapingNode, let_per_callback
-from chainshaper.planning.plan import revised
+from chainshaper.planning import Plan
+from chainshaper.planning.plan import ShapingNode, revised
+from chainshaper.planning.shaping import let_per_callback
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
     ShapingProcess,

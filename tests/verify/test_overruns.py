@@ -24,8 +24,9 @@ from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan,
 from chainshaper import measure_latency, save_plan, shape_application, simulate
 from chainshaper.flow.apply import apply_plan
 from chainshaper.gate.decision import Overrun, sleep_until
-from chainshaper.planning import Plan, let_per_chain, plan_shaping, publish_slots
+from chainshaper.planning import Plan, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
+from chainshaper.planning.shaping import let_per_chain
 from chainshaper.reporting.latency import doubts_text, latency_json
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (

@@ -14,17 +14,9 @@ from small_chain import small_chain
 
 from chainshaper import compare_recordings, measure_latency, plan_recording, simulate
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
-from chainshaper.planning import (
-    Margin,
-    Modes,
-    Plan,
-    PlanRequest,
-    Profile,
-    plan_chain,
-    publish_slots,
-)
+from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain, publish_slots
 from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected
-from chainshaper.planning.plan import revised
+from chainshaper.planning.plan import Margin, revised
 from chainshaper.reporting.latency import late_text, prediction_json, prediction_table
 from chainshaper.values.recording import Recording
 from chainshaper.verify.predictions import PredictionHeld, hold_prediction

@@ -1,11 +1,10 @@
 """A core that is clear of other work while an output is delivered there.
 
 DDS threads that receive outrank everything else on their core, but unless the kernel is fully
-preemptible, an ordinary thread that is inside a system call goes on until it is through with it,
-and a core that idles has to wake up first. So a thread of the lowest real-time priority watches the
-clock there, from somewhat before a release until the output is delivered: ordinary threads do not
-run meanwhile, and receiving ones preempt it within microseconds. It is a process of its own, since
-within one of Python it would hold up the gate.
+preemptible, an ordinary thread that is inside a system call ends that first, and a core that idles
+has to wake up. So a thread of the lowest real-time priority watches the clock there around a
+release: ordinary threads do not run meanwhile, and receiving ones preempt it within microseconds.
+It is a process of its own, since within one of Python it would hold up the gate.
 """
 
 import inspect

@@ -63,8 +63,8 @@ CHANGES = 64  # so many changes of the mode, or moves, reach back further than t
 class Modes:
     """Which of the gate's ``slots`` (by its place, from 0) the messages of each mode leave in.
 
-    ``default`` is in force until a mode is announced. ``late`` says what becomes of a message that
-    comes behind its mode's slot; with ``next-slot`` one behind the last slot is still an overrun.
+    ``default`` is in force until a mode is announced. ``late``: of messages that come behind their
+    mode's slot; with ``next-slot`` one behind the last slot is still an overrun.
     """
 
     bands: Mapping[str, int]
@@ -73,9 +73,9 @@ class Modes:
 
     def __post_init__(self) -> None:
         if self.default not in self.bands:
+            known = ", ".join(self.bands)
             raise ValueError(
-                f"the default mode {self.default!r} has no band: choose one of "
-                f"{', '.join(self.bands)}"
+                f"the default mode {self.default!r} has no band: choose one of {known}"
             )
         if self.late not in LATE:
             raise ValueError(f"late {self.late!r}: choose one of {', '.join(LATE)}")
@@ -87,13 +87,11 @@ class Gate:
 
     ``slots`` are half-open ``(start, end)`` intervals counted from the anchor, ascending, apart
     from each other and inside ``[0, cycle_ns)``. With the ``stamp`` anchor, ``phase_ns`` serves
-    messages whose stamp is of no use: it is older than :data:`MAX_AGE_CYCLES`, or from the future
-    (clocks of different hosts disagree a little).
+    messages whose stamp is of no use: it is older than :data:`MAX_AGE_CYCLES`, or from the future.
 
     A message is due in the cycle that it belongs to, or ``due_cycles`` later. With the ``cycle``
     anchor it belongs to the cycle it arrives in, and is due in the next one at the latest: the data
-    of each callback came a cycle before its output is due. Raises ValueError: such a gate makes no
-    sense.
+    of each callback came a cycle before. Raises ValueError: such a gate makes no sense.
     """
 
     slots: tuple[tuple[int, int], ...]
@@ -123,17 +121,13 @@ class Gate:
         previous_end = 0
         for start, end in self.slots:
             if not previous_end <= start < end <= self.cycle_ns:
-                raise ValueError(
-                    f"slot [{start}, {end}) ns: slots must ascend, not overlap and lie within the "
-                    f"cycle of {self.cycle_ns} ns"
-                )
+                reason = "slots must ascend, not overlap and lie within the cycle"
+                raise ValueError(f"slot [{start}, {end}) ns: {reason}")
             previous_end = end
         for mode, band in ({} if self.modes is None else self.modes.bands).items():
             if not 0 <= band < len(self.slots):
-                raise ValueError(
-                    f"mode {mode!r} has the band {band}, but the slots are numbered 0 to "
-                    f"{len(self.slots) - 1}"
-                )
+                last = len(self.slots) - 1
+                raise ValueError(f"mode {mode!r}: band {band}, but slots are numbered 0 to {last}")
 
     def may_move(self, by_ns: int) -> bool:
         """Whether slots that are moved by so much lie within the cycle still."""
@@ -149,9 +143,7 @@ class Gate:
     def lets_out(
         self, slot: tuple[int, int], cycle_start_ns: int, arrival_ns: int, ready_ns: int
     ) -> bool:
-        """Whether a message that came at one instant, and is ready at another, may leave in a slot
-        of a cycle, or before it begins.
-        """
+        """Whether a message may leave in a slot of a cycle, or before it begins."""
         start, end = slot
         in_time = self.into_open_slot == "at-once" or arrival_ns <= cycle_start_ns + start
         return in_time and ready_ns < cycle_start_ns + end
@@ -196,8 +188,8 @@ def release_of(
 
     ``stamp_ns`` is its origin, None if it has none; ``changes`` are the modes that were announced,
     each with the time, ascending. It leaves at ``ready_ns`` at the earliest, where others are
-    before it. ``phase_ns`` is in force instead of the gate's own. ``moves`` are from when on slots
-    are moved, ascending, and by how much from where the gate has them.
+    before it. ``phase_ns`` stands for the gate's own. ``moves`` are from when on slots are moved,
+    ascending, and by how much from where the gate has them.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: it waits
@@ -261,10 +253,7 @@ def missed(gate: Gate, release: Release, now_ns: int) -> bool:
 
 @dataclass
 class NodeParameters:
-    """The ROS parameters of shaping node, standby and throttler; times are ns, 0-based places.
-
-    Python nodes read them as they are here, those in C++ from the struct that `schema.hpp` has.
-    """
+    """The ROS parameters of shaping node, standby and throttler; times are ns, 0-based places."""
 
     slots_ns: list[int] = field(default_factory=list)  # start and end of each, one after the other
     cycle_ns: int = 0
@@ -300,10 +289,7 @@ class NodeParameters:
     rule: str = "newest"
 
     def gate(self, depth: int = DEPTH) -> Gate:
-        """The gate that they describe, with room for so many messages.
-
-        Raises ValueError: they describe none.
-        """
+        """The gate that they describe. Raises ValueError: they describe none."""
         bands = dict(zip(self.mode_names, self.mode_slots, strict=True))
         return Gate(
             slots=tuple(zip(self.slots_ns[::2], self.slots_ns[1::2], strict=False)),
@@ -339,10 +325,8 @@ def gate_parameters(gate: Gate, mode_topic: str = "") -> dict[str, Any]:
 
 
 def origin_of(payload: bytes) -> int | None:
-    """The header stamp of a serialized message in ns of its clock, None if it is zero or short.
-
-    It stands (int32 seconds, uint32 nanoseconds) right behind the encapsulation header of a message
-    whose first field is a ``std_msgs/Header``.
+    """The header stamp (int32 seconds, uint32 nanoseconds, behind the encapsulation header) of a
+    serialized message in ns of its clock, None if it is zero or short.
     """
     if len(payload) < 12:
         return None
@@ -355,13 +339,10 @@ def origin_of(payload: bytes) -> int | None:
 
 
 def text_of(payload: bytes) -> str | None:
-    """The text of a serialized ``std_msgs/String``, None where the bytes are none.
-
-    Its length, with the final NUL, and the characters stand behind the encapsulation header.
-    """
+    """The text of a serialized ``std_msgs/String``, None where the bytes are none."""
     if len(payload) < 8:
         return None
-    length = int.from_bytes(payload[4:8], "little" if payload[1] & 1 else "big")
+    length = int.from_bytes(payload[4:8], "little" if payload[1] & 1 else "big")  # with the NUL
     if not 1 <= length <= len(payload) - 8:
         return None
     return payload[8 : 7 + length].decode(errors="replace")
@@ -379,10 +360,7 @@ _TIMER_ABSTIME, _EINTR = 1, 4
 
 
 def sleep_until(deadline_ns: int) -> None:
-    """Sleep until an instant of CLOCK_MONOTONIC; returns at once when it has passed.
-
-    The relative time of ``time.sleep`` would be added to a pre-emption before it.
-    """
+    """Sleep until an instant of CLOCK_MONOTONIC, however late the sleep itself begins."""
     request = _Timespec(*divmod(max(0, deadline_ns), 1_000_000_000))
     error = _EINTR  # a signal ends the sleep early; the deadline stays the same
     while error == _EINTR:
@@ -396,9 +374,8 @@ def sleep_until(deadline_ns: int) -> None:
 def watch_until(deadline_ns: int) -> int:
     """Watch the clock, to microseconds, until an instant of CLOCK_MONOTONIC; the time then."""
     clock = time.monotonic_ns
-    now = clock()
-    while now < deadline_ns:
-        now = clock()
+    while (now := clock()) < deadline_ns:
+        pass
     return now
 
 
@@ -528,16 +505,15 @@ class Shaper:
     """A gate at work: holds each message until its release, and minds the clocks.
 
     Stamps are CLOCK_REALTIME, sleeping is CLOCK_MONOTONIC; the offset between the two is taken
-    anew for every message, since NTP or an operator may step the wall clock. The stamp of a message
-    under way during a step may be of either side: it is anchored to the cycle instead, at the phase
-    that the last good stamp had.
+    anew for every message, since the wall clock may be stepped. The stamp of a message under way
+    during a step may be of either side: it is anchored to the cycle instead, at the phase that the
+    last good stamp had.
 
-    One shaper belongs to one thread, which does nothing else at the time of a release: so it is a
-    witness of the machine's own stalls (:meth:`time_lost`). ``look`` has new messages
-    :meth:`arrive`, while others wait, before each release and behind it. ``moved`` says with each
-    message by how much slots are to be moved, and from when on (None: as before). ``on_waking``
-    gets the time of a release ``spin_ns`` before it, when the clock is watched from;
-    ``on_decision`` each decision, before it is waited for, and where cycles begin.
+    One shaper belongs to one thread, which does nothing else at the time of a release. ``look`` has
+    new messages :meth:`arrive`, while others wait, before each release and behind it. ``moved``
+    says with each message how slots are to be moved (:meth:`move_slots`; None: as before).
+    ``on_waking`` gets the time of a release ``spin_ns`` before it; ``on_decision`` each decision,
+    before it is waited for, and where cycles begin.
     """
 
     def __init__(
@@ -590,10 +566,8 @@ class Shaper:
         about: Any = None,
         lost: int | None = None,
     ) -> None:
-        """A message was taken now.
-
-        With ``source_ns``, its source timestamp (CLOCK_REALTIME), it counts as having come then,
-        if that is after the last look: it waited in the reader.
+        """A message was taken now. With ``source_ns`` (CLOCK_REALTIME) it counts as having come
+        then, if that is after the last look: it waited in the reader.
         """
         offset = clock_offset()
         stepped = abs(offset - self._offset) > STEP_NS
@@ -613,8 +587,8 @@ class Shaper:
     def hold(self) -> Outcome | None:
         """Wait until the oldest message leaves, or is dropped; None: it was overflowed meanwhile.
 
-        One that is to be discarded is not waited for. Where overruns are discarded, so is a
-        message that came in time and would leave behind its slot because this thread woke late.
+        Where overruns are discarded, so is a message that came in time and would leave behind its
+        slot because this thread woke late.
         """
         queue = self.queue
         message, now = queue.waiting[0], time.monotonic_ns()
@@ -673,10 +647,8 @@ class Shaper:
         self.queue.free_ns = time.monotonic_ns()
 
     def time_lost(self, release: Release, until_ns: int) -> int:
-        """How much of the delay from a release until then the machine itself took (ns).
-
-        What other threads did not run either, no thread used: interrupts, or a core that was taken
-        away from the whole system. To be called right after publishing.
+        """How much of the delay from a release until now, right after publishing, no thread used:
+        interrupts, or a core that was taken away from the whole system (ns).
         """
         if release.at_ns is None:
             return 0
@@ -684,10 +656,8 @@ class Shaper:
         return max(0, until_ns - since_ns - (self._others_ran_ns() - self._waited_ns))
 
     def _others_ran_ns(self) -> int:
-        """For how long this thread has been ready while others ran, by the kernel's account.
-
-        The second number of `/proc/thread-self/schedstat` (kernel: scheduler/sched-stats.rst);
-        without one, all delay is taken to be other threads', and none the machine's.
+        """For how long this thread has been ready while others ran, by the second number of its
+        schedstat (kernel: scheduler/sched-stats.rst); without one, all delay is other threads'.
         """
         if self._thread != threading.get_ident():  # the file is bound to who opened it
             self._thread, self._schedstat = threading.get_ident(), -1

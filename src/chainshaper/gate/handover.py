@@ -9,10 +9,9 @@ in force. For each one of the two is responsible, whenever either is killed, sto
 * The file itself is a **page** in memory that both map: which messages each of them has dealt with
   (by their source timestamps), and until when the node may take for the one that it holds.
 
-What the node has received and not released when it dies, the standby publishes; what the standby
-has published, the node leaves out. A node that is late for its own release by more than a given
-patience hangs, or is stopped: the standby publishes what is due. What is left are the microseconds
-from a publication until it is noted: who is killed just there leaves it to be published again.
+What the node has received and not released when it dies, or hangs longer than a given patience, the
+standby publishes; what the standby has published, the node leaves out. What is left are the
+microseconds from a publication until it is noted, in which a death has it published again.
 
 Who has slots follow the latencies reads these in a third ring, and says there by how much slots are
 moved. They are so only while it has its own lock: however it ends, they go back.
@@ -95,10 +94,8 @@ def page_folders() -> Iterator[str]:
 
 
 def open_page(name: str, topic: str) -> "Page":
-    """The page of an output: the one that is there, or else a new one.
-
-    ``name`` tells it from others in this domain; whoever publishes the ``topic`` gives the same.
-    OSError: no folder is ours alone, or the file is not.
+    """The page of an output: the one that is there, or else a new one; ``name`` is that for all who
+    publish the ``topic`` in this domain. OSError: no folder is ours alone, or the file is not.
     """
     domain = os.environ.get("ROS_DOMAIN_ID") or "0"
     problem = OSError("no folder")
@@ -130,9 +127,8 @@ class Page:
     def __init__(
         self, folder: str, name: str, topic: str | None = None, flags: int = os.O_RDONLY
     ) -> None:
-        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at.
-
-        The folder may be a process's of its open files, in `/proc`, all of which are links.
+        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at. In `/proc`,
+        the folder of a process's open files, all are links.
         """
         self.path = f"{folder}/{name}"
         flags |= os.O_CLOEXEC | os.O_NONBLOCK | (not folder.startswith("/proc/")) * os.O_NOFOLLOW
@@ -161,10 +157,7 @@ class Page:
         self._numbers[_AT[field]] = value
 
     def look(self) -> None:
-        """Read how the page is now, for who only looks: another user's may become shorter.
-
-        ValueError: it has.
-        """
+        """Read how the page is now, for who only looks. ValueError: it has become shorter."""
         content = os.pread(self._file, _SIZE, 0)
         if len(content) < _SIZE:
             raise ValueError(f"{self.path} is no page of an output")
@@ -239,9 +232,8 @@ class Page:
 
 
 class Turn:
-    """The shaping node's side: whose turn it is to publish a message.
-
-    Messages are named by their source timestamps; where that is not known (None), none is left out.
+    """The shaping node's side: whose turn it is to publish a message, which its source timestamp
+    names; where that is not known (None), none is left out.
     """
 
     def __init__(self, name: str, topic: str) -> None:
@@ -280,10 +272,7 @@ class Turn:
         return not self.was_bypassed(key)
 
     def hold(self, until_ns: int | None, phase_ns: int, mode: int = 0) -> None:
-        """The message is released then (None: never); cycles begin at ``phase_ns``.
-
-        ``mode`` is the number of its cycle's, from 1; 0: there are no modes.
-        """
+        """The message is released then (None: never); ``mode`` from 1, 0: there are no modes."""
         self.page["mode"] = mode
         if until_ns is not None:
             self.page["until_ns"] = until_ns
@@ -321,9 +310,8 @@ class Turn:
                 left.close()
 
     def moved(self) -> tuple[int, int] | None:
-        """By how much slots are to be moved, and from when on, for :meth:`.Shaper.move_slots`.
-
-        None: as they are. Back, where the process that moved them is not there any more.
+        """How slots are to be moved, for :meth:`.Shaper.move_slots` (None: as they are): back, if
+        the process that moved them is not there any more.
         """
         since, by = self.page["moved_from_ns"], self.page["moved_ns"]
         if since == 0 or since != self.page["moved_from_ns"]:
@@ -333,10 +321,8 @@ class Turn:
     def count(
         self, dropped: str | None, lost: int | None, *, late: bool, latency_ns: int | None = None
     ) -> None:
-        """A message has been published, or was ``dropped`` for that reason of the gate.
-
-        ``lost`` are those that are missing before it (None: not known), ``latency_ns`` is from its
-        origin to its arrival.
+        """A message has been published, or was ``dropped`` for that reason; ``lost`` are missing
+        before it, ``latency_ns`` is from its origin to its arrival (None: not known).
         """
         if latency_ns is not None:
             self.page.add("measured", MEASURED, latency_ns)
@@ -377,9 +363,9 @@ class _Waiting(NamedTuple):
 class Standby:
     """The standby's side: passes messages on while no shaping node is in force.
 
-    ``publish`` is called with the payload, the source timestamp and the arrival of each message
-    that is passed on; ``changed`` when a shaping node goes and when one is back, with a text.
-    ``patience_ns`` is by how much a shaping node may be late before it is taken to hang.
+    ``publish`` gets the payload, the source timestamp and the arrival of each message that is
+    passed on; ``changed`` a text when a shaping node goes or is back. One that is late by more than
+    ``patience_ns`` is taken to hang.
     """
 
     def __init__(  # noqa: PLR0917 - each is used once

@@ -1,10 +1,10 @@
 """A plan for a whole application: several chains whose servers and shaping nodes act together.
 
-Each chain has a :class:`~chainshaper.planning.plan.Plan`: its period, evidence, slots and outputs.
-Its cycles start ``offset`` after the instant from which those of all chains count, so all slots
-repeat with the **hyper-period**, the least common multiple of the cycles. Chains that begin at the
-same callback share the servers that run it; chains of different beginnings that pass the same node
-each reserve slots for its thread, which then runs in all of them.
+Each chain has a :class:`~chainshaper.planning.plan.Plan`, whose cycles start ``offset`` after the
+instant from which those of all chains count, so all slots repeat with the **hyper-period**, the
+least common multiple of the cycles. Chains that begin at the same callback share the servers that
+run it; chains of different beginnings that pass the same node each reserve slots for its thread,
+which then runs in all of them.
 
 :attr:`ApplicationPlan.servers` is what back ends and the simulator carry out: every server once,
 its slots played out over the hyper-period. A plan for one chain is the same with one chain.
@@ -14,7 +14,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from itertools import combinations, product
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -37,24 +37,17 @@ from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
 
 _GRID_NS = 1_000  # moved slots are found to microseconds
-MOST_SLOTS = 10_000
-"""So many slots of all servers fit into a hyper-period at the most."""
-MOST_OPENED = 64
-"""So many slots in a hyper-period has a server at the most that is opened for overruns (sched_ext's
-tables have no room for more)."""
-WAITING_NS = 1_000_000
-"""So long before a timer expires its thread's server is closed already."""
+MOST_SLOTS = 10_000  # of all servers in a hyper-period
+MOST_OPENED = 64  # of a server that is opened for overruns: sched_ext's tables have no more room
+WAITING_NS = 1_000_000  # so long before a timer expires its thread's server is closed already
+# Where a shaping node's server is in force, it is open for so long before the node watches for its
+# slot: 2 ms to take messages, and 2 ms for cycles whose beginning no server holds back (`LEAD_NS`
+# of `flow/threads.py`); and behind its pause, for its notes.
 BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
-"""Where a shaping node's server is in force, it is open for so long before the node watches for its
-slot, which takes 2 ms to take messages, and comes 2 ms earlier in cycles whose beginning no server
-holds back (`LEAD_NS` of :mod:`chainshaper.flow.threads`); and behind its pause, for its notes."""
 
 
 class ApplicationPlan(Part):
-    """The plans of an application's chains; what they share stands in each of them, and is equal.
-
-    In the file a server stands where it comes first; further chains have its name in its place.
-    """
+    """The plans of an application's chains; what they share stands in each, and is equal."""
 
     format: Literal[2] = 2
     chains: Annotated[tuple[Plan, ...], Field(min_length=1)]
@@ -84,9 +77,8 @@ class ApplicationPlan(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "ApplicationPlan":
-        for rule in (_outputs, _shared_servers, _threads, _slot_count, _apart):
-            for reason, *where in rule(self):
-                raise wrong_value(str(reason), "chains", *where)
+        for check in (_outputs, _shared_servers, _threads, _slot_count, _apart):
+            check(self)
         return self
 
     @property
@@ -156,12 +148,9 @@ def whole(plan: "Plan | ApplicationPlan") -> ApplicationPlan:
 
 
 def plan_of_chain(plan: "Plan | ApplicationPlan", output: str | None) -> Plan | None:
-    """The plan of the chain with this output; None if there is none, or it is not known which.
-
-    A plan that names no output is about any.
-    """
+    """The plan of the chain with this output, or of one that names none; None: there is no such."""
     for chain in whole(plan).chains:
-        named = [chain.chain.output, *(node.output for node in shaping_nodes(chain))]
+        named = (chain.chain.output, *(node.output for node in shaping_nodes(chain)))
         if chain.chain.output is None or output in named:
             return chain
     return None
@@ -171,11 +160,10 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
     See :func:`chainshaper.planning.overruns.open_until_done`; slots that are planned for other
-    chains are left out, so that an overrun delays none of these. In between, chains that overran
-    share their core; where that makes a server's slots too many, it stays as planned. Of several
-    chains, ``waits_ns`` is how long before its cycle each one's timer expires: its thread waits, so
-    that cycles start at their offsets. The first stage of a pipeline waits too, for slots of
-    further stages to count from the same instant.
+    chains are left out, so that an overrun delays none of these; where that makes a server's slots
+    too many, it stays as planned. Of several chains, ``waits_ns`` is how long before its cycle each
+    one's timer expires: its thread waits, so that cycles start at their offsets. So does the first
+    stage of a pipeline, for slots of further stages to count from the same instant.
     """
     opened: dict[str, Server] = {}
     known_ns = waits_ns or [-WAITING_NS] * len(plan.chains)
@@ -215,19 +203,13 @@ def _of_others(plan: ApplicationPlan, chain: Plan, server: Server) -> Iterator[S
 
 
 def combined(plans: Sequence[Plan]) -> ApplicationPlan:
-    """The plan of an application from those of its chains.
-
-    Raises InputError: they make none together, with the reason.
-    """
+    """The plan of an application from those of its chains. Raises InputError: they make none."""
     with wrong_values_refused(ApplicationPlan):
         return ApplicationPlan(chains=tuple(plans))
 
 
 def with_slots_moved(plan: ApplicationPlan, moved_ns: Mapping[int, int]) -> ApplicationPlan:
-    """The plan with the slots of some chains' outputs moved, as :func:`.with_output_moved` does it.
-
-    Raises InputError: also where they would meet another chain's.
-    """
+    """The plan with the slots of some chains' outputs moved, see :func:`.with_output_moved`."""
     chains = list(plan.chains)
     for place, by_ns in moved_ns.items():
         own = with_output_moved(chains[place], by_ns)
@@ -239,9 +221,8 @@ def with_slots_moved(plan: ApplicationPlan, moved_ns: Mapping[int, int]) -> Appl
 
 
 def reach(plan: ApplicationPlan, place: int, latest_ns: int | None = None) -> tuple[int, int]:
-    """How far the slots of a chain's output may be moved, earlier (negative) and later (ns).
-
-    None ends behind ``latest_ns``. Raises InputError: not at all, and why.
+    """How far the slots of a chain's output may be moved, earlier (negative) and later (ns), none
+    to end behind ``latest_ns``. Raises InputError: not at all, and why.
     """
     slots, cycle_ns = publish_slots(plan.chains[place]), plan.chains[place].cycle_ns
     latest = min(cycle_ns, cycle_ns if latest_ns is None else latest_ns)
@@ -277,9 +258,8 @@ def _played_out(server: Server, chain: Plan, hyper_period_ns: int) -> Iterator[S
 def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
     """A server's slots as they are carried out, from the start of a cycle of its chain on.
 
-    A shaping node that runs in them publishes where its gate says, in the slots as planned. Around
-    these its thread needs time to take messages, to watch the clock, to pause, and for its notes;
-    and until the cycle's end, where an output that missed its slot leaves at once.
+    Around these a shaping node's thread needs time to take messages, to watch the clock, to pause,
+    and for its notes; and until the cycle's end, where what missed its slot leaves at once.
     """
     nodes = [node for node in shaping_nodes(chain) if node.thread in server.threads]
     if not nodes or chain.shaping_thread == "free":
@@ -292,96 +272,79 @@ def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
     return [(start, min(end, start + chain.cycle_ns)) for start, end in slots]
 
 
-# The rules: each yields what is wrong, and where below `chains` ----------------------------------
-
-_Wrong: TypeAlias = Iterator[tuple[str | int, ...]]
+# The rules: each raises what is wrong, and where -------------------------------------------------
 
 
-def _pairs(plan: ApplicationPlan) -> Iterator[tuple[Plan, int, Plan]]:
-    """Every two chains, the later one with its place."""
+def _pairs(plan: ApplicationPlan) -> Iterator[tuple[Plan, Plan, tuple[str, int]]]:
+    """Every two chains, and where the later one stands."""
     for (_, one), (place, two) in combinations(enumerate(plan.chains), 2):
-        yield one, place, two
+        yield one, two, ("chains", place)
 
 
-def _outputs(plan: ApplicationPlan) -> _Wrong:
-    for one, place, two in _pairs(plan):
+def _outputs(plan: ApplicationPlan) -> None:
+    for one, two, where in _pairs(plan):
         if one.chain.output is not None and one.chain.output == two.chain.output:
             reason = f"{one.chain.output} is the output of an earlier chain too: plan it once"
-            yield reason, place, "chain", "output"
+            raise wrong_value(reason, *where, "chain", "output")
         ours = {name for node in shaping_nodes(one) for name in (node.name, node.output)}
         for node in shaping_nodes(two):
             if ours & {node.name, node.output}:
-                reason = (
-                    f"an earlier chain has the shaping node {node.name} or its output"
-                    f" {node.output} too: both must be its own"
-                )
-                yield reason, place, "shaping_node"
+                reason = f"an earlier chain has {node.name} or {node.output} too: write its own"
+                raise wrong_value(reason, *where, "shaping_node")
 
 
-def _shared_servers(plan: ApplicationPlan) -> _Wrong:
-    for one, place, two in _pairs(plan):
+def _shared_servers(plan: ApplicationPlan) -> None:
+    for one, two, where in _pairs(plan):
         known = {server.name: server for server in one.servers}
         for number, server in enumerate(two.servers):
             if server.name not in known:
                 continue
             if known[server.name] != server:
                 reason = f"an earlier chain has another server {server.name!r}: rename one"
-                yield reason, place, "servers", number, "name"
+                raise wrong_value(reason, *where, "servers", number, "name")
             if (one.cycle_ns, one.offset_ns) != (two.cycle_ns, two.offset_ns):
-                reason = (
-                    f"the server {server.name!r} is shared with an earlier chain, whose cycles"
-                    " have another length or offset: write a server of its own"
-                )
-                yield reason, place, "servers", number
+                reason = f"{server.name!r} is an earlier chain's too, whose cycles have another"
+                reason += " length or offset: write a server of its own"
+                raise wrong_value(reason, *where, "servers", number)
 
 
-def _threads(plan: ApplicationPlan) -> _Wrong:
+def _threads(plan: ApplicationPlan) -> None:
     homes: dict[Thread, Server] = {}
     for place, chain in enumerate(plan.chains):
         for number, server in enumerate(chain.servers):
+            where = ("chains", place, "servers", number)
             for thread in server.threads:
                 for other_thread in filter(thread.overlaps, tuple(homes)):
                     if other_thread != thread:
-                        yield (
-                            f"{thread.text} may be {other_thread.text} in server"
-                            f" {homes[other_thread].name!r}: name the same callbacks in both",
-                            *(place, "servers", number, "threads"),
-                        )
+                        reason = f"{thread.text} may be {other_thread.text} in server"
+                        reason += f" {homes[other_thread].name!r}: name the same callbacks in both"
+                        raise wrong_value(reason, *where, "threads")
                 if (other := homes.setdefault(thread, server)).core != server.core:
-                    reason = (
-                        f"{thread.text} would run on core {server.core} here"
-                        f" and on core {other.core} in server {other.name!r}: write one core"
-                    )
-                    yield reason, place, "servers", number, "core"
+                    reason = f"{thread.text} would run on core {server.core} here and on core"
+                    reason += f" {other.core} in server {other.name!r}: write one core"
+                    raise wrong_value(reason, *where, "core")
 
 
-def _slot_count(plan: ApplicationPlan) -> _Wrong:
+def _slot_count(plan: ApplicationPlan) -> None:
     chains = plan.chains
     slots = [sum(len(server.slots) for server in chain.servers) for chain in chains]
     counts = [plan.cycle_ns // one.cycle_ns * own for one, own in zip(chains, slots, strict=True)]
     if len(chains) > 1 and sum(counts) > MOST_SLOTS:
-        cycles = ", ".join(duration_text(chain.cycle_ns) for chain in chains)
-        yield (
-            f"the cycles {cycles} repeat together after {duration_text(plan.cycle_ns)} only, with"
-            f" {sum(counts)} slots; {MOST_SLOTS} is the most that is carried out: use periods with"
-            " a larger common divisor",
-            len(chains) - 1,
-            "cycle",
+        raise wrong_value(
+            f"all cycles repeat together after {duration_text(plan.cycle_ns)}, with {sum(counts)}"
+            f" slots; {MOST_SLOTS} is the most: use periods with a larger common divisor",
+            *("chains", len(chains) - 1, "cycle"),
         )
 
 
-def _apart(plan: ApplicationPlan) -> _Wrong:
+def _apart(plan: ApplicationPlan) -> None:
     """Slots of one core and priority are disjoint in all cycles, across chains as inside one."""
-    for one, place, two in _pairs(plan):
+    for one, two, where in _pairs(plan):
         if one.equal_priorities == two.equal_priorities == "round-robin":
             continue
         for text in _collisions(one, two):
-            yield (
-                f"{text}: move a slot, change the offset of one chain (`chainshaper offsets`), or"
-                " give their servers other cores or priorities",
-                place,
-                "offset",
-            )
+            reason = f"{text}: move a slot, change an offset (`chainshaper offsets`), or give their"
+            raise wrong_value(f"{reason} servers other cores or priorities", *where, "offset")
 
 
 def _collisions(one: Plan, two: Plan) -> Iterator[str]:

@@ -43,9 +43,8 @@ def fill_costs(grid, windows, costs, successors, work, positions, layers):
 def _compress(grid, windows, costs, work, positions):
     """Columns from which the bands behind can be placed, and rows that have such a column.
 
-    Only these are left, so that a row's columns are one run of those that remain and each of
-    them counts. ``work`` gets, per remaining column, its position, intercept and slope, and
-    per remaining row its position, count, first and last column; returned is how many rows.
+    So a row's columns are one run. ``work`` gets, per column, its position, intercept and slope,
+    and per row its position, count, first and last column; returned is how many rows.
     """
     row = 8 * (positions + 1)
     counts, ends = table_at(grid), table_at(grid + 8 * positions)
@@ -84,10 +83,10 @@ def _least_lines(work, height, positions):
     ``work`` is what :func:`_compress` has left: slopes ascend strictly; counts, low and high
     ascend, and no row's run of q is empty. Its rows 8 and 9 get the least and q.
 
-    The least of lines is found on their lower envelope, in constant time per row and line as
-    long as lines are only added. Windows that move lose lines too, so rows are taken in blocks
-    whose windows share a column, the pivot: left of it windows only grow from the last row to
-    the first, right of it they only grow from the first to the last.
+    The least of lines is found on their lower envelope, in constant time per row and line as long
+    as lines are only added. Windows that move lose lines too, so rows are taken in blocks whose
+    windows share a column: left of it they only grow from the last row to the first, right of it
+    from the first to the last.
     """
     row_bytes = 8 * (positions + 1)
     base, slope = table_at(work + row_bytes), table_at(work + 2 * row_bytes)

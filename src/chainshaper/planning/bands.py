@@ -19,8 +19,7 @@ band's share) says that j lies in a window whose ends ascend with i, and so do t
 keeps the lower envelope of the lines, in an order of rows in which windows only grow, so that it
 loses no line that a later row needs. Each layer is linear in the number of grid points.
 
-Placement by particle swarm, as the paper does it, and at random (section 5.1.5, tables 3 and 4) are
-for comparison: neither better nor faster.
+Placement by particle swarm and at random (section 5.1.5, tables 3 and 4) are for comparison.
 """
 
 import os
@@ -81,8 +80,6 @@ def predict_bands(
 
     The latest output is at x_ν, the earliest at x_1 − Δ: a jitter of 25 ms for the paper's slots
     [62, 63], [77, 78], [86, 87] ms. Where none leaves but when a slot begins, it is x_ν − x_1.
-
-    Raises InputError: slot ends that do not ascend, or the last is before the longest latency.
     """
     ends = [int(end) for end in slot_ends_ns]
     if not ends or any(after <= before for before, after in pairwise(ends)):
@@ -113,9 +110,7 @@ class BandProblem:
 
     Slots are ``publish_slot_ns`` long (Δ), the last ends at ``last_end_ns``, the others at
     multiples of ``grid_ns``. Neighbouring slot ends are at most ``max_gap_ns`` apart (LV), a band
-    has at most ``max_share`` of the executions. ``into_open_slot``: as the plan has it.
-
-    Raises InputError: values that make no sense for any number of bands.
+    has at most ``max_share`` of the executions.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -136,15 +131,12 @@ class BandProblem:
         if gap is not None and gap <= slot:
             raise InputError(
                 f"a largest gap of {duration_text(gap)} is not longer than the publish slot"
-                f" {duration_text(slot)}, so no two slots could follow each other: allow a"
-                " longer gap or use a shorter slot"
+                f" {duration_text(slot)}, so no two slots could follow each other: allow more"
             )
         if share is not None and not 0 < share <= 1:
             raise InputError(f"the largest share per band must be above 0, at most 1: not {share}")
         if latencies.size * self.last_end_ns >= 2**62:
-            raise InputError(
-                "latencies this long and this many overflow the planner: plan with fewer"
-            )
+            raise InputError("latencies this long and this many overflow: plan with fewer")
 
     @property
     def at_start_ns(self) -> int:
@@ -201,8 +193,7 @@ def with_bands(
     ``minimise`` and ``mean_at_most_ns`` see :func:`place_bands`; ``limits`` are ``grid_ns``,
     ``max_gap_ns`` and ``max_share`` of :class:`BandProblem`.
 
-    Raises InputError: a plan without a publish slot, or values that make no sense together.
-    OperationError: no such placement exists; the message names the binding constraint.
+    Raises OperationError: no such placement exists; the message names the binding constraint.
     """
     problem = _problem(plan, latencies_ns, limits)
     other_goal = minimise != "mean" or mean_at_most_ns is not None
@@ -216,10 +207,9 @@ def with_bands(
         placement = place_bands(problem, bands, minimise=minimise, mean_at_most_ns=mean_at_most_ns)
     else:
         placement = (place_by_swarm if solver == "pso" else place_randomly)(problem, bands, seed)
-    length = problem.publish_slot_ns
-    slots = tuple((end - length, end) for end in placement.slot_ends_ns)
-    ends, entry = placement.slot_ends_ns, plan.into_open_slot
-    predicted = predict_bands(problem.latencies_ns, ends, length, entry)
+    length, ends = problem.publish_slot_ns, placement.slot_ends_ns
+    slots = tuple((end - length, end) for end in ends)
+    predicted = predict_bands(problem.latencies_ns, ends, length, plan.into_open_slot)
     return with_publish_slots(plan, slots, predicted=predicted)
 
 
@@ -237,23 +227,15 @@ def choose_bands(
 ) -> BandChoice:
     """What :func:`with_bands` takes for ``auto``: the first number of bands behind which another
     one gains less than ``least_gain`` of the average.
-
-    Raises InputError: a plan without a publish slot, or a least gain that is no share.
-    OperationError: no number of bands can be placed.
     """
     if not 0 < least_gain < 1:
-        raise InputError(
-            f"the least gain is a share of the average, such as 0.02: not {least_gain}"
-        )
+        raise InputError(f"the least gain is a share, such as 0.02: not {least_gain}")
     curve = placement_curve(_problem(plan, latencies_ns, limits), MOST_BANDS)
     for number, (placement, following) in enumerate(pairwise(curve), start=1):
         gain = 1 - following.mean_ns / placement.mean_ns
         if gain < least_gain:
-            reason = (
-                f"stopped at {number}: another band would lower the average by {gain:.2%}, less"
-                f" than {least_gain:.2%}"
-            )
-            return BandChoice(tuple(curve), placement, reason)
+            why = f"another band would lower the average by {gain:.2%}, less than {least_gain:.2%}"
+            return BandChoice(tuple(curve), placement, f"stopped at {number}: {why}")
     why = "no more bands can be placed" if len(curve) < MOST_BANDS else "more bands are not tried"
     return BandChoice(tuple(curve), curve[-1], f"stopped at {len(curve)}: {why}")
 
@@ -263,15 +245,10 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
 
     An execution that is done earlier waits for it, any other publishes at once: the average falls
     and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
-
-    Raises InputError: a start that is negative, or behind that of the plan's own publish slot.
     """
     start, end = _last_publish_slot(plan)
     if not 0 <= slot_start_ns <= start:
-        raise InputError(
-            f"a long publish slot may start from 0 ms to {duration_text(start)}, where the plan's"
-            f" own does; {duration_text(slot_start_ns)} does not"
-        )
+        raise InputError(f"a long publish slot may start from 0 ms to {duration_text(start)}")
     published = np.maximum(check_latencies(latencies_ns), slot_start_ns)
     # Published at once, the output is late by the publication itself, which the slot's end bounds.
     predicted = Prediction(
@@ -313,8 +290,7 @@ def place_bands(
     average stays at or below ``mean_at_most_ns``, the overall jitter x_ν − (x_1 − Δ), or the
     largest gap between neighbouring bands.
 
-    Raises InputError: a goal that makes no sense, or as :func:`refuse_more_than_fit`.
-    OperationError: no placement exists; the message names the constraint that prevents it.
+    Raises OperationError: no placement exists; the message names the constraint that prevents it.
     """
     refuse_more_than_fit(problem, bands)
     if minimise == "jitter" and mean_at_most_ns is None:
@@ -324,11 +300,9 @@ def place_bands(
     if best is None:
         raise OperationError(_why_none(problem, bands))
     if mean_at_most_ns is not None and best.mean_ns > mean_at_most_ns:
-        raise OperationError(
-            f"no placement of {bands} bands has an average of {duration_text(mean_at_most_ns)}"
-            f" or less; the best is {duration_text(round(best.mean_ns))}: allow that, or more"
-            " bands"
-        )
+        wanted, least = duration_text(mean_at_most_ns), duration_text(round(best.mean_ns))
+        reason = f"no placement of {bands} bands has an average of {wanted} or less"
+        raise OperationError(f"{reason}; the best is {least}: allow that, or more bands")
     if minimise == "gap":
         return _smallest_gap(problem, best, mean_at_most_ns)
     if minimise == "jitter" and bands > 1 and mean_at_most_ns is not None:
@@ -338,10 +312,7 @@ def place_bands(
 
 
 def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
-    """The best placement for each number of bands from one upwards, as far as they fit (figure 7).
-
-    Raises OperationError: no number of bands up to ``most_bands`` can be placed.
-    """
+    """The best placement for each number of bands from one on, as far as they fit (figure 7)."""
     most = min(most_bands, problem.room)
     tables = _solve(problem, most)
     curve: list[Placement] = []
@@ -362,11 +333,9 @@ def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
         raise InputError(f"{bands} bands: plan with one band at least")
     if bands > problem.room:
         raise InputError(
-            f"{bands} bands cannot be placed: between the shortest latency"
-            f" {duration_text(int(problem.latencies_ns[0]))} and the last slot's end"
-            f" {duration_text(problem.last_end_ns)} there is room for {problem.room} publish"
-            f" slots of {duration_text(problem.publish_slot_ns)}; use fewer bands or a shorter"
-            " slot"
+            f"{bands} bands cannot be placed: behind the shortest latency"
+            f" {duration_text(int(problem.latencies_ns[0]))} there is room for {problem.room}"
+            f" publish slots of {duration_text(problem.publish_slot_ns)}: use fewer or shorter"
         )
 
 
@@ -416,10 +385,8 @@ def _solve(problem: BandProblem, bands: int) -> _Tables:
     size = max(0, fitting) if bands > 1 else 0
     layers = min(bands, size + 1)
     if size * layers > MOST_CELLS:
-        raise InputError(
-            f"{size} positions for {layers} bands are too many to search: use a grid coarser than"
-            f" {duration_text(grid)}"
-        )
+        reason = f"{size} positions for {layers} bands are too many to search"
+        raise InputError(f"{reason}: use a grid coarser than {duration_text(grid)}")
     ends = (first + np.arange(size, dtype=np.int64)) * grid
     counts = np.searchsorted(problem.ready_ns, ends, side="right").astype(np.int64)
     behind = problem.latencies_ns.size - counts
@@ -480,10 +447,8 @@ def _why_none(problem: BandProblem, bands: int) -> str:
 
 
 def _too_coarse(problem: BandProblem, bands: int) -> str:
-    return (
-        f"{bands} bands cannot be placed: the grid of {duration_text(problem.grid_ns)} is too"
-        f" coarse for slots of {duration_text(problem.publish_slot_ns)}; use a finer one"
-    )
+    grid, slot = duration_text(problem.grid_ns), duration_text(problem.publish_slot_ns)
+    return f"{bands} bands cannot be placed: the grid of {grid} is too coarse for slots of {slot}"
 
 
 def broken_constraint(problem: BandProblem, slot_ends_ns: Sequence[int]) -> str | None:
@@ -517,10 +482,7 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
     """Place bands with PySwarms and the paper's parameters; the same ``seed``, the same result.
 
     Particles are the ends of all slots but the last. One that breaks a constraint costs more than
-    any that does not, in proportion to how far it is off.
-
-    Raises InputError: as :func:`refuse_more_than_fit`. OperationError: the swarm ended at a
-    placement that breaks a constraint. PlatformError: PySwarms is not installed.
+    any that does not, in proportion to how far it is off: where the swarm ends at one, this raises.
     """
     refuse_more_than_fit(problem, bands)
     last, slot, grid = problem.last_end_ns, problem.publish_slot_ns, problem.grid_ns
@@ -550,8 +512,7 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
 def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
     """Place bands at random, every allowed placement on the grid being equally likely.
 
-    Raises InputError: as :func:`refuse_more_than_fit`. OperationError: the grid is too coarse for
-    so many, or no draw of many respects the limits.
+    Raises OperationError: the grid is too coarse, or no draw of many respects the limits.
     """
     refuse_more_than_fit(problem, bands)
     if bands == 1:

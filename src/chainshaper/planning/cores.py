@@ -1,8 +1,7 @@
 """Which core runs which executor: found from what overlaps in time.
 
-The paper takes the assignment as given (the front filter on a core of its own in section 5.1, 18
-callbacks on two cores in 5.4). Here executors gain from a core of their own where branches of a
-graph run at the same time, and where slots of different chains would collide.
+The paper takes the assignment as given (sections 5.1 and 5.4). Executors gain from a core of their
+own where branches of a graph run at the same time, or slots of different chains would collide.
 
 An assignment is judged by playing out one cycle of each graph: a callback starts when all that it
 waits for is done and its core is free, and is not pre-empted, as under SCHED_FIFO at one priority.
@@ -21,11 +20,11 @@ is improved by moving one executor, or swapping two, for as long as that is bett
 import math
 from collections import Counter
 from collections.abc import Callable, Hashable, Iterator, Sequence
-from dataclasses import dataclass
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple, TypeAlias
 
-from chainshaper.planning.shaping import CallbackTimes
+from chainshaper.planning.profile import Profile
 
 MOST_TRIED = 10  # executors, whose assignments are all tried
 
@@ -34,20 +33,6 @@ MOST_OF_MEAN = 2
 
 _Assignment: TypeAlias = tuple[int, ...]  # of each executor, the place of its core
 _Cost: TypeAlias = Callable[[_Assignment], tuple[float, float, int]]
-
-
-@dataclass(frozen=True)
-class Work:
-    """What a chain and its branches have to do in a cycle, the chain's last callback last.
-
-    ``begins`` is equal for chains of one graph, whose callbacks then are the same as far as they
-    wait for the same; ``margin_ns`` is what a slot is longer than the longest execution.
-    """
-
-    begins: Hashable
-    period_ns: int
-    callbacks: tuple[CallbackTimes, ...]
-    margin_ns: int = 0
 
 
 class _Callback(NamedTuple):
@@ -59,32 +44,26 @@ class _Callback(NamedTuple):
 
 class _Graph(NamedTuple):
     period_ns: int
-    margin_ns: int
     callbacks: list[_Callback]
     outputs: list[int]  # which callbacks publish them
 
 
 def assign_cores(
-    work: Sequence[Work],
-    cores: Sequence[int],
-    *,
-    together: Sequence[Sequence[str]] = (),
-    worth: float = 0.0,
+    profiles: Sequence[Profile], cores: Sequence[int], *, margin_ns: int = 0, worth: float = 0.0
 ) -> dict[str, int]:
     """The core of each node's executor, out of ``cores``: the first has that of the first callback.
 
     As few cores as do as well are used: a further one must let more chains fit, or take more than
-    the share ``worth`` off the latencies. ``together`` are nodes of one process, which move as one.
+    the share ``worth`` off the latencies. The nodes of one process move as one. A slot is
+    ``margin_ns`` longer than the longest execution.
     """
-    nodes = dict.fromkeys(callback.node for one in work for callback in one.callbacks)
-    hosts = {node: min(group) for group in together for node in group}
+    nodes = dict.fromkeys(callback.node for one in profiles for callback in one.callbacks)
+    hosts = {node: min(group) for one in profiles for group in one.together for node in group}
     executors = list(dict.fromkeys(hosts.get(node, node) for node in nodes))
     executor_of = {node: executors.index(hosts.get(node, node)) for node in nodes}
-    graphs = _graphs(work, executor_of)
+    graphs = _graphs(profiles, executor_of)
 
-    def cost(assignment: _Assignment) -> tuple[float, float, int]:
-        return _cost(graphs, assignment)
-
+    cost = partial(_cost, graphs, margin_ns)
     best: _Assignment = (0,) * len(executors)
     for count in range(2, min(len(cores), len(executors)) + 1):
         if len(executors) <= MOST_TRIED:
@@ -98,17 +77,20 @@ def assign_cores(
     return {node: cores[best[executor_of[node]]] for node in nodes}
 
 
-def _graphs(work: Sequence[Work], executor_of: dict[str, int]) -> list[_Graph]:
-    """The graphs of all chains: those that begin together are one."""
+def _graphs(profiles: Sequence[Profile], executor_of: dict[str, int]) -> list[_Graph]:
+    """The graphs of all chains: those that begin together are one, whose callbacks are the same as
+    far as they wait for the same.
+    """
     graphs: dict[Hashable, _Graph] = {}
     known: dict[Hashable, int] = {}
-    for one in work:
-        graph = graphs.setdefault(one.begins, _Graph(one.period_ns, one.margin_ns, [], []))
+    for one in profiles:
+        begins = (one.begins, one.period_ns)
+        graph = graphs.setdefault(begins, _Graph(one.period_ns, [], []))
         own: list[int] = []
         seen: Counter[Hashable] = Counter()
         for callback in one.callbacks:
             after = tuple(sorted({own[place] for place in callback.after}))
-            key = (one.begins, callback.node, after)
+            key = (begins, callback.node, after)
             seen[key] += 1
             mean = callback.mean_response_ns
             longest = min(callback.max_response_ns, MOST_OF_MEAN * mean)
@@ -141,7 +123,9 @@ def _improved(best: _Assignment, cores: int, cost: _Cost) -> _Assignment:
         best = found
 
 
-def _cost(graphs: Sequence[_Graph], assignment: _Assignment) -> tuple[float, float, int]:
+def _cost(
+    graphs: Sequence[_Graph], margin_ns: int, assignment: _Assignment
+) -> tuple[float, float, int]:
     cores = [{assignment[one.executor] for one in graph.callbacks} for graph in graphs]
     excess = latency = 0.0
     slots, crossing = [], 0
@@ -150,7 +134,7 @@ def _cost(graphs: Sequence[_Graph], assignment: _Assignment) -> tuple[float, flo
         mean = _played_out(graph, assignment, [one.mean_ns for one in graph.callbacks])
         longest = _played_out(graph, assignment, [one.longest_ns for one in graph.callbacks])
         latency += sum(mean[place] for place in graph.outputs) / graph.period_ns
-        slots.append(max(longest) + graph.margin_ns)
+        slots.append(max(longest) + margin_ns)
         for core in own:
             load[core] += slots[-1] / graph.period_ns
         home = [assignment[one.executor] for one in graph.callbacks]

@@ -20,14 +20,11 @@ The parameters are estimated by L-moments (Hosking and Wallis, Technometrics 29,
 few hundred excesses err less than maximum likelihood does. They may put the end of a bounded tail
 before the longest latency measured, which is then made the end (Dupuis and Tsao, Communications in
 Statistics 27, 1998). The goodness of fit (Anderson–Darling) and the confidence interval come from
-one parametric bootstrap, because tables for known parameters do not hold for estimated ones. In
-simulations with four distributions the 95 % interval for a probability of 1e-5 had the true value
-in 97 to 100 of 100 samples of 5,000, in 93 to 98 of 100 samples of 1,500; where it missed it was
-too low. Where the density does not vanish at the end of the distribution, it errs on the high side.
+one parametric bootstrap. In simulations with four distributions the 95 % interval for 1e-5 had the
+true value in 97 to 100 of 100 samples of 5,000, in 93 to 98 of 1,500; else it was too low.
 
 **On line** (:class:`Tail`) the same is estimated from the latencies as they come, so that slots can
-follow them. A move has to be certain: on stationary input it is the rare exception, however long
-that lasts.
+follow them: on stationary input a move is the rare exception, however long that lasts.
 """
 
 import math
@@ -44,10 +41,8 @@ from chainshaper.values.durations import duration_text, parse_duration
 from chainshaper.values.errors import InputError, OperationError
 
 LONGEST_NS = 24 * 3_600 * 1_000_000_000  # beyond a day it is a wrong unit, not a latency
-EPSILON_NS = 1_000_000
-"""What a margin adds to latencies seen: the way to the shaping node is not in them."""
-OVERRUN_PROBABILITY = 0.01
-"""The share of all cycles that may be late by default, at most, with 95 % confidence."""
+EPSILON_NS = 1_000_000  # a margin's beyond latencies: the way to the shaping node is not in them
+OVERRUN_PROBABILITY = 0.01  # the share of all cycles that may be late by default, at most
 
 # A tail is the n^(2/3) longest of n latencies, or these parts of it: the more there are, the
 # further out it begins. A fixed share would leave large samples with a systematic error.
@@ -59,9 +54,8 @@ GOODNESS = 0.10  # the fit's own test must not come near rejection
 CONFIDENCE = 0.95
 BOOTSTRAPS = 999
 WIDEST_INTERVAL = 0.5  # of the latency itself; wider, the sample does not tell
-# On line: what slots are moved to is late in this part of the promised share, so that they need not
-# move again soon. Counts that chance makes rarer than this are none of chance: looked at once in a
-# while, and with every late output.
+# On line: what slots are moved to is late in this part of the promised share. Counts that chance
+# makes rarer than this are none of chance: looked at once in a while, and with every late output.
 AIM = 0.8
 DOUBT, DOUBT_AT_ONCE = 1e-6, 1e-9
 AT_ONCE = (8, 16, 32, 64, 128)  # so many cycles are looked at for a step
@@ -81,8 +75,7 @@ def read_latencies(path: str | Path) -> _Latencies:
     """End-to-end latencies of a file, in nanoseconds, in the file's order: one duration a line with
     its unit (``59.3ms``; ``#`` begins a comment), or a ``.npy`` file of nanoseconds.
 
-    Raises InputError: no such file, a line that is no duration (named with its number), an array
-    that does not hold whole nanoseconds, fewer than two latencies, or none above zero.
+    Raises InputError: no such file, or what cannot be planned with; a wrong line by its number.
     """
     path = Path(path)
     try:
@@ -115,9 +108,8 @@ def _read_lines(path: Path) -> _Latencies:
         except InputError as error:
             raise InputError(f"{path}:{number}: {error}") from error
         if not 0 <= found[-1] <= LONGEST_NS:
-            raise InputError(
-                f"{path}:{number}: {content} is no latency: write 0 ms or more, up to a day"
-            )
+            reason = f"{content} is no latency: write 0 ms or more, up to a day"
+            raise InputError(f"{path}:{number}: {reason}")
     return np.array(found, dtype=np.int64)
 
 
@@ -128,14 +120,10 @@ def check_latencies(latencies: object) -> _Latencies:
     """
     array = np.asarray(latencies)
     if array.ndim != 1 or array.dtype.kind not in "iuf":
-        raise InputError(
-            f"latencies must be one row of numbers in nanoseconds, not {array.ndim}-dimensional"
-            f" {array.dtype}"
-        )
+        kind = f"{array.ndim}-dimensional {array.dtype}"
+        raise InputError(f"latencies must be one row of numbers in nanoseconds, not {kind}")
     if array.size < 2:
-        raise InputError(
-            f"{array.size} latencies are too few to plan with: measure more cycles (100 at least)"
-        )
+        raise InputError(f"{array.size} latencies are too few to plan with: measure 100 at least")
     for wrong, reason in (
         (~np.isfinite(array), "is not a number: remove it"),
         (array != np.floor(array), "is not a whole number of nanoseconds: convert it"),
@@ -188,7 +176,7 @@ def covered_latency(
 
     It is the k-th longest of n, with the largest k for which P(Bin(n, p) ≥ k) is 95 % at least; the
     longest, where the sample is too small (:func:`cycles_needed`). What does not fit before
-    ``latest_ns`` cannot be covered: then it is the longest that does, 0 if there is none.
+    ``latest_ns`` cannot be covered: then it is the longest that does, or 0.
 
         >>> covered_latency(np.arange(1, 300), 0.01), covered_latency(np.arange(1, 601), 0.01)
         (299, 599)
@@ -212,11 +200,7 @@ def derive_margin(
     longest_ns: int | None = None,
 ) -> Margin:
     """The margin ε, with its confidence interval, beyond ``longest_ns`` (default: the longest of
-    them) with which an execution overruns its slot with the given probability.
-
-    ``latencies_ns`` are in the order in which they were measured.
-
-    Raises: as :func:`fit_tail`.
+    them) with which an execution overruns its slot with the given probability: :func:`fit_tail`.
     """
     fit = fit_tail(latencies_ns, overrun_probability, seed)
     longest = int(np.max(latencies_ns)) if longest_ns is None else longest_ns
@@ -230,24 +214,21 @@ def derive_margin(
 
 
 def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> TailFit:
-    """Fit the tail of a sample and read the latency that is exceeded with a small probability.
+    """The tail of a sample, in the order of time, above the lowest of a few thresholds of good fit.
 
-    The threshold is the lowest of a few that leaves a tail of good fit.
-
-    Raises InputError: latencies that cannot be planned with, or a probability outside the tail.
-    OperationError: the data do not allow an answer: too few, not stationary, not independent, no
-    generalised Pareto tail, or an answer too vague to plan with.
+    Raises OperationError: the data do not allow an answer: too few, not stationary, not
+    independent, no generalised Pareto tail, or an answer too vague to plan with.
     """
     latencies = check_latencies(latencies_ns)
     if not 0 < probability < MOST_PROBABLE:
         raise InputError(
-            f"an overrun probability of {probability} must be between 0 and {MOST_PROBABLE}"
+            f"overrun probability {probability}: must be between 0 and {MOST_PROBABLE}"
         )
     fewest = round(FEWEST_EXCESSES**1.5)
     if latencies.size <= fewest:
         raise OperationError(
             f"{latencies.size} latencies are too few to say anything about rarer ones: measure"
-            f" more than {fewest} cycles, better thousands, or give the margin yourself"
+            f" more than {fewest} cycles, or give the margin yourself"
         )
     _refuse_not_stationary(latencies)
     ordered = np.sort(latencies)
@@ -267,14 +248,13 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
                 return fit
             raise OperationError(
                 f"{latencies.size} latencies are too few for an overrun probability of"
-                f" {probability:g}: the latency it asks for lies between {duration_text(low)}"
-                f" and {duration_text(high)}. Measure more cycles, or ask for less"
+                f" {probability:g}: its latency lies between {duration_text(low)} and"
+                f" {duration_text(high)}. Measure more cycles, or ask for less"
             )
     raise OperationError(
         "the longest latencies do not follow a generalised Pareto distribution above any of"
-        f" {len(thresholds)} thresholds (best p-value {best:.3f}), so rarer ones cannot be"
-        " extrapolated: look for two modes of the application in one recording, or give the"
-        " margin yourself"
+        f" {len(thresholds)} thresholds (best p-value {best:.3f}): look for two modes of the"
+        " application in one recording, or give the margin yourself"
     )
 
 
@@ -351,10 +331,9 @@ def _refuse_not_stationary(latencies: _Latencies) -> None:
     trend = stats.kendalltau(np.arange(latencies.size), latencies).pvalue
     if min(halves, trend) < SIGNIFICANCE / 2:
         raise OperationError(
-            "the latencies are not stationary (two halves alike:"
-            f" p = {halves:.2g}; no trend: p = {trend:.2g}): they come from a system that changed"
-            " while it was measured, and nothing follows for later. Measure after start-up and in"
-            " one operating mode, in the order of time, or give the margin yourself"
+            f"the latencies are not stationary (two halves alike: p = {halves:.2g}; no trend:"
+            f" p = {trend:.2g}): measure after start-up, in one operating mode and the order of"
+            " time, or give the margin yourself"
         )
 
 
@@ -368,8 +347,7 @@ def _refuse_clusters(latencies: _Latencies, threshold: int) -> None:
     if chance < SIGNIFICANCE:
         raise OperationError(
             f"long latencies come in clusters ({followed} of {long} are followed by another,"
-            f" p = {chance:.2g}): executions are not independent, as when one delays the next."
-            " Remove the cause, or give the margin yourself"
+            f" p = {chance:.2g}), as when one delays the next: remove the cause, or give the margin"
         )
 
 
@@ -380,22 +358,20 @@ def _refuse_clusters(latencies: _Latencies, threshold: int) -> None:
 class Tail:
     """Where the slot of an output has to begin, from latencies as they come (ns).
 
-    All later than ``start_ns``, where it begins now, are to be the share ``promised`` at most. It
-    begins between ``earliest_ns`` and ``latest_ns``. ``usual_ns`` is the median as planned.
+    Those later than ``start_ns``, where it begins now, are to be the share ``promised`` at most.
+    ``usual_ns`` is the median as planned.
 
     The window is what came since the last change, :attr:`.Adaptation.window` cycles at most:
 
     * A **step** shows at once, in more late outputs than chance makes. What came before is
       forgotten; the tail is taken to have grown as much as the median.
     * Every now and then the window is looked at. If its latest cycles lie elsewhere than those
-      before, it begins with them. A **drift**, where thirds of it lie apart, is taken out: all
-      count for where they would be now. Then the share that is late by now is compared with the
-      promise. Of a share so small that the window has hardly any beyond, the generalised Pareto
-      distribution says where it begins, with its standard error (Hosking and Wallis, 1987).
+      before, it begins with them. A **drift**, where thirds of it lie apart, is taken out. Then the
+      share that is late by now is compared with the promise; where one so small begins that the
+      window has hardly any beyond, the generalised Pareto distribution says.
     * Slots move earlier when far fewer than promised are late, or latencies fall, and that has been
       worth it for :attr:`.Adaptation.after` cycles on end; for twice as many, each time that this
-      was wrong and nothing has changed since. So however the input is distributed, on a stationary
-      one moves get rarer and rarer.
+      was wrong and nothing has changed since: on stationary input moves get rarer and rarer.
     """
 
     rules: Adaptation

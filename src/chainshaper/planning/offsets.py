@@ -1,8 +1,7 @@
 """Several chains on shared cores: when each one's cycles start, so that no slots collide.
 
-Within the hyper-period of their cycles, chains are moved against each other until every two slots
-of one core and one priority are disjoint in all cycles (the rule that holds inside a plan, across
-plans). The paper leaves this open (section 3.1).
+Chains are moved against each other until every two slots of one core and one priority are disjoint
+in all cycles of their hyper-period. The paper leaves this open (section 3.1).
 
 Two slots [a, a + d) and [b, b + e) that repeat every T and U collide in some cycle unless the
 distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are all
@@ -13,9 +12,8 @@ nothing else matters.
 the first by a chain of tight pairs (pairs whose difference is at an end of an allowed interval),
 and start all of them earlier until some pair becomes tight. Repeated, that links every chain to the
 first without breaking a constraint: it is enough to try the ends of allowed intervals. Many chains
-are first fitted in one after the other, pushing each other out where there is no room, which is
-quick and mostly enough; where it is not, the CP-SAT solver of OR-tools decides, which is exact as
-well but may run out of time.
+are first fitted in one after the other, which is quick and mostly enough; where it is not, the
+CP-SAT solver of OR-tools decides, which is exact as well but may run out of time.
 """
 
 import math
@@ -23,6 +21,7 @@ import random
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
+from functools import partial
 from itertools import combinations
 from typing import NamedTuple, TypeAlias
 
@@ -55,14 +54,9 @@ class Timetable(NamedTuple):
     slots: dict[tuple[int, int], list[Slot]]
 
 
-def _timetable(
-    plans: Sequence[Plan],
-    alone: Iterable[tuple[tuple[int, int], int]] = (),
-) -> Timetable:
-    """The slots of a chain, or of several that share servers, of which each counts once.
-
-    ``alone`` are cores and priorities at which others must not run for so long (ns) after the cycle
-    has begun.
+def _timetable(plans: Sequence[Plan], alone: Iterable[tuple[tuple[int, int], int]]) -> Timetable:
+    """The slots of a chain, or of several that share servers, of which each counts once; and
+    ``alone``, where others must not run for so long (ns) after the cycle has begun.
     """
     servers = {server.name: server for plan in plans for server in plan.servers}
     slots: dict[tuple[int, int], list[Slot]] = {}
@@ -85,10 +79,9 @@ def place_chains(
 
     The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at the
     same time, the chain with the shorter period at the better priority, and only their publish
-    slots stay apart. None begins while a better one runs, where there are such offsets, and has its
-    core for as long as there can be: slots count from when a chain really begins, so one that began
-    late would have its publish slot where another has its own. ``at_once`` plans the chains again,
-    with latencies that they have then. Raises as :func:`with_offsets`.
+    slots stay apart. None begins while a better one runs, where there are such offsets, for slots
+    count from when a chain really begins; and each has its core for as long as there can be.
+    ``at_once`` plans the chains again, with latencies that they have then.
     """
     together = together or [[k] for k in range(len(plans))]
     try:
@@ -102,12 +95,11 @@ def place_chains(
             f"{error}. Instead, the chains run at the same time at priorities of their own, and"
             f" only their publish slots are kept apart{'' if at_once else condition}."
         )
+        apart = partial(with_offsets, ranked, together=together, time_limit_s=time_limit_s)
         for share in SHARES:
             with suppress(OperationError):
-                return with_offsets(
-                    ranked, together=together, time_limit_s=time_limit_s, alone=share
-                ), [remark]
-        return with_offsets(ranked, together=together, time_limit_s=time_limit_s), [remark]
+                return apart(alone=share), [remark]
+        return apart(), [remark]
 
 
 def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
@@ -148,14 +140,11 @@ def with_offsets(
 
     ``together`` are groups of chains (places in ``plans``) that begin at the same callback: they
     share servers and have one offset (default: none do). The first group, and any that shares no
-    core with another, has the offset 0. ``time_limit_s`` bounds the search among groups that can
-    collide with each other. For the share ``alone`` of its slot no chain that begins has its core
-    taken by one of a better priority.
+    core with another, has the offset 0. For the share ``alone`` of its slot no chain that begins
+    has its core taken by one of a better priority.
 
-    Raises InputError: no plans, or plans that govern the same output. OperationError: there are no
-    such offsets, with the reason where a single pair of chains or the load of a core already
-    excludes them; or the time was up before an answer. PlatformError: more than a few chains
-    collide and OR-tools is not installed.
+    Raises InputError: plans that govern the same output. OperationError: there are no such offsets,
+    or the time was up before an answer. PlatformError: many chains collide and OR-tools is missing.
     """
     if not plans:
         raise InputError("no plans to find offsets for: give one per chain")
@@ -198,8 +187,7 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
             names = ", ".join(one.name for one in tables if (core, priority) in one.slots)
             raise OperationError(
                 f"the slots of {names} on core {core} at priority {priority} fill {load:.1%} of its"
-                f" time, {load - 1:.1%} too much: move a chain to another core, or give servers"
-                " different priorities"
+                " time: move a chain to another core, or give servers different priorities"
             )
     offsets = dict.fromkeys(range(len(tables)), 0)
     for group in linked(len(tables), allowed):
@@ -296,10 +284,9 @@ def _fitted(
 ) -> dict[int, int] | None:
     """Chains fitted in one after the other; None says nothing.
 
-    A chain that fits nowhere is put where it pushes out what was hardest to place the least, and
-    those chains wait their turn again. Every time a chain does not fit it weighs more, so that the
-    hard ones come to stay and the others move around them (guided ejection: Nagata and Bräysy,
-    Operations Research Letters 37, 2009).
+    A chain that fits nowhere pushes out what weighs least, to wait for its turn again, and weighs
+    more from then on: so the hard ones come to stay (guided ejection: Nagata and Bräysy, Operations
+    Research Letters 37, 2009).
     """
     busy = [sum(b - a for slots in one.slots.values() for a, b in slots) for one in tables]
     waiting = sorted(group, key=lambda k: (-tables[k].cycle_ns, busy[k]))
@@ -362,10 +349,9 @@ def _solve(
     loads = _loads([tables[k] for k in group])
     core, priority = max(loads, key=lambda place: (loads[place], place))
     raise OperationError(
-        f"undecided: in the time allowed neither offsets for {len(group)} chains that share cores"
-        f" were found nor a proof that there are none. Their slots fill"
-        f" {loads[core, priority]:.1%} of core {core} at priority {priority}. Put fewer chains on"
-        " it, shorten slots, use periods with a large common divisor, or allow more time"
+        f"undecided: no offsets for {len(group)} chains were found in time, nor a proof that there"
+        f" are none. Their slots fill {loads[core, priority]:.1%} of core {core} at priority"
+        f" {priority}: put fewer chains on it, shorten slots, or allow more time"
     )
 
 
@@ -374,8 +360,7 @@ def _played_out(
 ) -> Iterator[list[tuple[int, int, int]]]:
     """Per core and priority, every slot (chain, start, end) of a hyper-period and the cycle before.
 
-    Pairs of chains say all that there is to say, but only from slots side by side does a solver see
-    that a core is too full for all of them. Nothing, where a hyper-period is too long to be of use.
+    Only from slots side by side does a solver see that a core is too full for all of them.
     """
     hyper_period = math.lcm(*(tables[k].cycle_ns for k in group))
     if sum(hyper_period // tables[k].cycle_ns for k in group) > MOST_CYCLES:
@@ -410,11 +395,9 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
     excess = f", {duration_text(needed - common)} too long" if needed > common else ""
     return (
         f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide at"
-        f" every offset: with cycles of {duration_text(one.cycle_ns)} and"
-        f" {duration_text(two.cycle_ns)} they meet in every distance modulo"
-        f" {duration_text(common)}, which leaves no room for both (their longest take"
-        f" {duration_text(needed)}{excess}). Move one to another core, give their servers"
-        " different priorities, or use periods with a larger common divisor"
+        f" every offset: they meet in every distance modulo {duration_text(common)}, and their"
+        f" longest take {duration_text(needed)}{excess}. Give them other cores or priorities, or"
+        " periods with a larger common divisor"
     )
 
 
@@ -426,17 +409,12 @@ def chain_name(plan: Plan) -> str:
 def _refuse_same_beginning(one: Plan, two: Plan) -> None:
     begins = [(plan.chain.spec or "").split("..")[0].strip() for plan in (one, two)]
     if begins[0] and begins[0] == begins[1]:
-        raise InputError(
-            f"{chain_name(one)} and {chain_name(two)} begin at the same callback: plan them"
-            " together (`chainshaper plan REC --chain A --chain B`)"
-        )
+        names = f"{chain_name(one)} and {chain_name(two)}"
+        raise InputError(f"{names} begin at the same callback: plan them together (--chain twice)")
 
 
 def refuse_common(names: tuple[str, str], outputs: tuple[str | None, str | None]) -> None:
     """Refuse to plan two chains whose plans would have one output."""
-    one, two = names
     if outputs[0] is not None and outputs[0] == outputs[1]:
-        raise InputError(
-            f"{one} and {two} both publish {outputs[0]}, and one shaping node can hold it at one"
-            " place only: name each output once, with the chain that takes longest"
-        )
+        reason = f"{' and '.join(names)} both publish {outputs[0]}"
+        raise InputError(f"{reason}: name it once, with the chain that takes longest")

@@ -27,6 +27,7 @@ from chainshaper.planning.plan import (
     publishing_servers,
     revised,
     server_of,
+    until,
     with_slots,
 )
 from chainshaper.values.durations import duration_text, milliseconds
@@ -34,19 +35,16 @@ from chainshaper.values.errors import InputError
 
 IDLE_BAND = 0.02  # of the cycles: a band that has less does next to nothing for the average
 NEARLY_FULL = 0.95  # of the cycle; also the kernel's default share for real-time threads
-GATE_NS = 100_000
-"""How far apart a gate's outputs of one slot are: p0.5–p99.5 of 0.02–0.1 ms measured, on idle and
-on busy 2-core machines (experiments/RESULTS.md)."""
-STOPPED_THREAD_NS = 500_000
-"""The same where a publisher's own thread is stopped until its slot: 0.02–0.49 ms measured."""
+# How far apart a gate's outputs of one slot are (p0.5–p99.5 measured: 0.02–0.1 ms, see
+# experiments/RESULTS.md), and those of a publisher's thread stopped until its slot (0.02–0.49 ms):
+GATE_NS, STOPPED_THREAD_NS = 100_000, 500_000
 ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls for 1 to 8 ms
 
 
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
-    """How many cycles after its own an output is due, and leaves at the earliest: 0 but under LET.
+    """How many cycles after its own the chain's output, or what ``node`` republishes, is due.
 
-    It is the chain's output, or what ``node`` republishes: under LET per callback, each topic is
-    due a cycle after the one before it. Without slots for outputs: as predicted.
+    Under LET per callback, each topic is due a cycle after the one before it.
     """
     if plan.policy == "let-per-chain":
         return 1
@@ -60,8 +58,7 @@ def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
 class Expected(NamedTuple):
     """What is seen of outputs that gates let go as slots start, at ``leave_ns`` (all in ns).
 
-    The ``prediction`` of a plan counts the ends of slots (eq. 5): what may come in an open slot
-    makes that the bound.
+    A plan's prediction counts the ends of slots (eq. 5), the bound of what comes in an open one.
     """
 
     leave_ns: tuple[int, ...]
@@ -86,10 +83,9 @@ def output_lifespan(plan: Plan) -> int | None:
     """The lifespan (ns) by which DDS discards what overruns; None where it is not needed.
 
     It is as short as it may be: an output in time waits at most until the end of the first slot,
-    or of the next slot when it just missed one. An overrun with latency l waits for the first slot
-    of the next cycle, CT + (x_1 − Δ) − l. So overruns are discarded up to a latency of CT − Δ with
-    one slot; one that took longer still is taken for an early output of the next cycle. Under LET,
-    where every output waits for the next cycle, age tells nothing.
+    or of the next slot when it just missed one; an overrun with latency l for the first slot of the
+    next cycle, CT + (x_1 − Δ) − l. So with one slot, overruns are discarded up to a latency of
+    CT − Δ. Under LET, where every output waits for the next cycle, age tells nothing.
     """
     publisher = plan.chain.publisher
     if plan.overrun != "discard" or publisher is None or cycles_until_output(plan):
@@ -106,16 +102,14 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     The servers that run the chain to its end stay open until the cycle's end (section 6), whatever
     becomes of the output: stopped at L̄ + ε, the chain would go on in the next cycle, and delay its
     output too. Where an output that missed its slot is to leave at once, so does the last publish
-    slot of an asynchronous publisher. The plan itself states what is reserved (eq. 1); the slots of
-    other servers of the same core and priority are left out, and the last ``closed_ns`` of a cycle:
-    a thread whose timer expires in these waits for its slot. A stage of a pipeline stays open until
-    the next slot of its core begins.
+    slot of an asynchronous publisher. The slots of other servers of the same core and priority are
+    left out, and the last ``closed_ns`` of a cycle: a thread whose timer expires in these waits for
+    its slot. A stage of a pipeline stays open until the next slot of its core begins.
 
-    Servers of callbacks stay open as well, but for one of its own in which chains begin: what comes
-    too late for its slot waits. A callback that was stopped would take its next slot, which is as
-    long as one execution, and leave that cycle's no room: every output would be late until two
-    short executions met. Those that wait for it have no other use for their slots. A server of a
-    whole chain that shapes nothing is closed as it says: it is there for what runs beside it.
+    Servers of callbacks stay open as well, but for one of its own in which chains begin: a callback
+    that was stopped would take its next slot, which is as long as one execution, and every output
+    would be late until two short executions met. A server of a whole chain that shapes nothing is
+    closed as it says: it is there for what runs beside it.
     """
     if plan.overrun == "publish" and plan.policy == "pipelined":
         longer_stages = dict(_longer_stages(plan, plan.cycle_ns - closed_ns))
@@ -155,21 +149,15 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
 def _until(plan: Plan, end_ns: int) -> Iterator[Server]:
     """The servers, with last slots that end there, but for one that begins chains for others."""
     for server in plan.servers:
-        *before, (start, end) = server.slots
         begins = server.slots[0][0] == 0 and len(plan.servers) > 1
-        if begins or server.best_effort:
-            yield server
-        else:
-            slots = (*before, (start, max(end, end_ns)))
-            yield server.model_copy(update={"slots": slots})
+        end = server.slots[-1][1]
+        longer = end if begins or server.best_effort else max(end, end_ns)
+        yield server.model_copy(update={"slots": until(server, longer)})
 
 
 def with_output_moved(plan: Plan, by_ns: int) -> Plan:
     """The plan with the slots of its output moved by so much, and with them the ends of those that
-    run the chain until then.
-
-    Raises InputError: they would leave the cycle, end behind the longest latency that is allowed,
-    or meet others of their core and priority.
+    run the chain until then. Raises InputError: there they may not be.
     """
     edges = {edge for slot in publish_slots(plan) for edge in slot}
     slots = {
@@ -229,8 +217,8 @@ def _longer_stages(plan: Plan, end_ns: int) -> Iterator[tuple[str, list[Slot]]]:
 
 @dataclass(frozen=True)
 class Writer:
-    """A writer of an application: node, topic, history (keep last), and whether a publisher thread
-    sends for it. None is: not known. Those of one ``process`` have one such thread.
+    """A writer of an application, ``depth`` its history; ``asynchronous``: a thread sends for all
+    such writers of its ``process``. None is: not known.
     """
 
     node: str
@@ -241,8 +229,7 @@ class Writer:
 
 
 def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
-    """Check a plan that gates publishers' threads against the writers of the application; returns
-    what a person must know, one sentence each.
+    """What a person must know of a plan that gates the publishers' threads of these writers.
 
     Raises InputError: the output is published by another node, or synchronously, or its history is
     too shallow for what is handed over while the thread may not run.
@@ -255,40 +242,36 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
             if node == plan.chain.publisher and output is not None:
                 _check_output(output, node, own.get(output), messages_waiting(plan, server))
             processes = {writer.process for writer in own.values()} - {None}
+            beside = (one for one in writers if one.node == node or one.process in processes)
             others = [
-                writer
-                for writer in writers
-                if writer.node == node or writer.process in processes
-                if writer.asynchronous is not False
-                and (writer.node, writer.topic) != (node, output)
+                one
+                for one in beside
+                if one.asynchronous is not False and (one.node, one.topic) != (node, output)
             ]
             if others:
                 doubt = {True: "", None: " (if asynchronous)"}
                 topics = sorted({f"{one.topic}{doubt[one.asynchronous]}" for one in others})
                 warnings.append(
                     f"{', '.join(topics)} of {', '.join(sorted({one.node for one in others}))}"
-                    f" will be delayed as well, until the slots of server {server.name!r}: one"
-                    " thread sends for all asynchronous writers of a process. Publish them"
-                    " synchronously, or from another process."
+                    f" will be delayed as well, until the slots of server {server.name!r}: publish"
+                    " synchronously, or from another process, which has a thread of its own."
                 )
     return warnings
 
 
 def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) -> None:
     if writer is None:
-        raise InputError(
-            f"the plan gates the thread by which {node} publishes {topic}, but {node} does not"
-            " publish it: plan again from a recording of this application"
-        )
+        gated = f"{node} is to publish {topic}, but {node} does not publish it"
+        raise InputError(f"{gated}: plan again from a recording of this application")
     if writer.asynchronous is False:
         raise InputError(
-            f"{node} publishes {topic} synchronously, so gating its publisher thread would hold"
-            " nothing: publish it asynchronously, or plan with --publication synchronous"
+            f"{node} publishes {topic} synchronously, so gating its thread would hold nothing:"
+            " publish it asynchronously, or plan with --publication synchronous"
         )
     if writer.depth is not None and writer.depth < waiting:
         raise InputError(
-            f"{topic} has a history of {writer.depth}, but {waiting} messages are handed over while"
-            f" the publisher thread of {node} may not run: give it a depth of {waiting + 1}"
+            f"{topic} has a history of {writer.depth}, but {waiting} messages come while the"
+            f" publisher thread of {node} may not run: give it a depth of {waiting + 1}"
         )
 
 
@@ -298,29 +281,25 @@ def publication_warnings(plan: Plan) -> list[str]:
     for _, server, nodes in publisher_servers(open_until_done(plan)):
         names = ", ".join(nodes)
         warnings.append(
-            f"only asynchronous publication can be shaped like this, and all of it is: whatever"
-            f" else {names} publishes asynchronously, such as /rosout, waits for the slots of"
-            f" server {server.name!r} too."
+            f"only asynchronous publication can be shaped like this, and all of it is: what else"
+            f" {names} publishes so, such as /rosout, waits for the slots of {server.name!r} too."
         )
         shortest = min(end - start for start, end in server.slots)
         if shortest < ROOMY_SLOT_NS:
             warnings.append(
                 f"a slot of {duration_text(shortest)} that opens late may end while {names}"
-                " sends, which blocks the whole process until the next one; it costs nothing to"
-                f" give it {duration_text(ROOMY_SLOT_NS)} (--publish-slot), since outputs leave"
-                " when it opens."
+                " sends, which blocks the whole process until the next one; one of"
+                f" {duration_text(ROOMY_SLOT_NS)} (--publish-slot) costs nothing."
             )
         depth, mine = plan.chain.output_depth, plan.chain.publisher in nodes
         if mine and plan.overrun == "wait" and depth == messages_waiting(plan, server):
             warnings.append(
-                f"a history of {depth} has no room for an output that overran: it will be"
-                " overwritten by the next. A depth of one more would keep it."
+                f"a history of {depth} has no room for an output that overran: give it one more."
             )
     if plan.overrun == "discard" and warnings:
         lifespan, topic = output_lifespan(plan), plan.chain.output or "their topic"
         warnings.append(
-            "outputs that are due in a later cycle than their own look like overruns by"
-            " their age: none will be discarded."
+            "outputs due in a later cycle look like overruns by their age: none will be discarded."
             if lifespan is None
             else f"outputs that overran are discarded by DDS if {topic} has a lifespan of"
             f" {duration_text(lifespan)}: give it one."
@@ -329,16 +308,9 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 
 def plan_warnings(*plans: Plan) -> list[str]:
-    """What a person must know before relying on a plan; one sentence each, none if all is well. Of
-    several chains, each with its chain.
-    """
-    about = (
-        _about_stages,
-        _about_bands,
-        _about_late_outputs,
-        _about_evidence,
-        publication_warnings,
-    )
+    """What a person must know before relying on plans; one sentence each, none if all is well."""
+    first = (_about_stages, _about_bands, _about_late_outputs)
+    about = (*first, _about_evidence, publication_warnings)
     names = [f"{plan.chain.spec or plan.chain.output}: " if plans[1:] else "" for plan in plans]
     return [
         f"{name}{warning}"
@@ -366,8 +338,8 @@ def _about_stages(plan: Plan) -> Iterator[str]:
         both = product(one.slots, two.slots) if one.core == two.core else ()
         if any(first[0] < second[1] and second[0] < first[1] for first, second in both):
             yield (
-                f"{one.name} and {two.name} have core {one.core} at the same time: that is right"
-                " only where their callbacks wait (for a device, a sleep) rather than compute."
+                f"{one.name} and {two.name} have core {one.core} at the same time: right only where"
+                " their callbacks wait rather than compute."
             )
 
 
@@ -378,8 +350,7 @@ def _about_bands(plan: Plan) -> Iterator[str]:
     if idle and len(shares) > 1 and plan.modes is None:
         yield (
             f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(map(str, idle))} of"
-            f" {len(shares)}, which hardly lower the average: limit it (--mean-at-most) or a band's"
-            " share (--max-share), or plan fewer bands."
+            f" {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
         )
 
 
@@ -407,8 +378,8 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
     if evidence.all_disturbed:
         yield (
-            f"the machine disturbed every cycle, but one at most{what}: the plan rests on latencies"
-            " with its stalls in them. Record again on a calmer machine."
+            f"the machine disturbed every cycle, but one at most{what}: its stalls are in the plan."
+            " Record again on a calmer machine."
         )
     elif evidence.disturbed:
         yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."
@@ -431,29 +402,25 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
     """What is doubtful about the measurements, or about how much of the cycle is used."""
     if plan.modes is not None and plan.evidence.modes is None:
         yield (
-            "nothing says which mode was in force while latencies were measured, so the modes share"
-            " bands of them all: a mode that takes longer than its slot will be late. Give each"
-            " mode's own profile (--mode-profile MODE=REC)."
+            "nothing says which mode was in force, so the modes share bands of them all: one that"
+            " takes longer will be late. Give each one's profile (--mode-profile MODE=REC)."
         )
     evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
     longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
     last = max((end for _, end in publish_slots(plan)), default=longest)
     if evidence.realtime is False:
         yield (
-            "the latencies were taken without real-time scheduling: other programs are in them,"
-            " and the chain's slot is longer than it needs to be. Record again with the privilege"
-            " to use SCHED_FIFO."
+            "the latencies were taken without real-time scheduling: other programs are in them."
+            " Record again with the privilege to use SCHED_FIFO."
         )
     if evidence.lost_events:
         yield (
-            f"{evidence.lost_events} events were lost while recording: cycles are missing, and the"
-            " longest latency may be among them. Record again, see the recording's notes."
+            f"{evidence.lost_events} events were lost while recording, maybe the longest latency's:"
+            " record again, see the recording's notes."
         )
     if evidence.interference_ns:
-        yield (
-            f"{milliseconds(evidence.interference_ns)} ms of the slot are for other chains of the"
-            " plan, which may have the core first."
-        )
+        delay = milliseconds(evidence.interference_ns)
+        yield f"{delay} ms of the slot are for other chains, which may have the core first."
     if evidence.incomplete:
         yield (
             f"{evidence.incomplete} executions of the chain have no end in the recording; their"
@@ -461,10 +428,8 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         )
     if margin.confidence_interval_ns:
         low, high = map(duration_text, margin.confidence_interval_ns)
-        yield (
-            f"the margin {duration_text(margin.epsilon_ns)} is an estimate; with 95 % confidence"
-            f" it lies between {low} and {high}."
-        )
+        epsilon = duration_text(margin.epsilon_ns)
+        yield f"the margin {epsilon} is an estimate, 95 % confidence between {low} and {high}."
     if NEARLY_FULL * cycle < last <= cycle:
         yield (
             f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}: an execution"
@@ -473,17 +438,12 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
     if longest >= cycle and plan.policy != "pipelined":
         yield (
             f"the longest latency {duration_text(longest)} is not shorter than the cycle"
-            f" {duration_text(cycle)}: executions of the chain overlapped while they were"
-            " measured, and response times have each other's interference in them."
+            f" {duration_text(cycle)}: executions delayed each other while they were measured."
         )
     if NEARLY_FULL * cycle < longest < cycle:
         yield (
-            "a cycle as long as the longest measured has its core busy for more than"
-            f" {NEARLY_FULL:.0%}, where the kernel throttles real-time threads"
-            " (/proc/sys/kernel/sched_rt_runtime_us)."
+            f"the longest execution takes more than {NEARLY_FULL:.0%} of a cycle, where the kernel"
+            " throttles real-time threads (/proc/sys/kernel/sched_rt_runtime_us)."
         )
     if used > NEARLY_FULL:
-        yield (
-            f"the chain's execution takes {used:.1%} of its core: latencies will pile up from"
-            " cycle to cycle, whatever the slots."
-        )
+        yield f"the chain takes {used:.1%} of its core: latencies will pile up, whatever the slots."

@@ -6,9 +6,7 @@ order, when the slowest instance would be through: at a constant latency of seve
 shaping node sees by the stamp.
 
 **What a callback takes** is counted from the message before it to its own, without the time for
-which other instances of the chain had its core. So a recording in which instances piled up on one
-core tells the same as one in which nothing overlapped, where an instance's times sum up to its
-latency; and what took long together stays together, as L̄ has it.
+which other instances of the chain had its core: the same whether instances piled up or not.
 
 **Stages.** On the axis of the chain's latency stage j begins when all executions of j − 1 were
 over: s_1 = 0 and s_{j+1} ≥ s_j + W_j, with W_j the longest time that its callbacks took together,
@@ -20,14 +18,12 @@ chain.
 **Search.** The shortest cut is that with the earliest end; of several, with the fewest stages, then
 the fewest cores. Once cut, cores and turns are chosen, the starts obey difference constraints
 (s_b ≥ s_a + constant), whose least solution is a longest path. What is chosen is searched in depth,
-stage by stage; the shortest cut of the rest, into stages that have room on some core, is the bound.
-That is exact, and quick unless cores are nearly full: after :data:`MOST_STEPS` the best so far has
-to do.
+stage by stage, bounded by the shortest cut of the rest: exact, and quick unless cores are nearly
+full. After :data:`MOST_STEPS` the best so far has to do.
 
-**Slots that open early.** To begin when all executions before were over costs latency, since the
-longest of all stages never come in one instance. So slots open in the end as soon as the first data
-may come, unless another stage has the core then, or a slot would be longer than a cycle. With a
-core for each stage, all is over by the chain's own L̄ + ε, below which nothing is.
+**Slots that open early.** The longest of all stages never come in one instance. So slots open in
+the end as soon as the first data may come, unless another stage has the core then, or a slot would
+be longer than a cycle. With a core for each stage, all is over by the chain's own L̄ + ε.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,9 +43,7 @@ from chainshaper.values.yaml_file import wrong_values_refused
 
 @dataclass(frozen=True)
 class Stage:
-    """Callbacks [first, end) of a chain on the core of that ``place``, and their slot, with the
-    margin, on the axis of the chain's latency.
-    """
+    """Callbacks [first, end) on a core, and their slot, with the margin, on the latency's axis."""
 
     first: int
     end: int
@@ -61,8 +55,7 @@ class Stage:
 Longest = Sequence[Sequence[int]]
 """``longest[i][j]``: the longest that the callbacks [i, j) took together (ns)."""
 
-MOST_STEPS = 100_000
-"""Of the search, which take some seconds."""
+MOST_STEPS = 100_000  # of the search, which take some seconds
 
 _Piece = tuple[int, int, int]  # of a stage: first, end, place
 _Turn = tuple[int, int, int]  # stages a < b of one core, and how many cycles lie between
@@ -218,19 +211,14 @@ def pipelined(
     ``nodes`` are those of the chain's callbacks, in order; ``steps_ns`` has a row per instance and
     a column per callback. A core that is named twice has two stages at a time, of which the first
     has the better priority: right where callbacks wait for something rather than compute.
-
-    Raises InputError: a plan without a shaping node. OperationError: no cut fits; the message names
-    what prevents it.
+    OperationError: no cut fits; the message names what prevents it.
     """
     before = list(dict.fromkeys(core_of[node] for node in nodes))
     # In the order of the chain, so that nodes stay where they are, if that can be.
     cores = sorted(cores or before, key=lambda one: (*before, one).index(one))
     margin, cycle, node = plan.margin.epsilon_ns, plan.cycle_ns, plan.shaping_node
     if node is None:
-        raise InputError(
-            "a pipeline needs a shaping node, which sees how many cycles old an output is: plan"
-            " from a recording, with --publication synchronous"
-        )
+        raise InputError("a pipeline needs a shaping node: plan with --publication synchronous")
     longest, cuts = _longest(steps_ns), _cuts(nodes)
     _refuse_too_long(longest, cuts, nodes, margin, cycle)
     stages = shortest_cut(longest, cuts, margin, cycle, len(cores))
@@ -314,10 +302,8 @@ def _refuse_too_long(
             why = "" if end == first + 1 else " together, which one thread has to run,"
             raise OperationError(
                 f"the work of {several}{why} takes up to {duration_text(longest[first][end])},"
-                f" with the margin {duration_text(margin_ns)} that is"
-                f" {duration_text(needed - cycle_ns)} longer than the cycle of"
-                f" {duration_text(cycle_ns)}, and no cut makes it shorter. What helps: a period"
-                f" of {duration_text(needed)} or more, or parts of it in nodes of their own"
+                f" with its margin {duration_text(needed - cycle_ns)} longer than the cycle: take"
+                f" a period of {duration_text(needed)}, or parts of it in nodes of their own"
             )
 
 
@@ -329,7 +315,6 @@ def _no_room(
     enough = next(n for n in most if shortest_cut(longest, cuts, margin_ns, cycle_ns, n))
     return (
         f"no cut of the chain fits on the cores {named}: it takes {duration_text(total)},"
-        f" {total / cycle_ns:.2f} times the cycle of {duration_text(cycle_ns)}, and each stage"
-        f" {duration_text(margin_ns)} more for the margin. What helps: {enough} cores"
-        f" (--cores {named},…), a longer period, or a smaller margin (--epsilon)"
+        f" {total / cycle_ns:.2f} times the cycle, and a stage {duration_text(margin_ns)} more."
+        f" What helps: {enough} cores (--cores {named},…), a longer period, or a smaller margin"
     )

@@ -6,10 +6,10 @@ their values with a unit (``period: 100ms``). Slots are half-open and count from
 
 A server may stop the thread of an asynchronous publisher (design 1, section 3.2.1), which shares
 locks with the rest of its process. With Fast DDS 2.14, three things are destructive and refused:
-a slot hardly longer than a send (stopped in the midst of one, 0.25 ms did that, the thread has what
-every publisher and the executor need); a thread that out-ranks its executor on the same core (it
-spins for the lock under which the executor hands a message over, which happens only after the
-shortest latency measured); and a history too shallow for what is handed over while it may not run.
+a slot hardly longer than a send (0.25 ms; stopped in the midst of one, the thread has what every
+publisher and the executor need); a thread that out-ranks its executor on the same core (it spins
+for the lock under which the executor hands a message over, after the shortest latency at the
+earliest); and a history too shallow for what is handed over while it may not run.
 """
 
 import re
@@ -42,10 +42,7 @@ def _plain_name(what: str) -> AfterValidator:
     def check(value: str) -> str:
         if re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", value):
             return value
-        raise ValueError(
-            f"{value!r} is not a {what}'s name: write letters, digits and underscores, no slash,"
-            " no digit first"
-        )
+        raise ValueError(f"{value!r} is not a {what}'s name: write letters, digits and underscores")
 
     return AfterValidator(check)
 
@@ -58,10 +55,8 @@ Slot: TypeAlias = tuple[Duration, Duration]
 
 
 class ChainOfPlan(Part):
-    """The chain that is planned for, as far as it is known: a plan from bare latencies knows only
-    the period, and can be studied but not carried out.
-
-    ``publisher`` is the node that publishes ``output``, ``output_depth`` its writer's history.
+    """The chain that is planned for. From bare latencies only the period is known: such a plan can
+    be studied, not carried out. ``publisher`` is a node, ``output_depth`` its writer's history.
     """
 
     spec: str | None = None
@@ -75,13 +70,12 @@ class Evidence(Part):
     """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
 
     They are of undisturbed cycles; where the machine disturbed all but one at most
-    (``all_disturbed``), of all. ``max_of_all_ns`` is the longest of all, ``incomplete`` counts
-    traversals without an end, ``disturbed`` those hit by a stall of the machine; ``utilisation`` is
-    the share of its core that the chain takes. ``interference_ns`` of every latency are for others
-    (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's
-    asynchronous publisher, ``longest_publication_ns`` of its synchronous one, for which Δ was
-    ``given``, is as long as ``measured``, or the ``least``. ``intra_process``: subscribers of the
-    output get it without DDS. ``modes`` has each mode's own. ``None`` is: not known.
+    (``all_disturbed``), of all. ``max_of_all_ns`` is of all, ``incomplete`` counts traversals
+    without an end; ``utilisation`` is the share of its core that the chain takes,
+    ``interference_ns`` the part of each latency that is for others
+    (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's asynchronous
+    publisher, ``longest_publication_ns`` of its synchronous one; ``publish_slot`` says where Δ is
+    from. ``intra_process``: subscribers get the output without DDS. ``None`` is: not known.
     """
 
     recording: str | None = None
@@ -132,15 +126,11 @@ def _callback(value: str) -> str:
         return f"every {format_duration(parse_duration(value.removeprefix('every ')))}"
     if re.fullmatch(r"(/[A-Za-z_]\w*)+", value):
         return value
-    raise ValueError(
-        f"{value!r} is no callback: write the topic that it subscribes to, or a timer's period, as"
-        " in `every 100ms`"
-    )
+    raise ValueError(f"{value!r} is no callback: write its topic, or a timer's `every 100ms`")
 
 
 class Thread(Part):
-    """A thread of a node that runs inside a server; other DDS threads are never gated (section
-    3.1).
+    """A thread of a node that runs inside a server; other DDS threads are never gated (sec. 3.1).
 
     A node may have callback groups with an executor each (section 6): ``callbacks`` are those of
     the one that is meant, by topic or as ``every 100ms``. Without, all executors of the node are.
@@ -179,14 +169,15 @@ class Server(Part):
     @model_validator(mode="after")
     def _slots_ascend(self) -> "Server":
         for number, slot in enumerate(self.slots):
-            reason = "" if slot[0] < slot[1] else "is empty: its end must come after its start"
-            if number and slot[0] < (before := self.slots[number - 1])[1]:
-                reason = reason or (
-                    f"begins before {slot_text(before)} ends: write a server's slots in ascending"
-                    " order, without overlap"
+            if slot[0] >= slot[1]:
+                reason = "is empty: its end must come after its start"
+            elif number and slot[0] < (before := self.slots[number - 1])[1]:
+                reason = (
+                    f"begins before {slot_text(before)} ends: write slots ascending, no overlap"
                 )
-            if reason:
-                raise wrong_value(f"the slot {slot_text(slot)} {reason}", "slots", number)
+            else:
+                continue
+            raise wrong_value(f"the slot {slot_text(slot)} {reason}", "slots", number)
         return self
 
 
@@ -197,11 +188,10 @@ class ShapingNode(Part):
     It sleeps until ``spin_ns`` before the slot and spins from there; it pauses for ``pause_ns``
     after a publication so that it does not delay delivery. ``publisher`` is the node whose output
     it takes, where that is not `chain.publisher`. The executors of ``receivers``, which subscribe
-    to the output, run under SCHED_FIFO below all servers. ``depth`` is how many messages may wait
-    in it; None: as many as the history of the output's publisher has room for, and 10 at least.
-    With ``in_process`` it is no node of its own but a thread in the publisher's process, where a
-    library takes what is published: ``input`` is what tracers call that. With ``delivery_ns`` a
-    library in the receivers' processes hands them each message that long behind its publication.
+    to the output, run under SCHED_FIFO below all servers. ``depth`` messages may wait in it (None:
+    see :class:`.Wishes`). With ``in_process`` it is a thread in the publisher's process, where a
+    library takes what is published, which tracers call ``input``. With ``delivery_ns`` a library in
+    the receivers' processes hands them each message that long behind its publication.
     """
 
     name: Annotated[str, _plain_name("node")]
@@ -225,16 +215,12 @@ class ShapingNode(Part):
     @model_validator(mode="after")
     def _two_topics(self) -> "ShapingNode":
         if self.input == self.output:
-            raise wrong_value(
-                f"the shaping node would feed itself: input and output are both {self.input};"
-                f" let the chain publish on another topic, such as {self.output}_tmp",
-                "input",
-            )
+            reason = f"the node would feed itself: let the chain publish on {self.output}_tmp"
+            raise wrong_value(reason, "input")
         if self.delivery_ns is not None and not self.receivers:
             raise wrong_value(
-                f"{self.output} is to be handed to its receivers at a constant time, and none is"
-                " named: plan from a recording that has its subscribers, with --receivers, or leave"
-                " out --delivery",
+                f"no receiver of {self.output} is named: plan with --receivers, from a recording"
+                " that has its subscribers, or leave out --delivery",
                 "delivery_ns",
             )
         return self
@@ -244,8 +230,8 @@ class Modes(Part):
     """Which latency band, 1 for the first slot, the output has in each mode (sections 3.3, 6).
 
     The active mode is read from ``topic``, a ``std_msgs/msg/String``; until then it is ``default``.
-    An early output waits for its mode's slot. A late one waits for the same slot of the next cycle
-    (``wait``), is discarded, leaves at once (``publish``), or takes the ``next-slot`` of the cycle.
+    A ``late`` output waits for its mode's slot of the next cycle, is discarded, leaves at once
+    (``publish``), or takes the ``next-slot`` of the cycle.
     """
 
     topic: FullName
@@ -256,11 +242,8 @@ class Modes(Part):
     @model_validator(mode="after")
     def _default_exists(self) -> "Modes":
         if self.default not in self.bands:
-            raise wrong_value(
-                f"the mode {self.default!r} has no band: write one of {', '.join(self.bands)}, or"
-                " give it a band",
-                "default",
-            )
+            reason = f"{self.default!r} has no band: write one of {', '.join(self.bands)}"
+            raise wrong_value(reason, "default")
         return self
 
 
@@ -284,8 +267,7 @@ class Prediction(Part):
     """What the plan promises: end-to-end latency, and the share of cycles per latency band.
 
     A band is represented by the end of its slot (section 4.1). The jitter is the widest distance of
-    two outputs, from the start of the first slot to the end of the last. ``modes`` has the same for
-    each mode in its slot, with the share of its cycles that are in time for it.
+    two outputs, from the start of the first slot to the end of the last. ``modes`` has each mode's.
     """
 
     mean_ns: Duration
@@ -313,17 +295,11 @@ class Plan(Part):
     """Servers and shaping nodes for one chain, with the evidence and the prediction.
 
     ``cycle_ns`` is a whole multiple of the chain's period. Its cycles start ``offset_ns`` after the
-    instant from which those of all chains count; ``anchor``: by the stamp that each message carries
-    from the chain's first callback, or by the servers' own cycle. ``overrun`` says what becomes of
-    an output that missed its last slot, ``into_open_slot`` of one that comes when its slot is open
-    already, ``messages`` which of several outputs of one cycle leave, ``fallback`` what becomes of
-    outputs while their shaping node is not there. With ``shaping_thread`` in-slots, back ends keep
-    the threads of shaping nodes in their servers' slots (:attr:`.ApplicationPlan.servers`); free
-    ones are timed by their gates alone. ``equal_priorities`` says whether servers of one core and
-    priority may overlap. ``shaping_node``
-    serves the chain's output, unless the publisher's own thread is gated; ``further_shaping_nodes``
-    serve other sinks, or topics inside a chain (LET per callback). Without an ``adaptation`` slots
-    that follow the latencies do so as it is by default.
+    instant from which those of all chains count. For ``anchor``, ``overrun``, ``into_open_slot``
+    and ``messages`` see :mod:`chainshaper.gate.decision`, for the next three
+    :mod:`chainshaper.values.plan_choices`. ``shaping_node`` serves the chain's output, unless the
+    publisher's own thread is gated; ``further_shaping_nodes`` serve other sinks, or topics inside a
+    chain (LET per callback). Without an ``adaptation`` slots follow the latencies as by default.
     """
 
     format: Literal[1] = 1
@@ -350,9 +326,8 @@ class Plan(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "Plan":
         first = (_cycle, _servers, _overlaps, _shaping_nodes, _modes)
-        for rule in (*first, _publisher_threads, _entry, _adaptation):
-            for reason, *where in rule(self):
-                raise wrong_value(str(reason), *where)
+        for check in (*first, _publisher_threads, _entry, _adaptation):
+            check(self)
         return self
 
 
@@ -369,8 +344,7 @@ def shaping_nodes(plan: Plan) -> list[ShapingNode]:
 def output_server(plan: Plan) -> Server | None:
     """The server in whose slots the chain's output is published; None without shaping.
 
-    It has the thread of the shaping node or of the asynchronous publisher; a plan from bare
-    latencies names no threads, and its server ``output`` is meant.
+    A plan from bare latencies names no threads, and its server ``output`` is meant.
     """
     server = None
     if plan.shaping_node is not None:
@@ -386,10 +360,7 @@ def publish_slots(plan: Plan) -> tuple[Slot, ...]:
 
 
 def band_predictions(plan: Plan) -> tuple[BandPrediction, ...]:
-    """The prediction band by band; none where nothing is shaped, or slots were edited in number.
-
-    Slots count from the start of a cycle, under LET one after the execution's own.
-    """
+    """The prediction band by band; none where nothing is shaped, or slots were edited in number."""
     slots, shares = publish_slots(plan), plan.predicted.shares
     if len(slots) != len(shares):
         return ()
@@ -426,73 +397,61 @@ def until(server: Server, end_ns: int) -> tuple[Slot, ...]:
 
 
 def revised(plan: Plan, **changes: object) -> Plan:
-    """A copy of a plan with some fields replaced, checked like any other plan.
-
-    Raises InputError: the fields make no plan together.
-    """
+    """A copy of a plan with some fields replaced, checked. Raises InputError: they make no plan."""
     values = {name: getattr(plan, name) for name in Plan.model_fields}
     with wrong_values_refused(Plan):
         return Plan.model_validate({**values, **changes})
 
 
-# The rules: each yields what is wrong, and where (keys as in the file) ------------------------
-
-_Wrong: TypeAlias = Iterator[tuple[str | int, ...]]
+# The rules: each raises what is wrong, and where (keys as in the file) -------------------------
 
 
-def _cycle(plan: Plan) -> _Wrong:
+def _cycle(plan: Plan) -> None:
     cycle, period, longest = plan.cycle_ns, plan.chain.period_ns, plan.evidence.max_latency_ns
     if cycle % period:
-        yield (
-            f"the cycle {duration_text(cycle)} is no multiple of the chain's period"
-            f" {duration_text(period)}: make it the period, or a whole multiple",
+        raise wrong_value(
+            f"{duration_text(cycle)} is no multiple of the period {duration_text(period)}",
             "cycle",
         )
     if cycle <= longest and plan.policy not in PER_CALLBACK:
-        yield (
-            f"the cycle {duration_text(cycle)} is not longer than the longest latency measured,"
+        raise wrong_value(
+            f"{duration_text(cycle)} is not longer than the longest latency measured,"
             f" {duration_text(longest)}: plan with a longer period or a shorter chain",
             "cycle",
         )
     if plan.policy == "pipelined" and plan.anchor == "cycle":
-        yield (
-            "an output of a pipeline is whole cycles old, and only its stamp says how many: write"
-            " stamp (--anchor)",
-            "anchor",
-        )
+        reason = "an output of a pipeline is whole cycles old, as only its stamp says: write stamp"
+        raise wrong_value(reason, "anchor")
 
 
-def _servers(plan: Plan) -> _Wrong:
+def _servers(plan: Plan) -> None:
     names: set[str] = set()
     homes: dict[Thread, str] = {}
     for place, server in enumerate(plan.servers):
         if server.name in names:
             reason = f"two servers are named {server.name!r}: rename one"
-            yield reason, "servers", place, "name"
+            raise wrong_value(reason, "servers", place, "name")
         names.add(server.name)
         for number, slot in enumerate(server.slots):
             if slot[1] > plan.cycle_ns:
+                cycle = duration_text(plan.cycle_ns)
                 reason = (
-                    f"the slot {slot_text(slot)} ends after the cycle"
-                    f" {duration_text(plan.cycle_ns)}: move it, or split it in two slots"
+                    f"the slot {slot_text(slot)} ends after the cycle {cycle}: move or split it"
                 )
-                yield reason, "servers", place, "slots", number
+                raise wrong_value(reason, "servers", place, "slots", number)
         for number, thread in enumerate(server.threads):
             for taken in filter(thread.overlaps, homes):
-                reason = (
-                    f"{taken.text} is already in server {homes[taken]!r}: a thread belongs to one"
-                    " server, remove it from the other"
-                )
-                yield reason, "servers", place, "threads", number
+                reason = f"{taken.text} is already in server {homes[taken]!r}: write it in one"
+                raise wrong_value(reason, "servers", place, "threads", number)
             homes[thread] = server.name
         for other in plan.servers:
             above = server.best_effort and not other.best_effort and server.core == other.core
             if above and server.priority <= other.priority:
                 reason = f"best effort comes behind all others: write more than {other.priority}"
-                yield reason, "servers", place, "priority"
+                raise wrong_value(reason, "servers", place, "priority")
 
 
-def _overlaps(plan: Plan) -> _Wrong:
+def _overlaps(plan: Plan) -> None:
     """Two servers of one core may overlap only when a priority says who runs, or by turns."""
     if plan.equal_priorities == "round-robin":
         return
@@ -502,14 +461,13 @@ def _overlaps(plan: Plan) -> _Wrong:
         for (number, slot), other in product(enumerate(two.slots), one.slots):
             if slot[0] < other[1] and other[0] < slot[1]:
                 reason = (
-                    f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server"
-                    f" {one.name!r} on core {one.core} at the same priority {one.priority}: move"
-                    " one of them, or give one server another priority"
+                    f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server {one.name!r}"
+                    f" on core {one.core}: move one, or give one server another priority"
                 )
-                yield reason, "servers", place, "slots", number
+                raise wrong_value(reason, "servers", place, "slots", number)
 
 
-def _shaping_nodes(plan: Plan) -> _Wrong:
+def _shaping_nodes(plan: Plan) -> None:
     further = enumerate(plan.further_shaping_nodes)
     first = [] if plan.shaping_node is None else [(("shaping_node",), plan.shaping_node)]
     placed = [*first, *((("further_shaping_nodes", number), node) for number, node in further)]
@@ -517,59 +475,43 @@ def _shaping_nodes(plan: Plan) -> _Wrong:
         others = [other for place, other in placed if place != where]
         server, output = server_of(plan, node.thread), plan.chain.output
         if any(node.name == other.name or node.output == other.output for other in others):
-            yield (
-                f"another shaping node has the name {node.name} or the output {node.output} too:"
-                " both must be its own",
-                *where,
-            )
+            reason = f"another one has the name {node.name} or the output {node.output} too: both"
+            raise wrong_value(f"{reason} must be its own", *where)
         if node is plan.shaping_node and output not in (None, node.output):
-            yield (
-                f"publishes {node.output}, but the chain's output is {output}: make them the same",
-                *(*where, "output"),
-            )
+            reason = f"publishes {node.output}, but the chain's output is {output}"
+            raise wrong_value(f"{reason}: make them the same", *where, "output")
         if server is None:
-            yield (
-                f"no server holds the shaping node's thread: add {{node: {node.thread.node}}} to"
-                " the threads of the server whose slots it publishes in",
-                *(*where, "name"),
+            reason = (
+                f"no server holds its thread: add {{node: {node.thread.node}}} to one's threads"
             )
-        elif server.core != node.core:
-            yield (
-                f"core {node.core}, but its server {server.name!r} is on core {server.core}: make"
-                " them the same",
-                *(*where, "core"),
-            )
+            raise wrong_value(reason, *where, "name")
+        if server.core != node.core:
+            reason = f"{node.core}, but server {server.name!r} is on {server.core}"
+            raise wrong_value(f"{reason}: make them the same", *where, "core")
     if not placed and plan.shaping_thread != "free":
         reason = f"{plan.shaping_thread}, but the plan has no shaping node: remove it"
-        yield reason, "shaping_thread"
+        raise wrong_value(reason, "shaping_thread")
 
 
-def _modes(plan: Plan) -> _Wrong:
+def _modes(plan: Plan) -> None:
     if plan.modes is None:
         return
     if plan.shaping_node is None:
-        yield (
-            "only a shaping node knows the mode of the system, and the plan has no `shaping_node`:"
-            " remove the modes, or plan with synchronous publication",
-            "modes",
+        reason = (
+            "only a shaping node knows the mode of the system, and the plan has none: plan with"
         )
-    elif plan.modes.topic in (plan.shaping_node.input, plan.shaping_node.output):
-        yield (
-            f"{plan.modes.topic} carries the chain's output: name the topic on which the mode is"
-            " published",
-            *("modes", "topic"),
-        )
+        raise wrong_value(f"{reason} synchronous publication, or without modes", "modes")
+    if plan.modes.topic in (plan.shaping_node.input, plan.shaping_node.output):
+        reason = f"{plan.modes.topic} carries the chain's output: name that of the mode"
+        raise wrong_value(reason, "modes", "topic")
     slots = len(publish_slots(plan))
     for mode, band in plan.modes.bands.items():
         if band > slots:
-            yield (
-                f"the band {band}, but the shaping node publishes in {slots} slots: write a number"
-                f" from 1 to {slots}, or add a slot",
-                *("modes", "bands", mode),
-            )
+            reason = f"{band}, but there are {slots} slots: write from 1 to {slots}, or add a slot"
+            raise wrong_value(reason, "modes", "bands", mode)
 
 
-def _publisher_threads(plan: Plan) -> _Wrong:
+def _publisher_threads(plan: Plan) -> None:
     """A gated asynchronous publisher must not stop, or be stopped by, its process."""
     measured, depth = plan.evidence.longest_send_ns, plan.chain.output_depth
     shortest = max(SHORTEST_SLOT_NS, SENDS_PER_SLOT * (measured or 0))
@@ -578,58 +520,51 @@ def _publisher_threads(plan: Plan) -> _Wrong:
             if slot[1] - slot[0] < shortest:
                 took = f" (the longest took {duration_text(measured)})" if measured else ""
                 reason = (
-                    f"the slot {slot_text(slot)} is too short for an asynchronous publisher:"
-                    f" stopped in the midst of a send{took}, its thread would block the whole"
-                    f" process; make it {duration_text(shortest)} or longer (--publish-slot)"
+                    f"the slot {slot_text(slot)} is too short for a publisher's thread: stopped in"
+                    f" a send{took}, it would block the whole process; make it"
+                    f" {duration_text(shortest)} or longer (--publish-slot)"
                 )
-                yield reason, "servers", place, "slots", number
+                raise wrong_value(reason, "servers", place, "slots", number)
         for node, other in product(nodes, plan.servers):
             for slot in _out_ranked(plan, server, node, other):
                 reason = (
                     f"the publisher thread of {node} would out-rank its executor, which server"
-                    f" {other.name!r} runs at priority {other.priority} on the same core in"
-                    f" {slot_text(slot)}: spinning for a lock that the executor holds, it would"
-                    f" never let it go on; write a number above {other.priority}, or move the slot"
-                    " behind the executor's"
+                    f" {other.name!r} runs at priority {other.priority} in {slot_text(slot)}, and"
+                    f" spin for its lock: write a number above {other.priority}, or move the slot"
                 )
-                yield reason, "servers", place, "priority"
+                raise wrong_value(reason, "servers", place, "priority")
         if plan.overrun == "publish" and plan.policy not in ("shaped", "one-long-slot"):
-            yield (
-                f"under {plan.policy} an output of an asynchronous publisher that comes in its own"
-                " cycle looks like an overrun of the one before: write wait or discard, or plan"
-                " with --publication synchronous",
+            raise wrong_value(
+                f"under {plan.policy} an asynchronous output in its own cycle looks like an"
+                " overrun: write wait or discard, or plan with --publication synchronous",
                 "overrun",
             )
         waiting = messages_waiting(plan, server)
         if depth is not None and plan.chain.publisher in nodes and depth < waiting:
-            yield (
-                f"a history of {depth} is too shallow: while the publisher's thread may not run,"
-                f" {waiting} messages are handed over, and the oldest would be lost; give"
-                f" {plan.chain.output or 'the output'} a depth of {waiting + 1}, or the server"
-                f" {server.name!r} more slots",
+            raise wrong_value(
+                f"a history of {depth} is too shallow for the {waiting} messages that come while"
+                f" the thread may not run: give {plan.chain.output or 'the output'} a depth of"
+                f" {waiting + 1}, or the server {server.name!r} more slots",
                 *("chain", "output_depth"),
             )
 
 
-def _entry(plan: Plan) -> _Wrong:
+def _entry(plan: Plan) -> None:
     gated = any(publisher_servers(plan))
     if plan.into_open_slot == "next-slot" and (gated or plan.policy != "shaped"):
-        yield (
-            "only a shaping node sees when an output comes, and only the policy shaped has slots"
-            f" for it, not {'a gated publisher' if gated else plan.policy}: write at-once",
+        raise wrong_value(
+            "only a shaping node sees when an output comes, under the policy shaped, not"
+            f" {'a gated publisher' if gated else plan.policy}: write at-once",
             "into_open_slot",
         )
 
 
-def _adaptation(plan: Plan) -> _Wrong:
+def _adaptation(plan: Plan) -> None:
     latest = None if plan.adaptation is None else plan.adaptation.max_latency_ns
     for slot in publish_slots(plan)[-1:]:
         if latest is not None and slot[1] > latest:
-            yield (
-                f"{duration_text(latest)}, but the slot {slot_text(slot)} ends behind it: write"
-                " more, or plan a shorter latency",
-                *("adaptation", "max_latency"),
-            )
+            reason = f"{duration_text(latest)}, but the slot {slot_text(slot)} ends behind it"
+            raise wrong_value(f"{reason}: write more", "adaptation", "max_latency")
 
 
 def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Slot]:
@@ -649,17 +584,14 @@ def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Sl
 def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:
     """The servers, with those of publishers' threads ranked below what may run at the same time."""
     publishing = [s for s in servers if any(t.role == "publisher" for t in s.threads)]
-    ranked = []
-    for server in servers:
-        below = [
-            other.priority + 1
-            for other in servers
-            if server in publishing and other not in publishing
-            if other.core == server.core and other.slots[-1][1] > server.slots[0][0]
-        ]
-        priority = max([server.priority, *below])
-        ranked.append(server.model_copy(update={"priority": priority}))
-    return tuple(ranked)
+    executors = [server for server in servers if server not in publishing]
+
+    def priority(server: Server) -> int:
+        others = (one for one in executors if server in publishing and one.core == server.core)
+        below = (one.priority + 1 for one in others if one.slots[-1][1] > server.slots[0][0])
+        return max([server.priority, *below])
+
+    return tuple(one.model_copy(update={"priority": priority(one)}) for one in servers)
 
 
 def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
@@ -671,10 +603,8 @@ def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
 
 
 def messages_waiting(plan: Plan, server: Server) -> int:
-    """How many messages may be handed over while a server is closed, in one stretch: one per period
-    of the chain, and one more for where the stretch begins.
-    """
-    (first, _), (_, last) = server.slots[0], server.slots[-1]
-    closed = [after[0] - before[1] for before, after in pairwise(server.slots)]
-    longest = max([*closed, plan.cycle_ns + first - last])
-    return longest // plan.chain.period_ns + 1
+    """How many messages may be handed over while a server is closed, in one stretch."""
+    first, *_ = server.slots
+    again = (first[0] + plan.cycle_ns, first[1])
+    longest = max(after[0] - before[1] for before, after in pairwise([*server.slots, again]))
+    return longest // plan.chain.period_ns + 1  # one where the stretch begins

@@ -48,11 +48,7 @@ _SECTION_COMMENTS = {
 
 
 def load_plan(path: str | Path) -> Plan:
-    """Read a plan, however a person has laid it out.
-
-    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
-    reason and remedy.
-    """
+    """Read a plan, however a person has laid it out. Raises: as :func:`.read_model`."""
     several = ("chains", _OfSeveralChains)
     return read_model(path, Plan, made_by="written by `chainshaper plan`", otherwise=several)
 
@@ -138,28 +134,26 @@ _Dumper.add_representer(
 )
 
 
-def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write a plan, whole or not at all.
+def save_plan(plan: Plan | ApplicationPlan, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a plan, whole or not at all; an application's of one chain as that chain's.
 
     Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
     OperationError: it cannot be written; nothing is left behind, an existing file stays.
     """
-    write_plans([plan], path, overwrite=overwrite)
-
-
-def write_plans(plans: Sequence[Plan], path: str | Path, *, overwrite: bool) -> None:
-    """Write plans into one file. Raises: as :func:`save_plan`."""
     path = Path(path)
     if not (overwrite and path.is_file()):
         new_file(path)
+    plans = [plan] if isinstance(plan, Plan) else plan.chains
     write_whole(path, [plans_as_text(plans).encode()])
 
 
-def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
-    """Write the plans of several chains into a new folder, each named after its output.
+save_application_plan = save_plan
 
-    Raises InputError: ``folder`` exists, or what it stands in does not. OperationError: they cannot
-    be written; nothing is left behind.
+
+def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
+    """Write the plans of several chains into a new folder, each named after its output, or none.
+
+    Raises: as :func:`save_plan`.
     """
     folder = new_file(folder)
     try:
@@ -195,11 +189,7 @@ def plan_json(plan: Plan) -> dict[str, Any]:
 
 
 def load_application_plan(path: str | Path) -> ApplicationPlan:
-    """Read a plan for an application, or for one chain (format 1), however it is laid out.
-
-    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
-    reason and remedy.
-    """
+    """Read a plan for an application, or for one chain. Raises: as :func:`.read_model`."""
     made_by = "written by `chainshaper plan`"
     return whole(read_model(path, Plan, made_by=made_by, otherwise=("chains", ApplicationPlan)))
 
@@ -214,13 +204,3 @@ def plan_in(values: Mapping[str, Any]) -> ApplicationPlan:
 def plan_values(plan: ApplicationPlan) -> dict[str, Any]:
     """What a recording or a run has of a plan: plain data, as :func:`plan_in` reads it."""
     return (plan.chains[0] if len(plan.chains) == 1 else plan).model_dump(mode="json")
-
-
-def save_application_plan(
-    plan: ApplicationPlan, path: str | Path, *, overwrite: bool = False
-) -> None:
-    """Write a plan, whole or not at all; one chain is written as its own plan.
-
-    Raises: as :func:`save_plan`.
-    """
-    write_plans(plan.chains, path, overwrite=overwrite)

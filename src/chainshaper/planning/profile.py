@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from chainshaper.planning.margins import check_latencies
 from chainshaper.planning.plan import SHORTEST_SLOT_NS
 from chainshaper.planning.shaping import CallbackTimes
-from chainshaper.values.durations import format_duration
+from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Wishes
 
@@ -48,22 +48,18 @@ class Profile:
     ``latencies_ns`` are those of undisturbed cycles (where ``all_disturbed``, of all),
     ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time;
     ``starts_ns`` is when each of the former began in the recording (None: a period apart).
-    ``nodes`` are those of the chain's callbacks, one per callback, ``topics`` what each of these
-    publishes for the chain. ``core_of`` names the core of every node whose executor takes part,
-    also on branches that the chain waits for, ``cores`` that of any node that has one core; where a
-    node has several executors that run different callbacks, ``executors`` are those that take part,
-    each by its callbacks. ``begins`` is the first callback's number in the graph, and its name,
-    ``upstream`` the topics that the output waits for: on the chain, on those branches, and before
-    the chain begins. ``receivers`` are the nodes that subscribe to the chain's output and are none
-    of these. ``callbacks`` are those of the chain and its branches, see
+    ``nodes`` and ``topics`` have the node and the topic of each callback of the chain. ``core_of``
+    names the core of every node whose executor takes part, also on branches that the chain waits
+    for, ``cores`` that of any node that has one core; of a node with several executors,
+    ``executors`` are those that take part, each by its callbacks. ``begins`` is the first
+    callback's number in the graph, and its name, ``upstream`` the topics that the output waits for:
+    on the chain, on those branches, and before the chain begins. ``receivers`` are other nodes that
+    subscribe to the output. ``callbacks`` are those of the chain and its branches, see
     :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
-    are what each callback of the chain took, a row per latency, see
-    :mod:`~chainshaper.planning.pipeline`. ``output_depth`` is the history of the output's writer,
-    ``asynchronous`` whether its process has a thread that publishes (None: not known),
-    ``intra_process`` whether subscribers of the output get it without DDS, ``together``
-    are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
-    ``of_modes`` has what was measured in each mode of the system. The rest is
-    :class:`~chainshaper.planning.plan.Evidence`.
+    are what each callback of the chain took, a row per latency. ``asynchronous``: the process of
+    the output's writer has a thread that publishes; ``together`` are nodes that share a process,
+    ``simulated`` nodes of the chain that follow `/clock`. The rest is
+    :class:`~chainshaper.planning.plan.Evidence`, and :class:`~.plan.ChainOfPlan`.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -107,6 +103,11 @@ class Profile:
         return self.spec or "..".join(self.topics)
 
     @property
+    def last(self) -> str | None:
+        """The node of the last callback, which publishes the output."""
+        return self.nodes[-1] if self.nodes else None
+
+    @property
     def every(self) -> NDArray[np.int64]:
         """The latencies of all cycles."""
         every = self.every_latency_ns
@@ -134,10 +135,7 @@ class Profile:
 
 
 def up_to(profile: Profile, percentile: float) -> Profile:
-    """The profile up to a percentile of its latencies: what takes longer is taken to be late.
-
-    Raises InputError: no percentile.
-    """
+    """The profile up to a percentile of its latencies: what takes longer is taken to be late."""
     if not 0 < percentile <= 100:
         raise InputError(f"--percentile {percentile:g}: write more than 0, at most 100")
     latencies = profile.latencies_ns
@@ -149,8 +147,7 @@ def up_to(profile: Profile, percentile: float) -> Profile:
 def deciding_cycles(profile: Profile) -> str | None:
     """Which few cycles decide the longest latency, the likely cause, and what leaves them out.
 
-    They are 1 % of all at most, and all of them :data:`APART` times as long as the next longest
-    (None: there are none such).
+    They are 1 % of all at most, and :data:`APART` times as long as the next longest.
     """
     latencies, starts = profile.latencies_ns, profile.starts
     order = np.argsort(latencies, kind="stable")[::-1]
@@ -167,7 +164,9 @@ def deciding_cycles(profile: Profile) -> str | None:
     if len(profile.steps_ns) == latencies.size and profile.nodes:
         longer = profile.steps_ns[few[0]] - np.median(profile.steps_ns, axis=0)
         worst = int(np.argmax(longer))
-        where = f", {_brief(longer[worst])} of it more than usual at {profile.nodes[worst]}"
+        where = (
+            f", {milliseconds(longer[worst], 1)} ms of it more than usual at {profile.nodes[worst]}"
+        )
     if last < START_UP_NS:
         cause = "it is the start-up (first instances, discovery)"
         remedy = f"--skip {format_duration((last // 1_000_000_000 + 1) * 1_000_000_000)}"
@@ -178,15 +177,12 @@ def deciding_cycles(profile: Profile) -> str | None:
         cause = "the application's own" if watched else "a stall of the machine (not watched)"
         remedy = f"--percentile {math.floor(1000 * (1 - number / latencies.size)) / 10:g}"
     cycles = ", ".join(f"{start / 1e9:.1f} s" for start in starts[few[:3]])
+    longest, beyond = milliseconds(int(latencies[few[0]]), 1), milliseconds(next_longest, 1)
     return (
         f"{number} of {latencies.size} cycles decide{'s' * (number == 1)} the longest latency, at"
-        f" {cycles}{', …' * (number > 3)}: {_brief(int(latencies[few[0]]))}{where}; the next"
-        f" longest takes {_brief(next_longest)}. Likely {cause}: leave it out with {remedy}"
+        f" {cycles}{', …' * (number > 3)}: {longest} ms{where}; the next longest takes {beyond} ms."
+        f" Likely {cause}: leave it out with {remedy}"
     )
-
-
-def _brief(nanoseconds: float) -> str:
-    return f"{nanoseconds / 1e6:.1f} ms"
 
 
 class Rival(NamedTuple):
@@ -198,11 +194,10 @@ class Rival(NamedTuple):
 
 
 def interference(own_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
-    """How long rivals can delay what takes ``own_ns`` alone (ns); what reaches ``limit_ns`` ends
-    the search.
+    """How long rivals can delay what takes ``own_ns`` alone, as far as ``limit_ns`` (ns).
 
-        >>> interference(5, [Rival(10, 2), Rival(7, 1)], 100)  # both once more in 5 + 2 + 1 > 7
-        4
+    >>> interference(5, [Rival(10, 2), Rival(7, 1)], 100)  # both once more in 5 + 2 + 1 > 7
+    4
     """
     delay = 0
     while own_ns + delay < limit_ns:
@@ -228,17 +223,17 @@ def with_interference(
     """
     if len(profiles) == 1 or wishes.policy not in _ADDED_UP:
         return list(profiles)
-    alone = [_alone(profile) for profile in profiles]
-    delayed = list(alone)
+    undelayed = [alone(profile) for profile in profiles]
+    delayed = list(undelayed)
     gates = wishes.policy != "server-per-chain" and wishes.publication != "asynchronous"
     better: list[list[Profile]] = []  # the chains of each group so far
     for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):
         for k in group:
-            one, siblings = alone[k], [alone[j] for j in group if j != k]
+            one, siblings = undelayed[k], [undelayed[j] for j in group if j != k]
             forked = {*_stages([one])} - {*_stages(siblings)}  # none of these before the fork
             rivals = [Rival(one.period_ns, _demand(one, siblings, forked))]
             rivals += [_group(one, chains) for chains in better if at_once]
-            for place, other in enumerate(alone):
+            for place, other in enumerate(undelayed):
                 cores = _cores(one, forked if place in group else _stages([one]))
                 if gates and place != k and other.core_of.get(other.nodes[-1]) in cores:
                     rivals.append(_gate(other, wishes.spin_ns))
@@ -248,7 +243,7 @@ def with_interference(
     return delayed
 
 
-def _alone(profile: Profile) -> Profile:
+def alone(profile: Profile) -> Profile:
     """The profile with what its callbacks took, in sum; bare latencies as they are."""
     if not profile.steps_ns.size:
         return profile
@@ -256,7 +251,7 @@ def _alone(profile: Profile) -> Profile:
         profile,
         latencies_ns=profile.steps_ns.sum(axis=1),
         every_latency_ns=profile.every_step_ns.sum(axis=1),
-        of_modes={mode: _alone(one) for mode, one in profile.of_modes.items()},
+        of_modes={mode: alone(one) for mode, one in profile.of_modes.items()},
     )
 
 

@@ -1,8 +1,5 @@
 """From what was measured of a chain, and what is wished, to its plan of any policy.
 
-A :class:`Profile` may come from a recording or consist of bare latencies and a period; a policy
-that needs more says so.
-
 Further outputs of a chain's graph can be planned with it (``sinks``); several chains, of equal
 standing, are planned by :mod:`chainshaper.planning.several_chains`. A plan is made from latencies
 that were measured while nothing was shaped: shaping a topic that another chain's output waits for
@@ -25,7 +22,7 @@ from chainshaper.planning.bands import (
     with_long_slot,
     with_publish_slots,
 )
-from chainshaper.planning.cores import Work, assign_cores
+from chainshaper.planning.cores import assign_cores
 from chainshaper.planning.margins import (
     EPSILON_NS,
     MOST_PROBABLE,
@@ -51,7 +48,13 @@ from chainshaper.planning.plan import (
     Slot,
     revised,
 )
-from chainshaper.planning.profile import Profile, deciding_cycles, up_to, with_interference
+from chainshaper.planning.profile import (
+    Profile,
+    alone,
+    deciding_cycles,
+    up_to,
+    with_interference,
+)
 from chainshaper.planning.shaping import (
     evidence_of,
     let_per_callback,
@@ -97,8 +100,8 @@ def plan_chain(
 
     ``sinks`` are profiles of further outputs of the same graph, each of which is shaped too.
 
-    Raises InputError: wishes that exclude each other, or a policy that needs more than the profile
-    has. OperationError: no such plan exists; the message names what prevents it. PlatformError: a
+    Raises InputError: wishes that exclude each other, or need more than was measured.
+    OperationError: no such plan exists; the message names what prevents it. PlatformError: a
     library that only this request needs is not installed.
     """
     try:
@@ -112,18 +115,15 @@ def plan_chain(
 
 def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]) -> Plan:
     refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
+    every: Sequence[Profile] = (profile, *sinks)
     if request.percentile is not None:
-        profile, *sinks = (up_to(one, request.percentile) for one in (profile, *sinks))
-    if request.policy == "pipelined":
-        profile = _apart(profile)
-    else:
-        (profile, *sinks), _ = on_cores((profile, *sinks), request)
-    refuse_entangled((profile, *sinks), request.policy, sinks=True)
-    refuse_simulated((profile, *sinks), request)
-    every, together = (profile, *sinks), [range(1 + len(sinks))]
-    profile, *sinks = with_interference(every, together, request, at_once=False)
-    if any(sink.all_disturbed for sink in sinks) or profile.all_disturbed:
-        profile, sinks = _covered(profile, request), [_covered(sink, request) for sink in sinks]
+        every = [up_to(one, request.percentile) for one in every]
+    every = [_apart(one) for one in every] if request.policy == "pipelined" else every
+    every, _ = on_cores(every, request)
+    refuse_entangled(every, request.policy, sinks=True)
+    refuse_simulated(every, request)
+    every = with_interference(every, [range(len(every))], request, at_once=False)
+    profile, *sinks = (_covered(one, request) for one in every)
     if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":
         profile, margin, modes, finish = _together(profile, request, modes)
     else:
@@ -132,9 +132,8 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
         raise OperationError(
-            f"the longest latency {duration_text(longest)} is not shorter than the period"
-            f" {duration_text(period)}, in which LET per chain has to be done: plan LET per"
-            " callback, or a longer period"
+            f"LET per chain has to be done in the period {duration_text(period)}, and the longest"
+            f" latency is {duration_text(longest)}: plan LET per callback, or a longer period"
         )
     measured = profile
     if request.policy in OWN_SLOTS:  # shaping, only the start of the plan, must fit into a cycle
@@ -152,15 +151,13 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
             plan,
             sink.latencies_ns,
             sink.topics[-1],
-            publisher=sink.nodes[-1] if sink.nodes else None,
+            publisher=sink.last,
             receivers=sink.receivers if request.with_receivers else (),
         )
-    alone = plan.shaping_node is None or plan.shaping_node.in_process
-    if request.fallback != _STANDARD.fallback and alone:
-        raise InputError(
-            f"--fallback {request.fallback} is for a shaping node that is a process, and the"
-            " plan has none: leave it out, or plan with --publication synchronous"
-        )
+    no_process = plan.shaping_node is None or plan.shaping_node.in_process
+    if request.fallback != _STANDARD.fallback and no_process:
+        reason = f"--fallback {request.fallback} is for a shaping node that is a process"
+        raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
     plan = with_executors(plan, [one.executors for one in (profile, *sinks)])
     plan = with_turns(revised(plan, modes=modes), request.equal_priorities)
     return with_best_effort([plan], best_effort_cores([profile], request))[0]
@@ -168,23 +165,19 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
 
 def _apart(profile: Profile) -> Profile:
     """The profile of a chain whose instances do not overlap: what its callbacks took, in sum."""
-    steps, every, name = profile.steps_ns, profile.every_step_ns, profile.name or "a chain"
-    if not steps.size:
+    name = profile.name or "a chain"
+    if not profile.steps_ns.size:
         raise InputError(f"{name}: stages are cut by what callbacks took: plan from a recording")
     if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
-        raise InputError(
-            f"{name} waits for {', '.join(beside)} beside it, which would begin while the instance"
-            " before is in that stage, and delay it: begin the chain behind what waits for them"
-        )
-    return replace(profile, latencies_ns=steps.sum(axis=1), every_latency_ns=every.sum(axis=1))
+        reason = f"{name} waits for {', '.join(beside)} beside it, which would begin too early"
+        raise InputError(f"{reason}: begin the chain behind what waits for them")
+    return alone(profile)
 
 
 def best_effort_cores(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
     """The core of each node that is best effort: its own, if it has one, or the first chain's."""
     cores = {node: core for one in profiles for node, core in one.cores.items()}
-    chain = profiles[0].core_of.get(
-        profiles[0].nodes[-1] if profiles[0].nodes else "", DEFAULT_CORE
-    )
+    chain = profiles[0].core_of.get(profiles[0].last or "", DEFAULT_CORE)
     names = ["/" + name.strip("/") for name in request.best_effort]
     return {name: cores.get(name, chain) for name in names}
 
@@ -196,31 +189,23 @@ def cores_for(
     worth: float = 0.0,
 ) -> dict[str, int]:
     """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`
-    and, for stages, :func:`.stage_cores`.
-
-    Raises InputError: a profile has no callbacks, being bare latencies.
+    and, for stages, :func:`.stage_cores`. Raises InputError: a profile is bare latencies.
     """
-    if bare := [profile.name for profile in profiles if not profile.callbacks]:
-        raise InputError(
-            f"--cores distributes callbacks, and latencies do not tell those of {bare[0]}: plan"
-            " from a recording"
-        )
+    for profile in profiles:
+        if not profile.callbacks:
+            reason = f"--cores distributes callbacks, and latencies do not say {profile.name}'s"
+            raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
         staged = (stage_cores(p.nodes, _apart(p).steps_ns, p.period_ns, cores) for p in profiles)
         return {node: core for own in staged for node, core in own.items()}
     margin = EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
-    work = [Work((p.begins, p.period_ns), p.period_ns, p.callbacks, margin) for p in profiles]
-    together = [group for profile in profiles for group in profile.together]
-    return assign_cores(work, cores, together=together, worth=worth)
+    return assign_cores(profiles, cores, margin_ns=margin, worth=worth)
 
 
 def on_cores(
     profiles: Sequence[Profile], request: PlanRequest
 ) -> tuple[tuple[Profile, ...], list[str]]:
-    """The profiles with their executors on the wished cores, and whose latency is another there.
-
-    Raises: as :func:`cores_for`.
-    """
+    """The profiles with their executors on the wished cores, and whose latency is another there."""
     if request.cores is None or request.policy == "pipelined":  # there, stages get them
         return tuple(profiles), []
     core_of, moved, doubts = cores_for(profiles, request.cores, request), [], []
@@ -229,9 +214,9 @@ def on_cores(
         homes = {(own[node], core) for node, core in one.core_of.items()}
         if not len(homes) == len(set(own.values())) == len(set(one.core_of.values())):
             doubts.append(
-                f"{one.name} was measured with its executors distributed over cores in another way"
-                " than planned, which is another latency: measure it so (`chainshaper profile"
-                f" --cores {','.join(map(str, request.cores))}`)"
+                f"{one.name} was measured with its executors on cores in another way than planned,"
+                " which is another latency: measure it so (`chainshaper profile --cores"
+                f" {','.join(map(str, request.cores))}`)"
             )
         callbacks = tuple(replace(each, core=core_of[each.node]) for each in one.callbacks)
         moved.append(replace(one, core_of=own, callbacks=callbacks))
@@ -255,8 +240,7 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
     if request.ideal_machine:
         raise OperationError(
             f"{profile.recording or profile.name}: the machine disturbed every cycle of"
-            f" {profile.name}, but one at most, too few to plan an ideal machine from: leave out"
-            " --ideal-machine, or record again on a calmer one"
+            f" {profile.name}, but one at most: leave out --ideal-machine, or record again"
         )
     share = request.overrun_probability or OVERRUN_PROBABILITY
     latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
@@ -272,10 +256,8 @@ def _latest(profile: Profile, request: PlanRequest) -> int:
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
-    """Δ, long enough for a publication (eq. 2 and 4): given, or as long as the longest measured.
-
-    It is 1 ms at least, which moves no output, and which a machine that stalls needs; several times
-    as long as a send of an asynchronous publisher, whose thread must not be stopped in one.
+    """Δ, long enough for a publication (eq. 2 and 4): given, or as long as the longest measured,
+    1 ms at least; several sends of an asynchronous publisher, whose thread must not stop in one.
     """
     if request.publish_slot_ns is not None:
         return request.publish_slot_ns
@@ -290,10 +272,8 @@ def place_modes(
     starts_ns: Mapping[str, int], length_ns: int, given: Mapping[str, int] | None = None
 ) -> tuple[dict[str, int], tuple[Slot, ...]]:
     """The band of each mode, and the slots: each behind the one before, when all outputs of its
-    modes may leave (with L̄ and ε of the cycles that began in a mode, from L̄ + ε on: eq. 1 for
-    each mode by itself). Unless bands are ``given``, slots that would overlap are one.
-
-    Raises InputError: of the bands given, one is no mode's.
+    modes may leave (from L̄ + ε of the cycles that began in a mode on: eq. 1 for each by itself).
+    Unless bands are ``given``, slots that would overlap are one.
     """
     first, band, bands = 0, 0, dict(given or {})
     for mode in () if given else sorted(starts_ns, key=starts_ns.__getitem__):
@@ -303,10 +283,7 @@ def place_modes(
     slots: list[Slot] = []
     for band in range(1, max(bands.values()) + 1):
         if band not in bands.values():
-            raise InputError(
-                f"no mode has the band {band}, so no latencies say where its slot is: number the"
-                " modes' bands from 1 on, or leave out the numbers"
-            )
+            raise InputError(f"no mode has the band {band}: number them from 1 on, or leave it out")
         own = (start for mode, start in starts_ns.items() if bands[mode] == band)
         start = max(*own, slots[-1][1] if slots else 0)
         slots.append((start, start + length_ns))
@@ -372,24 +349,21 @@ def _together(
 def _shaped(
     profile: Profile, request: PlanRequest, margin: Margin, sinks: Sequence[Profile]
 ) -> Plan:
-    last = profile.nodes[-1] if profile.nodes else None
+    last = profile.last
     values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
     if request.publication == "asynchronous":
         if profile.asynchronous is False:
             raise InputError(
-                f"{last} has no thread that publishes for it, so {profile.name} cannot be shaped by"
-                " gating one: let it publish asynchronously (rmw_fastrtps_cpp, with"
-                " RMW_FASTRTPS_PUBLICATION_MODE=ASYNCHRONOUS) and record again, or plan with"
-                " --publication synchronous"
+                f"{last} has no thread that publishes for it: plan with --publication synchronous,"
+                " or record with rmw_fastrtps_cpp, RMW_FASTRTPS_PUBLICATION_MODE=ASYNCHRONOUS"
             )
         values["output_depth"] = profile.output_depth
     if request.publication == "in-process" and profile.intra_process:
-        raise InputError(
-            f"subscribers of {profile.topics[-1]} get its messages inside the process of {last},"
-            " without DDS, and a gate before DDS would not see these: switch intra-process"
-            " communication off for it, or plan with --publication synchronous and splice with"
-            " --node component"
+        reason = (
+            f"subscribers of {profile.topics[-1]} get its messages inside the process of {last}"
         )
+        remedy = "switch that off, or plan with --publication synchronous and --node component"
+        raise InputError(f"{reason}, where no gate before DDS sees them: {remedy}")
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it
     length = _slot_ns(profile, request)
@@ -435,11 +409,9 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
         raise InputError(f"an overrun probability of {probability}: write one between 0 and 1")
     if probability is not None and probability < MOST_PROBABLE:
         return derive_margin(covered, probability, request.seed, longest_ns=longest)
-    if probability is not None and covered.size < cycles_needed(probability):
-        raise OperationError(
-            f"{covered.size} cycles are too few for an overrun probability of {probability:g}:"
-            f" measure {cycles_needed(probability)} or more"
-        )
+    if probability is not None and covered.size < (needed := cycles_needed(probability)):
+        reason = f"{covered.size} cycles are too few for an overrun probability of {probability:g}"
+        raise OperationError(f"{reason}: measure {needed} or more")
     stalls = 0
     shown_late = request.percentile is not None  # what takes longer has been left out
     if not shown_late and (request.policy not in OWN_SLOTS or request.policy == "pipelined"):
@@ -467,10 +439,8 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     if request.policy in ("server-per-chain", "let-per-chain"):
         return (server_per_chain if request.policy in UNSHAPED else let_per_chain)(plan)
     if not profile.callbacks or not profile.topics:
-        raise InputError(
-            f"the policy {request.policy} needs the chain's callbacks, which latencies do not tell:"
-            " plan from a recording"
-        )
+        reason = f"the policy {request.policy} needs the chain's callbacks"
+        raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
         steps, every = profile.steps_ns, profile.every_step_ns
         if profile.all_disturbed:
@@ -485,15 +455,11 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
     """Refuse wishes that nothing fulfils, with further ``sinks``, and ``modes`` measured or not."""
     if request.bands_of_modes == "found" and not (modes and request.policy == "shaped"):
         raise InputError(
-            "nothing says which mode was in force while latencies were measured, so none has a"
-            " slot that can be found: give the modes' own profiles (--mode-profile MODE=REC),"
-            " or record an application whose description `announces` them"
+            "nothing says which mode was in force while latencies were measured: give the modes'"
+            " own profiles (--mode-profile MODE=REC), or describe what `announces` them"
         )
     if request.epsilon_ns is not None and request.overrun_probability is not None:
-        raise InputError(
-            "the margin is either given or covers a share of the cycles: leave out --epsilon or the"
-            " overrun probability"
-        )
+        raise InputError("the margin is either given or covers a share: leave out one of both")
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
     cores = request.cores or ()
@@ -531,9 +497,7 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
         if on_the_way and policy not in UNSHAPED:
             raise InputError(
                 f"{waiting.name} waits for {', '.join(on_the_way)}, which the plan for"
-                f" {shaped.name} publishes later than it was measured: {waiting.name} would miss"
-                f" its own slot. Plan {waiting.name} alone, whose output is constant then, or"
-                f" {shaped.name} alone"
+                f" {shaped.name} publishes later than it was measured: plan one of the two alone"
             )
     for one, two in combinations(profiles, 2):
         if one.begins is None or two.begins is None or one.begins == two.begins:
@@ -543,21 +507,19 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
         )
         if sinks:
             raise InputError(
-                f"{begin}: the slots of a sink count from the beginning of the chain. Name"
-                " a sink behind the same first callback, or plan one of the two alone"
+                f"{begin}, and slots of a sink count from the beginning of the chain: name one"
+                " behind the same first callback, or plan one of the two alone"
             )
         if common := sorted(_waited_for(one, two) | _waited_for(two, one)):
             raise InputError(
-                f"{begin}, and both need {', '.join(common)}: neither's cycles can start at another"
-                " instant without the other's. Begin both at the callback that all of it comes"
-                " from, or plan one of the two alone"
+                f"{begin}, and both need {', '.join(common)}: neither's cycles can start without"
+                " the other's. Begin both where all of it comes from, or plan one of the two alone"
             )
     for one, two in combinations(profiles, 2):
         if sinks and one.period_ns != two.period_ns:
             raise InputError(
                 f"{two.name} has the period {duration_text(two.period_ns)}, {one.name}"
-                f" {duration_text(one.period_ns)}: a plan has one cycle. Plan one of the two"
-                " alone"
+                f" {duration_text(one.period_ns)}: plan one of the two alone"
             )
 
 
@@ -571,9 +533,8 @@ def refuse_simulated(profiles: Sequence[Profile], request: PlanRequest) -> None:
 def simulated_stamps(node: str) -> str:
     """Why no slot counts from the stamps of a node that follows `/clock`, and what to do."""
     return (
-        f"{node} follows /clock (use_sim_time): its stamps are of simulated time, from which no"
-        " slot can count. Start it with use_sim_time:=false; or, where /clock runs at the speed of"
-        " time, plan with --anchor cycle"
+        f"{node} follows /clock (use_sim_time): its stamps are of simulated time. Start it with"
+        " use_sim_time:=false; or, where /clock is as fast as time, plan with --anchor cycle"
     )
 
 

@@ -8,9 +8,6 @@ what they share is then made one:
 * chains of different beginnings that pass the same node take turns on its thread;
 * chains that share no more than a core take turns on it, or run at the same time at priorities of
   their own (:func:`~chainshaper.planning.offsets.place_chains`).
-
-What a chain's output waits for must not be shaped by another: it would come later than was measured
-and is refused.
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,7 +21,6 @@ from chainshaper.planning.plan import (
     Plan,
     Prediction,
     Server,
-    Slot,
     publishing_servers,
     revised,
     with_slots,
@@ -38,7 +34,7 @@ from chainshaper.planning.request import (
     refuse_entangled,
     refuse_simulated,
 )
-from chainshaper.planning.shaping import with_best_effort
+from chainshaper.planning.shaping import behind_others, with_best_effort
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 
@@ -56,8 +52,7 @@ def plan_application(
 
     A chain that is added to others moves their outputs by what it can delay them, once.
 
-    Raises: as :func:`.plan_chain` and :func:`.place_chains`. OperationError names the core, the
-        chains and by how much they do not fit, and what would.
+    Raises: as :func:`.plan_chain` and :func:`.place_chains`; OperationError names what would fit.
     """
     if not profiles:
         raise InputError("no chain is named: give one at least")
@@ -79,10 +74,7 @@ def plan_application(
 
 
 def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
-    """The plans, in which a server that has the name of another one before it has one of its own.
-
-    Plans that were made one by one all have a server ``chain``, and an ``output``.
-    """
+    """The plans, whose servers have names of their own: each had a ``chain``, and an ``output``."""
     known, renamed = dict[str, Server](), []
     for place, plan in enumerate(plans, start=1):
         servers = []
@@ -123,7 +115,7 @@ def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequ
     try:
         return plan_chain(profile, request)
     except OperationError as error:
-        core = profile.core_of.get(profile.nodes[-1]) if profile.nodes else None
+        core = profile.core_of.get(profile.last or "")
         others = [one.name for one in every if one is not profile and core in one.core_of.values()]
         if core is None or not profile.interference_ns:
             raise
@@ -147,28 +139,23 @@ def _sharing_servers(plans: list[Plan]) -> list[Plan]:
     if len(plans) == 1:
         return plans
     if plans[0].policy not in _SHARING:
-        raise InputError(
-            f"{' and '.join(map(chain_name, plans))} begin at the same callback, and such chains"
-            f" are shaped, not planned as {plans[0].policy}: plan them one by one"
-        )
+        names = " and ".join(map(chain_name, plans))
+        reason = f"{names} begin at the same callback, and are not planned as {plans[0].policy}"
+        raise InputError(f"{reason}: shape them, or plan them one by one")
     shared: dict[tuple[int, int], Server] = {}  # by core and where the first slot starts
     for plan in plans:
-        for server in _running(plan):
+        publishing = publishing_servers(plan)
+        for server in (one for one in plan.servers if one not in publishing):
             place = (server.core, server.slots[0][0])
             shared[place] = _joined(shared.get(place, server), server)
-    taken: list[tuple[int, Slot]] = []
+    taken: list[Server] = []
     changed = []
     for plan in plans:
         later = _behind(plan, taken)
         own = publishing_servers(later)
-        taken += [(server.core, slot) for server in own for slot in server.slots]
+        taken += own
         changed.append(revised(later, servers=(*shared.values(), *own)))
     return changed
-
-
-def _running(plan: Plan) -> list[Server]:
-    publishing = publishing_servers(plan)
-    return [server for server in plan.servers if server not in publishing]
 
 
 def _joined(one: Server, two: Server) -> Server:
@@ -178,30 +165,10 @@ def _joined(one: Server, two: Server) -> Server:
     return one.model_copy(update={"slots": longest, "threads": threads})
 
 
-def _behind(plan: Plan, taken: Sequence[tuple[int, Slot]]) -> Plan:
+def _behind(plan: Plan, taken: Sequence[Server]) -> Plan:
     """The plan with its publish slots so much later that none meets those taken on their core."""
     gates = publishing_servers(plan)
-    own = [(server.core, slot) for server in gates for slot in server.slots]
-
-    def meets(later_ns: int) -> bool:
-        return any(
-            core == other_core and start + later_ns < other_end and other_start < end + later_ns
-            for core, (start, end) in own
-            for other_core, (other_start, other_end) in taken
-        )
-
-    ends = {other_end - start for _, (start, _) in own for _, (_, other_end) in taken}
-    later_ns = next(one for one in sorted({0} | {e for e in ends if e > 0}) if not meets(one))
-    if later_ns == 0:
-        return plan
-    end = later_ns + max(slot[1] for _, slot in own)
-    if end > plan.cycle_ns:
-        raise OperationError(
-            f"{chain_name(plan)} would be published until {duration_text(end)}, behind the other"
-            f" outputs of core {own[0][0]} and {duration_text(end - plan.cycle_ns)} after its"
-            f" cycle of {duration_text(plan.cycle_ns)}: use a shorter publish slot, or another"
-            " core for one of the outputs"
-        )
+    later_ns = behind_others(chain_name(plan), gates, taken, plan.cycle_ns)
     slots = {s.name: [(a + later_ns, b + later_ns) for a, b in s.slots] for s in gates}
     predicted = _later(plan.predicted, later_ns)
     return revised(plan, servers=with_slots(plan.servers, slots), predicted=predicted)

@@ -3,17 +3,14 @@
 **Shaping** (sections 3.1 and 3.2): the chain runs in a server that is open from the start of a
 cycle until every execution seen so far was complete, and its output is published in a server whose
 slot comes then: late for most cycles, but at the same time in all of them. :func:`plan_shaping`
-plans one chain; :func:`over_cores`, :func:`with_first_node_apart` and :func:`with_sink` take its
-plan and return one that covers more of a graph (sections 5.1 and 5.4).
-
-**The others** (sections 2.5, 5.1 and 5.3) take a shaped plan, for the chain, the evidence and the
-cores it names, and return that of another policy. An output in a slot is represented by its end.
+plans one chain; further functions take its plan and return one that covers more of a graph
+(sections 5.1 and 5.4), or of another policy (sections 2.5, 5.1 and 5.3).
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from itertools import zip_longest
-from typing import Any
+from itertools import product, zip_longest
+from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +44,7 @@ from chainshaper.values.yaml_file import wrong_values_refused
 
 OUTPUT_PRIORITY = 1  # better than the chain's: a publish slot inside its slot has to pre-empt it
 CHAIN_PRIORITY = 2
+BOUNDARY_NS = 1_000_000  # slots of callbacks are whole multiples of it
 PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get to its callback
 _WISHES = {field.name for field in fields(Wishes)}
 
@@ -73,12 +71,9 @@ def plan_shaping(
 
     ε is the margin's or, without one, 1 ms unless the wishes say otherwise; so is Δ. ``nodes`` are
     those whose executors run the chain, ``fifo_priority`` and ``receivers`` for the shaping node.
-    ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` (without ``output`` the
-    plan can be studied, not carried out) and of :class:`~chainshaper.planning.plan.Evidence`, and
-    single :class:`~chainshaper.values.plan_choices.Wishes`.
-
-    Raises InputError: latencies or values that no plan may have. OperationError: L̄ + ε + Δ does
-    not fit into the period.
+    ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` and
+    :class:`~chainshaper.planning.plan.Evidence`, and single
+    :class:`~chainshaper.values.plan_choices.Wishes`. OperationError: L̄ + ε + Δ does not fit.
     """
     latencies = check_latencies(latencies_ns)
     of_chain = {n: values.pop(n) for n in ChainOfPlan.model_fields.keys() & values.keys()}
@@ -88,20 +83,18 @@ def plan_shaping(
     given = EPSILON_NS if wishes.epsilon_ns is None else wishes.epsilon_ns
     epsilon = given if margin is None else margin.epsilon_ns
     if epsilon < 0 or length <= 0 or period_ns <= 0:
-        raise InputError(
-            "epsilon must be 0 ms or more, the publish slot and the period longer than 0 ms; found"
-            f" {duration_text(epsilon)}, {duration_text(length)}, {duration_text(period_ns)}"
-        )
-    _refuse_too_long(longest, epsilon, length, period_ns)
-    start, end = longest + epsilon, longest + epsilon + length
+        found = ", ".join(map(duration_text, (epsilon, length, period_ns)))
+        raise InputError(f"epsilon must be 0 ms or more, slot and period longer than 0 ms: {found}")
+    start = longest + epsilon
+    if (end := start + length) > period_ns:
+        _refuse_too_long(longest, epsilon, length, period_ns)
     output_core = core if output_core is None else output_core
     with wrong_values_refused(Plan):
         chain = ChainOfPlan(period_ns=period_ns, **of_chain)
         node, gated = _gate(chain, wishes, output_core, fifo_priority, receivers)
         threads = tuple(Thread(node=name) for name in nodes)
-        slots = ((0, start),)
         running = Server(
-            name="chain", core=core, priority=CHAIN_PRIORITY, slots=slots, threads=threads
+            name="chain", core=core, priority=CHAIN_PRIORITY, slots=((0, start),), threads=threads
         )
         return Plan(
             chain=chain,
@@ -134,10 +127,7 @@ def _gate(
     if chain.output is None:
         return None, ()
     if wishes.publication == "asynchronous":
-        raise InputError(
-            "asynchronous publication gates the publisher's own thread: name the node that"
-            " publishes the chain's output"
-        )
+        raise InputError("asynchronous publication: name the node that publishes the output")
     pause = min(PAUSE_NS, chain.period_ns // 20) if wishes.pause_ns is None else wishes.pause_ns
     node = ShapingNode(
         **_names(chain.output),
@@ -154,7 +144,7 @@ def _gate(
 
 
 def _names(output: str) -> dict[str, str]:
-    # The chain publishes on a topic of its own, and the shaping node takes over the output's.
+    """The chain publishes on a topic of its own, and the shaping node takes over the output's."""
     name = "chainshaper" + output.replace("/", "_")
     return {"name": name, "input": f"{output}_tmp", "output": output}
 
@@ -179,10 +169,8 @@ def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
     )
 
 
-def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int) -> None:
+def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int) -> NoReturn:
     missing = longest + epsilon + publish_slot - period
-    if missing <= 0:
-        return
     remedies = ["a longer period", "a shorter chain"]
     if longest + epsilon < period:
         remedies.insert(0, f"a publish slot of {duration_text(period - longest - epsilon)}")
@@ -202,10 +190,7 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
     ``core_of`` names the core of every node that takes part, also on branches that the chain waits
-    for and that the plan does not know yet. The server of the first node, whose timer begins the
-    cycle, comes first.
-
-    Raises InputError: a node of the plan is missing.
+    for; its first is that whose timer begins the cycle. Raises InputError: a node is missing.
     """
     chain, others = _chain_and_others(plan)
     if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:
@@ -230,19 +215,14 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
 
     Stopped until its slot, a first callback that is no timer starts every execution at the
     beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
-
-    Raises InputError: the chain's server has no thread of that node, or is shorter than the slot.
     """
     chain, others = _chain_and_others(plan)
     (start, end), thread = chain.slots[0], Thread(node=node)
     if thread not in chain.threads:
         raise InputError(f"{node} is no node of the chain's server: name its first node")
     if not start < slot_end_ns < end:
-        raise InputError(
-            f"the first node's slot must end after {duration_text(start)} and before"
-            f" {duration_text(end)}, where the chain's does: not at"
-            f" {duration_text(slot_end_ns)}"
-        )
+        limits = f"after {duration_text(start)} and before {duration_text(end)}"
+        raise InputError(f"the first node's slot must end {limits}, where the chain's does")
     alone = {"name": "first", "slots": ((start, slot_end_ns),), "threads": (thread,)}
     rest = tuple(other for other in chain.threads if other != thread)
     behind = {"slots": ((slot_end_ns, end),), "threads": rest}
@@ -258,10 +238,9 @@ def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[
     """
     first, *others = plans
     known = {one.node: server.name for p in plans for server in p.servers for one in server.threads}
-    if taken := sorted(known.keys() & core_of.keys()):
-        raise InputError(
-            f"{taken[0]} is in the server {known[taken[0]]!r}: best effort are nodes beside chains"
-        )
+    for node in sorted(known.keys() & core_of.keys()):
+        reason = f"{node} is in the server {known[node]!r}"
+        raise InputError(f"{reason}: best effort are nodes beside chains")
     worst = max(server.priority for plan in plans for server in plan.servers)
     with wrong_values_refused(Plan):
         added = [
@@ -297,9 +276,8 @@ def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
 def with_executors(
     plan: Plan, executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]]
 ) -> Plan:
-    """The plan with those executors of nodes in its servers that run the given callbacks.
-
-    Of a node whose callback groups have executors of their own, the others run on (section 6).
+    """The plan with those executors of nodes in its servers that run the given callbacks; others of
+    a node whose callback groups have executors of their own run on (section 6).
     """
     servers = []
     for server in plan.servers:
@@ -312,6 +290,26 @@ def with_executors(
     return revised(plan, servers=tuple(servers))
 
 
+def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cycle_ns: int) -> int:
+    """How much later (ns) slots have to be to meet none of those taken on their core.
+
+    Raises OperationError: then they leave the cycle, and the output of that ``name`` with them.
+    """
+    same_core = (pair for pair in product(own, taken) if pair[0].core == pair[1].core)
+    pairs = [pair for one, other in same_core for pair in product(one.slots, other.slots)]
+    later_ns = min(
+        later
+        for later in {0, *(max(0, end - start) for (start, _), (_, end) in pairs)}
+        if not any(one[0] + later < two[1] and two[0] < one[1] + later for one, two in pairs)
+    )
+    if (end := later_ns + max(one.slots[-1][1] for one in own)) > cycle_ns:
+        raise OperationError(
+            f"{name} would be published until {duration_text(end)}, after the cycle of"
+            f" {duration_text(cycle_ns)}: use a shorter slot, or another core for an output"
+        )
+    return later_ns
+
+
 def with_sink(
     plan: Plan,
     latencies_ns: NDArray[np.int64],
@@ -322,16 +320,14 @@ def with_sink(
 ) -> Plan:
     """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
 
-    The sink gets a shaping node behind its ``publisher`` and before its ``receivers``; where the
-    plan's output is published asynchronously, that node's publisher thread is gated instead.
-    ``latencies_ns`` are those from the start of the graph to this sink. Its slot starts the plan's
-    margin after the longest, or where a publish slot that is in the way on the same core ends; the
-    chain's servers stay open as long as the slowest sink needs. The prediction stays that of the
-    first output.
+    The sink gets a shaping node; where the plan's output is published asynchronously, the thread of
+    its ``publisher`` is gated instead. ``latencies_ns`` are those from the start of the graph to
+    this sink. Its slot starts the plan's margin after the longest, or where a publish slot that is
+    in the way on the same core ends; the chain's servers stay open as long as the slowest sink
+    needs. The prediction stays that of the first output.
 
-    Raises InputError: a plan that shapes nothing or publishes in the other way, a sink that it
-    shapes already, latencies or a topic that no plan may have. OperationError: the slot does not
-    fit into the cycle.
+    Raises InputError: the plan shapes nothing, or this sink already. OperationError: the slot does
+    not fit into the cycle.
     """
     node, publishing = plan.shaping_node, output_server(plan)
     if publishing is None or not publishing.threads:
@@ -339,23 +335,11 @@ def with_sink(
     if output in {plan.chain.output, *(other.output for other in plan.further_shaping_nodes)}:
         raise InputError(f"the plan shapes {output} already: name each sink once")
     if node is None and publisher is None:
-        raise InputError(
-            f"the plan gates publishers' threads, and who publishes {output} is not known: name it"
-        )
+        raise InputError(f"a thread is to be gated, but who publishes {output} is not known")
     done = start = int(check_latencies(latencies_ns).max()) + plan.margin.epsilon_ns
     length = publishing.slots[-1][1] - publishing.slots[-1][0]
-    gates = publishing_servers(plan)
-    taken = [slot for server in gates if server.core == publishing.core for slot in server.slots]
-    for other_start, other_end in sorted(taken):
-        if start < other_end and other_start < start + length:
-            start = other_end
-    slot = (start, start + length)
-    if slot[1] > plan.cycle_ns:
-        raise OperationError(
-            f"the sink {output} would be published until {duration_text(slot[1])}, after the"
-            f" cycle of {duration_text(plan.cycle_ns)}: plan with a longer period, a shorter"
-            " slot, or another core for one of the outputs"
-        )
+    gates, wanted = publishing_servers(plan), {"slots": ((start, start + length),)}
+    start += behind_others(output, [publishing.model_copy(update=wanted)], gates, plan.cycle_ns)
     # Servers that run the graph to its end stay open until the slowest sink is done.
     running = [server for server in plan.servers if server not in gates]
     latest = max((server.slots[-1][1] for server in running), default=done)
@@ -365,7 +349,7 @@ def with_sink(
         added = () if node is None else (_node_like(node, output, publisher, receivers),)
         thread = added[0].thread if added else Thread(node=publisher or "", role="publisher")
         name = f"output_{thread.node.strip('/')}"
-        server = _publishing(name, publishing.core, slot, (thread,))
+        server = _publishing(name, publishing.core, (start, start + length), (thread,))
         return revised(
             plan,
             servers=below_executors([*longer, server]),
@@ -396,50 +380,48 @@ def server_per_chain(plan: Plan) -> Plan:
     what was measured.
     """
     publishing, evidence = output_server(plan), plan.evidence
-    shortest, longest = evidence.min_latency_ns, evidence.max_latency_ns
-    mean = evidence.mean_latency_ns
-    predicted = Prediction(mean_ns=mean, max_ns=longest, jitter_ns=longest - shortest)
-    servers = tuple(server for server in plan.servers if server is not publishing)
-    return _unshaped(plan, policy="server-per-chain", servers=servers, predicted=predicted)
-
-
-def _unshaped(plan: Plan, **changes: object) -> Plan:
-    return revised(plan, shaping_node=None, further_shaping_nodes=(), **changes)
+    longest, jitter = evidence.max_latency_ns, evidence.max_latency_ns - evidence.min_latency_ns
+    return revised(
+        plan,
+        policy="server-per-chain",
+        servers=tuple(server for server in plan.servers if server is not publishing),
+        shaping_node=None,
+        further_shaping_nodes=(),
+        predicted=Prediction(mean_ns=evidence.mean_latency_ns, max_ns=longest, jitter_ns=jitter),
+    )
 
 
 def server_per_callback(
-    plan: Plan,
-    callbacks: Sequence[CallbackTimes],
-    *,
-    margin_ns: int = 0,
-    boundary_ns: int = 1_000_000,
+    plan: Plan, callbacks: Sequence[CallbackTimes], *, margin_ns: int = 0
 ) -> Plan:
     """Time-triggered scheduling: each callback runs in a slot of its own, as long as its longest.
 
     A slot starts when the slots of all callbacks that this one waits for have ended (table 4 row
     1), and the slot before it on its core. It is the longest response time plus ``margin_ns`` long,
-    rounded up to a multiple of ``boundary_ns``. Callbacks of one node share a server with several
-    slots. Each of ``callbacks`` comes after those it waits for; the chain's last stands last.
+    rounded up to whole milliseconds. Callbacks of one node share a server with several slots.
+    Each of ``callbacks`` comes after those it waits for; the chain's last stands last.
 
     Raises InputError: no callbacks, or one that waits for itself or a later one. OperationError:
     the slots do not fit into the cycle.
     """
-    slots = _slots_in_sequence(callbacks, margin_ns, boundary_ns)
+    slots = _slots_in_sequence(callbacks, margin_ns)
     end = max(slot[1] for slot in slots)
     if end > plan.cycle_ns:
         raise OperationError(
             f"one slot per callback takes {duration_text(end)}, the cycle is"
-            f" {duration_text(plan.cycle_ns)}: shape the chain instead, plan with a smaller"
-            " margin (--epsilon), or move callbacks to another core"
+            f" {duration_text(plan.cycle_ns)}: shape the chain, plan with a smaller margin"
+            " (--epsilon), or move callbacks to another core"
         )
     last, (start, _) = callbacks[-1], slots[-1]
     of_node: dict[str, list[tuple[int, Slot]]] = {}
     for callback, slot in zip(callbacks, slots, strict=True):
         of_node.setdefault(callback.node, []).append((callback.core, slot))
     with wrong_values_refused(Plan):
-        return _unshaped(
+        return revised(
             plan,
             policy="server-per-callback",
+            shaping_node=None,
+            further_shaping_nodes=(),
             servers=tuple(_server_of_node(node, own) for node, own in of_node.items()),
             predicted=Prediction(
                 mean_ns=start + last.mean_response_ns,
@@ -449,26 +431,19 @@ def server_per_callback(
         )
 
 
-def _slots_in_sequence(
-    callbacks: Sequence[CallbackTimes], margin_ns: int, boundary_ns: int
-) -> list[Slot]:
-    if not callbacks or margin_ns < 0 or boundary_ns <= 0:
-        raise InputError(
-            "slots per callback need callbacks, a margin of 0 ms or more and a boundary longer"
-            " than 0 ms"
-        )
+def _slots_in_sequence(callbacks: Sequence[CallbackTimes], margin_ns: int) -> list[Slot]:
+    if not callbacks or margin_ns < 0:
+        raise InputError("slots per callback need callbacks, and a margin of 0 ms or more")
     slots: list[Slot] = []
     busy_until: dict[int, int] = {}
     for number, callback in enumerate(callbacks):
         if any(not 0 <= before < number for before in callback.after):
-            raise InputError(
-                f"callback {number} of {callback.node} waits for {callback.after}, which must be"
-                " callbacks before it: order them along the graph"
-            )
+            waits = f"callback {number} of {callback.node} waits for {callback.after}"
+            raise InputError(f"{waits}, no callbacks before it: order them along the graph")
         waited_for = [slots[before][1] for before in callback.after]
         start = max([busy_until.get(callback.core, 0), *waited_for])
-        steps = -(-(callback.max_response_ns + margin_ns) // boundary_ns)
-        slots.append((start, start + max(1, steps) * boundary_ns))
+        steps = -(-(callback.max_response_ns + margin_ns) // BOUNDARY_NS)
+        slots.append((start, start + max(1, steps) * BOUNDARY_NS))
         busy_until[callback.core] = slots[-1][1]
     return slots
 
@@ -490,17 +465,11 @@ def _server_of_node(node: str, own: list[tuple[int, Slot]]) -> Server:
 def let_per_chain(plan: Plan) -> Plan:
     """Logical execution time for the chain as one task: its output leaves in a slot at the start of
     the next cycle, so the latency is one period (section 5.3, table 5).
-
-    Raises InputError: a plan without a publish slot, or a chain so fast that it could publish in
-    the cycle it began in.
     """
     publishing, length = _one_slot(plan)
     if plan.evidence.min_latency_ns <= length:
-        raise InputError(
-            f"the shortest latency {duration_text(plan.evidence.min_latency_ns)} is not longer"
-            f" than the publish slot {duration_text(length)}, so an output could leave in its"
-            " own cycle: use a shorter slot"
-        )
+        shortest = f"the shortest latency {duration_text(plan.evidence.min_latency_ns)}"
+        raise InputError(f"{shortest} could leave in its own cycle: use a shorter publish slot")
     ends = {s.name: length if s is publishing else plan.cycle_ns for s in plan.servers}
     slots = {name: ((0, end),) for name, end in ends.items()}
     predicted = _after_periods(plan, 1, length)
@@ -515,18 +484,14 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     ``publishers`` their nodes, where known. Behind each topic a shaping node republishes at the
     beginning of the next cycle, or the publishers' threads run then, where the plan gates one: as
     many periods as there are callbacks (section 5.3, table 5).
-
-    Raises InputError: a plan that shapes nothing, topics (or gated publishers) that do not end with
-    the chain's, or repeat one. OperationError: the slots do not fit into the cycle.
     """
     publishing, length = _one_slot(plan)
     last = plan.shaping_node
     end, given = (plan.chain.publisher, publishers) if last is None else (last.output, topics)
     if end is None or list(given[-1:]) != [end]:
         raise InputError(
-            "LET per callback needs a plan with a shaping node and all topics of the chain, its"
-            " output last; or one for asynchronous publication and the nodes of the chain, the one"
-            " that publishes its output last"
+            "LET per callback needs all topics of the chain, its output last; or, with asynchronous"
+            " publication, its nodes, the one that publishes its output last"
         )
     if length * len(given) > plan.cycle_ns:
         raise OperationError(
