@@ -363,10 +363,7 @@ def _begun_outside(published: pl.DataFrame, instances: pl.DataFrame) -> pl.DataF
 def _with_assumed_writers(
     objects: Objects, instances: pl.DataFrame, published: pl.DataFrame
 ) -> tuple[Objects, pl.DataFrame, pl.DataFrame]:
-    """Add a callback, and instances, for topics published only outside callbacks.
-
-    Returns the objects, the instances (the new ones last) and the publications with them.
-    """
+    """Add a callback, and (last) instances, for topics published only outside callbacks."""
     key = ["pid", "node", "topic"]
     # By publisher first: one number per row to group by instead of three.
     of_publisher = published.group_by("publisher").agg(

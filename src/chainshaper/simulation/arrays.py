@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from chainshaper.analysis.chains import find_chain
+from chainshaper.gate.decision import CHANGES
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import Server, Thread
 from chainshaper.simulation import layout as at
@@ -589,7 +590,7 @@ def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing
         G.AT_ONCE: int(gate.into_open_slot == "at-once"),
         G.PHASE: timing.start_ns + gate.phase_ns if gate.phase_ns is not None else timing.anchor_ns,
         G.CHANGED: 0,
-        G.CHANGES: rows.add(at.CHANGES_KEPT, 2).start,
+        G.CHANGES: rows.add(CHANGES, 2).start,
     }.items():
         rows[row + column] = value
     if gate.modes is not None:

@@ -19,7 +19,7 @@ cannot call Python; tests hold the two against each other, on random gates and m
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
-from chainshaper.gate.decision import MAX_AGE_CYCLES, MAX_FUTURE_NS
+from chainshaper.gate.decision import CHANGES, MAX_AGE_CYCLES, MAX_FUTURE_NS
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, M, P, Q, R, S, T, X
 from chainshaper.values.compiled.memory import compiled
@@ -610,9 +610,9 @@ def switch_mode(m, gate, mode):
     count, changes = m[gate + G.CHANGED], m[gate + G.CHANGES]
     current = m[gate + G.DEFAULT]
     if count:
-        current = m[changes + 2 * ((count - 1) % at.CHANGES_KEPT) + 1]
+        current = m[changes + 2 * ((count - 1) % CHANGES) + 1]
     if mode != current:
-        place = changes + 2 * (count % at.CHANGES_KEPT)
+        place = changes + 2 * (count % CHANGES)
         m[place], m[place + 1] = m[X.NOW], mode
         m[gate + G.CHANGED] = count + 1
 
@@ -632,8 +632,8 @@ def _mode_at(m, gate, origin):
     if mode == NONE:
         return mode
     count, changes = m[gate + G.CHANGED], m[gate + G.CHANGES]
-    for number in range(count - 1, max(-1, count - 1 - at.CHANGES_KEPT), -1):
-        place = changes + 2 * (number % at.CHANGES_KEPT)
+    for number in range(count - 1, max(-1, count - 1 - CHANGES), -1):
+        place = changes + 2 * (number % CHANGES)
         if m[place] <= origin:
             return m[place + 1]
     return mode

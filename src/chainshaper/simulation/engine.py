@@ -70,11 +70,9 @@ def expire(m, entity):
 @compiled()
 def _call_timer(m, entity):
     """Move on to the first expiry that is not over yet, as `rcl_timer_call` does."""
-    now = m[X.NOW]
-    m[entity + E.DUE] += m[entity + E.PERIOD]
-    if m[entity + E.DUE] < now:
-        period = m[entity + E.PERIOD]
-        m[entity + E.DUE] += -(-(now - m[entity + E.DUE]) // period) * period
+    period = m[entity + E.PERIOD]
+    missed = max(0, -(-(m[X.NOW] - m[entity + E.DUE]) // period) - 1)
+    m[entity + E.DUE] += (1 + missed) * period
     if m[entity + E.DUE] <= m[X.LAST_TIMER]:
         callbacks.push_event(m, m[entity + E.DUE], at.EXPIRY, entity)
 

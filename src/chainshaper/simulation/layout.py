@@ -18,8 +18,6 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from chainshaper.gate.decision import CHANGES
-
 Int64s = npt.NDArray[np.int64]
 
 NONE = -1
@@ -94,8 +92,6 @@ WAIT, DISCARD, PUBLISH_LATE, NEXT_SLOT = range(4)
 ALL_IN_ORDER, NEWEST, FIRST = range(3)
 REPLACED, SURPLUS, OVERFLOWED, DISCARDED = range(4)
 """Policies and reasons, as :data:`chainshaper.workload.event_log.WORDS` numbers them."""
-
-CHANGES_KEPT = CHANGES
 
 S = IntEnum("S", "FIRST END COLUMNS", start=0)
 I = IntEnum("I", "ON_CHAIN RING DEPTH HEAD WAITING COLUMNS", start=0)  # noqa: E741 - an input

@@ -212,11 +212,11 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     logs = [EventLog(clock=lambda: 0) for _ in system.processes]
     for process, log in zip(system.processes, logs, strict=True):
         log.node(process.node, "simulation")
-    publishers, entities = [], []
-    for publisher in system.publishers:
-        depth = system.depth(publisher.topic)
-        log = logs[publisher.process]
-        publishers.append(log.publisher(publisher.topic, depth, publisher.asynchronous))
+    publishers = [
+        logs[one.process].publisher(one.topic, system.depth(one.topic), one.asynchronous)
+        for one in system.publishers
+    ]
+    entities = []
     for entity in system.entities:
         log = logs[entity.process]
         filtered = "message_filters::" if entity.described.synchronises else ""
@@ -278,10 +278,8 @@ def _logged(system: System, machine: Machine, handles: Handles) -> dict[str, pl.
             if field in handles:
                 columns[field] = pl.Series(field, handles[field][numbers])
             elif field:
-                is_address = field == "message"
-                columns[field] = pl.Series(
-                    field, numbers.view(np.uint64) if is_address else numbers
-                )
+                values = numbers.view(np.uint64) if field == "message" else numbers
+                columns[field] = pl.Series(field, values)
         if name == "callback_start":
             columns["is_intra_process"] = pl.zeros(time.size, dtype=pl.Int32(), eager=True)
         elif name == "rmw_publish":

@@ -15,7 +15,7 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 from xml.etree import ElementTree
 
 import polars as pl
@@ -194,12 +194,12 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
         )
     callbacks = tuple(
         CallbackBudget(
-            node=row["node"],
-            starts=trigger_text(row["topic"], row["period_ns"]),
+            node=node,
+            starts=starts,
             response_ns=limit(_most(row["response_ns"])),
             execution_ns=limit(_most(row["execution_ns"])),
         )
-        for row in named_callbacks(flow).to_dicts()
+        for (node, starts), row in named_callbacks(flow).items()
     )
     return Budget(chains=tuple(of_chains), callbacks=callbacks)
 
@@ -230,10 +230,7 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
             one = Judged(name, chain.chain, what, limit, value, at_rest)
             found.append(one if one.met else replace(one, because=because))
         found += hops
-    rows = {
-        (row["node"], trigger_text(row["topic"], row["period_ns"])): row
-        for row in named_callbacks(flow).to_dicts()
-    }
+    rows = named_callbacks(flow)
     for callback in budget.callbacks:
         row = rows.get((callback.node, callback.starts))
         lacks = "no such callback" if row is None else "no such time"
@@ -345,9 +342,12 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
 
 
-def named_callbacks(flow: DataFlow) -> pl.DataFrame:
-    """Callbacks that ran and are named alike in every run, without those that every node has."""
-    return (
+def named_callbacks(flow: DataFlow) -> dict[tuple[str, str], dict[str, Any]]:
+    """Callbacks that ran and are named alike in every run, by node and what starts them.
+
+    They are rows of :func:`.callback_statistics`, without those that every node has.
+    """
+    found = (
         callback_statistics(flow)
         .filter(
             pl.col("node").is_not_null()
@@ -356,6 +356,8 @@ def named_callbacks(flow: DataFlow) -> pl.DataFrame:
         )
         .unique(["node", "topic", "period_ns"], keep="first", maintain_order=True)
     )
+    rows = found.iter_rows(named=True)
+    return {(row["node"], trigger_text(row["topic"], row["period_ns"])): row for row in rows}
 
 
 def _most(times: dict[str, float] | None) -> float | None:
@@ -389,13 +391,10 @@ def markdown_report(
     """
     noun, bad, good = words
     broken = [one for one in judged if not one.met]
-    lines = [
-        f"**{len(broken)} of {len(judged)} {noun} are {bad}**"
-        if broken
-        else f"**All {len(judged)} {noun} are {good}**"
-    ]
-    if broken:
-        lines += ["", f"| recording | {noun.removesuffix('s')} |", "|---|---|"]
-        cells = ((shown(t).replace("|", "\\|") for t in (o.recording, o.text)) for o in broken)
-        lines += [f"| {' | '.join(own)} |" for own in cells]
+    if not broken:
+        return f"**All {len(judged)} {noun} are {good}**\n"
+    lines = [f"**{len(broken)} of {len(judged)} {noun} are {bad}**", ""]
+    lines += [f"| recording | {noun.removesuffix('s')} |", "|---|---|"]
+    cells = ((shown(t).replace("|", "\\|") for t in (o.recording, o.text)) for o in broken)
+    lines += [f"| {' | '.join(own)} |" for own in cells]
     return "\n".join(lines) + "\n"

@@ -37,7 +37,6 @@ from chainshaper.analysis import data_flow
 from chainshaper.analysis.disturbance import stalled_after
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
-from chainshaper.values.application import trigger_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.budgets import named_callbacks
@@ -158,10 +157,7 @@ def _read(
 def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None = None) -> Sample:
     """What counts of a recording, and of the ``chains`` that it has (none: its own)."""
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    names = {
-        row["callback_id"]: (row["node"], trigger_text(row["topic"], row["period_ns"]))
-        for row in named_callbacks(flow).to_dicts()
-    }
+    names = {row["callback_id"]: name for name, row in named_callbacks(flow).items()}
     ended = flow.instances.filter(pl.col("callback_id").is_in([*names]) & ~pl.col("assumed"))
     ended = ended.drop_nulls("end")
     hit = pl.Series(stalled_after(flow, ended["start"].to_numpy(), ended["end"].to_numpy()))
@@ -218,10 +214,10 @@ def find_slowdowns(
         )
     beside = [[_beside(own[0], one) for one in own] for _, own in times.values()]
     shifts, errors, noise = np.moveaxis(np.array(beside), 2, 0)  # [callback, recording]
-    found = _tested(shifts, errors[:, 1:], noise[:, 1:], len(before))
-    if abs(found.common) > LEAST:
+    common, tested = _tested(shifts, errors[:, 1:], noise[:, 1:], len(before))
+    if abs(common) > LEAST:
         notes.append(
-            f"all callbacks took {expm1(found.common):+.1%}: the machine, or all of the program;"
+            f"all callbacks took {expm1(common):+.1%}: the machine, or all of the program;"
             " taken out of each"
         )
     first = samples[0].recording
@@ -229,7 +225,7 @@ def find_slowdowns(
     compared = []
     for place, (name, (time, own)) in enumerate(times.items()):
         median = float(np.median([np.nanmedian(one) for one in own[: len(before)]]))
-        change, p, resolution = (float(figure[place]) for figure in found[1:])
+        change, p, resolution = (float(figure[place]) for figure in tested)
         compared.append(
             Compared(
                 recording=label,
@@ -311,20 +307,13 @@ def _alike(first: Times, own: Times) -> tuple[Places, Places]:
     return places[:, 0].ravel(), places[:, 1].ravel()
 
 
-class _Found(NamedTuple):
-    """What the callbacks have in common, and of each the change, ``p`` and the resolution, in
-    logarithms."""
-
-    common: float
-    change: Times
-    p: Times
-    resolution: Times
-
-
-def _tested(shifts: Times, errors: Times, noise: Times, before: int) -> _Found:
+def _tested(
+    shifts: Times, errors: Times, noise: Times, before: int
+) -> tuple[float, tuple[Times, Times, Times]]:
     """The test of each row of ``shifts`` (a callback's in every recording, those of before first).
 
-    ``errors`` and ``noise`` are those of :func:`_beside`.
+    ``errors`` and ``noise`` are those of :func:`_beside`. Returns what the callbacks have in common
+    and of each the change, ``p`` and the resolution; changes are logarithms.
     """
     count, runs = shifts.shape
     shifts = shifts - np.median(shifts[:, :before], axis=1, keepdims=True)
@@ -354,7 +343,7 @@ def _tested(shifts: Times, errors: Times, noise: Times, before: int) -> _Found:
     p = np.minimum(1.0, count * stats.t.sf((change - LEAST) / error, freedom))
     quantiles = stats.t.isf(LEVEL / count, freedom) + stats.t.isf(0.05, freedom)
     taken_out = np.median(common[:, before:]) - np.median(common[:, :before])
-    return _Found(float(taken_out), change, p, LEAST + quantiles * error)
+    return float(taken_out), (change, p, LEAST + quantiles * error)
 
 
 def _weighted_median(rows: Times, weights: Times) -> Times:
