@@ -25,7 +25,7 @@ plan = of.Plan(
     chain=of.ChainOfPlan(spec="sensor", period_ns=cycle),
     evidence=of.Evidence(samples=1, min_latency_ns=1, mean_latency_ns=1, max_latency_ns=end),
     margin=of.Margin(epsilon_ns=0),
-    policy="server-per-callback",
+    policy="server-per-chain",  # whose server is closed outside its slots
     cycle_ns=cycle,
     servers=(sensor,),
     predicted=of.Prediction(mean_ns=1, max_ns=1, jitter_ns=0),
