@@ -103,7 +103,7 @@ def test_slots_turn_with_the_anchor(
     ("slots", "reason"),
     [
         (tuple((10 * n, 10 * n + 5) for n in range(1025)), r"server any has 1025 slots.*1024"),
-        (((10, 11),), "server any: the slot at 10ns is shorter than 2 ns"),
+        (((10, 11),), "server any: the slot at 10 ns is shorter than 2 ns"),
     ],
 )
 def test_slots_that_the_kernel_does_not_take_are_refused(

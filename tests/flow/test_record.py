@@ -245,8 +245,8 @@ def test_a_trace_that_cannot_be_read_is_kept_and_named(
         record.record_command(tmp_path / "rec", ["sleep", "60"])
     (kept,) = tmp_path.iterdir()
     assert str(caught.value) == (
-        "it cannot be read; tracing ended before the application did: it broke; what was traced is "
-        f"kept in {kept}"
+        "it cannot be read; tracing ended before the application did: it broke; what was traced "
+        f"stays in {kept}"
     )
     assert kept.name.startswith("rec.tracing-")
     assert (kept / "events").read_text() == "what was traced"

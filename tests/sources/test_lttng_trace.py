@@ -272,7 +272,7 @@ def test_what_a_conversion_leaves_behind_is_said(tmp_path: Path) -> None:
     for name in ("once", "twice"):
         again = json_of("info", tmp_path / name)
         assert again["events"] == shown["events"]
-        assert sum("not kept" in note for note in again["notes"]) == 1
+        assert sum("left out" in note for note in again["notes"]) == 1
 
 
 def container(folder: Path, host: str, names: tuple[str, str], shift: int) -> None:

@@ -104,7 +104,7 @@ def test_modes_that_nobody_announces_are_refused(tmp_path: Path, plan: Plan) -> 
     ("gate", "reason"),
     [
         ("bands: {city: 1}, default: sea", r"gate\.modes: the default mode 'sea' has no band"),
-        ("bands: {city: 5}, default: city", r"gate\.modes: mode 'city' has the band 5"),
+        ("bands: {city: 5}, default: city", r"gate\.modes: mode 'city': band 5"),
         ("bands: {city: 0}, default: city", r"gate\.modes\.topic: no callback `announces`"),
     ],
 )

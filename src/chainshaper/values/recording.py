@@ -234,11 +234,11 @@ def open_recording(path: str | Path) -> Recording:
     path = Path(path)
     file = path / INFO_FILE
     if not file.is_file():
-        what = "a folder without recording.json" if path.is_dir() else "no such folder"
+        what, place = "a folder without recording.json" if path.is_dir() else "no such folder", path
         if path.is_file():
-            what = "a file, where the folder of a recording is wanted"
+            what, place = "a file, where the folder of a recording is wanted", Path("REC")
         raise InputError(
-            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o REC`, a "
+            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {place}`, a "
             "trace, which is accepted as well, with `ros2 trace`"
         )
     try:
