@@ -168,6 +168,7 @@ def assert_attached(program: Program, folder: Path, distribution: str) -> None:
     assert info.processes == {wanted.pid: "/first, /second"}
 
 
+@pytest.mark.timed  # a timer is known by wake-ups that are not late
 def test_an_application_that_runs_already_is_attached_to_and_its_chain_is_found(
     open_folder: Path, tmp_path: Path
 ) -> None:
@@ -185,6 +186,7 @@ def test_an_application_that_runs_already_is_attached_to_and_its_chain_is_found(
     assert "cat(" not in (tmp_path / "trace" / "events.bt").read_text()
 
 
+@pytest.mark.timed  # a timer is known by wake-ups that are not late
 def test_an_application_of_humble_is_attached_to_by_the_handles_of_rcl(
     humble: Program, tmp_path: Path
 ) -> None:
