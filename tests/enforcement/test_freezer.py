@@ -533,7 +533,9 @@ def test_where_a_frozen_thread_was_tells_whether_it_wanted_to_run(tmp_path: Path
             folders[name] = make_threaded_child(home, name)
             move_thread(pid, folders[name])
             threads[name] = os.open(folders[name] / "cgroup.threads", os.O_RDONLY)
-        wait_for(lambda: overrun([threads["busy"]]) is None, "it to run")
+        began = cpu_ns(spinner.tid)  # behind the system call that said that it was ready
+        wait_for(lambda: cpu_ns(spinner.tid) > began + 20 * MS, "it to compute")
+        assert overrun([threads["busy"]]) is None
         for folder in folders.values():
             (folder / "cgroup.freeze").write_text("1")
             wait_for(lambda: frozen(folder), "the freezer")  # noqa: B023

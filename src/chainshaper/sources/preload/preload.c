@@ -103,8 +103,11 @@ static inline uint64_t now(clockid_t clock) {
 // restartable sequence (rseq(2)) when it takes the core away outside of that sequence, and ours is
 // empty. The clock itself is read again after SURELY_USED, so that interrupts and stolen time, which
 // it leaves out, add up to no more. A kernel need not reset the pointer of a thread that waits in a
-// system call: one try in each process finds that out, and the clock is read each time.
-#define SURELY_USED 200000u  // ns
+// system call: one try in each process finds that out, and the clock is read each time. A reading
+// that an interrupt separates from its instant (READ_AT_ONCE) serves for one event only: what came
+// between them would be missing from all that follow.
+#define SURELY_USED 200000u   // ns
+#define READ_AT_ONCE 4000u    // ns
 #if defined(__x86_64__)
 #define SIGNATURE 0x53053053u
 #define THREAD_POINTER(to) __asm__("mov %%fs:0, %0" : "=r"(to))
@@ -147,9 +150,11 @@ static uint64_t thread_time(uint64_t time) {
   uint64_t used = own.used + (time - own.used_at);
   bool stayed = own.rseq && own.rseq->section == (uintptr_t)&no_section;
   if (!stayed || time - own.used_at >= SURELY_USED) {
+    uint64_t before = now(CLOCK_MONOTONIC);
     if (own.rseq) own.rseq->section = (uintptr_t)&no_section;
     used = own.used = now(CLOCK_THREAD_CPUTIME_ID);
     own.used_at = now(CLOCK_MONOTONIC);
+    if (own.rseq && own.used_at - before > READ_AT_ONCE) own.rseq->section = 0;
   }
   if (used > own.last_used) own.last_used = used;
   return own.last_used;
