@@ -95,6 +95,16 @@ def test_executors_run_on_the_cores_that_are_named(nodes: dict[str, int], tmp_pa
             assert (executor.priority, executor.cores) == (87, (core,))
 
 
+def test_earlier_stages_on_a_core_are_more_urgent(nodes: dict[str, int], tmp_path: Path) -> None:
+    core, (front, rear) = available_cores()[-1], nodes
+    cores, ranks = {front: core, rear: core}, {front: 0, rear: 1}
+    with profiling_condition(cores, cores, folder=tmp_path, before=ranks) as see_to_it:
+        see_to_it(list_processes(nodes.values()))
+        front_one, rear_one = (list_threads(nodes[node])[0] for node in (front, rear))
+        assert front_one.priority > rear_one.priority
+        assert front_one.cores == rear_one.cores == (core,)
+
+
 def test_all_is_as_before_when_the_run_fails(nodes: dict[str, int], tmp_path: Path) -> None:
     before = _states(nodes)
     with pytest.raises(ZeroDivisionError), profiling_condition(folder=tmp_path) as see_to_it:

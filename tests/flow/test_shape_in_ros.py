@@ -68,6 +68,16 @@ PARKING = [
 """Valley parking in small (section 5.1): the front filter runs beside the rear one on a core of its
 own. A second chain shares a core with it."""
 
+WAITING = [
+    "camera   /image   40 48  every 100",
+    "encoder  /code    30 40  on /image",
+    "detector /objects 60 70  after /code",
+    "tracker  /tracks  20 25  after /objects",
+    "planner  /command 45 55  on /tracks",
+    "actuator -        0  0.1 on /command",
+]
+"""A chain of up to 2.4 periods; two nodes sleep, since two cores could not compute all of it."""
+
 MODES = [
     "camera  /image   1 2 every 100",
     "slow    /objects 5 9 on /image",
@@ -209,13 +219,19 @@ def test_a_graph_of_18_callbacks_runs_on_two_cores(run: Callable[..., Result]) -
     assert [one.name for one in servers] == ["chain_core1", "chain_core0", "output"]
 
 
-def test_a_chain_longer_than_its_period_becomes_a_pipeline(run: Callable[..., Result]) -> None:
+@pytest.mark.parametrize("further_cycles", [1, 2])
+def test_a_chain_longer_than_its_period_becomes_a_pipeline(
+    run: Callable[..., Result], further_cycles: int
+) -> None:
+    (first, *_, last), cores = available_cores(), list[str]()
     chain, nodes = described("examples/pipeline.yaml")
-    options = ("--chain", chain, "--policy", "pipelined", "--duration", "30s")
-    values, folder = run(nodes, "shape", "pipelined", *options)
+    if further_cycles == 2:
+        nodes, cores = WAITING, ["--cores", f"{last},{first},{first}"]
+    options = ("--chain", chain, "--policy", "pipelined", "--duration", "30s", *cores)
+    values, folder = run(nodes, "shape", f"pipelined_{further_cycles}", *options)
     plan = load_plan(folder / "plan.yaml")
-    assert {one.core for one in plan.servers} == set(available_cores()[-2:])
-    assert cycles_until_output(plan) == 1
+    assert {one.core for one in plan.servers} == {first, last}
+    assert cycles_until_output(plan) == further_cycles
     before, after = values["recordings"]
     assert after["count"] > 100
     assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 10

@@ -2,6 +2,7 @@
 //
 //   vertex OUTPUT|- LEAST_MS MOST_MS every PERIOD_MS
 //   vertex OUTPUT|- LEAST_MS MOST_MS on INPUT [INPUT]      (two inputs: synchronised)
+//   vertex OUTPUT|- LEAST_MS MOST_MS after INPUT           (it sleeps where others compute)
 //   vertex TOPIC modes PERIOD_S MODE [MODE]                (names the modes in turn, as strings)
 //
 // With the parameter `twice_in` it takes twice as long while that is the mode on /driving_mode.
@@ -10,6 +11,7 @@
 #include <memory>
 #include <random>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include "geometry_msgs/msg/point_stamped.hpp"
@@ -25,7 +27,9 @@ using Filter = message_filters::Subscriber<Message>;
 class Vertex : public rclcpp::Node {
  public:
   explicit Vertex(const std::vector<std::string>& words)
-      : Node("vertex"), time_ms_(std::stod(words[2]), std::stod(words[3])) {
+      : Node("vertex"),
+        time_ms_(std::stod(words[2]), std::stod(words[3])),
+        sleeps_(words[4] == "after") {
     const auto slow = declare_parameter("twice_in", "");
     if (!slow.empty()) {
       mode_ = create_subscription<String>("/driving_mode", 1, [this, slow](const String& mode) { factor_ = mode.data == slow ? 2 : 1; });
@@ -49,8 +53,9 @@ class Vertex : public rclcpp::Node {
 
  private:
   void finish(const Message& message) {
-    const double end_ms = ran_ms() + factor_ * time_ms_(random_);
-    while (ran_ms() < end_ms) {
+    const double lasts_ms = factor_ * time_ms_(random_), end_ms = ran_ms() + lasts_ms;
+    if (sleeps_) std::this_thread::sleep_for(std::chrono::duration<double, std::milli>(lasts_ms));
+    while (!sleeps_ && ran_ms() < end_ms) {
     }
     if (output_) output_->publish(message);
   }
@@ -62,6 +67,7 @@ class Vertex : public rclcpp::Node {
   }
 
   std::uniform_real_distribution<double> time_ms_;
+  const bool sleeps_;
   double factor_ = 1;
   std::mt19937 random_{std::random_device{}()};
   rclcpp::Publisher<Message>::SharedPtr output_;

@@ -50,6 +50,7 @@ from chainshaper.planning.request import (
     refuse_contradictions,
     refuse_entangled,
     refuse_simulated,
+    stages_before,
 )
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import build_package, check_build_tools
@@ -173,7 +174,9 @@ def shape_launch(
         cores = {node: core_of[node] for node in chain_nodes(first, *own)}
         before = record(
             *("before" if number == 1 else f"before_{number}", shaped, duration_ns),
-            scheduling=profiling_condition(cores, cores, like=first, chains=own)
+            scheduling=profiling_condition(
+                *(cores, cores), like=first, chains=own, before=stages_before(seen, request)
+            )
             if permitted
             else None,
             chain=own[0],

@@ -11,6 +11,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 
 from chainshaper.analysis import data_flow, find_chain, graph_of
 from chainshaper.enforcement.guardian import run_claimed
@@ -46,13 +47,16 @@ def profiling_condition(
     folder: Path | None = None,
     like: Recording | None = None,
     chains: Sequence[str] = (),
+    *,
+    before: Mapping[str, int] = MappingProxyType({}),
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
     ``core`` is where the executors run (default: the last that we may use), or the core of each of
-    ``nodes``, which those that share a process have in common. ``folder`` is where journals are
-    (default: `/run/chainshaper`). An earlier recording of the application that this one is ``like``
+    ``nodes``, which those that share a process have in common, ``before`` how many stages of
+    a pipeline are more urgent there, as a plan has it. ``folder`` is where journals are (default:
+    `/run/chainshaper`). An earlier recording of the application that this one is ``like``
     says which components a container has, and which executors several threads; ``chains`` in it
     begin as a plan has them begin (:mod:`chainshaper.enforcement.threads`).
 
@@ -62,7 +66,8 @@ def profiling_condition(
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
     cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
-    servers = [ReservationServer(f"the executors of core {one}", one, 1, ()) for one in cores]
+    homes = {(core, before.get(node, 0)) for node, core in core_of.items()} or {(cores[0], 0)}
+    servers = {(c, k): ReservationServer(f"core {c}, {k}", c, 1 + k, ()) for c, k in homes}
     recorded = recorded_processes(like)[0] if like is not None else ()
     first = _first_nodes(like, chains) if like is not None else ()
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
@@ -80,13 +85,14 @@ def profiling_condition(
                     f" {duration_text(START_NS)}; running: {running or 'no node'}"
                 )
             return False
-        homes = {
-            server.name: [one for one in members if _core(one, core_of, cores) == server.core]
-            for server in servers
-        }
+        at_home: dict[str, list[NodeThread]] = {server.name: [] for server in servers.values()}
+        for one in members:
+            node = next((node for node in one.nodes if node in core_of), "")
+            server = servers[core_of.get(node, cores[0]), before.get(node, 0)]
+            at_home[server.name].append(one)
         clear = cores[:1] if len(cores) > 1 else ()  # the plan's, whose output it has mostly
         around = scheduling_around(
-            homes, servers, found, available_cores(), clear=clear, first=first
+            *(at_home, servers.values(), found, available_cores()), clear=clear, first=first
         )
         new = [one for one in around if one.thread.thread.identity not in done]
         # One after the other, as under SCHED_FIFO in the paper: no turns.
@@ -97,10 +103,6 @@ def profiling_condition(
 
     with run_claimed(cores, nodes, folder) as journal:
         yield see_to_it
-
-
-def _core(thread: NodeThread, core_of: Mapping[str, int], cores: Sequence[int]) -> int:
-    return next((core_of[node] for node in thread.nodes if node in core_of), cores[0])
 
 
 def check_profiling(core: int | Sequence[int] | None = None) -> Sequence[int]:

@@ -260,17 +260,19 @@ def pipelined(
         )
 
 
-def stage_cores(
-    nodes: Sequence[str], steps_ns: NDArray[np.int64], cycle_ns: int, cores: Sequence[int]
+def stage_places(
+    nodes: Sequence[str], steps_ns: NDArray[np.int64], cycle_ns: int, cores: int
 ) -> dict[str, int]:
-    """Where to measure nodes, so that instances do not pile up: on the core of their stage, by the
-    medians, without a margin. Where no cut fits, the fullest stage has as little to do as can be.
+    """On which of so many cores to measure nodes, so that instances do not pile up.
+
+    On that of their stage, by the medians, without a margin. Where no cut fits, the fullest stage
+    has as little to do as can be.
     """
     usual, cuts = _longest(np.median(steps_ns, axis=0, keepdims=True)), _cuts(nodes)
     cycles = (cycle_ns * tenths // 10 for tenths in count(10))
-    tried = (shortest_cut(usual, cuts, 0, cycle, len(cores)) for cycle in cycles)
+    tried = (shortest_cut(usual, cuts, 0, cycle, cores) for cycle in cycles)
     stages = next(found for found in tried if found)
-    return {node: cores[one.place] for one in stages for node in nodes[one.first : one.end]}
+    return {node: one.place for one in stages for node in nodes[one.first : one.end]}
 
 
 def _longest(steps_ns: NDArray[np.floating | np.integer]) -> Longest:

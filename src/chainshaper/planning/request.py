@@ -34,7 +34,7 @@ from chainshaper.planning.margins import (
     late_share,
 )
 from chainshaper.planning.offsets import refuse_common
-from chainshaper.planning.pipeline import pipelined, stage_cores
+from chainshaper.planning.pipeline import pipelined, stage_places
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     SENDS_PER_SLOT,
@@ -182,6 +182,20 @@ def best_effort_cores(profiles: Sequence[Profile], request: PlanRequest) -> dict
     return {name: cores.get(name, chain) for name in names}
 
 
+def _places(profiles: Sequence[Profile], cores: Sequence[int]) -> dict[str, int]:
+    """The place in ``cores`` of the stage that each node of a pipeline is in."""
+    staged = (stage_places(p.nodes, _apart(p).steps_ns, p.period_ns, len(cores)) for p in profiles)
+    return {node: place for own in staged for node, place in own.items()}
+
+
+def stages_before(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
+    """How many stages of a pipeline are more urgent than a node's, where cores are named twice."""
+    if request.policy != "pipelined" or request.cores is None:
+        return {}
+    cores, places = request.cores, _places(profiles, request.cores)
+    return {node: cores[:place].count(cores[place]) for node, place in places.items()}
+
+
 def cores_for(
     profiles: Sequence[Profile],
     cores: Sequence[int],
@@ -189,15 +203,14 @@ def cores_for(
     worth: float = 0.0,
 ) -> dict[str, int]:
     """The core of each node of these chains, see :func:`~chainshaper.planning.cores.assign_cores`
-    and, for stages, :func:`.stage_cores`. Raises InputError: a profile is bare latencies.
+    and, for stages, :func:`.stage_places`. Raises InputError: a profile is bare latencies.
     """
     for profile in profiles:
         if not profile.callbacks:
             reason = f"--cores distributes callbacks, and latencies do not say {profile.name}'s"
             raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
-        staged = (stage_cores(p.nodes, _apart(p).steps_ns, p.period_ns, cores) for p in profiles)
-        return {node: core for own in staged for node, core in own.items()}
+        return {node: cores[k] for node, k in _places(profiles, cores).items()}
     margin = EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
     return assign_cores(profiles, cores, margin_ns=margin, worth=worth)
 

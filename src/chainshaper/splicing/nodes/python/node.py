@@ -4,6 +4,7 @@ said.
 """
 
 import atexit
+import contextlib
 import ctypes
 import fcntl
 import functools
@@ -221,13 +222,14 @@ _MESSAGE_EVENTS = {
 def _functions(wanted: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
     """The functions of events by name, with these types of arguments.
 
-    None where the library is not loaded, or one of them is missing.
+    None where the library is not loaded, or one of them is missing. What stands in front of it for
+    the whole process (LD_PRELOAD) comes first, and hands events on.
     """
-    try:
-        library = ctypes.CDLL("libtracetools.so", mode=os.RTLD_NOLOAD)
-        functions = {name: getattr(library, f"ros_trace_{name}") for name in wanted}
-    except (OSError, AttributeError):
-        return {}
+    functions: dict[str, Any] = {}
+    for place in ("libtracetools.so", None):
+        with contextlib.suppress(OSError, AttributeError):
+            library = ctypes.CDLL(place, mode=os.RTLD_NOLOAD)
+            functions = {name: getattr(library, f"ros_trace_{name}") for name in wanted}
     for name, function in functions.items():
         function.argtypes, function.restype = wanted[name], None
     return functions
