@@ -24,9 +24,13 @@ LIBRARIES = {
 #include <stdio.h>
 #include <stdlib.h>
 
+#ifndef BY
+#define BY "HEARD"
+#endif
+
 static void tell(const char * event, const void * first, intptr_t second, const char * text)
 {
-  FILE * heard = fopen(getenv("HEARD"), "a");
+  FILE * heard = fopen(getenv(BY), "a");
   fprintf(heard, "%s %zu %zu %s\n", event, (size_t)first, (size_t)second, text);
   fclose(heard);
 }
@@ -114,6 +118,18 @@ def test_the_throttlers_callbacks_are_seen_like_those_of_rclcpp(tmp_path: Path) 
 def test_a_library_without_all_trace_points_is_left_alone(tmp_path: Path) -> None:
     throttled_once(tmp_path, preloaded(tmp_path, "-DINCOMPLETE"))
     assert not (tmp_path / "heard").exists()
+
+
+def test_a_library_in_front_of_the_process_gets_the_events(tmp_path: Path) -> None:
+    """It hands them on to the library behind it; the one that records by default is such."""
+    behind, front = preloaded(tmp_path), tmp_path / "libfront.so"
+    flags = ["-shared", "-fPIC", '-DBY="IN_FRONT"', "-o", front, tmp_path / "tracetools.c"]
+    subprocess.run(["gcc", *flags], check=True)
+    preload = f"{front}:{behind['LD_PRELOAD']}"
+    environment = {**behind, "LD_PRELOAD": preload, "IN_FRONT": str(tmp_path / "front")}
+    throttled_once(tmp_path, environment)
+    assert not (tmp_path / "heard").exists()
+    assert "callback_start" in (tmp_path / "front").read_text()
 
 
 def test_the_shaping_node_still_gets_message_and_source_timestamp(
