@@ -123,8 +123,8 @@ def test_a_library_without_all_trace_points_is_left_alone(tmp_path: Path) -> Non
 def test_a_library_in_front_of_the_process_gets_the_events(tmp_path: Path) -> None:
     """It hands them on to the library behind it; the one that records by default is such."""
     behind, front = preloaded(tmp_path), tmp_path / "libfront.so"
-    flags = ["-shared", "-fPIC", '-DBY="IN_FRONT"', "-o", front, tmp_path / "tracetools.c"]
-    subprocess.run(["gcc", *flags], check=True)
+    gcc = ["gcc", "-shared", "-fPIC", '-DBY="IN_FRONT"', "-o", str(front)]
+    subprocess.run([*gcc, str(tmp_path / "tracetools.c")], check=True)
     preload = f"{front}:{behind['LD_PRELOAD']}"
     environment = {**behind, "LD_PRELOAD": preload, "IN_FRONT": str(tmp_path / "front")}
     throttled_once(tmp_path, environment)

@@ -28,7 +28,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from traced_program import built
 
 from chainshaper import plan_recording
-from chainshaper.analysis import analyse_latency, latency_statistics
+from chainshaper.analysis import analyse_latency, data_flow, latency_statistics
 from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
@@ -77,8 +77,11 @@ def watched(watch: Watch, seconds: float, every: float = 0.25) -> list[Seen]:
     return [*seen, watch.look()]
 
 
-def own_watch(*chains: str, plan: ApplicationPlan | None = None) -> Watch:
-    return Watch(chains or (CHAIN,), users={os.geteuid()}, plan=plan, longest_ns=LONGEST_NS)
+def own_watch(*chains: str, plan: ApplicationPlan | None = None, callbacks: bool = False) -> Watch:
+    own = {os.geteuid()}
+    return Watch(
+        chains or (CHAIN,), users=own, plan=plan, longest_ns=LONGEST_NS, callbacks=callbacks
+    )
 
 
 def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> None:
@@ -87,13 +90,14 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     tracer = PreloadTracer(tmp_path / "trace", ["command"], ())
     with running(tmp_path, 80, **{VARIABLE: tracer.start()[VARIABLE]}) as process:
         time.sleep(0.5)
-        watch, other = own_watch(), own_watch()
+        watch, other = own_watch(callbacks=True), own_watch()
         seen = watched(watch, 2.0)
         other_seen = other.look()
         process.communicate()
     tracer.remove()
     tables, info = tracer.recording()
-    whole = analyse_latency(tables, CHAIN, info.clock_offset_ns).traversals
+    analysis = analyse_latency(tables, CHAIN, info.clock_offset_ns)
+    whole = analysis.traversals
     (chain,) = watch.chains
     latencies = dict(whole.select("start", "latency_ns").iter_rows())
     begun, found, count = chain.cycles["start"], chain.cycles["latency_ns"], chain.cycles.height
@@ -109,6 +113,18 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
         found.mean(), rel=1e-6
     )
     assert [hop.node for hop in last.hops] == ["/first", "/second"]
+    own = analysis.hops.join(same_time, on="traversal", how="semi").group_by("hop")
+    most = own.agg(pl.col("communication_ns", "computation_ns").max()).sort("hop")
+    assert [hop.longest_ns for hop in last.hops] == most.drop("hop").rows()
+    (second,) = (one for one in seen[-1].callbacks if one.node == "/second")
+    (ran,) = (one for one in analysis.graph.callbacks if one.node == "/second")
+    flow = data_flow(tables, info.clock_offset_ns)
+    since, until = begun[0], begun[-1]
+    times = flow.instances.filter(callback_id=ran.id).filter(
+        pl.col("start").is_between(since, until)
+    )
+    assert second.starts == "/ebpf1"
+    assert second.longest_ns[0] == (times["end"] - times["start"]).max()
     assert abs(other_seen.chains[0].spans["hour"].count - count) <= 5
     assert seen[-1].lost == 0
 
@@ -291,7 +307,10 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         assert objects[-1]["chains"][0]["spans"]["hour"]["count"] > 5
         assert objects[-1]["processes"] == {str(process.pid): "/first, /second"}
         (tmp_path / "budget.yaml").write_text(
-            f"format: 1\nchains: [{{chain: {CHAIN}, maximum: 1us, jitter: 10s}}]\n"
+            f"format: 1\nchains:\n- {{chain: {CHAIN}, maximum: 1us, jitter: 10s,"
+            " hops: [{topic: /ebpf2, communication: 10s, computation: 1us}]}\n"
+            "callbacks:\n- {node: /second, starts: /ebpf1, response: 1us, execution: 10s}\n"
+            "- {node: /ended, starts: /other, response: 1us}\n"
         )
         (tmp_path / "broken").mkdir()
         words += ["--budget", str(tmp_path / "budget.yaml"), "--recorder", str(tmp_path / "broken")]
@@ -302,7 +321,9 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         shown.send_signal(signal.SIGINT)
         text, said = shown.communicate(timeout=20)
     assert f"{CHAIN}: maximum" in said, "the limit that is broken, once"
-    assert said.count("budget 1 us") == 1
+    assert said.count("budget 1 us") == 3
+    assert f"{CHAIN}: computation of /ebpf2" in said
+    assert "/second (/ebpf1): response" in said
     (broken,) = (tmp_path / "broken").glob("watch-*")
     assert open_recording(broken).info.chain == CHAIN
     assert re.search(rf"{CHAIN}: \d\d\.\d\d cycles a second", text)
@@ -326,7 +347,10 @@ class Collector(BaseHTTPRequestHandler):
 
 def test_metrics_are_the_figures_that_are_shown() -> None:
     hour = latency_statistics(np.arange(5, 25) * 1_000_000, late=1)
-    hops = (Hop("/first", "/ebpf1", 0.0, 2e6), Hop("/second", "/ebpf2", 1e6, 3e6))
+    hops = (
+        Hop("/first", "/ebpf1", 0.0, 2e6, (0, 2)),
+        Hop("/second", "/ebpf2", 1e6, 3e6, (1, 3)),
+    )
     counted = {"complete": hour.count, "late": 1, "incomplete": 0, "unclear": 0}
     spans = dict.fromkeys(SPANS, hour)
     chain = ChainNow(CHAIN, spans, 20.0, hops, (), None, 0, counted, problem=None)

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -99,6 +99,24 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
             *("tids", "count", "unfinished", "response_ns", "execution_ns"),
         )
     )
+
+
+def named_callbacks(flow: DataFlow) -> dict[tuple[str, str], dict[str, Any]]:
+    """Callbacks that ran and are named alike in every run, by node and what starts them.
+
+    They are rows of :func:`.callback_statistics`, without those that every node has.
+    """
+    found = (
+        callback_statistics(flow)
+        .filter(
+            pl.col("node").is_not_null()
+            & pl.col("kind").is_in(["timer", "subscription"])
+            & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
+        )
+        .unique(["node", "topic", "period_ns"], keep="first", maintain_order=True)
+    )
+    rows = found.iter_rows(named=True)
+    return {(row["node"], trigger_text(row["topic"], row["period_ns"])): row for row in rows}
 
 
 class Executor(NamedTuple):

@@ -275,8 +275,8 @@ def watch(
     every: int = opt.option("--every DURATION", "How often to look.", 1_000_000_000),
     budget: Path | None = opt.option(
         "--budget FILE",
-        "What chains have to keep to in the last minute: a limit that breaks is said, and the last"
-        " ten seconds are written.",
+        "What chains, hops and callbacks may take in the last minute: a limit that breaks is said,"
+        " and the last ten seconds are written.",
     ),
     recorder: Path = opt.option(
         "--recorder DIR",
@@ -336,7 +336,13 @@ def watch(
         show = until.enter_context(out.live())
         export = until.enter_context(exporting(metrics, otlp))
         asked = until.enter_context(out.asked_for(signal.SIGQUIT))
-        watched = Watch(chains, users=run_users(user or []), plan=known, longest_ns=longest)
+        watched = Watch(
+            chains,
+            users=run_users(user or []),
+            plan=known,
+            longest_ns=longest,
+            callbacks=bool(limits.callbacks),
+        )
         publish = _publisher(watched, until) if diagnostics else lambda _: None
         next_look, breaks = time.monotonic_ns() + every, set[tuple[str, str]]()
         while not stop.wait(0.1) and (started is None or started.poll() is None):

@@ -12,10 +12,10 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 ``starts`` is the topic or period that starts a callback, as `chainshaper callbacks` shows it.
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
 from xml.etree import ElementTree
 
 import polars as pl
@@ -23,17 +23,15 @@ import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
 from chainshaper.analysis import data_flow
-from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.latency import (
     PERCENTILES,
     LatencyAnalysis,
     LatencyStatistics,
-    callback_statistics,
     latency_statistics,
+    named_callbacks,
 )
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
-from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, shown
 from chainshaper.values.files import new_file, write_whole
@@ -50,6 +48,8 @@ ROOM = 0.1
 GRAIN_NS = 10_000
 """Proposed limits are whole multiples of it."""
 LEAST_MISSING = 0.01
+
+_Longest: TypeAlias = tuple[float | None, float | None]
 
 
 def _share_in(value: object) -> object:
@@ -222,7 +222,11 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
             )
             continue
         calm, parts = _calm(analysis), hop_breakdown(analysis)
-        hops = list(_judged_hops(name, chain, parts))
+        longest = {
+            one["topic"]: (_most(one["communication_ns"]), _most(one["computation_ns"]))
+            for one in parts.to_dicts()
+        }
+        hops = list(_judged_hops(name, chain, longest))
         because = _from_where(hops, parts)
         every = _chain_limits(chain, analysis.statistics, _missing(analysis))
         undisturbed = _chain_limits(chain, calm.statistics, _missing(calm))
@@ -231,17 +235,8 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
             found.append(one if one.met else replace(one, because=because))
         found += hops
     rows = named_callbacks(flow)
-    for callback in budget.callbacks:
-        row = rows.get((callback.node, callback.starts))
-        lacks = "no such callback" if row is None else "no such time"
-        where = f"{callback.node} ({callback.starts})"
-        for what in ("response", "execution"):
-            limit = getattr(callback, f"{what}_ns")
-            if limit is not None:
-                most = _most((row or {}).get(f"{what}_ns"))
-                why = None if most is not None else f"the recording has {lacks}"
-                found.append(Judged(name, where, what, limit, most, because=why))
-    return found
+    times = {key: (_most(r["response_ns"]), _most(r["execution_ns"])) for key, r in rows.items()}
+    return [*found, *_judged_callbacks(name, budget.callbacks, times)]
 
 
 def check_budgets(
@@ -271,15 +266,20 @@ def _checked(
 
 
 def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
-    """What chains break of their limits in the last minute; one that does not run breaks none."""
-    of_chain = {one.chain: one.spans["minute"] for one in seen.chains}
-    found = []
+    """What is broken of a budget's limits in the last minute; what does not run breaks none."""
+    of_chain = {one.chain: one for one in seen.chains}
+    found: list[Judged] = []
     for chain in budget.chains:
-        figures = of_chain.get(chain.chain)
-        if figures is not None and (every := figures.count + figures.incomplete):
-            missing = ((figures.late or 0) + figures.incomplete) / every
-            limits = _chain_limits(chain, figures, missing)
-            found += [Judged("now", chain.chain, *one) for one in limits]
+        now = of_chain.get(chain.chain)
+        if now is not None and (every := (minute := now.spans["minute"]).count + minute.incomplete):
+            missing = ((minute.late or 0) + minute.incomplete) / every
+            why = None if minute.count else "no cycle was complete"
+            limits = _chain_limits(chain, minute, missing)
+            found += [Judged("now", chain.chain, *one, because=why) for one in limits]
+            found += _judged_hops("now", chain, {one.topic: one.longest_ns for one in now.hops})
+    times = {(one.node, one.starts): one.longest_ns for one in seen.callbacks}
+    running = [one for one in budget.callbacks if (one.node, one.starts) in times]
+    found += _judged_callbacks("now", running, times)
     return [one for one in found if not one.met]
 
 
@@ -316,16 +316,39 @@ def _missing(analysis: LatencyAnalysis) -> float | None:
     return float(gone) / over.height
 
 
-def _judged_hops(name: str, chain: ChainBudget, parts: pl.DataFrame) -> Iterator[Judged]:
-    rows = {row["topic"]: row for row in parts.to_dicts()}
+def _judged_hops(
+    name: str, chain: ChainBudget, longest: Mapping[str, _Longest]
+) -> Iterator[Judged]:
+    """The limits of hops; ``longest`` are communication and computation by topic."""
     for hop in chain.hops:
-        for part in ("communication", "computation"):
-            limit = getattr(hop, f"{part}_ns")
+        limits = zip(
+            ("communication", "computation"),
+            (hop.communication_ns, hop.computation_ns),
+            longest.get(hop.topic, (None, None)),
+            strict=True,
+        )
+        for part, limit, most in limits:
             if limit is not None:
-                most = _most(rows.get(hop.topic, {}).get(f"{part}_ns"))
                 why = None if most is not None else "the chain has no such hop here"
                 what = f"{part} of {hop.topic}"
                 yield Judged(name, chain.chain, what, limit, most, because=why)
+
+
+def _judged_callbacks(
+    name: str, callbacks: Sequence[CallbackBudget], longest: Mapping[tuple[str, str], _Longest]
+) -> Iterator[Judged]:
+    """Their limits; ``longest`` are response and execution times by node and what starts it."""
+    for one in callbacks:
+        key = (one.node, one.starts)
+        lacks = "time" if key in longest else "callback"
+        times = longest.get(key, (None, None))
+        for what, limit, most in zip(
+            ("response", "execution"), (one.response_ns, one.execution_ns), times, strict=True
+        ):
+            if limit is not None:
+                why = None if most is not None else f"the recording has no such {lacks}"
+                where = f"{one.node} ({one.starts})"
+                yield Judged(name, where, what, limit, most, because=why)
 
 
 def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
@@ -340,24 +363,6 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
     longest = parts.row(0, named=True)
     mean = duration_text(round(longest["computation_ns"]["mean"]))
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
-
-
-def named_callbacks(flow: DataFlow) -> dict[tuple[str, str], dict[str, Any]]:
-    """Callbacks that ran and are named alike in every run, by node and what starts them.
-
-    They are rows of :func:`.callback_statistics`, without those that every node has.
-    """
-    found = (
-        callback_statistics(flow)
-        .filter(
-            pl.col("node").is_not_null()
-            & pl.col("kind").is_in(["timer", "subscription"])
-            & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
-        )
-        .unique(["node", "topic", "period_ns"], keep="first", maintain_order=True)
-    )
-    rows = found.iter_rows(named=True)
-    return {(row["node"], trigger_text(row["topic"], row["period_ns"])): row for row in rows}
 
 
 def _most(times: dict[str, float] | None) -> float | None:

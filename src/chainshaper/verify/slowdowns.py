@@ -35,11 +35,11 @@ from scipy import stats
 
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.disturbance import stalled_after
+from chainshaper.analysis.latency import named_callbacks
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
-from chainshaper.verify.budgets import named_callbacks
 from chainshaper.verify.measure import measure_latency
 
 LEVEL = 1 / 200

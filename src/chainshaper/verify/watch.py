@@ -13,8 +13,8 @@ hour, and only as three numbers each.
 import contextlib
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -23,9 +23,9 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.analysis import data_flow, find_chain, graph_of, traverse
+from chainshaper.analysis import DataFlow, data_flow, find_chain, graph_of, traverse
 from chainshaper.analysis.disturbance import with_punctuality
-from chainshaper.analysis.latency import LatencyStatistics, latency_statistics
+from chainshaper.analysis.latency import LatencyStatistics, latency_statistics, named_callbacks
 from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.gate.decision import clock_offset
 from chainshaper.planning import ApplicationPlan
@@ -65,12 +65,27 @@ _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave 
 
 @dataclass(frozen=True)
 class Hop:
-    """A callback of the chain: mean shares of the latency over the last minute (ns)."""
+    """A callback of the chain: its shares of the latency over the last minute (ns).
+
+    Means, and in ``longest_ns`` the longest communication and computation.
+    """
 
     node: str
     topic: str
     communication_ns: float
     computation_ns: float
+    longest_ns: tuple[int, int]
+
+
+@dataclass(frozen=True)
+class CallbackNow:
+    """A callback, and what starts it; in ``longest_ns`` its longest response and execution time
+    over the last minute (None: not known).
+    """
+
+    node: str
+    starts: str
+    longest_ns: tuple[float | None, float | None]
 
 
 @dataclass(frozen=True)
@@ -101,12 +116,14 @@ class Seen:
     """One look: its instant (CLOCK_MONOTONIC, ns), the nodes by process, and the chains.
 
     ``lost`` counts events that were overwritten before we read them, or found no room.
+    ``callbacks`` are there where they are asked for.
     """
 
     at_ns: int
     processes: Mapping[int, str]
     lost: int
     chains: tuple[ChainNow, ...]
+    callbacks: tuple[CallbackNow, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -166,10 +183,11 @@ class _Chain:
         self.counted["late"] += int(traversals["late"].sum() or 0)
         own = hops.join(traversals.filter("complete"), on="traversal", how="semi")
         if own.height:
-            shares = (pl.col("communication_ns", "computation_ns")).sum()
-            self.hops.append((now_ns, own.group_by("hop").agg(shares, count=pl.len())))
-        while self.hops and self.hops[0][0] < now_ns - SPANS["minute"]:
-            self.hops.popleft()
+            shares = pl.col("communication_ns", "computation_ns")
+            most = shares.max().name.prefix("longest_")
+            figures = own.group_by("hop").agg(shares.sum(), most, count=pl.len())
+            self.hops.append((now_ns, figures))
+        _forget(self.hops, now_ns)
 
     def statistics(self, since_ns: int) -> LatencyStatistics:
         begun = self.cycles.filter(pl.col("start") >= since_ns)
@@ -189,12 +207,19 @@ class _Chain:
         return tuple((counted / places.size).tolist())
 
 
+def _forget(seen: deque[tuple[int, Any]], now_ns: int) -> None:
+    """Leave out what is older than a minute."""
+    while seen and seen[0][0] < now_ns - SPANS["minute"]:
+        seen.popleft()
+
+
 class Watch:
     """The chains of what runs, or will run, with the library in front.
 
     ``chains`` as `--chain` has them; ``users`` are whose processes are followed, ``longest_ns`` is
     what a cycle may take: one that takes longer counts as incomplete. ``plan`` says when outputs
-    are due. Between two looks :meth:`read` wants to be called every tenth of a second or so.
+    are due. With ``callbacks`` their times are looked at, too. Between two looks :meth:`read` wants
+    to be called every tenth of a second or so.
     """
 
     def __init__(
@@ -204,7 +229,9 @@ class Watch:
         users: Collection[int],
         plan: ApplicationPlan | None = None,
         longest_ns: int = 2 * SECOND,
+        callbacks: bool = False,
     ) -> None:
+        self.callbacks: deque[tuple[int, Any]] | None = deque() if callbacks else None
         self.users, self.plan, self.longest_ns = users, plan, longest_ns
         self.due = [] if plan is None else [due for one in plan.chains for due in due_of(one)]
         self.chains = [_Chain(text, self._slots(text)) for text in chains]
@@ -266,6 +293,7 @@ class Watch:
         # Where publications carry no stamp, the clock's offset says which one was taken.
         stampless = flow.publications["source_timestamp"].null_count() > 0
         clear_ns = self._stepped_ns if stampless else 0
+        within = pl.col("start").is_between(self._over_ns, over, "right")
         graph = graph_of(flow)
         nodes = {one.id: one.node or "" for one in graph.callbacks}
         for one in self.chains:
@@ -278,12 +306,15 @@ class Watch:
             found = traverse(flow, chain, graph)
             due = next((d for d in self.due if d.output in {None, chain.topics[-1]}), None)
             judged, _ = with_punctuality(flow, found, due)
-            new = judged.filter(pl.col("start").is_between(self._over_ns, over, "right"))
+            new = judged.filter(within)
             one.take_over(clear := new.filter(pl.col("start") > clear_ns), found.hops, now)
             one.counted["unclear"] += new.height - clear.height
             one.names = list(
                 zip(map(nodes.__getitem__, chain.callbacks), chain.topics, strict=True)
             )
+        if self.callbacks is not None:
+            self.callbacks.append((now, _longest(flow, within)))
+            _forget(self.callbacks, now)
         self._over_ns = over
         moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
         return Seen(
@@ -291,6 +322,7 @@ class Watch:
             processes=processes_of(tables, dict.fromkeys(self.processes, "")),
             lost=self.lost,
             chains=tuple(self._now(one, over, moved) for one in self.chains),
+            callbacks=tuple(_callbacks(own for _, own in self.callbacks or ())),
         )
 
     def _objects(self, tables: EventTables, since_ns: int) -> Objects:
@@ -387,10 +419,36 @@ class Watch:
 def _hops(one: _Chain) -> Iterator[Hop]:
     if not one.hops:
         return
-    sums = pl.concat([frame for _, frame in one.hops]).group_by("hop").sum().sort("hop")
-    for number, communication, computation, count in sums.iter_rows():
+    figures = pl.concat([frame for _, frame in one.hops]).group_by("hop")
+    sums = figures.agg(pl.exclude("^longest_.*$").sum(), pl.col("^longest_.*$").max()).sort("hop")
+    for number, communication, computation, count, *longest in sums.iter_rows():
         node, topic = one.names[number]
-        yield Hop(node, topic, communication / count, computation / count)
+        most = (longest[0], longest[1])
+        yield Hop(node, topic, communication / count, computation / count, most)
+
+
+_Longest: TypeAlias = tuple[float | None, float | None]
+"""A callback's response and execution time."""
+
+
+def _longest(flow: DataFlow, within: pl.Expr) -> dict[tuple[str, str], _Longest]:
+    rows = named_callbacks(replace(flow, instances=flow.instances.filter(within)))
+    none: dict[str, float] = {}
+    return {
+        name: ((row["response_ns"] or none).get("max"), (row["execution_ns"] or none).get("max"))
+        for name, row in rows.items()
+    }
+
+
+def _callbacks(looks: Iterable[Mapping[tuple[str, str], _Longest]]) -> Iterator[CallbackNow]:
+    every: dict[tuple[str, str], list[_Longest]] = {}
+    for own in looks:
+        for name, times in own.items():
+            every.setdefault(name, []).append(times)
+    for (node, starts), found in every.items():
+        response = max((one for one, _ in found if one is not None), default=None)
+        execution = max((one for _, one in found if one is not None), default=None)
+        yield CallbackNow(node, starts, (response, execution))
 
 
 @contextlib.contextmanager
