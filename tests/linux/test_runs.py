@@ -277,8 +277,8 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
     unknown = recording.info.model_copy(update={"in_force": None})
     whole = measure_latency(replace(recording, info=unknown))
     assert (whole.analysis.statistics.min_ns or 0) < shortest
-    assert measured.held is not None
-    assert measured.held.mean.measured_ns is not None
+    assert measured.prediction is not None
+    assert measured.prediction.mean.measured_ns is not None
 
 
 def _asynchronous_plan() -> Plan:

@@ -168,7 +168,7 @@ def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
         with_offsets(chains)
     placed, remarks = place_chains(chains)
     assert [[server.priority for server in plan.servers] for plan in placed] == [[3, 1], [2, 1]]
-    assert ["only their publish slots are kept apart" in remark for remark in remarks] == [True]
+    assert ["only their publish slots do not overlap" in remark for remark in remarks] == [True]
     slots = [plan.offset_ns + plan.servers[1].slots[0][0] for plan in placed]
     assert (slots[1] - slots[0]) % (50 * MS) in range(MS, 49 * MS + 1)
     # The worse chain begins while the better one's slot, 30 ms of 50, is closed.

@@ -96,8 +96,8 @@ def test_a_run_known_by_hand_is_written_as_it_was(tmp_path: Path) -> None:
         ("/chainshaper_t2 → /t2", 17 * MS, MS + LATENCY_NS),
     ]
     assert [one[:3] for one in trace.slices("Gate")] == [
-        ("held", 17 * MS, MS + LATENCY_NS),
-        ("held", PERIOD_NS + 17 * MS, PERIOD_NS + MS + LATENCY_NS),
+        ("in the gate", 17 * MS, MS + LATENCY_NS),
+        ("in the gate", PERIOD_NS + 17 * MS, PERIOD_NS + MS + LATENCY_NS),
     ]
     slots = {(trace.name(track), start) for _, start, _, track in trace.slices("Servers")}
     assert slots == {

@@ -145,8 +145,8 @@ def test_a_page_has_all_of_few_cycles(tmp_path: Path) -> None:
         [3, 16 * MS - 1, 16 * MS, LATENCY_NS, LATENCY_NS + 1000],
     ]
     assert one["latency"] == LATENCY_NS
-    held = (3, 16 * MS, LATENCY_NS - 16 * MS, 0, "cycle 0: held", None)
-    assert _bars(data, "held")[0] == held
+    gated = (3, 16 * MS, LATENCY_NS - 16 * MS, 0, "cycle 0: in the gate", None)
+    assert _bars(data, "gated")[0] == gated
     names = [name for name, _ in data["rows"]]
     slot = _bars(data, "slot")[0]
     assert (names[slot[0]], *slot[1:4]) == ("server chain", 0, 30 * MS, 0)

@@ -9,7 +9,7 @@ from chainshaper import plan_recording, simulate
 from chainshaper.planning import PlanRequest
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.verify.measure import measure_latency
-from chainshaper.verify.predictions import hold_prediction
+from chainshaper.verify.predictions import judge_prediction
 from chainshaper.workload.description import Application
 
 TAKE = 10_000  # ns
@@ -60,7 +60,7 @@ def test_outputs_leave_once_a_cycle_in_order(
 
     shaped = simulate(described, tmp_path / "shaped", plan, cycles=1000)
     analysis = measure_latency(shaped).analysis
-    held = hold_prediction(plan, analysis)
+    held = judge_prediction(plan, analysis)
     assert held.mean.holds and held.max.holds and held.jitter.holds
     figures = analysis.statistics
     assert (figures.count, figures.incomplete, figures.late) == (1000, 0, 0)

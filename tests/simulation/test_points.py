@@ -42,9 +42,9 @@ def test_a_point_is_what_simulate_plan_simulate_give(tmp_path: Path) -> None:
     for name in ("count", "incomplete", "min_ns", "mean_ns", "max_ns", "jitter_ns", "spread_ns"):
         assert row[name] == getattr(measured.analysis.statistics, name), name
     assert row["p99_ns"] == measured.analysis.statistics.percentiles_ns["99"]
-    assert measured.held is not None
-    assert row["late"] == measured.held.late
-    for ours, held in zip(row["per_band"], measured.held.bands, strict=True):
+    assert measured.prediction is not None
+    assert row["late"] == measured.prediction.late
+    for ours, held in zip(row["per_band"], measured.prediction.bands, strict=True):
         assert ours["share"] * row["count"] == pytest.approx(held.count)
         assert ours["jitter_ns"] == held.jitter_ns
 

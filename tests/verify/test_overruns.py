@@ -77,10 +77,10 @@ def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> Non
     ((start, end),) = publish_slots(_too_early())
     within = let_go["time"] - let_go["origin"]
     assert ((within >= start) & (within < end)).all()
-    assert measured.held is not None
+    assert measured.prediction is not None
     # What was let go as the slot ended leaves a moment later, and is late.
     at_the_end = measured.analysis.traversals.filter(pl.col("latency_ns") >= end - MS // 10)
-    assert measured.held.late <= at_the_end.height
+    assert measured.prediction.late <= at_the_end.height
     # It is reported wherever the latency is.
     said = overruns_text({"discard": count})
     assert said in " ".join(called("latency", recording.path).out.split())
@@ -175,8 +175,8 @@ def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
     assert measured.analysis.incomplete == {}
     assert (late["release"] == late["arrival"]).all()
     assert late["slot"].null_count() == late.height
-    assert measured.held is not None
-    assert measured.held.late > 0
+    assert measured.prediction is not None
+    assert measured.prediction.late > 0
 
 
 def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Path) -> None:
@@ -363,5 +363,5 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
     assert values["max_all_ns"] >= stopped["latency_ns"]
     assert values["jitter_all_ns"] == values["max_all_ns"] - values["min_ns"]
     measured = measure_latency(recording)
-    assert measured.held is not None
-    assert (measured.held.late_of_all, measured.held.cycles) == (late, values["count"])
+    assert measured.prediction is not None
+    assert (measured.prediction.late_of_all, measured.prediction.cycles) == (late, values["count"])

@@ -19,7 +19,7 @@ from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected
 from chainshaper.planning.plan import Margin, revised
 from chainshaper.reporting.latency import late_text, prediction_json, prediction_table
 from chainshaper.values.recording import Recording
-from chainshaper.verify.predictions import PredictionHeld, hold_prediction
+from chainshaper.verify.predictions import JudgedPrediction, judge_prediction
 
 MS = 1_000_000
 PROFILE = Profile(np.array([40, 50, 60, 61, 69, 84]) * MS, 100 * MS)
@@ -41,8 +41,8 @@ def _measured(
     return replace(like, traversals=rows, releases=like.releases.clear(), statistics=statistics)
 
 
-def _verdicts(held: PredictionHeld) -> tuple[bool | None, bool | None, bool | None]:
-    return held.mean.holds, held.max.holds, held.jitter.holds
+def _verdicts(said: JudgedPrediction) -> tuple[bool | None, bool | None, bool | None]:
+    return said.mean.holds, said.max.holds, said.jitter.holds
 
 
 @pytest.fixture
@@ -59,34 +59,34 @@ def test_outputs_at_slot_starts_are_as_predicted(like: LatencyAnalysis) -> None:
     starts = [start for start, _ in publish_slots(plan)]
     counts = [round(share * 6) for share in plan.predicted.shares]
     latencies = np.repeat(np.array(starts) + 50_000, counts).tolist()
-    held = hold_prediction(plan, _measured(latencies, like))
-    assert _verdicts(held) == (True, True, True)
-    assert held.mean.at_end_ns == plan.predicted.mean_ns
-    assert held.mean.at_start_ns == pytest.approx(plan.predicted.mean_ns - MS, abs=2)
-    assert held.max.at_start_ns == starts[-1]
-    assert held.jitter.at_start_ns == starts[-1] - starts[0]
-    assert [band.count for band in held.bands] == counts
-    assert [band.inside for band in held.bands] == counts
-    assert [band.share for band in held.bands] == pytest.approx(plan.predicted.shares)
-    assert [band.jitter_ns for band in held.bands] == [0, 0, 0]
-    assert held.late == 0
+    said = judge_prediction(plan, _measured(latencies, like))
+    assert _verdicts(said) == (True, True, True)
+    assert said.mean.at_end_ns == plan.predicted.mean_ns
+    assert said.mean.at_start_ns == pytest.approx(plan.predicted.mean_ns - MS, abs=2)
+    assert said.max.at_start_ns == starts[-1]
+    assert said.jitter.at_start_ns == starts[-1] - starts[0]
+    assert [band.count for band in said.bands] == counts
+    assert [band.inside for band in said.bands] == counts
+    assert [band.share for band in said.bands] == pytest.approx(plan.predicted.shares)
+    assert [band.jitter_ns for band in said.bands] == [0, 0, 0]
+    assert said.late == 0
 
 
 def test_what_differs_is_said_to_differ(like: LatencyAnalysis) -> None:
     plan = _bands(1)
-    held = hold_prediction(plan, _measured([85 * MS, 97 * MS, 203 * MS], like))
-    assert (held.max.holds, held.jitter.holds) == (False, False)
-    assert held.bands[0].inside == 1
-    assert held.bands[0].jitter_ns == 12 * MS
-    assert held.late == 1
+    said = judge_prediction(plan, _measured([85 * MS, 97 * MS, 203 * MS], like))
+    assert (said.max.holds, said.jitter.holds) == (False, False)
+    assert said.bands[0].inside == 1
+    assert said.bands[0].jitter_ns == 12 * MS
+    assert said.late == 1
     late = "1 of 3 outputs late, none expected"
     sure = revised(plan, margin=Margin(epsilon_ns=MS))
-    broken = hold_prediction(sure, _measured([85 * MS, 97 * MS, 203 * MS], like)).broken
+    broken = judge_prediction(sure, _measured([85 * MS, 97 * MS, 203 * MS], like)).broken
     assert [text.partition(" ms, not")[0] for text in broken] == [
         *("average 128.333", "maximum 203.000", "jitter 118.000", late)
     ]
-    assert late not in held.broken, "six latencies promise little"
-    nothing = hold_prediction(plan, _measured([], like))
+    assert late not in said.broken, "six latencies promise little"
+    nothing = judge_prediction(plan, _measured([], like))
     assert (nothing.mean.holds, nothing.bands[0].share) == (None, None)
     assert prediction_json(nothing)["bands"][0]["jitter_ns"] is None
     assert prediction_json(nothing)["kept"] is None
@@ -98,25 +98,25 @@ def test_a_wide_slot_promises_no_wide_jitter(like: LatencyAnalysis) -> None:
     seen = expected(plan)
     assert seen == ((85 * MS,), 85 * MS, 85 * MS + GATE_NS, GATE_NS)
     for apart, kept in ((MS, True), (4 * MS, False)):
-        held = hold_prediction(plan, _measured([85 * MS, 85 * MS + apart], like))
-        assert (held.jitter.holds, held.max.holds) == (kept, kept)
+        said = judge_prediction(plan, _measured([85 * MS, 85 * MS + apart], like))
+        assert (said.jitter.holds, said.max.holds) == (kept, kept)
 
 
 def test_let_publishes_a_cycle_later(like: LatencyAnalysis) -> None:
     plan = plan_chain(PROFILE, PlanRequest(policy="let-per-chain"))
     assert cycles_until_output(plan) == 1
-    held = hold_prediction(plan, _measured([100 * MS + 10, 100 * MS + 20], like, 200 * MS))
-    assert (held.mean.at_start_ns, held.mean.at_end_ns) == (100 * MS, 101 * MS)
-    assert (held.mean.holds, held.max.holds, held.late) == (True, True, 0)
-    assert held.bands[0].count == held.bands[0].inside == 2
+    said = judge_prediction(plan, _measured([100 * MS + 10, 100 * MS + 20], like, 200 * MS))
+    assert (said.mean.at_start_ns, said.mean.at_end_ns) == (100 * MS, 101 * MS)
+    assert (said.mean.holds, said.max.holds, said.late) == (True, True, 0)
+    assert said.bands[0].count == said.bands[0].inside == 2
 
 
 def test_policies_without_slots_predict_one_figure(like: LatencyAnalysis) -> None:
     for policy, start in (("server-per-chain", None), ("one-long-slot", 62 * MS)):
         request = PlanRequest(policy=policy, slot_start_ns=start)  # type: ignore[arg-type]
         plan = plan_chain(PROFILE, request)
-        held = hold_prediction(plan, _measured([63 * MS, 85 * MS], like))
-        assert held.mean.at_start_ns == held.mean.at_end_ns == plan.predicted.mean_ns
+        said = judge_prediction(plan, _measured([63 * MS, 85 * MS], like))
+        assert said.mean.at_start_ns == said.mean.at_end_ns == plan.predicted.mean_ns
 
 
 def test_each_mode_is_held_by_its_own_band(like: LatencyAnalysis) -> None:
@@ -138,18 +138,18 @@ def test_each_mode_is_held_by_its_own_band(like: LatencyAnalysis) -> None:
     types = {"traversal": pl.UInt32, "hop": pl.Int64, "mode": pl.String}
     types |= {"slot": pl.Int32, "overrun": pl.String}
     releases = pl.DataFrame(rows, types, orient="row")
-    held = hold_prediction(plan, replace(analysis, releases=releases))
-    slow, fast = held.bands
+    said = judge_prediction(plan, replace(analysis, releases=releases))
+    slow, fast = said.bands
     assert (slow.mode, slow.count, slow.inside, slow.late, slow.jitter_ns) == ("slow", 2, 2, 0, 30)
     assert (fast.mode, fast.count, fast.inside, fast.late, fast.jitter_ns) == ("fast", 1, 1, 1, 0)
     assert (slow.share, fast.share) == (1, 0.5)
     assert (slow.predicted_share, fast.predicted_share) == (1, plan.predicted.shares[0])
     assert (slow.slot_start_ns, fast.slot_start_ns) == (last, first)
-    assert held.late == 1
-    assert _verdicts(held) == (None, None, None), "the modes decide"
-    assert [one["mode"] for one in prediction_json(held)["bands"]] == ["slow", "fast"]
+    assert said.late == 1
+    assert _verdicts(said) == (None, None, None), "the modes decide"
+    assert [one["mode"] for one in prediction_json(said)["bands"]] == ["slow", "fast"]
     with io.StringIO() as text:
-        Console(file=text, width=120).print(prediction_table(held))
+        Console(file=text, width=120).print(prediction_table(said))
         assert "fast, 1 late" in text.getvalue()
 
 
@@ -159,13 +159,13 @@ def test_three_bands_of_a_simulated_chain(tmp_path: Path) -> None:
     request = PlanRequest(bands=3, publish_slot_ns=100_000, epsilon_ns=3 * MS)
     plan = plan_recording(before, request=request)
     after = simulate(application, tmp_path / "after", plan, cycles=100)
-    held = compare_recordings([before, after]).measurements[1].held
-    assert held is not None
-    assert [(band.slot_start_ns, band.slot_end_ns) for band in held.bands] == [*publish_slots(plan)]
+    said = compare_recordings([before, after]).measurements[1].prediction
+    assert said is not None
+    assert [(band.slot_start_ns, band.slot_end_ns) for band in said.bands] == [*publish_slots(plan)]
     undisturbed = measure_latency(after).analysis.undisturbed
-    assert sum(band.count for band in held.bands) + held.late == undisturbed.count
-    assert sum(band.count > 0 for band in held.bands) > 1
-    for band in held.bands:
+    assert sum(band.count for band in said.bands) + said.late == undisturbed.count
+    assert sum(band.count > 0 for band in said.bands) > 1
+    for band in said.bands:
         assert band.min_ns is None or band.min_ns >= band.slot_start_ns, "before its slot"
 
 
@@ -174,15 +174,15 @@ def test_the_plan_may_be_named_where_the_recording_does_not(
 ) -> None:
     comparison = compare_recordings([unshaped, unshaped], plan=plan)
     first, second = comparison.measurements
-    assert first.held is None
-    assert second.held is not None
-    assert second.held.mean.holds is False
+    assert first.prediction is None
+    assert second.prediction is not None
+    assert second.prediction.mean.holds is False
 
 
-def _shown(held: PredictionHeld) -> list[list[str]]:
+def _shown(said: JudgedPrediction) -> list[list[str]]:
     """The rows of the printed table, as their cells."""
     with io.StringIO() as text:
-        Console(file=text, width=200).print(prediction_table(held))
+        Console(file=text, width=200).print(prediction_table(said))
         lines = text.getvalue().splitlines()
     return [[cell.strip() for cell in line.split("│")[1:-1]] for line in lines if "│" in line]
 
@@ -195,9 +195,9 @@ PLACES = st.integers(84 * MS, 87 * MS)
 def test_a_verdict_is_what_its_printed_figures_say(
     places: list[int], bands: int, like: LatencyAnalysis
 ) -> None:
-    held = hold_prediction(_bands(bands), _measured(places, like))
-    rows = _shown(held)
-    for title, figure in (("average", held.mean), ("maximum", held.max), ("jitter", held.jitter)):
+    said = judge_prediction(_bands(bands), _measured(places, like))
+    rows = _shown(said)
+    for title, figure in (("average", said.mean), ("maximum", said.max), ("jitter", said.jitter)):
         _, predicted, measured, verdict, *_ = next(row for row in rows if row[0].startswith(title))
         low, _, high = predicted.partition(" … ")
         inside = float(low) <= float(measured) <= float(high or low)
@@ -212,14 +212,14 @@ def test_with_the_anchor_cycle_the_place_in_the_cycle_is_judged(like: LatencyAna
     ((start, _),) = publish_slots(plan)
     latencies = [start - behind for behind in range(0, 5 * MS, MS // 2)]
     analysis = _measured(latencies, like, places=[start + 40] * len(latencies))
-    held = hold_prediction(plan, analysis)
-    assert held.counted_from == "cycle"
-    assert _verdicts(held) == (True, True, True)
-    assert (held.bands[0].inside, held.bands[0].count) == (10, 10)
-    assert (held.mean.measured_ns, held.bands[0].jitter_ns) == (start + 40, 0)
-    assert any("from the start of the cycle" in row for row in [prediction_table(held).title or ""])
+    said = judge_prediction(plan, analysis)
+    assert said.counted_from == "cycle"
+    assert _verdicts(said) == (True, True, True)
+    assert (said.bands[0].inside, said.bands[0].count) == (10, 10)
+    assert (said.mean.measured_ns, said.bands[0].jitter_ns) == (start + 40, 0)
+    assert any("from the start of the cycle" in row for row in [prediction_table(said).title or ""])
     # With the anchor `stamp` the latency is promised, and it is not constant.
-    other = hold_prediction(revised(plan, anchor="stamp"), analysis)
+    other = judge_prediction(revised(plan, anchor="stamp"), analysis)
     assert (other.counted_from, other.jitter.holds) == ("chain", False)
 
 
@@ -233,10 +233,10 @@ def test_of_a_gated_publisher_too_the_place_is_judged_and_no_average_is_as_predi
     plan = plan_chain(profile, request)
     assert publish_slots(plan) == ((58_500_000, 68_500_000),)
     too_soon = [56_800_000] * 20
-    early = hold_prediction(plan, _measured(too_soon, like))
+    early = judge_prediction(plan, _measured(too_soon, like))
     assert (early.mean.from_ns, early.mean.to_ns) == (58_500_000, 59_600_000)
     assert (early.mean.measured_ns, early.mean.holds) == (56_800_000, False)
-    places = hold_prediction(plan, _measured(too_soon, like, places=[58_600_000] * 20))
+    places = judge_prediction(plan, _measured(too_soon, like, places=[58_600_000] * 20))
     assert (places.mean.measured_ns, places.mean.holds) == (58_600_000, True)
     assert (places.max.holds, places.bands[0].inside) == (True, 20)
 
@@ -246,10 +246,10 @@ def test_a_band_that_may_well_be_empty_is_not_expected(like: LatencyAnalysis) ->
     plan = _bands(2)
     (first, _), (last, _) = publish_slots(plan)
     assert plan.predicted.shares[0] > 0.5
-    few = hold_prediction(plan, _measured([first + 10] * 2, like))
+    few = judge_prediction(plan, _measured([first + 10] * 2, like))
     assert (few.max.from_ns, few.max.holds) == (first, True)
     assert (few.jitter.from_ns, few.jitter.holds) == (0, True)
-    many = hold_prediction(plan, _measured([first + 10] * 60, like))
+    many = judge_prediction(plan, _measured([first + 10] * 60, like))
     assert (many.max.from_ns, many.max.holds, many.jitter.holds) == (last, False, False)
 
 
@@ -257,15 +257,15 @@ def test_a_band_that_may_well_be_empty_is_not_expected(like: LatencyAnalysis) ->
 def test_a_baseline_predicts_at_most(like: LatencyAnalysis, longest: int, holds: bool) -> None:
     """Outputs leave when they are ready: a maximum below the predicted one is as predicted."""
     plan = plan_chain(PROFILE, PlanRequest(policy="server-per-chain"))
-    held = hold_prediction(plan, _measured([50 * MS, 60 * MS, longest], like))
-    assert held.max.holds is holds
+    said = judge_prediction(plan, _measured([50 * MS, 60 * MS, longest], like))
+    assert said.max.holds is holds
 
 
 def test_late_outputs_are_counted_in_all_cycles(like: LatencyAnalysis) -> None:
     """One of two late outputs was in a disturbed cycle; both are said."""
     analysis = _measured([85 * MS, 85 * MS, 185 * MS, 185 * MS], like)
     hidden = analysis.traversals.with_columns(disturbed=pl.Series([False, False, False, True]))
-    held = hold_prediction(_bands(1), replace(analysis, traversals=hidden))
-    assert (held.late, held.late_of_all, held.cycles) == (1, 2, 4)
-    assert late_text(held) == "of all 4 outputs 2 came late, 1 of them in disturbed cycles"
-    assert prediction_json(held)["late_of_all"] == 2
+    said = judge_prediction(_bands(1), replace(analysis, traversals=hidden))
+    assert (said.late, said.late_of_all, said.cycles) == (1, 2, 4)
+    assert late_text(said) == "of all 4 outputs 2 came late, 1 of them in disturbed cycles"
+    assert prediction_json(said)["late_of_all"] == 2

@@ -105,7 +105,7 @@ CHAIN: str | None = option(
     "--chain FIRST..LAST",
     "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
 )
-STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is kept.", False)
+STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.", False)
 PLAN_IN_FORCE: Path | None = option(
     "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
 )

@@ -302,16 +302,16 @@ def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
     tables = [overview_table(comparisons)] if len(comparisons) > 1 else []
     for comparison in comparisons:
         predictions = [
-            prediction_table(one.held, one.recording.path.name)
+            prediction_table(one.prediction, one.recording.path.name)
             for one in comparison.measurements
-            if one.held is not None
+            if one.prediction is not None
         ]
         tables += [comparison_table(comparison), *predictions]
     return tables
 
 
 def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -> None:
-    """Say whether promises of plans were kept.
+    """Say whether promises of plans were met.
 
     Raises OperationError, InputError: not all were, or there was none, and ``strict`` asks for it.
     """
@@ -319,18 +319,18 @@ def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -
 
     several = len(comparisons) > 1
     found = [
-        (kept, f"{one.chain}: {text}" if several else text)
+        (met, f"{one.chain}: {text}" if several else text)
         for one in comparisons
         for measured in one.measurements
         if measured.plan is not None
-        for kept, text in [verdict(measured)]
+        for met, text in [verdict(measured)]
     ]
     for _, text in found if not json else ():
         out.show_line(text)
     if strict and not found:
         raise InputError("--strict judges a plan's promise: name the plan in force with --plan")
-    if strict and not all(kept for kept, _ in found):
-        raise OperationError("the plan's promise is not kept (--strict)")
+    if strict and not all(met for met, _ in found):
+        raise OperationError("the plan's promise is not met (--strict)")
 
 
 def compare(
@@ -346,7 +346,7 @@ def compare(
     """Show the same chain in several recordings side by side, usually before and after shaping.
 
     Where a plan was in force, its prediction stands beside the measurement, band by band, and the
-    last line says whether its promise was kept. Without --chain, all chains of
+    last line says whether its promise was met. Without --chain, all chains of
     the plan in force in the last recording are shown.
     """
     from chainshaper.reporting.latency import comparisons_json

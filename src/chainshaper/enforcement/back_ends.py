@@ -134,11 +134,11 @@ _KNOWN: dict[str, tuple[str, Callable[[], str | None]]] = {
     "scx": ("the kernel itself keeps threads inside their slots (sched_ext)", scx.missing),
     "litmus": ("the kernel itself keeps threads inside their slots (LITMUS^RT)", litmus.missing),
     "freezer": (
-        "unmodified threads are kept inside their slots by freezing them (cgroup v2)",
+        "unmodified threads run in their slots only: outside they are frozen (cgroup v2)",
         _missing_for_freezer,
     ),
     "fifo": (
-        "threads are isolated by SCHED_FIFO priorities; nothing is held back between slots",
+        "threads are isolated by SCHED_FIFO priorities; between slots they run on",
         _missing_for_fifo,
     ),
 }

@@ -93,7 +93,7 @@ def place_chains(
         condition = ": their latencies must have been measured while all of them ran like this"
         remark = (
             f"{error}. Instead, the chains run at the same time at priorities of their own, and"
-            f" only their publish slots are kept apart{'' if at_once else condition}."
+            f" only their publish slots do not overlap{'' if at_once else condition}."
         )
         apart = partial(with_offsets, ranked, together=together, time_limit_s=time_limit_s)
         for share in SHARES:

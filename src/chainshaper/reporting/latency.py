@@ -34,7 +34,7 @@ from chainshaper.verify.overruns import (
     next_cycles,
     overruns_text,
 )
-from chainshaper.verify.predictions import FigureHeld, PredictionHeld
+from chainshaper.verify.predictions import JudgedFigure, JudgedPrediction
 
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows that say what happened to cycles that are called disturbed."""
@@ -120,8 +120,8 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         entry = {"recording": str(measurement.recording.path), **latency_json(measurement)}
         if measurement.plan is not None:
             entry["predicted"] = measurement.plan.predicted.model_dump(mode="json")
-        if measurement.held is not None:
-            entry["prediction"] = prediction_json(measurement.held)
+        if measurement.prediction is not None:
+            entry["prediction"] = prediction_json(measurement.prediction)
         entries.append(entry)
     return {"format": JSON_FORMAT, "chain": comparison.chain, "recordings": entries}
 
@@ -233,19 +233,21 @@ def expected_text(plan: Plan) -> str:
 
 def verdict(one: Measurement) -> tuple[bool | None, str]:
     """Whether a recording has what its plan promised (None: nothing to judge), in a sentence."""
-    held, statistics, name = one.held, one.analysis.statistics, one.recording.path.name
-    if held is None or one.plan is None:
+    judged, statistics, name = one.prediction, one.analysis.statistics, one.recording.path.name
+    if judged is None or one.plan is None:
         return None, f"{name}: no plan was in force, so nothing was promised"
     left_out = statistics.disturbed
     aside = f"; without {left_out} of {statistics.count} cycles, disturbed by the machine"
     aside = aside if left_out else ""
-    if held.broken:
-        return False, f"{name}: promise broken: {'; '.join(held.broken)}{aside}"
-    if held.mean.measured_ns is None:
+    if judged.broken:
+        return False, f"{name}: promise broken: {'; '.join(judged.broken)}{aside}"
+    if judged.mean.measured_ns is None:
         return None, f"{name}: no undisturbed cycle to judge the promise by{aside}"
-    late = "" if held.late_of_all is None else f", {held.late_of_all} of {held.cycles} outputs late"
-    jitter = f"jitter {ms(held.jitter.measured_ns)} ms"
-    return True, f"{name}: promise kept: {jitter}{late} ({expected_text(one.plan)}){aside}"
+    late, of_all = "", judged.late_of_all
+    if of_all is not None:
+        late = f", {of_all} of {judged.cycles} outputs late"
+    jitter = f"jitter {ms(judged.jitter.measured_ns)} ms"
+    return True, f"{name}: promise met: {jitter}{late} ({expected_text(one.plan)}){aside}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
@@ -283,7 +285,7 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
         " → ".join(f"{ms(getattr(calm[n], field))} ms ({names[n]})" for n in ends)
         for field in ("jitter_ns", "mean_ns")
     )
-    said, prediction = f"Jitter {jitter}; average {average}", measurements[-1].held
+    said, prediction = f"Jitter {jitter}; average {average}", measurements[-1].prediction
     if prediction is None:
         return f"{said}."
     named = ("average", prediction.mean), ("maximum", prediction.max), ("jitter", prediction.jitter)
@@ -305,22 +307,22 @@ def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ())
     return table
 
 
-def prediction_table(held: PredictionHeld, name: str = "") -> ResultTable:
+def prediction_table(judged: JudgedPrediction, name: str = "") -> ResultTable:
     """Predicted beside measured: the whole, then band by band; of a recording with a ``name``."""
-    whence = ", from the start of the cycle" if held.counted_from == "cycle" else ""
+    whence = ", from the start of the cycle" if judged.counted_from == "cycle" else ""
     columns = [*words(""), *figures("predicted", "measured"), *words("verdict")]
     columns += figures("jitter", "share predicted", "measured")
     title = f"Prediction and measurement{f' of {name}' if name else ''}{whence} [ms]"
     table = ResultTable(title, columns)
     for title, figure in (
-        ("average", held.mean),
-        ("maximum", held.max),
-        ("jitter (max − min)", held.jitter),
+        ("average", judged.mean),
+        ("maximum", judged.max),
+        ("jitter (max − min)", judged.jitter),
     ):
         verdict = {True: "as predicted", False: "differs", None: ABSENT}[figure.holds]
         table.add(title, figure.range_text, ms(figure.measured_ns), verdict, "", "", "")
     table.line()
-    for number, band in enumerate(held.bands, start=1):
+    for number, band in enumerate(judged.bands, start=1):
         name = band.mode or f"band {number}"
         table.add(
             f"{name}, {band.late} late" if band.mode and band.late else name,
@@ -332,8 +334,8 @@ def prediction_table(held: PredictionHeld, name: str = "") -> ResultTable:
             percent(band.share),
         )
     of_mode = "; shares of a mode: its outputs that were in time for its slot"
-    late = of_mode if any(band.mode for band in held.bands) else ""
-    late += "" if held.late_of_all is None else f"; {late_text(held)}"
+    late = of_mode if any(band.mode for band in judged.bands) else ""
+    late += "" if judged.late_of_all is None else f"; {late_text(judged)}"
     table.caption = (
         "undisturbed cycles; predicted: outputs at the start … the end of their slots (a gate"
         " publishes at the start, eq. 5 counts the end), averages with three standard errors, no"
@@ -342,30 +344,30 @@ def prediction_table(held: PredictionHeld, name: str = "") -> ResultTable:
     return table
 
 
-def late_text(held: PredictionHeld) -> str:
+def late_text(judged: JudgedPrediction) -> str:
     """How many outputs came late, no cycle left out."""
-    disturbed = (held.late_of_all or 0) - held.late
+    disturbed = (judged.late_of_all or 0) - judged.late
     among = f", {disturbed} of them in disturbed cycles" if disturbed else ""
-    return f"of all {held.cycles} outputs {held.late_of_all} came late{among}"
+    return f"of all {judged.cycles} outputs {judged.late_of_all} came late{among}"
 
 
-def prediction_json(held: PredictionHeld) -> dict[str, Any]:
+def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
     """The same as plain data, integers in nanoseconds."""
 
-    def plain(figure: FigureHeld) -> dict[str, Any]:
+    def plain(figure: JudgedFigure) -> dict[str, Any]:
         return {name.removesuffix("_ns"): value for name, value in vars(figure).items()}
 
     return {
         "convention": CONVENTION,
-        "mean_ns": plain(held.mean),
-        "max_ns": plain(held.max),
-        "jitter_ns": plain(held.jitter),
-        "bands": [vars(band) for band in held.bands],
-        "late": held.late,
-        "late_of_all": held.late_of_all,
-        "counted_from": held.counted_from,
-        "kept": None if held.mean.measured_ns is None and not held.broken else not held.broken,
-        "broken": list(held.broken),
+        "mean_ns": plain(judged.mean),
+        "max_ns": plain(judged.max),
+        "jitter_ns": plain(judged.jitter),
+        "bands": [vars(band) for band in judged.bands],
+        "late": judged.late,
+        "late_of_all": judged.late_of_all,
+        "counted_from": judged.counted_from,
+        "kept": not judged.broken if judged.broken or judged.mean.measured_ns is not None else None,
+        "broken": list(judged.broken),
     }
 
 

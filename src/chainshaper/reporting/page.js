@@ -300,7 +300,7 @@ function plotRows(id, { label, length, zoom, rows }) {
   });
 }
 
-/** Bars of the timeline by kind: cycles, callbacks, those without an end, held, slots, stalls. */
+/** Bars of the timeline by kind: cycles, callbacks, those without an end, gated, slots, stalls. */
 const FILLS = [OTHER, OTHER, OTHER, "url(#hatched)", "var(--series-1)", "var(--bad)"];
 
 /**

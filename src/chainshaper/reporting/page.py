@@ -271,12 +271,12 @@ def _legend(names: Sequence[str]) -> str:
 
 def _prediction(part: _Part) -> str:
     """Predicted beside measured, where a plan was in force."""
-    held = part.measurement.held
-    if held is None:
+    judged = part.measurement.prediction
+    if judged is None:
         return ""
-    table = of_chain.prediction_table(held)
+    table = of_chain.prediction_table(judged)
     about = f"The plan's prediction and {part.name} [ms]: {table.caption}."
-    if held.counted_from == "cycle":
+    if judged.counted_from == "cycle":
         about += " Times count from the start of the cycle."
     return _paragraph(about) + table.html()
 

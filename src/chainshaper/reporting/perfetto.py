@@ -243,7 +243,7 @@ def _gate_tracks(analysis: LatencyAnalysis, timeline: Timeline) -> Iterator[Trac
             late = None if row["release"] is None else row["let_go"] - row["release"]
             arguments = {"cycle": row["traversal"], "slot": row["slot"], "planned": row["release"]}
             arguments |= {"behind_plan_ns": late, "overrun": row["overrun"]}
-            name = "held" if row["overrun"] is None else f"overran: {row['overrun']}"
+            name = "in the gate" if row["overrun"] is None else f"overran: {row['overrun']}"
             families.append([Slice(row["arrival"], row["let_go"], name, arguments)])
         yield Track("Gate", nodes[analysis.chain.callbacks[hop]], families)
 

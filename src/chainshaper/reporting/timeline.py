@@ -33,8 +33,8 @@ SLICES = 20_000
 EXTREMES = 20
 """How many of the longest cycles, and of the shortest, are among them in any case."""
 
-KINDS = ("cycle", "callback", "unended", "held", "slot", "stall")
-CYCLE, CALLBACK, UNENDED, HELD, SLOT, STALL = range(len(KINDS))
+KINDS = ("cycle", "callback", "unended", "gated", "slot", "stall")
+CYCLE, CALLBACK, UNENDED, GATED, SLOT, STALL = range(len(KINDS))
 BARS = ("row", "start", "length", "kind", "cycle", "text", "used")
 """What bars the page's timeline has, and what is said of each."""
 
@@ -44,7 +44,7 @@ FAR = 10**15
 Bar: TypeAlias = tuple[int, int, int, int, int, str, int | None]
 Windows: TypeAlias = tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]
 
-_HELD = {
+_GATED = {
     "traversal": pl.UInt32(),
     "hop": pl.UInt8(),
     **dict.fromkeys(("arrival", "origin", "release", "let_go"), pl.Int64()),
@@ -95,7 +95,7 @@ def timeline_of(
         pl.col("end").is_not_null().alias("ended"),
         "execution_ns",
     )
-    holds = pl.DataFrame(schema=_HELD) if analysis is None else analysis.releases.select(*_HELD)
+    holds = pl.DataFrame(schema=_GATED) if analysis is None else analysis.releases.select(*_GATED)
     origins = _origins(analysis, plan, holds)
     servers = () if plan is None else plan.servers
     slots = [(one.name, n, *slot) for one in servers for n, slot in enumerate(one.slots)]
@@ -238,10 +238,10 @@ def _bars(
         text = label if whole else f"{label}\nits end was not recorded"
         yield row, start, end - start, CALLBACK if whole else UNENDED, -1, text, used
     columns = ["row", "traversal", "arrival", "let_go", "overrun"]
-    held = timeline.holds.join(hops, on=["traversal", "hop"], maintain_order="left")
-    for row, cycle, arrival, let_go, overrun in held.select(columns).iter_rows():
-        text = f"cycle {cycle}: held{f', overran: {overrun}' if overrun else ''}"
-        yield row, arrival, let_go - arrival, HELD, cycle, text, None
+    gated = timeline.holds.join(hops, on=["traversal", "hop"], maintain_order="left")
+    for row, cycle, arrival, let_go, overrun in gated.select(columns).iter_rows():
+        text = f"cycle {cycle}: in the gate{f', overran: {overrun}' if overrun else ''}"
+        yield row, arrival, let_go - arrival, GATED, cycle, text, None
     # A cycle that two traversals share has its slots once, with either of them.
     shown = timeline.origins.join(traversals.select("traversal"), on="traversal", how="semi")
     slots = timeline.slots.join(timeline.origins, on="traversal", maintain_order="left").join(

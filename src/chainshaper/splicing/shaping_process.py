@@ -127,7 +127,7 @@ def write_shaping_process(
     of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
         "shaping_node": node.name,
         "fallback": plan.fallback,
-        # A node that is kept in its server's slots may get to a message a cycle later.
+        # A node that runs only in its server's slots may get to a message a cycle later.
         "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS)
         + (plan.cycle_ns if plan.shaping_thread == "in-slots" else 0),
         "server_cores": _server_cores(plan),

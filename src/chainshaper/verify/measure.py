@@ -38,7 +38,7 @@ from chainshaper.verify.overruns import (
     outcomes_in,
     overruns_in,
 )
-from chainshaper.verify.predictions import PredictionHeld, due_of, hold_prediction
+from chainshaper.verify.predictions import JudgedPrediction, due_of, judge_prediction
 
 MOST_PROPOSED = 3  # chains, to who names none
 
@@ -73,7 +73,7 @@ class Measurement:
     ``outcomes`` says what became of those of the chain, and of the cycles behind them,
     ``into_open_slots`` those that came in time, but too late to wait until their slot's start,
     ``dropped`` messages that were lost at a gate, per reason (None: no gate decided). ``plan`` is
-    the plan in force, ``held`` its prediction beside this measurement. All of it is about the time
+    the plan in force, ``prediction`` its own beside this measurement. All of it is about the time
     in which the plan was in force; ``left_out`` names the rest.
     """
 
@@ -85,7 +85,7 @@ class Measurement:
     into_open_slots: int | None
     dropped: dict[str, int] | None
     plan: Plan | None
-    held: PredictionHeld | None
+    prediction: JudgedPrediction | None
     left_out: LeftOut
 
 
@@ -173,7 +173,7 @@ def _measured(
                 into_open_slots=into_open_slots(recording, own, analysis),
                 dropped=dropped_in(recording, own, analysis),
                 plan=own,
-                held=hold_prediction(own, analysis) if own and planned_for else None,
+                prediction=judge_prediction(own, analysis) if own and planned_for else None,
                 left_out=left_out,
             )
         )

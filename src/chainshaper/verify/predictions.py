@@ -36,7 +36,7 @@ MISSING = 0.003  # a band that is empty with no more than this probability is ex
 
 
 @dataclass(frozen=True)
-class FigureHeld:
+class JudgedFigure:
     """One figure: predicted with outputs at slot starts and at slot ends, and measured (ns).
 
     ``holds``: the measured figure lies from ``from_ns`` to ``to_ns``, to the printed digit (None:
@@ -79,7 +79,7 @@ class BandHeld:
 
 
 @dataclass(frozen=True)
-class PredictionHeld:
+class JudgedPrediction:
     """A plan's prediction beside the measurement, over undisturbed cycles.
 
     The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
@@ -88,9 +88,9 @@ class PredictionHeld:
     Policies without slots have no ``bands``.
     """
 
-    mean: FigureHeld
-    max: FigureHeld
-    jitter: FigureHeld
+    mean: JudgedFigure
+    max: JudgedFigure
+    jitter: JudgedFigure
     bands: tuple[BandHeld, ...]
     late: int
     late_of_all: int | None
@@ -141,7 +141,7 @@ def _from_cycle(plan: Plan) -> bool:
     return by_cycle or any(publisher_servers(plan))
 
 
-def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
+def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
     """Hold the prediction of the plan in force against the analysis of a recording.
 
     The analysis knows from :func:`due_of` when outputs were due.
@@ -167,7 +167,7 @@ def hold_prediction(plan: Plan, analysis: LatencyAnalysis) -> PredictionHeld:
             found = _band(slots[band - 1], share, own, pl.lit(True), own.height)
             bands.append(replace(found, mode=mode, late=behind))
     mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))
-    return PredictionHeld(
+    return JudgedPrediction(
         mean=mean,
         max=longest,
         jitter=jitter,
@@ -188,7 +188,7 @@ def _most_late(plan: Plan, cycles: int) -> int:
 
 def _figures(
     plan: Plan, slots: list[tuple[int, int]], measured: LatencyStatistics
-) -> tuple[FigureHeld, FigureHeld, FigureHeld]:
+) -> tuple[JudgedFigure, JudgedFigure, JudgedFigure]:
     """Average, maximum and jitter: with outputs at slot starts and ends, with room, measured."""
     predicted = plan.predicted
     mean, longest, jitter = predicted.mean_ns, predicted.max_ns, predicted.jitter_ns
@@ -218,7 +218,7 @@ def _figures(
     samples = 1 / plan.evidence.samples + 1 / measured.count if measured.count else 0.0
     room = round(STANDARD_ERRORS * (variance * samples) ** 0.5)
 
-    def figure(at_start: int, name: str, lowest: int, above: int = 0) -> FigureHeld:
+    def figure(at_start: int, name: str, lowest: int, above: int = 0) -> JudgedFigure:
         at_end, found = getattr(predicted, name), getattr(measured, name)
         low, high, holds = min(lowest, at_start), at_end + above, None
         if seen is not None and len(seen.leave_ns) == 1 and lowest == at_start:
@@ -226,7 +226,7 @@ def _figures(
         if plan.modes is None and found is not None:
             printed = [float(milliseconds(one)) for one in (low, found, high)]
             holds = printed == sorted(printed)
-        return FigureHeld(at_start, at_end, low, high, found, holds)
+        return JudgedFigure(at_start, at_end, low, high, found, holds)
 
     return (
         figure(mean, "mean_ns", mean - room, room),
