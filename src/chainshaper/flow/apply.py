@@ -317,9 +317,7 @@ class _Run:
         with contextlib.suppress(OSError):  # a full /run ends no plan; recordings lack it then
             (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
         self.state = replace(
-            self.state,
-            anchor_ns=anchor,
-            in_force_ns=since + (anchor - since) % cycle_ns,
+            self.state, anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns
         )
 
     def measure_phases(self, progress: Callable[[float, str], None]) -> list[Phase]:

@@ -25,12 +25,7 @@ from chainshaper.sources.lttng.trace import table_name
 from chainshaper.values.application import INTERNAL_TOPICS
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
-from chainshaper.values.recording import (
-    Recording,
-    RecordingInfo,
-    event_counts,
-    write_recording,
-)
+from chainshaper.values.recording import Recording, RecordingInfo, event_counts, write_recording
 from chainshaper.values.yaml_file import AS_YAML, wrong_values_refused
 from chainshaper.workload.description import Application
 

@@ -388,10 +388,7 @@ def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) ->
 
 
 def _steps(
-    flow: DataFlow,
-    analysis: LatencyAnalysis,
-    core_of: dict[str, int],
-    planned: Collection[int],
+    flow: DataFlow, analysis: LatencyAnalysis, core_of: dict[str, int], planned: Collection[int]
 ) -> npt.NDArray[np.int64]:
     """What each callback of the chain took, a row per traversal's number: from the message before
     it to its own, without the time for which other instances of the chain, and ``planned``
@@ -578,10 +575,7 @@ def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:
 
 
 def _utilisation(
-    flow: DataFlow,
-    graph: ApplicationGraph,
-    core_of: dict[str, int],
-    running: Sequence[Executor],
+    flow: DataFlow, graph: ApplicationGraph, core_of: dict[str, int], running: Sequence[Executor]
 ) -> float | None:
     """The largest share of a core that the executors of the chain take."""
     theirs = {number for one in running for number in one.callbacks}

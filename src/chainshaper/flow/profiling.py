@@ -17,12 +17,7 @@ from chainshaper.analysis import data_flow, find_chain, graph_of
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
-from chainshaper.enforcement.threads import (
-    Allocation,
-    NodeThread,
-    allocate,
-    scheduling_around,
-)
+from chainshaper.enforcement.threads import Allocation, NodeThread, allocate, scheduling_around
 from chainshaper.flow.plan import graph_stages, profile_chains
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
@@ -146,10 +141,7 @@ def _graph(recording: Recording) -> ApplicationGraph:
 
 
 def profiled_cores(
-    recording: Recording,
-    chains: Sequence[str],
-    request: PlanRequest,
-    period_ns: int | None = None,
+    recording: Recording, chains: Sequence[str], request: PlanRequest, period_ns: int | None = None
 ) -> tuple[tuple[Profile, ...], dict[str, int]]:
     """What an earlier recording shows of chains, and on which cores to profile their executors.
 
@@ -190,9 +182,7 @@ def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[
 
 
 def executors_of(
-    found: Allocation,
-    nodes: frozenset[str],
-    processes: Sequence[Process],
+    found: Allocation, nodes: frozenset[str], processes: Sequence[Process]
 ) -> list[NodeThread]:
     """The threads that execute these nodes, or publish for them; of all nodes if none are named.
 

@@ -45,12 +45,7 @@ from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.sources.system import own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import (
-    ChainshaperError,
-    InputError,
-    OperationError,
-    PlatformError,
-)
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
 from chainshaper.values.files import open_to_all
 from chainshaper.values.recording import (
     EndpointInfo,

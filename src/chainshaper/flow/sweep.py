@@ -53,11 +53,7 @@ from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
-from chainshaper.workload.description import (
-    Application,
-    application_as_written,
-    origin_timer,
-)
+from chainshaper.workload.description import Application, application_as_written, origin_timer
 
 __all__ = ["parse_axis", "rows_beside", "sweep"]
 
