@@ -55,8 +55,6 @@ from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.workload.description import Application, application_as_written, origin_timer
 
-__all__ = ["parse_axis", "rows_beside", "sweep"]
-
 Values: TypeAlias = Mapping[str, Any]
 """One value for every axis: a point."""
 Row: TypeAlias = Mapping[str, Any]
@@ -65,17 +63,13 @@ _Model = TypeVar("_Model", bound=BaseModel)
 
 INTERFERENCE = "interference"
 PLAN = "plan."
-UNPLANNED = "none"
-"""The policy of a point whose application runs as it is described."""
+UNPLANNED = "none"  # the policy of a point whose application runs as it is described
 MOST_POINTS = 1_000_000
 BY_CALLBACK = ("server-per-callback", "pipelined")
 STRUCTURE_CYCLES = 100  # enough of a recording to see who publishes what where
 MOST_RECORDED = 100_000
-URGENT = 90
-"""A chain is profiled at this priority where it is not more urgent than all others anyway."""
-OTHER_RUN = 1 << 32
-"""Added to a seed for the run that is judged; seeds that people count up never meet it."""
-
+URGENT = 90  # a chain's profile has this priority where it is not the most urgent anyway
+OTHER_RUN = 1 << 32  # on top of the seed for the judged run: seeds counted up never meet it
 _REQUEST = TypeAdapter(PlanRequest)
 _WISHES = {
     field.name.removesuffix("_ns"): field.name
@@ -115,9 +109,7 @@ where there are no slots). ``per_band`` has the bands, with the outputs that lef
 
 @dataclass(frozen=True)
 class Grid:
-    """Every combination of the axes' values for one application, each simulated for ``cycles``
-    periods of the chain. ``plan`` is in force in all of them; without one each point is planned.
-    """
+    """What :func:`sweep` is asked for: every combination of the axes' values is a point."""
 
     application: Application
     plan: Plan | None
@@ -135,7 +127,7 @@ def sweep(
     seed: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> pl.DataFrame:
     """Simulate an application at every combination of some values, planned and shaped for each.
 
@@ -168,13 +160,12 @@ def sweep(
     }
     with finished_rows(rows_file, about) as (rows, add):
         missing = [(number, values) for number, values in enumerate(points) if number not in rows]
-        most = min(workers or len(available_cores()), max(1, len(missing)))
-        if missing and progress is not None:
+        if missing:
+            most = min(workers or len(available_cores()), len(missing))
             progress(len(rows) / len(points), f"{len(points)} points")
-        with closing(rows_of(grid, missing, most, scheduler)) as coming:
-            for number, row in coming if missing else ():
-                add(number, row)
-                if progress is not None:
+            with closing(rows_of(grid, missing, most, scheduler)) as coming:
+                for number, row in coming:
+                    add(number, row)
                     progress(len(rows) / len(points), f"{len(points)} points")
         frame = _frame(grid, points, [rows[number] for number in range(len(points))])
         content = io.BytesIO()
@@ -185,30 +176,28 @@ def sweep(
 
 
 def _frame(grid: Grid, points: Sequence[Values], rows: Sequence[Row]) -> pl.DataFrame:
-    axes = [_axis(name, values, points) for name, values in grid.axes.items()]
-    own = [pl.Series("cycles", [grid.cycles] * len(points), dtype=pl.Int64)]
-    if "seed" not in grid.axes:
-        own.append(pl.Series("seed", [grid.application.seed] * len(points), dtype=pl.Int64))
+    axes = [_axis(name, [values[name] for values in points]) for name in grid.axes]
+    same = {"cycles": grid.cycles, "seed": grid.application.seed}
+    own = [pl.lit(n, pl.Int64).alias(name) for name, n in same.items() if name not in grid.axes]
     figures = pl.DataFrame([dict(row) for row in rows], schema=FIGURES)
-    return pl.DataFrame([*axes, *own]).hstack(figures)
+    return pl.DataFrame(axes).with_columns(own).hstack(figures)
 
 
-def _axis(name: str, values: Sequence[Any], points: Sequence[Values]) -> pl.Series:
+def _axis(name: str, column: Sequence[Any]) -> pl.Series:
     """An axis as a column: nanoseconds, numbers, truth values, or else texts as YAML has them."""
-    column = [values_of_point[name] for values_of_point in points]
-    if is_duration(name, values):
+    if is_duration(name, column):
         times = [parse_duration(v) if isinstance(v, str) else v for v in column]
         return pl.Series(f"{name}_ns", times, dtype=pl.Int64)
-    kinds = {type(value) for value in values if value is not None}
+    kinds = {type(value) for value in column if value is not None}
     for dtype, those in ((pl.Boolean, {bool}), (pl.Int64, {int}), (pl.Float64, {int, float})):
         if kinds and kinds <= those:
             return pl.Series(name, column, dtype=dtype)
-    texts = [
-        value
-        if value is None or isinstance(value, str)
-        else yaml.safe_dump(value, default_flow_style=True, width=1000).split("\n")[0]
-        for value in column
-    ]
+
+    def text(value: Any) -> str:
+        flow = yaml.safe_dump(value, default_flow_style=True, width=1000)
+        return value if isinstance(value, str) else flow.split("\n")[0]
+
+    texts = [None if value is None else text(value) for value in column]
     return pl.Series(name, texts, dtype=pl.String)
 
 
@@ -281,12 +270,10 @@ def grid_of(
     if (points := prod(map(len, named.values()))) > MOST_POINTS:
         raise InputError(f"{points} points: give fewer values, for {MOST_POINTS} points at most")
     first = {name: values[0] for name, values in named.items()}
-    for name, values in named.items():
-        for value in values:
-            point = {**first, name: value}
-            application_at(grid, point)
-            plan_at(grid, point)
-            request_at(grid, point)
+    for point in ({**first, name: value} for name, values in named.items() for value in values):
+        application_at(grid, point)
+        plan_at(grid, point)
+        request_at(grid, point)
     return grid
 
 
@@ -320,22 +307,16 @@ def _refuse_unknown(name: str, plan: Plan | None) -> None:
 
 def is_duration(name: str, values: Sequence[Any]) -> bool:
     """Whether an axis has durations only: all with units, but for zeros."""
-    if _WISHES.get(name, "").endswith("_ns"):
-        return True
-    texts = [value for value in values if value not in (0, None)]
+    texts = {str(value) for value in values if value not in (0, None)}
     try:
-        for text in texts:
-            parse_duration(text if isinstance(text, str) else "")
+        durations = [parse_duration(text) for text in texts]
     except InputError:
-        return False
-    return bool(texts)
+        durations = []
+    return bool(durations) or _WISHES.get(name, "").endswith("_ns")
 
 
 def application_at(grid: Grid, values: Values) -> Application:
-    """The application of a point.
-
-    Raises InputError: it cannot be; the values and the reason are named.
-    """
+    """The application of a point. Raises InputError: it cannot be."""
     changes = {name: value for name, value in values.items() if _changes_application(name)}
     if not changes:
         return grid.application
@@ -343,24 +324,16 @@ def application_at(grid: Grid, values: Values) -> Application:
     if (load := changes.get(INTERFERENCE)) is not None:
         _, timer = origin_timer(grid.application)
         described = _interfered(described, timer.timer_ns or 0, _nanoseconds(INTERFERENCE, load))
-    for name, value in changes.items():
-        if name != INTERFERENCE:
-            described = _replaced(described, name.split("."), value)
-    return _validated(Application, described, changes)
+    return _changed(Application, described, changes, without=INTERFERENCE)
 
 
 def plan_at(grid: Grid, values: Values) -> Plan | None:
-    """The given plan with the point's values in it; None without one.
-
-    Raises InputError: that is no plan.
-    """
+    """The given plan with the point's values in it, if any. Raises InputError: that is no plan."""
     changes = {name: value for name, value in values.items() if name.startswith(PLAN)}
     if grid.plan is None or not changes:
         return grid.plan
-    written: Any = grid.plan.model_dump(mode="json", by_alias=True, context=AS_YAML)
-    for name, value in changes.items():
-        written = _replaced(written, name.removeprefix(PLAN).split("."), value)
-    return _validated(Plan, written, changes)
+    written = grid.plan.model_dump(mode="json", by_alias=True, context=AS_YAML)
+    return _changed(Plan, written, changes)
 
 
 def request_at(grid: Grid, values: Values) -> PlanRequest | None:
@@ -371,19 +344,25 @@ def request_at(grid: Grid, values: Values) -> PlanRequest | None:
     if grid.plan is not None or values.get("policy") == UNPLANNED:
         return None
     wishes: dict[str, Any] = {"seed": values.get("seed", grid.application.seed)}
-    for name, value in values.items():
-        field = _WISHES.get(name)
-        if field is not None:
-            wishes[field] = _nanoseconds(name, value) if field.endswith("_ns") else value
+    for name in values.keys() & _WISHES.keys():
+        field, value = _WISHES[name], values[name]
+        wishes[field] = _nanoseconds(name, value) if field.endswith("_ns") else value
     try:
         return _REQUEST.validate_json(json.dumps(wishes), strict=True)
     except ValidationError as error:
-        wrong = error.errors()[0]
-        name = str(wrong["loc"][0])
-        raise InputError(
-            f"axis {name.removesuffix('_ns')}: {wishes.get(name)!r} is no value of it:"
-            f" {wrong['msg']}"
-        ) from error
+        wrong, name = error.errors()[0], str(error.errors()[0]["loc"][0])
+        said = f"axis {name.removesuffix('_ns')}: {wishes.get(name)!r} is no value of it"
+        raise InputError(f"{said}: {wrong['msg']}") from error
+
+
+def _changed(model: type[_Model], data: Any, changes: Values, without: str = "") -> _Model:
+    """A model's plain data with values replaced by their paths, validated."""
+    for name, value in changes.items():
+        if name != without:
+            data = _replaced(data, name.removeprefix(PLAN).split("."), value)
+    said = ", ".join(f"{name}={value}" for name, value in changes.items())
+    with wrong_values_refused(model, f"{said}: "):
+        return model.model_validate_json(json.dumps(data), context=AS_YAML)
 
 
 def _replaced(data: Any, path: list[str], value: Any) -> Any:
@@ -391,9 +370,8 @@ def _replaced(data: Any, path: list[str], value: Any) -> Any:
     if not path:
         return value
     key, *rest = path
-    if isinstance(data, list) and key.isdecimal() and int(key) < len(data):
-        number = int(key)
-        return [*data[:number], _replaced(data[number], rest, value), *data[number + 1 :]]
+    if isinstance(data, list) and key.isdecimal() and (at := int(key)) < len(data):
+        return [*data[:at], _replaced(data[at], rest, value), *data[at + 1 :]]
     mapping = data if isinstance(data, dict) else {}
     return {**mapping, key: _replaced(mapping.get(key), rest, value)}
 
@@ -401,8 +379,8 @@ def _replaced(data: Any, path: list[str], value: Any) -> Any:
 def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> dict[str, Any]:
     """The description with a load beside the chain, as in section 2.5.
 
-    Once a period, for between half the time and all of it, at the lowest priority on the
-    executors' core. A node of that name that is described has everything else as described.
+    Once a period, for between half the time and all of it, at the lowest priority on the executors'
+    core. What a described node of that name has stays.
     """
     own = described["nodes"].get(INTERFERENCE, {})
     first, *others = own.get("callbacks", [{"timer": format_duration(period_ns)}])
@@ -410,19 +388,6 @@ def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> d
     callbacks = [{**first, "execution": {"uniform": times}}, *others]
     node = {"priority": 1, "dds_priority": 1, **own, "callbacks": callbacks}
     return {**described, "nodes": {**described["nodes"], INTERFERENCE: node}}
-
-
-def _validated(model: type[_Model], data: Any, changes: Values) -> _Model:
-    said = ", ".join(f"{name}={value}" for name, value in changes.items())
-    with wrong_values_refused(model, f"{said}: "):
-        return model.model_validate(_as_read(data), context=AS_YAML)
-
-
-def _as_read(value: Any) -> Any:
-    """Plain data as a file is read: sequences are tuples."""
-    if isinstance(value, dict):
-        return {key: _as_read(one) for key, one in value.items()}
-    return tuple(map(_as_read, value)) if isinstance(value, list | tuple) else value
 
 
 def _nanoseconds(name: str, value: Any) -> Any:
@@ -468,68 +433,61 @@ def _urgent(application: Application) -> Application:
     others = [priority[name] for name in application.nodes if name not in chain]
     if min(priority[name] for name in chain) > max(others, default=0):
         return application
-    urgent = {n: URGENT if n in chain else min(priority[n], URGENT - 1) for n in application.nodes}
-    nodes = {
-        name: node.model_copy(update={"priority": urgent[name]})
-        for name, node in application.nodes.items()
-    }
+    nodes = dict(application.nodes)
+    for name, node in application.nodes.items():
+        urgent = URGENT if name in chain else min(priority[name], URGENT - 1)
+        nodes[name] = node.model_copy(update={"priority": urgent})
     return application.model_copy(update={"nodes": nodes})
 
 
 def row_at(
     grid: Grid, values: Values, profile: Profile | str | None, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The figures of one point, under the names of :data:`FIGURES`.
+    """The :data:`FIGURES` of one point; an impossible one has the reason in its row.
 
-    ``profile`` None: no plan is made. An impossible point raises nothing, its row has the reason.
+    Without a ``profile`` no plan is made.
     """
     began = time.perf_counter()
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     try:
         if isinstance(profile, str):
             raise InputError(profile)
-        figures |= _judged(grid, values, profile, progress)
+        application, plan = application_at(grid, values), plan_at(grid, values)
+        request = request_at(grid, values)
+        if profile is not None and request is not None:
+            plan = plan_chain(profile, request)
+        latencies = simulate_latencies(
+            application,
+            plan,
+            cycles=grid.cycles,
+            seed=application.seed + OTHER_RUN,
+            progress=progress,
+        )
+        complete = latencies[latencies >= 0]
+        measured = latency_statistics(complete, incomplete=latencies.size - complete.size)
+        figures |= {name: getattr(measured, name) for name in ("count", "incomplete", *_OF_RUN)}
+        figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
+        figures |= {} if plan is None else _beside(plan, complete)
     except ChainshaperError as error:
         figures["error"] = str(error)
     return {**figures, "seconds": round(time.perf_counter() - began, 6)}
-
-
-def _judged(
-    grid: Grid, values: Values, profile: Profile | None, progress: Progress | None
-) -> dict[str, Any]:
-    application, plan = application_at(grid, values), plan_at(grid, values)
-    request = request_at(grid, values)
-    if profile is not None and request is not None:
-        plan = plan_chain(profile, request)
-    seed = application.seed + OTHER_RUN
-    latencies = simulate_latencies(
-        application, plan, cycles=grid.cycles, seed=seed, progress=progress
-    )
-    complete = latencies[latencies >= 0]
-    measured = latency_statistics(complete, incomplete=latencies.size - complete.size)
-    figures = {name: getattr(measured, name) for name in ("count", "incomplete", *_OF_RUN)}
-    figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
-    return figures if plan is None else {**figures, **_beside(plan, complete)}
 
 
 def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
     """What the plan says, and what became of its bands."""
     delay = cycles_until_output(plan) * plan.cycle_ns
     slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
-    shares = plan.predicted.shares
+    shares: Sequence[float | None] = plan.predicted.shares
+    if len(shares) != len(slots):  # slots were edited in number
+        shares = [None] * len(slots)
+    # An output belongs to the last slot that had started when it left, if it is not late.
+    until = [start for start, _ in slots[1:]] + [end for _, end in slots[-1:]]
     bands = []
-    for number, (start, end) in enumerate(slots):
-        # An output belongs to the last slot that had started when it left, if it is not late.
-        until = slots[number + 1][0] if slots[number + 1 :] else end
-        inside = latencies[(latencies >= start) & (latencies < until)]
-        band = {
-            "start_ns": start,
-            "end_ns": end,
-            "predicted_share": shares[number] if len(shares) == len(slots) else None,
-            "share": inside.size / latencies.size if latencies.size else None,
-            "jitter_ns": int(inside.max() - inside.min()) if inside.size else None,
-        }
-        bands.append(band)
+    for (start, end), before, share in zip(slots, until, shares, strict=True):
+        inside = latencies[(latencies >= start) & (latencies < before)]
+        jitter = int(np.ptp(inside)) if inside.size else None
+        seen = inside.size / latencies.size if latencies.size else None
+        bands.append(dict(zip(_BAND, (start, end, share, seen, jitter), strict=True)))
     latest = slots[-1][1] - 1 if slots else plan.predicted.max_ns
     jitters = [band["jitter_ns"] for band in bands if band["jitter_ns"] is not None]
     evidence, predicted = plan.evidence, plan.predicted
@@ -551,7 +509,7 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Group:
-    """Points, by their numbers, that share a profile; ``profiled``: or need none."""
+    """Points, by their numbers, that share a profile, or are not ``profiled``."""
 
     profiled: bool
     points: tuple[tuple[int, Values], ...]
@@ -559,26 +517,23 @@ class Group:
 
 def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
     """Points in groups of one profile each, in their order."""
-    groups: dict[str, list[tuple[int, Values]]] = {}
+    groups: dict[tuple[bool, bool, str], list[tuple[int, Values]]] = {}
     for number, values in points:
         profiled = request_at(grid, values) is not None
         application = {name: value for name, value in values.items() if _changes_application(name)}
-        per_callback = values.get("policy") in BY_CALLBACK
-        key = json.dumps([profiled, profiled and per_callback, application])
+        per_callback = profiled and values.get("policy") in BY_CALLBACK
+        key = (profiled, per_callback, json.dumps(application))
         groups.setdefault(key, []).append((number, values))
-    return [Group(json.loads(key)[0], tuple(points)) for key, points in groups.items()]
+    return [Group(key[0], tuple(points)) for key, points in groups.items()]
 
 
 def rows_of(
     grid: Grid, points: Iterable[tuple[int, Values]], workers: int, scheduler: str | None = None
 ) -> Generator[tuple[int, Row], None, None]:
-    """Rows by the numbers of their points, as they are finished.
+    """Rows by the numbers of their points, as they are finished, whoever computes them.
 
-    ``workers`` threads compute, or a Dask cluster, where points of a worker that dies are computed
-    by others; a row does not depend on who computes it. Points that differ in nothing measured
-    share a profile; those whose profile is there come first, so that few are in memory at a time.
-
-    Raises: as :func:`~chainshaper.linux.computing.engine`.
+    Points whose profile is there come first, so that few profiles are in memory at a time. Raises:
+    as :func:`~chainshaper.linux.computing.engine`.
     """
     coming = iter(groups_of(grid, points))
     ready: deque[tuple[int, Values, Any]] = deque()
@@ -608,9 +563,8 @@ def rows_of(
 # Where finished rows stand ---------------------------------------------------------------------
 
 
-def rows_beside(output: str | Path) -> Path:
+def rows_beside(output: Path) -> Path:
     """Where the finished rows of a sweep stand until it is whole."""
-    output = Path(output)
     return output.with_name(output.name + ".rows")
 
 
@@ -637,16 +591,20 @@ def finished_rows(
                     f"{path}: another process works on this sweep: wait for it, or name another"
                     " output"
                 ) from error
-            finished = _read(file, path, about)
-            if finished is None:
-                _append(file, about)
-            rows = dict(finished or {})
+            rows = _read(file, path, about)
+
+            def append(value: Mapping[str, Any]) -> None:
+                file.write(json.dumps(value) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
 
             def add(number: int, row: Row) -> None:
                 rows[number] = row  # first: an interruption must not take it for an empty file
-                _append(file, {"number": number, "row": row})
+                append({"number": number, "row": row})
 
             try:
+                if not path.stat().st_size:
+                    append(about)
                 yield rows, add
             finally:
                 if not rows:
@@ -658,17 +616,14 @@ def finished_rows(
         ) from error
 
 
-def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row] | None:
-    """The rows of whole lines; what is behind them is cut off. None: the file is new."""
+def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]:
+    """The rows of whole lines; what is behind them is cut off."""
     file.seek(0)
     text = file.read()
     whole = text[: text.rfind("\n") + 1]
-    if len(whole) < len(text):
-        os.truncate(file.fileno(), len(whole.encode()))
-    if not whole:
-        return None
+    file.truncate(len(whole.encode()))
     try:
-        first, *rows = map(json.loads, whole.splitlines())
+        first, *rows = map(json.loads, whole.splitlines() or [json.dumps(about)])
         finished = {row["number"]: row["row"] for row in rows}
         changed = [name for name in about if first[name] != about[name]]
     except (ValueError, KeyError, TypeError) as error:
@@ -681,9 +636,3 @@ def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]
             " changed since. Undo that to go on with them, name another output, or remove the file"
         )
     return finished
-
-
-def _append(file: IO[str], value: Mapping[str, Any]) -> None:
-    file.write(json.dumps(value) + "\n")
-    file.flush()
-    os.fsync(file.fileno())
