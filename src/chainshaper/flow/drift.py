@@ -2,11 +2,10 @@
 
 A chain that a sensor starts has the sensor's clock: 50 ppm off, it has moved by a whole cycle of
 100 ms after half an hour. Its servers' slots have to move with it, so that they open shortly after
-the timer has expired. When it expires cannot be seen while its thread waits for the slot: the
-thread begins as the slot opens, however long before that the timer was. Only a timer that expires
-in the open slot shows where it is. So the slots open a little before the timer is expected, once in
-a while, just to see; in between they move at the rate that was found. Outputs are not moved by
-this: they count from the stamp of their own cycle.
+the timer has expired. A thread that waits for its slot begins as that opens: only a timer that
+expires in the open slot shows where it is. So the slots open a little before the timer is expected,
+once in a while, just to see; in between they move at the rate that was found. Outputs do not move:
+they count from the stamp of their own cycle.
 
 On a busy machine a thread begins late without its timer. So slots soon open still earlier once
 more: the timer stays where it is, while a thread that only begins late moves with the opening. What
@@ -81,9 +80,7 @@ class TimerTrack:
         return place + round(self.rate * (now_ns - at))
 
     def saw(self, begins_ns: int, now_ns: int) -> int:
-        """Where slots are to open from now on, the thread having begun so long behind their
-        opening.
-        """
+        """Where slots open from now on: the thread has begun so long behind their opening."""
         expires_ns, expected = self.opens_ns + begins_ns, self.expected(now_ns)
         perhaps_ns, self._perhaps_ns = self._perhaps_ns, None
         furthest = self._furthest(now_ns - self.sightings[-1][0])
@@ -141,8 +138,7 @@ class SlotFollower:
 
     ``pids`` are processes of which one may be the gate, ``reach_ns`` is how far slots may be moved.
     ``put_in_force`` has servers move theirs by so much, and says from when on the gate has to.
-    Following ends by itself where that fails, or the gate does. Raises OperationError: see
-    :class:`.FollowedOutput`.
+    It may end by itself, with a ``failure``. Raises OperationError: see :class:`.FollowedOutput`.
     """
 
     def __init__(

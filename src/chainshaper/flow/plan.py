@@ -28,7 +28,6 @@ from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.margins import read_latencies
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.planning.request import DEFAULT_CORE
-from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
@@ -36,7 +35,7 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
-from chainshaper.verify.measure import chain_of, longest_stall
+from chainshaper.verify.measure import chain_of, longest_stall, opened
 from chainshaper.workload.description import Application, node_name
 from chainshaper.workload.live import Enforcement, Progress, run_application, timing_of
 
@@ -68,8 +67,7 @@ def profile_chains(
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
+    recording = opened(recording)
     starts = events.table(recording.events, "callback_start")["time"]
     begun = int(starts.min() or 0)  # type: ignore[arg-type]
     if since_ns or until_ns is not None:

@@ -2,8 +2,7 @@
 
 The executors of the nodes of the chain, and of the branches that it waits for, run under SCHED_FIFO
 at a high priority, on one core or distributed over several (:mod:`chainshaper.planning.cores`),
-their DDS threads above them on the others, so that nothing else disturbs the chain. Threads are
-changed as `apply` changes them; those that appear later get theirs at the next look.
+their DDS threads above them on the others. Threads that appear later get theirs at the next look.
 """
 
 import time
@@ -31,8 +30,7 @@ from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording
 
 START_NS = 30_000_000_000  # so long the nodes have to appear
-WORTH = 0.05
-"""A further core is taken unasked if it takes this share off the latencies."""
+WORTH = 0.05  # a further core is taken unasked if it takes this share off the latencies
 
 
 @contextmanager
@@ -49,22 +47,24 @@ def profiling_condition(
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
     ``core`` is where the executors run (default: the last that we may use), or the core of each of
-    ``nodes``, which those that share a process have in common, ``before`` how many stages of
-    a pipeline are more urgent there, as a plan has it. ``folder`` is where journals are (default:
-    `/run/chainshaper`). An earlier recording of the application that this one is ``like``
-    says which components a container has, and which executors several threads; ``chains`` in it
-    begin as a plan has them begin (:mod:`chainshaper.enforcement.threads`).
+    ``nodes``, ``before`` how many stages of a pipeline are more urgent there, as a plan has it.
+    ``folder`` is where journals are (default: `/run/chainshaper`). An earlier recording that this
+    one is ``like`` says which components a container has, and which executors several threads;
+    ``chains`` in it begin as a plan has them begin.
 
     Raises InputError: no such chain. PlatformError: no such core, or SCHED_FIFO is not permitted.
-    OperationError: `apply` governs one of the nodes, or the core; not all could be put back. And
-    where it is called: a node does not appear, or the kernel refuses something.
+    OperationError: `apply` governs one of the nodes, or the core; a node does not appear; not all
+    could be changed or put back.
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
     cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     homes = {(core, before.get(node, 0)) for node, core in core_of.items()} or {(cores[0], 0)}
     servers = {(c, k): ReservationServer(f"core {c}, {k}", c, 1 + k, ()) for c, k in homes}
     recorded = recorded_processes(like)[0] if like is not None else ()
-    first = _first_nodes(like, chains) if like is not None else ()
+    first: set[str] = set()
+    if like is not None and chains:
+        graph = _graph(like)
+        first = {graph.callbacks[find_chain(graph, one).callbacks[0]].node for one in chains}
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
 
     def see_to_it(processes: Sequence[Process]) -> bool:
@@ -89,11 +89,14 @@ def profiling_condition(
         around = scheduling_around(
             *(at_home, servers.values(), found, available_cores()), clear=clear, first=first
         )
-        new = [one for one in around if one.thread.thread.identity not in done]
         # One after the other, as under SCHED_FIFO in the paper: no turns.
-        changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
-        change_all(journal, changes)
-        done.update(thread.identity for thread, _ in changes)
+        new = [
+            (one.thread.thread, replace(one.wanted, takes_turns=False))
+            for one in around
+            if one.thread.thread.identity not in done
+        ]
+        change_all(journal, new)
+        done.update(thread.identity for thread, _ in new)
         return not new
 
     with run_claimed(cores, nodes, folder) as journal:
@@ -101,10 +104,8 @@ def profiling_condition(
 
 
 def check_profiling(core: int | Sequence[int] | None = None) -> Sequence[int]:
-    """The cores on which executors will run, once it is sure that they may.
-
-    Raises InputError: a core is named twice. PlatformError: no such core, or SCHED_FIFO is not
-    permitted.
+    """The cores on which executors will run. Raises InputError: a core is named twice.
+    PlatformError: no such core, or SCHED_FIFO is not permitted.
     """
     if isinstance(core, Sequence) and len(set(core)) < len(core):
         raise InputError("--cores names a core twice: name each once")
@@ -128,14 +129,6 @@ def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(stage.node for one in stages for stage in one))
 
 
-def _first_nodes(recording: Recording, chains: Sequence[str]) -> set[str]:
-    """The nodes that begin chains."""
-    graph = _graph(recording) if chains else None
-    return {
-        graph.callbacks[find_chain(graph, chain).callbacks[0]].node for chain in chains if graph
-    }
-
-
 def _graph(recording: Recording) -> ApplicationGraph:
     return graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
 
@@ -145,12 +138,9 @@ def profiled_cores(
 ) -> tuple[tuple[Profile, ...], dict[str, int]]:
     """What an earlier recording shows of chains, and on which cores to profile their executors.
 
-    Without ``request.cores`` these are found: the last, and others as far as they are worth it. On
-    machines of three cores and more, the first is left to DDS threads. One chain of which too
-    little is to be seen runs on the last core.
-
-    Raises InputError: no such chain, or several of which too little is to be seen. PlatformError:
-        no such core. OperationError: as :func:`.profile_chains`.
+    Without ``request.cores`` these are the last, and others as far as they are worth it; of three
+    cores and more, the first is left to DDS threads. One chain of which too little is to be seen
+    runs on the last core. Raises: as :func:`.profile_chains`; PlatformError: no such core.
     """
     available = available_cores()
     found = (available[1:] if len(available) > 2 else available)[::-1]
@@ -173,11 +163,13 @@ def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[
     found: list[tuple[list[int], set[int]]] = []
     for group in beginning_together(seen):
         cores = {core_of[node] for place in group for node in seen[place].core_of}
-        apart = next((one for one in found if not one[1] & cores), ([], set()))
-        if not apart[0]:
-            found.append(apart)
-        apart[0].extend(group)
-        apart[1].update(cores)
+        for places, taken in found:
+            if taken.isdisjoint(cores):
+                places.extend(group)
+                taken.update(cores)
+                break
+        else:
+            found.append((list(group), cores))
     return [places for places, _ in found] or [[0]]
 
 
@@ -188,13 +180,9 @@ def executors_of(
 
     What has started other nodes is left out: `ros2 launch` is a node as well, and in no chain.
     """
+    running = [one for one in found.threads if one.thread.role in ("executor", "publisher")]
+    if nodes:
+        return [one for one in running if not nodes.isdisjoint(one.nodes)]
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}
-
-    def is_meant(one: NodeThread) -> bool:
-        if nodes:
-            return not nodes.isdisjoint(one.nodes)
-        return bool(one.nodes) and one.thread.pid not in launchers
-
-    running = (one for one in found.threads if one.thread.role in ("executor", "publisher"))
-    return [one for one in running if is_meant(one)]
+    return [one for one in running if one.nodes and one.thread.pid not in launchers]
