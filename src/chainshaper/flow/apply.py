@@ -337,9 +337,7 @@ class _Run:
         return (anchor_ns + chain.offset_ns - self.early(place)) % chain.cycle_ns
 
     def early(self, place: int) -> int:
-        """How long before its slot a chain begins: with its timer, unless a server stops it until
-        then, which is one that is closed when the cycle ends.
-        """
+        """How long before its slot a chain begins: with its timer, unless a server stops it."""
         chain = self.plan.chains[place]
         if not gates(self.choice.name):
             return LEAD_NS
@@ -368,9 +366,7 @@ class _Run:
             self.followers[place] = SlotFollower(chain, pids, reach_ns, move, cores=cores)
 
     def move_slots(self, place: int, moved_ns: int) -> int:
-        """Move a chain's slots in the servers, if any of theirs change; from when on the gate has
-        to: half a cycle before the chain begins its first cycle with them.
-        """
+        """Move a chain's slots in the servers, if they change there; from when on the gate has to."""
         with self.arming:
             moves = {**self.moved_ns, place: moved_ns}
             plan = open_until_done(with_slots_moved(self.given, moves), self.waits_ns)
@@ -463,7 +459,6 @@ class _Run:
 
         Not where nothing gates, nor from a given phase, which need not be a timer's. Of several
         chains, whose timers have one clock, that with the shortest wait for its slot is followed.
-        Where outputs count from the cycle, slots never open before the timer to see it.
         """
         anchor_ns, waits = self.state.anchor_ns or 0, self.waits_ns
         if not gates(self.choice.name) or not waits:
@@ -620,14 +615,11 @@ def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
 
 @contextlib.contextmanager
 def threads_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None]:
-    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only.
+    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only (paper,
+    section 3.2.1, design 1).
 
-    For the live workload (paper, section 3.2.1, design 1), of which processes and cycles are known.
-
-    Raises:
-        PlatformError: threads cannot be frozen here.
-        OperationError: another run governs one of the cores or nodes, a node has no such thread,
-            or the servers failed meanwhile.
+    Raises PlatformError: threads cannot be frozen here. OperationError: another run governs one of
+    the cores or nodes, a node has no such thread, or the servers failed meanwhile.
     """
     choice = choose_back_end("freezer")  # the others want threads of the fair class
     planned = gated_threads(plan)

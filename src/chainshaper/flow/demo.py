@@ -60,8 +60,6 @@ def run_demo(
 ) -> DemoResult:
     """Run an application, plan, shape, run again and compare.
 
-    ``planned`` gets the plan before it is used, to say what is doubtful about it.
-
     Raises InputError: ``folder`` exists and is not empty, or the application is not right.
     PlatformError, OperationError: a step failed; complete recordings stay, without one nothing.
     """

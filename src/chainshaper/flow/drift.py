@@ -44,9 +44,8 @@ MOST_RATE = 500e-6  # of a quartz, and of timers that a program counts itself
 class TimerTrack:
     """Where a timer expires, and where slots open for it; ns behind the first such opening.
 
-    ``lead_ns`` is how long before the opening the timer is to expire. It was seen to expire at the
-    times (CLOCK_MONOTONIC) and places of ``sightings``. Unless it ``looks``, the slots never open
-    before the timer to see it.
+    ``lead_ns`` is how long before the opening the timer is to expire. ``sightings`` are when
+    (CLOCK_MONOTONIC) and where it did. Unless it ``looks``, slots never open before it to see it.
     """
 
     lead_ns: int

@@ -43,10 +43,7 @@ def list_chains(
 
 
 def named_chain(file: str | Path, name: str | None = None) -> str:
-    """The chain that a CARET architecture file calls ``name``, as we write it.
-
-    Raises InputError: no such path in the file, or several and no ``name``.
-    """
+    """The chain that a CARET architecture file calls ``name``, which only one path needs not."""
     paths = load_named_paths(file)
     known = ", ".join(paths) or "none"
     if name is None and len(paths) != 1:
@@ -60,8 +57,8 @@ def named_chain(file: str | Path, name: str | None = None) -> str:
 
 
 def convert_recording(recording: Recording | str | Path, output: str | Path) -> Recording:
-    """Write a trace as a recording of ours, with all events that the analysis knows: every figure
-    stays the same to the nanosecond. A note names the other events.
+    """Write a trace as a recording of ours: every figure stays the same to the nanosecond. A note
+    names the events that the analysis does not know.
 
     Raises InputError: ``output`` exists already, or no event is known.
     """
@@ -93,10 +90,9 @@ QUANTILES = 20  # of a callback's times: so many stand for all in a description
 def application_file(recording: Recording | str | Path, chain: str | None = None) -> str:
     """The description of an application (YAML) as a recording shows it, to simulate and to run.
 
-    Callbacks execute as long as they did, by quantiles (without execution times: their response
-    times); what no node of it publishes comes from a timer. ``chain`` defaults to the heaviest.
-
-    Raises InputError: no chain is in it, or no description can be made of it.
+    Callbacks execute as long as they did, by quantiles; what no node of it publishes comes from a
+    timer. ``chain`` defaults to the heaviest. Raises InputError: no chain is in it, or no
+    description can be made of it.
     """
     recording = opened(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)

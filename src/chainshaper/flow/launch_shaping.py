@@ -294,10 +294,8 @@ def plan_in_force(
     notes: list[str],
     **how: Any,
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
-    """The plan in force on what runs; what it gives says whether all servers have opened.
-
-    A thread does what `chainshaper apply` does, until the context ends, which adds its ``notes``;
-    ``how`` goes to :func:`.apply_plan`.
+    """The plan in force on what runs, by a thread that does what `chainshaper apply` does (``how``)
+    until the context ends, which adds its ``notes``; it gives whether all servers have opened.
     """
     stop, states = threading.Event(), list[RunState]()
     how |= {"back_end": back_end, "recording": recording, "users": users, "wait_ns": START_NS}

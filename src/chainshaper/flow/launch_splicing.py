@@ -74,10 +74,9 @@ class Splicing:
 
 
 class ThrottledInput(Part):
-    """A topic that is to reach its ``subscriber`` once every ``period_ns``, at the most.
+    """A topic that is to reach its ``subscriber`` (None: all) once every ``period_ns`` at most.
 
-    Without a ``subscriber`` all of them are meant, as a recording knows them. The ``rule`` says
-    which messages reach it, and when (:mod:`chainshaper.gate.throttling`).
+    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.gate.throttling`).
     """
 
     topic: FullName
@@ -177,9 +176,8 @@ def splice_throttlers(
     """Write a launch file whose nodes get these inputs by way of a throttler.
 
     It takes ``/points`` and republishes it as ``/points_throttled``, where the subscribers listen
-    now. Inputs with the same period and rule have one throttler, as in the paper. A plan is spliced
-    into such a launch file later, since it is made from a recording of it. The rest is as for
-    :func:`splice_launch_files`, errors too. Raises InputError: who subscribes is not known.
+    now. Inputs with the same period and rule have one throttler, as in the paper. The rest is as
+    for :func:`splice_launch_files`. Raises InputError: who subscribes is not known.
     """
     if not inputs:
         raise InputError("no input to throttle: name one, such as /points_raw=100ms")

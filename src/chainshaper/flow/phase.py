@@ -61,7 +61,6 @@ def measure_phase(
     progress: Callable[[float], None] = lambda _: None,
 ) -> Phase:
     """Watch a thread for some cycles and find its phase; again, where it was disturbed meanwhile.
-
     Raises OperationError: it ended, or does not wake up regularly.
     """
     for _ in range(MOST_TRIES):
@@ -86,10 +85,10 @@ def watch_wake_ups(
     rest_ns: Callable[[int], int] = lambda _: 0,
 ) -> npt.NDArray[np.int64]:
     """When a thread became ready to run (ns of CLOCK_MONOTONIC): the later of two looks, minus the
-    time that it waited for its core.
+    time that it waited for its core. Raises OperationError: it has ended.
 
     Wake-ups after which it ran for less than ``least_ns`` are left out. ``rest_ns`` says at any
-    time for how long not to look. Raises OperationError: the thread has ended.
+    time for how long not to look.
     """
     # When it woke up (0: a rest begins, or the end), and how long it had run by then.
     found: list[tuple[int, int]] = []
@@ -258,9 +257,8 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that get the phase by a script, since ``begun`` (s of CLOCK_MONOTONIC).
-
-    ``script`` is None where no node is to get it, or it was ``refused``.
+    """Nodes that get the phase by a ``script`` (None: none is to, or it was ``refused``), since
+    ``begun`` (s of CLOCK_MONOTONIC).
     """
 
     nodes: tuple[str, ...]
@@ -291,9 +289,8 @@ NO_NODE = Telling((), None, 0.0)  # none is to get a phase
 
 
 def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int) -> Telling:
-    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle.
-
-    The nodes of a chain are in one domain: any of them has the environment in which all are found.
+    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle: they are in one
+    domain, any has the environment in which all are found.
     """
     names = [node.thread.node for node in nodes]
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}

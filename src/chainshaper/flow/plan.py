@@ -57,12 +57,11 @@ def profile_chains(
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
     ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
-    names. Latencies and all other times but ``every_latency_ns`` are over cycles that the machine
-    did not disturb: a stall is not part of the chain's latency, but its output is late
-    nevertheless. Only where fewer than two were undisturbed, they are over all. Of ``modes``, each
-    has a profile of its own: of its recording or file of latencies in ``mode_recordings``, or of
-    the cycles that began in it, where the description of what ran says when that was. What happened
-    before ``since_ns`` of the recording, or from ``until_ns`` on, is left out.
+    names. All times but ``every_latency_ns`` are over cycles that the machine did not disturb (of
+    fewer than two: over all): a stall is not part of the chain's latency, but its output is late
+    nevertheless. Of ``modes``, each has a profile of its own: of its recording or file of latencies
+    in ``mode_recordings``, or of the cycles that began in it, by the description of what ran. What
+    happened before ``since_ns`` of the recording, or from ``until_ns`` on, is left out.
 
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
@@ -181,10 +180,8 @@ def _profile_of(
 def _modes_in_force(
     recording: Recording, flow: DataFlow, starts: pl.Series, modes: Modes
 ) -> pl.Series:
-    """The mode in which each cycle began, as gates count them; null where that is not known.
-
-    No event has it, but the description of what ran has what its timers announce in turn. Of a
-    recording that lacks events nothing is sure.
+    """The mode in which each cycle began, as gates count them, by the description of what ran; null
+    where that is not known, or the recording lacks events.
     """
     named: list[tuple[int, str]] = []
     described = recording.info.application
@@ -250,10 +247,7 @@ def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class _Stage:
-    """One step of the graph: a callback, or the inputs of a synchronising one, as one.
-
-    ``after`` are the places of the stages that it waits for.
-    """
+    """One step of the graph: a callback, or the inputs of a synchronising one."""
 
     node: str
     topic: str
@@ -419,9 +413,8 @@ def _steps(
 
 
 def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:
-    """Finished instances, with their response time, that began in none of these traversals.
-
-    Where no event says that one ended (rclpy), it did with its last publication.
+    """Finished instances that began in none of these traversals, with their response time. Of those
+    without an end (rclpy), the last publication is it.
     """
     left = flow.publications.drop_nulls("instance").group_by("instance")
     ended = flow.instances.join(
@@ -447,9 +440,8 @@ def _together(graph: ApplicationGraph, nodes: Collection[str]) -> tuple[tuple[st
 def _running(
     flow: DataFlow, stages: Sequence[_Stage]
 ) -> tuple[list[Executor], dict[str, tuple[tuple[str, ...], ...]]]:
-    """The executors that run the chain and its branches; of nodes with several, their callbacks.
-
-    Where two executors have callbacks of one name, nothing tells them apart in another run.
+    """The executors that run the chain and its branches; of nodes with several, their callbacks, if
+    these have names of their own.
     """
     every = executors(flow)
     members = {number for stage in stages for number in stage.members}
@@ -466,10 +458,7 @@ def _running(
 def _executors(
     recording: Recording, graph: ApplicationGraph, running: Sequence[Executor]
 ) -> tuple[dict[str, int], dict[str, int]]:
-    """Core and SCHED_FIFO priority of every node's executor, where the recording knows them.
-
-    Of several in a process that which runs the chain is meant.
-    """
+    """Core and SCHED_FIFO priority, if known, of every node's executor, of several the chain's."""
     ours = {(one.pid, tid) for one in running for tid in one.threads}
     threads = sorted(recording.info.threads, key=lambda one: (one.pid, one.tid) in ours)
     by_pid = {thread.pid: thread for thread in threads if thread.role == "executor"}
@@ -575,14 +564,12 @@ def shape_application(
 ) -> Recording:
     """Splice the plan's shaping nodes into an application, run it and record it.
 
-    ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without; the
-    thread of an asynchronous publisher, and the stages of a pipeline, are gated unless
-    ``enforcement`` does so (:func:`chainshaper.flow.apply.threads_gated`). With ``adapt`` slots
-    follow the latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
+    ``enforcement`` puts the plan's servers in force while it runs; without, the thread of an
+    asynchronous publisher and the stages of a pipeline are gated. With ``adapt`` slots follow the
+    latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
 
-    Raises InputError: the plan does not fit the application, or no slot can follow; and what
-    :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates
-    threads, and threads cannot be frozen here.
+    Raises InputError: the plan does not fit the application, or no slot can follow; PlatformError:
+    threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
     """
     joint = whole(plan)
     if enforcement is None:

@@ -120,10 +120,7 @@ def check_profiling(core: int | Sequence[int] | None = None) -> Sequence[int]:
 
 
 def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
-    """The nodes of chains, and of the branches that they wait for, in an earlier recording.
-
-    Raises InputError: no such chain.
-    """
+    """The nodes of recorded chains, and of the branches that they wait for."""
     graph = _graph(recording)
     stages = (graph_stages(graph, find_chain(graph, chain)) for chain in chains)
     return tuple(dict.fromkeys(stage.node for one in stages for stage in one))
@@ -156,9 +153,8 @@ def profiled_cores(
 
 
 def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[int]]:
-    """The places of chains, together where one recording can measure each as if it were alone.
-
-    Chains that begin together are one graph; others delay each other where they share a core.
+    """The places of chains, together where one recording can measure each as if it were alone: of
+    one graph, or sharing no core.
     """
     found: list[tuple[list[int], set[int]]] = []
     for group in beginning_together(seen):
@@ -176,9 +172,8 @@ def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[
 def executors_of(
     found: Allocation, nodes: frozenset[str], processes: Sequence[Process]
 ) -> list[NodeThread]:
-    """The threads that execute these nodes, or publish for them; of all nodes if none are named.
-
-    What has started other nodes is left out: `ros2 launch` is a node as well, and in no chain.
+    """The threads that execute these nodes, or publish for them; if none are named, of all but
+    `ros2 launch` and the like, which is a node as well, and in no chain.
     """
     running = [one for one in found.threads if one.thread.role in ("executor", "publisher")]
     if nodes:

@@ -256,9 +256,8 @@ def _trace(
 
 
 def _watch(run: _Run) -> None:
-    """Look at the application now and then, until it, its time or the tracer ends.
-
-    Its time begins when the scheduling that was asked for is in force.
+    """Look at the application now and then, until it, its time or the tracer ends; its time begins
+    when the scheduling that was asked for is in force.
     """
     next_look = _FIRST_LOOK_NS
     while True:
@@ -365,10 +364,8 @@ def _written(
 
 
 def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tuple[ThreadInfo, ...]:
-    """The threads of the nodes among ``processes``, numbered as in the recording.
-
-    Where it saw no node, the processes that take part in DDS are. A thread that works for several
-    nodes (a component container's) is given to none.
+    """The threads of the nodes among ``processes`` (without nodes, of those in DDS), numbered as in
+    the recording. One that works for several nodes (a container's) is given to none.
     """
     recorded, _ = recorded_processes(recording)
     pids = {seen.pid for seen in recorded}
@@ -394,10 +391,7 @@ def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tup
 def _known_endpoints(
     tables: events.EventTables, asked: Sequence[EndpointInfo]
 ) -> tuple[EndpointInfo, ...]:
-    """The graph's endpoints with their depths from the trace, then those that only it saw.
-
-    Several of one node, topic and kind are taken in the order in which they were created.
-    """
+    """The graph's endpoints with their depths from the trace, in order, then those only it saw."""
     objects = resolve_objects(tables)
     traced: list[EndpointInfo] = []
     for kind, owners in (

@@ -205,10 +205,7 @@ def _axis(name: str, column: Sequence[Any]) -> pl.Series:
 
 
 def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
-    """An axis as it is written: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none,shaped``.
-
-    Raises InputError: it is not of this form.
-    """
+    """An axis as it is written: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none,shaped``."""
     name, _, values = text.partition("=")
     try:
         root = compose(f"[{values}]", "value")
@@ -245,10 +242,7 @@ def grid_of(
     cycles: int,
     seed: int | None = None,
 ) -> Grid:
-    """A grid, once it is sure that each value of each axis means something.
-
-    Raises InputError: an axis that is unknown or empty, or a value that it cannot have.
-    """
+    """A grid. Raises InputError: an unknown or empty axis, or a value that it cannot have."""
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
     if cycles < 1:
@@ -337,10 +331,7 @@ def plan_at(grid: Grid, values: Values) -> Plan | None:
 
 
 def request_at(grid: Grid, values: Values) -> PlanRequest | None:
-    """What is wished of a point's plan; None where none is made.
-
-    Raises InputError: a value that no such wish can have.
-    """
+    """What is wished of a point's plan, if one is made. Raises InputError: no such wish can be."""
     if grid.plan is not None or values.get("policy") == UNPLANNED:
         return None
     wishes: dict[str, Any] = {"seed": values.get("seed", grid.application.seed)}
@@ -377,10 +368,8 @@ def _replaced(data: Any, path: list[str], value: Any) -> Any:
 
 
 def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> dict[str, Any]:
-    """The description with a load beside the chain, as in section 2.5.
-
-    Once a period, for between half the time and all of it, at the lowest priority on the executors'
-    core. What a described node of that name has stays.
+    """The description with a load beside the chain, as in section 2.5: once a period, for between
+    half the time and all of it, at the lowest priority on the executors' core.
     """
     own = described["nodes"].get(INTERFERENCE, {})
     first, *others = own.get("callbacks", [{"timer": format_duration(period_ns)}])
@@ -402,10 +391,8 @@ def _nanoseconds(name: str, value: Any) -> Any:
 
 
 def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> Profile | str:
-    """The measurements that a point is planned from, or why there are none.
-
-    Where callbacks are planned one by one, response times of as many cycles are needed, 100,000 at
-    most, which takes events.
+    """The measurements that a point is planned from, or why there are none. Response times of
+    callbacks, which are needed where these are planned one by one, take events.
     """
     try:
         application = _urgent(application_at(grid, values))
@@ -443,10 +430,7 @@ def _urgent(application: Application) -> Application:
 def row_at(
     grid: Grid, values: Values, profile: Profile | str | None, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The :data:`FIGURES` of one point; an impossible one has the reason in its row.
-
-    Without a ``profile`` no plan is made.
-    """
+    """The :data:`FIGURES` of one point, planned from a ``profile``, if any; or why it cannot be."""
     began = time.perf_counter()
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     try:
@@ -530,11 +514,7 @@ def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
 def rows_of(
     grid: Grid, points: Iterable[tuple[int, Values]], workers: int, scheduler: str | None = None
 ) -> Generator[tuple[int, Row], None, None]:
-    """Rows by the numbers of their points, as they are finished, whoever computes them.
-
-    Points whose profile is there come first, so that few profiles are in memory at a time. Raises:
-    as :func:`~chainshaper.linux.computing.engine`.
-    """
+    """Rows by their points' numbers, as they are finished; few profiles are in memory at once."""
     coming = iter(groups_of(grid, points))
     ready: deque[tuple[int, Values, Any]] = deque()
     pending: dict[Any, Group | int] = {}
@@ -575,11 +555,10 @@ def finished_rows(
     """The rows that are finished, by the number of their point, and how to add one.
 
     One line of JSON a row, behind a first line that says what is swept (``about``, plain data).
-    Each is on disk before the next; a crash leaves half a line at most, which is removed. A file
-    without rows is removed.
+    Each is on disk before the next; a crash leaves half a line at most, which is removed.
 
-    Raises InputError: the file is of another sweep; the message names what differs. OperationError:
-    another process works on it, or it cannot be read or written.
+    Raises InputError: the file is of another sweep. OperationError: another process works on it, or
+    it cannot be read or written.
     """
     about = json.loads(json.dumps(about))
     try:

@@ -232,7 +232,6 @@ def check_publishers(
 
 def _asynchronous(pid: int) -> dict[str, bool]:
     """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others, if known.
-
     In Fast DDS's files of profiles a topic's own counts, or the default one; else synchronous.
     """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
@@ -279,9 +278,8 @@ def planned_changes(
     phase_ns: int | None = None,
     users: Collection[str | int] = (),
 ) -> Changes:
-    """What :func:`.apply_plan` would do, with the same errors; nothing is changed.
-
-    LITMUS^RT's commands are given on any kernel, with ``TID:NODE`` for threads that do not run.
+    """What :func:`.apply_plan` would do, with the same errors. LITMUS^RT's commands are given on
+    any kernel, with ``TID:NODE`` for threads that do not run.
     """
     plan = open_until_done(whole(plan))
     table = server_table(plan)
@@ -362,10 +360,7 @@ def followed_chains(
 
 
 def server_table(plan: ApplicationPlan) -> ServerTable:
-    """The servers of a plan whose threads a back end has to keep inside their slots.
-
-    Raises OperationError: there are none.
-    """
+    """The servers of a plan whose threads a back end has to keep inside their slots."""
     servers = [s for s in plan.servers if set(s.threads) - plan.free_threads]
     if not servers:
         raise OperationError(
@@ -382,10 +377,7 @@ def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
 
 
 def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
-    """The running thread that begins each chain (:func:`.first_planned`).
-
-    Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
-    """
+    """The running thread that begins each chain."""
     allocation.server_members(plan, found)  # none is in two servers
     begin: list[Thread] = []
     for chain in plan.chains:
@@ -402,10 +394,7 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
 def chain_phases(
     plan: ApplicationPlan, found: Allocation, progress: Callable[[float], None] = lambda _: None
 ) -> list[Phase]:
-    """Where in its cycle each chain begins, watched one after the other.
-
-    Raises OperationError: as :func:`first_threads` and :func:`.measure_phase`.
-    """
+    """Where in its cycle each chain begins, watched one after the other."""
     wanted = [
         (origin.pid, origin.tid, chain.cycle_ns)
         for chain, origin in zip(plan.chains, first_threads(plan, found), strict=True)
