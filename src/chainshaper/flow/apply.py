@@ -34,7 +34,7 @@ from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProc
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
-from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
+from chainshaper.flow.phase import DriftWatch, Telling, tell_phase
 from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
@@ -208,8 +208,10 @@ class _Run:
         )
         self.show(servers=tuple(servers))
 
-    def note(self, *notes: str) -> None:
-        self.show(notes=(*self.state.notes, *notes))
+    def note(self, *notes: str, instead: Collection[str] = ()) -> None:
+        """Add notes, each once; ``instead`` of others."""
+        others = (one for one in self.state.notes if one not in instead)
+        self.show(notes=tuple(dict.fromkeys((*others, *notes))))
 
     def find(self) -> Allocation:
         return threads.find_threads(self.plan, recorded=self.recorded, users=self.users)
@@ -274,8 +276,22 @@ class _Run:
 
     def find_anchor(self, phase_ns: int | None, progress: Callable[[float, str], None]) -> None:
         """Measure where chains begin, and see from when on their slots count."""
+
+        def measured(share: float) -> None:
+            self.go_on()
+            progress(share, "measuring where in a cycle the chain begins")
+
         if phase_ns is None:
-            phases = self.measure_phases(progress)
+            phases = threads.chain_phases(self.plan, self.found, measured)
+            self.note(
+                *(
+                    f"the beginning of {chain_name(chain)} varies by"
+                    f" {duration_text(phase.spread_ns)} from cycle to cycle: it is started by"
+                    " something less regular than a timer"
+                    for chain, phase in zip(self.plan.chains, phases, strict=True)
+                    if phase.spread_ns > LEAD_NS
+                )
+            )
             self.anchor_ns = threads.common_anchor(self.given, phases)
             self.waits_ns = [
                 (self.anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
@@ -304,32 +320,14 @@ class _Run:
         """Put the threads into the servers, and close these."""
         anchor, cycle_ns = self.anchor_ns, self.plan.cycle_ns
         self.tell(anchor, dict.fromkeys(range(len(self.plan.chains)), 0))
-        while self.still_telling() and not (self.stop.wait(0.05) or self.command_ended):
+        while not self.end_telling() and not (self.stop.wait(0.05) or self.command_ended):
             progress(1.0, "telling shaping nodes where cycles begin")
-        self.end_telling()
         self.assign(servers)
         servers.arm(anchor)
         since = servers.in_force_from() or time.monotonic_ns()
         with contextlib.suppress(OSError):  # a full /run ends no plan; recordings lack it then
             (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
         self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
-
-    def measure_phases(self, progress: Callable[[float, str], None]) -> list[Phase]:
-        """Where in its cycle each chain begins."""
-
-        def measured(share: float) -> None:
-            self.go_on()
-            progress(share, "measuring where in a cycle the chain begins")
-
-        phases = threads.chain_phases(self.plan, self.found, measured)
-        for chain, phase in zip(self.plan.chains, phases, strict=True):
-            if phase.spread_ns > LEAD_NS:
-                self.note(
-                    f"the beginning of {chain_name(chain)} varies by"
-                    f" {duration_text(phase.spread_ns)} from cycle to cycle: it is started by"
-                    " something less regular than a timer"
-                )
-        return phases
 
     def begins(self, place: int, anchor_ns: int) -> int:
         """Where the chain at this place begins in its cycles."""
@@ -354,8 +352,13 @@ class _Run:
             begins = (self.begins(place, anchor_ns) + by_ns) % chain.cycle_ns
             self.telling.append(tell_phase(shaping_nodes(chain), self.found, begins))
 
-    def still_telling(self) -> bool:
-        return not all(telling.is_over() for telling in self.telling)
+    def end_telling(self) -> bool:
+        """Whether shaping nodes know where cycles begin, or never will, which is noted."""
+        is_over = all(one.is_over() for one in self.telling)
+        if is_over:
+            self.note(*(said for one in self.telling for said in one.end()))
+            self.telling.clear()
+        return is_over
 
     def start_followers(self, reaches_ns: Mapping[int, tuple[int, int]]) -> None:
         """Have the slots of chains follow the latencies, each within its reach."""
@@ -366,7 +369,7 @@ class _Run:
             self.followers[place] = SlotFollower(chain, pids, reach_ns, move, cores=cores)
 
     def move_slots(self, place: int, moved_ns: int) -> int:
-        """Move a chain's slots in the servers, if they change there; from when on the gate has to."""
+        """Move a chain's slots in the servers, where they change; from when on the gate has to."""
         with self.arming:
             moves = {**self.moved_ns, place: moved_ns}
             plan = open_until_done(with_slots_moved(self.given, moves), self.waits_ns)
@@ -395,19 +398,17 @@ class _Run:
         themselves = {thread.node for thread in self.plan.free_threads}
         already = {one.name: one.threads for one in self.state.servers}
         members = allocation.server_members(self.plan, self.found)
-        for name, group in members.items():
-            for member in group:
-                self.go_on()
-                tid = member.thread.tid
-                if tid not in already[name] and themselves.isdisjoint(member.nodes):
-                    with self.arming:
-                        servers.assign(tid, name)
+        for name, one in ((name, one) for name, group in members.items() for one in group):
+            self.go_on()
+            if one.thread.tid not in already[name] and themselves.isdisjoint(one.nodes):
+                with self.arming:
+                    servers.assign(one.thread.tid, name)
         tids = {name: tuple(one.thread.tid for one in group) for name, group in members.items()}
         self.show_servers(threads=tids)
 
     def watch_over(self, servers: BackEnd, watch: Callable[[RunState], None]) -> None:
         """Watch over the run until it is to end; the state is then as it was last."""
-        drifts, sent, said = self.drift_watches(), dict[int, int](), tuple[str, ...]()
+        drifts, sent, said = self.drift_watches(), dict[int, int](), list[str]()
         following = self.follow(servers, drifts)
         latest: tuple[NodeThread, ...] = ()
         unsaved = untaken = ""
@@ -440,14 +441,14 @@ class _Run:
             if new and not self.telling:
                 sent.update(new)
                 self.tell(self.state.anchor_ns or 0, {k: ns - followed_ns for k, ns in new.items()})
-                others = [note for note in self.state.notes if note not in said]
-                said = tuple(
+                notes = [
                     f"the beginning of {chain_name(self.plan.chains[place])} has moved by"
                     f" {duration_text(ns)} since the plan was put in force; shaping nodes get it,"
                     " and outputs without a stamp follow from the next cycle"
                     for place, ns in sent.items()
-                )
-                self.show(notes=(*others, *said))
+                ]
+                self.note(*notes, instead=said)
+                said = notes
             if self.stop.wait(_LOOK_S):
                 continue
             if self.guardians is not None:
@@ -463,20 +464,19 @@ class _Run:
         anchor_ns, waits = self.state.anchor_ns or 0, self.waits_ns
         if not gates(self.choice.name) or not waits:
             yield from repeat(0)
-        first = min(range(len(drifts)), key=lambda place: waits[place])
+        first = waits.index(min(waits))
+        drift, cycle_ns = drifts[first], self.plan.chains[first].cycle_ns
         stamped = all(chain.anchor == "stamp" for chain in self.plan.chains)
-        track = TimerTrack(
-            waits[first], time.monotonic_ns(), self.plan.chains[first].cycle_ns, looks=stamped
-        )
-        seen = 0
+        track = TimerTrack(waits[first], time.monotonic_ns(), cycle_ns, looks=stamped)
+        looks = 0
         while True:
             before_ns = track.opens_ns
-            if drifts[first].looks > seen:
-                seen = drifts[first].looks
+            if drift.looks > looks:
+                looks = drift.looks
                 early = self.early(first)  # nothing stops it: one look alone may just be late
-                seen_ns = drifts[first].surely_ns if early else drifts[first].latest_ns
+                seen_ns = drift.surely_ns if early else drift.latest_ns
                 track.saw((seen_ns or 0) - early, time.monotonic_ns())
-                drifts[first].look_soon = track.is_unsure
+                drift.look_soon = track.is_unsure
             if track.opens_ns != before_ns:
                 moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
                 try:
@@ -488,33 +488,31 @@ class _Run:
                     yield before_ns  # asked to end meanwhile, which is no failure
                     continue
                 self.show(anchor_ns=moved_ns)
-                for place, drift in enumerate(drifts):
-                    drift.expect(self.begins(place, moved_ns))
+                for place, one in enumerate(drifts):
+                    one.expect(self.begins(place, moved_ns))
             yield track.opens_ns
 
     def drift_watches(self) -> list[DriftWatch]:
         """Watches over where chains begin, one for each first thread."""
         gated, cores = gates(self.choice.name), {server.core for server in self.plan.servers}
         watches: dict[int, DriftWatch] = {}
-        found = []
         origins = threads.first_threads(self.plan, self.found)
         for place, (chain, origin) in enumerate(zip(self.plan.chains, origins, strict=True)):
+            own = (
+                one.slots
+                for one in chain.servers
+                for state in self.state.servers
+                if gated and state.name == one.name and origin.tid in state.threads
+                if not self.early(place)  # else nothing stops it, and short runs count too
+            )
             if origin.tid not in watches:
-                own = (
-                    one.slots
-                    for one in chain.servers
-                    for state in self.state.servers
-                    if gated and state.name == one.name and origin.tid in state.threads
-                    if not self.early(place)  # else nothing stops it, and short runs count too
-                )
                 watches[origin.tid] = DriftWatch(
                     *(origin.pid, origin.tid, chain.cycle_ns),
                     self.begins(place, self.state.anchor_ns or 0),
                     next(own, ()),
                     cores=set(available_cores()) - cores,
                 )
-            found.append(watches[origin.tid])
-        return found
+        return [watches[origin.tid] for origin in origins]
 
     def look_at(self, servers: BackEnd, drift_ns: int | None) -> None:
         """What the servers have done so far, and why the plan is no longer in force, if so."""
@@ -539,11 +537,10 @@ class _Run:
         new, ended = allocation.new_and_ended(before, now)
         self.name_fleeting(latest, ended)
         self.name_strangers(now)
-        there = {one.thread.tid for one in now.threads}
-        threads_of = {one.name: one.threads for one in self.state.servers}
-        self.show_servers(
-            threads={s: tuple(t for t in own if t in there) for s, own in threads_of.items()}
-        )
+        gone = {one.thread.tid for one in ended}
+        servers_now = self.state.servers
+        left = {one.name: tuple(t for t in one.threads if t not in gone) for one in servers_now}
+        self.show_servers(threads=left)
         self.found = now
         try:
             note_descendants(self.journal)
@@ -559,27 +556,19 @@ class _Run:
     def name_strangers(self, found: Allocation) -> None:
         """One line about strangers who say they are nodes: the latest replaces the one before."""
         if found.strangers is not None:
-            notes = self.state.notes
-            others = (note for note in notes if not note.startswith(allocation.LEFT_ALONE))
-            self.show(notes=(*others, found.strangers))
+            said = [one for one in self.state.notes if one.startswith(allocation.LEFT_ALONE)]
+            self.note(found.strangers, instead=said)
 
     def name_fleeting(self, latest: Sequence[NodeThread], ended: Sequence[NodeThread]) -> None:
         """Name the processes whose threads come and go: what ended since it was new."""
         gone = {one.thread.identity for one in ended}
         counted = Counter(one.thread.pid for one in latest if one.thread.identity in gone)
-        said = (
-            f"threads of process {pid} come and go: each has the class, cores and cgroup of the "
-            "thread that started it, and is left so"
-            for pid, times in counted.items()
-            if times >= _FLEETING
-        )
-        self.show(notes=tuple(dict.fromkeys((*self.state.notes, *said))))
-
-    def end_telling(self) -> None:
-        """Note what went wrong with telling the shaping nodes, once that is over."""
-        if not self.still_telling():
-            telling, self.telling = self.telling, []
-            self.note(*(said for one in telling for said in one.end()))
+        for pid, times in counted.items():
+            if times >= _FLEETING:
+                self.note(
+                    f"threads of process {pid} come and go: each has the class, cores and cgroup of"
+                    " the thread that started it, and is left so"
+                )
 
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""
@@ -673,11 +662,11 @@ def slots_followed(
 def _threads_of(wanted: Thread, nodes: "StartedNodes") -> list[int]:
     pid = nodes.pids.get(wanted.node)
     found = [t.tid for t in list_threads(pid) if t.role == wanted.role] if pid is not None else []
-    if found:
-        return found
-    if wanted.role == "executor":
+    if not found and wanted.role == "executor":
         raise OperationError(f"{wanted.node} of the plan is no node of the application")
-    raise OperationError(
-        f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
-        "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
-    )
+    if not found:
+        raise OperationError(
+            f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
+            "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
+        )
+    return found

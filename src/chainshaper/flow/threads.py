@@ -106,28 +106,18 @@ def find_threads(
         for one in allocation.with_gates(found, gates).threads:
             nodes[one.thread.pid].update(one.nodes)
         planned = {thread.node: server.name for server in servers for thread in server.threads}
-        hosted = None
+        hosted, chosen = None, [p for p in processes if nodes[p.pid] or p.participates]
         if plan is not None:  # receivers need not run
-            hosted = {receiver for gate in gates for receiver in gate.receivers} | {*planned}
-            hosted |= ROUTERS
-        chosen = [
-            one
-            for one in processes
-            if one.user in taken
-            and (
-                nodes[one.pid] & hosted
-                if hosted is not None
-                else nodes[one.pid] or one.participates
-            )
-        ]
+            hosted = ROUTERS.union(planned, *(gate.receivers for gate in gates))
+            chosen = [process for process in processes if nodes[process.pid] & hosted]
+        chosen = [process for process in chosen if process.user in taken]
         strangers = allocation.strangers_text(processes, taken, hosted)
         running = sorted(set().union(*nodes.values()))
-        notes += tuple(
-            f"node {node} of server {server} is not running, or cannot be recognised; running: "
-            f"{', '.join(running) or 'no node'}"
-            for node, server in planned.items()
-            if node not in running
+        known = (
+            f"is not running, or cannot be recognised; running: {', '.join(running) or 'no node'}"
         )
+        missing = [(node, server) for node, server in planned.items() if node not in running]
+        notes += tuple(f"node {node} of server {server} {known}" for node, server in missing)
         if plan is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
     found = allocation.with_gates(allocate(chosen, recorded, processes, taken), gates)
