@@ -85,12 +85,15 @@ class _Run:
 
     tracer: Tracer
     folder: Path
+    words: Sequence[str]  # of the command
     duration_ns: int | None
+    scheduling: Scheduling | None
     stop: threading.Event
     progress: Callable[[float, str], None]
     users: frozenset[int]
-    pids: Sequence[int] = ()
-    gate_logs: Sequence[Path] = ()
+    pids: Sequence[int]
+    gate_logs: Sequence[Path]
+    notes: tuple[str, ...]
     command: "subprocess.Popen[bytes] | None" = None
     schedule: Callable[[Sequence[Process]], bool] | None = None
     begun_ns: int = 0
@@ -105,7 +108,6 @@ class _Run:
     governed: tuple[Governed, ...] = ()  # plans that others put in force meanwhile
     stalls: StallWatch = field(default_factory=StallWatch)
     exit_code: int | None = None
-    notes: tuple[str, ...] = ()
 
 
 def record_command(
@@ -152,15 +154,14 @@ def record_command(
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
         tracer, notes = _tracer(source, folder, command, pids, buffer, users=taken)
-        stop = stop or threading.Event()
-        run = _Run(tracer, folder, duration_ns, stop, progress, taken, pids, gate_logs)
-        run.notes = notes
+        how = (command, duration_ns, scheduling, stop or threading.Event(), progress, taken, pids)
+        run = _Run(tracer, folder, *how, gate_logs, notes)
         for note in notes:
             progress(0.0, note)
-        _trace(run, command, command_stdout, scheduling, watch_stalls=watch_stalls)
+        _trace(run, command_stdout, watch_stalls=watch_stalls)
         progress(1.0, "reading the events")
         try:
-            recording = _written(output, run, command, chain, plan)
+            recording = _written(output, run, chain, plan)
         except ChainshaperError as error:
             said = "".join(f"; {note.rstrip('.')}" for note in run.notes)
             if any(folder.iterdir()):
@@ -217,28 +218,21 @@ def _tracer(
     return EbpfTracer(folder, command, pids, users), ()
 
 
-def _trace(
-    run: _Run,
-    command: Sequence[str],
-    stdout: int | None,
-    scheduling: Scheduling | None,
-    *,
-    watch_stalls: bool,
-) -> None:
+def _trace(run: _Run, stdout: int | None, *, watch_stalls: bool) -> None:
     with ExitStack() as undo:
         if watch_stalls:
             run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
         undo.callback(run.tracer.remove)
         run.progress(0.0, "starting to trace")
         environment = run.tracer.start()
-        if command:
-            run.command = start_command(command, environment, stdout)
+        if run.words:
+            run.command = start_command(run.words, environment, stdout)
             undo.callback(end_command, run.command)
             run.pids = (run.command.pid,)
-        if scheduling is not None:
-            run.schedule = undo.enter_context(scheduling)
+        if run.scheduling is not None:
+            run.schedule = undo.enter_context(run.scheduling)
         run.begun_ns = time.monotonic_ns()
-        if scheduling is None:
+        if run.scheduling is None:
             run.stalls.begin()
         _watch(run)
         run.ended_ns = time.monotonic_ns()
@@ -311,11 +305,7 @@ def _look(run: _Run) -> None:
 
 
 def _written(
-    output: Path,
-    run: _Run,
-    command: Sequence[str],
-    chain: str | None,
-    plan: Plan | ApplicationPlan | None,
+    output: Path, run: _Run, chain: str | None, plan: Plan | ApplicationPlan | None
 ) -> Recording:
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
@@ -347,7 +337,7 @@ def _written(
         "kernel": platform.release(),
         "distribution": variables.get("ROS_DISTRO") or info.distribution,
         "rmw": variables.get("RMW_IMPLEMENTATION") or info.rmw,
-        "command": tuple(command),
+        "command": tuple(run.words),
         "threads": threads,
         "endpoints": _known_endpoints(tables, run.endpoints),
         "realtime": run.schedule is not None or in_real_time,

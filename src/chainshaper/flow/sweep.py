@@ -28,7 +28,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import product
 from math import prod
@@ -55,8 +55,7 @@ from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.workload.description import Application, application_as_written, origin_timer
 
-Values: TypeAlias = Mapping[str, Any]
-"""One value for every axis: a point."""
+Values: TypeAlias = Mapping[str, Any]  # one for every axis: a point
 Row: TypeAlias = Mapping[str, Any]
 Progress: TypeAlias = Callable[[float, str], None]
 _Model = TypeVar("_Model", bound=BaseModel)
@@ -99,11 +98,9 @@ FIGURES: dict[str, Any] = {
 """The columns of a row behind those of the axes.
 
 ``profile_…`` are L̲, the average and L̄ that the plan rests on, ``predicted_…`` the plan's own
-(eq. 5). All others are of the judged run, in which ``incomplete`` instances of the chain gave no
-output, and ``late`` ones gave it behind the last slot it was due in (or later than the plan says,
-where there are no slots). ``per_band`` has the bands, with the outputs that left in their slots;
-``band_jitter_ns`` is the widest of their jitters. ``error`` says why there is nothing else.
-``seconds`` is the computing time, without that of the profile, which points share.
+(eq. 5). All others are of the judged run: ``incomplete`` instances of the chain gave no output,
+``late`` ones behind the last slot (without slots: later than the plan says); ``band_jitter_ns`` is
+the widest of those ``per_band``. ``seconds`` were computed, the profile, which points share, apart.
 """
 
 
@@ -289,23 +286,22 @@ def _refuse_unknown(name: str, plan: Plan | None) -> None:
     if plan is None and name.startswith(PLAN):
         raise InputError(f"axis {name} is a value of a plan's file: give the plan, too")
     keys = [field.removesuffix("_ns") for field in Application.model_fields]
-    first = name.partition(".")[0]
+    first, others = name.partition(".")[0], [*_WISHES, INTERFERENCE]
     if _changes_application(name) and first not in (*keys, INTERFERENCE):
-        near = difflib.get_close_matches(first, [*_WISHES, *keys, INTERFERENCE], n=1)
+        near = difflib.get_close_matches(first, [*others, *keys], n=1)
         raise InputError(
             f"axis {name}: no such thing{f', did you mean {near[0]}?' if near else ''} There are"
-            f" {', '.join([*_WISHES, INTERFERENCE])}, plan.PATH with a plan, and values of the"
-            f" description, by paths that begin with {', '.join(keys)}"
+            f" {', '.join(others)}, plan.PATH with a plan, and values of the description, by paths"
+            f" that begin with {', '.join(keys)}"
         )
 
 
 def is_duration(name: str, values: Sequence[Any]) -> bool:
     """Whether an axis has durations only: all with units, but for zeros."""
-    texts = {str(value) for value in values if value not in (0, None)}
-    try:
+    durations = []
+    with suppress(InputError):
+        texts = {str(value) for value in values if value not in (0, None)}
         durations = [parse_duration(text) for text in texts]
-    except InputError:
-        durations = []
     return bool(durations) or _WISHES.get(name, "").endswith("_ns")
 
 
@@ -491,53 +487,50 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
 # Who computes ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Group:
-    """Points, by their numbers, that share a profile, or are not ``profiled``."""
-
-    profiled: bool
-    points: tuple[tuple[int, Values], ...]
+Points: TypeAlias = list[tuple[int, Values]]  # by their numbers
 
 
-def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
-    """Points in groups of one profile each, in their order."""
-    groups: dict[tuple[bool, bool, str], list[tuple[int, Values]]] = {}
+def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> Iterator[tuple[bool, Points]]:
+    """Points that share a profile, and whether they need one."""
+    groups: dict[tuple[bool, bool, str], Points] = {}
     for number, values in points:
         profiled = request_at(grid, values) is not None
         application = {name: value for name, value in values.items() if _changes_application(name)}
         per_callback = profiled and values.get("policy") in BY_CALLBACK
         key = (profiled, per_callback, json.dumps(application))
         groups.setdefault(key, []).append((number, values))
-    return [Group(key[0], tuple(points)) for key, points in groups.items()]
+    return ((profiled, own) for (profiled, *_), own in groups.items())
 
 
 def rows_of(
     grid: Grid, points: Iterable[tuple[int, Values]], workers: int, scheduler: str | None = None
 ) -> Generator[tuple[int, Row], None, None]:
     """Rows by their points' numbers, as they are finished; few profiles are in memory at once."""
-    coming = iter(groups_of(grid, points))
+    coming = groups_of(grid, points)
     ready: deque[tuple[int, Values, Any]] = deque()
-    pending: dict[Any, Group | int] = {}
+    pending: dict[Any, Points | int] = {}
     with engine(workers, scheduler, "a sweep", "; finished rows stay") as computing:
         while True:
             while len(pending) < computing.under_way:
                 if ready:
                     number, values, profile = ready.popleft()
                     pending[computing.submit(row_at, grid, values, profile)] = number
-                elif (group := next(coming, None)) is None:
-                    break
-                elif group.profiled:
-                    pending[computing.submit(profile_at, grid, group.points[0][1])] = group
+                    continue
+                profiled, group = next(coming, (False, []))
+                if profiled:
+                    pending[computing.submit(profile_at, grid, group[0][1])] = group
+                elif group:
+                    ready.extend((number, values, None) for number, values in group)
                 else:
-                    ready.extend((number, values, None) for number, values in group.points)
+                    break
             if not pending:
                 return
             future = computing.finished()
             result, of = future.result(), pending.pop(future)
-            if isinstance(of, Group):
-                ready.extend((number, values, future) for number, values in of.points)
-            else:
+            if isinstance(of, int):
                 yield of, result
+            else:
+                ready.extend((number, values, future) for number, values in of)
 
 
 # Where finished rows stand ---------------------------------------------------------------------
