@@ -118,9 +118,9 @@ def apply_plan(
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
     threads.refuse_unfit(given, choice.name)
-    followed = threads.Followed({}, ())
+    reaches_ns, why_not = dict[int, tuple[int, int]](), list[str]()
     if adapt:
-        given, followed = threads.followed_chains(given, choice.name, max_latency_ns)
+        given, reaches_ns, why_not = threads.followed_chains(given, choice.name, max_latency_ns)
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     # Looked up once: that takes longer than looking at processes.
@@ -144,8 +144,8 @@ def apply_plan(
         table = threads.server_table(run.plan)
         run.servers = make_back_end(choice.name, table, journal, run.go_on)
         run.arm(run.servers, progress)
-        run.note(*followed.notes)
-        run.start_followers(followed.reaches_ns)
+        run.note(*why_not)
+        run.start_followers(reaches_ns)
         run.watch_over(run.servers, watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
@@ -594,12 +594,12 @@ def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
     gates = {node.thread for node in plan.shaping_nodes}
     pipelines = [chain for chain in plan.chains if chain.policy == "pipelined"]
     staged = {one for chain in pipelines for server in chain.servers for one in server.threads}
-    found = [
-        (server, [one for one in server.threads if one.role == "publisher" or one in staged])
+    return [
+        (server, own)
         for server in open_until_done(plan).servers
         if gates.isdisjoint(server.threads)
+        if (own := [one for one in server.threads if one.role == "publisher" or one in staged])
     ]
-    return [(server, threads) for server, threads in found if threads]
 
 
 @contextlib.contextmanager

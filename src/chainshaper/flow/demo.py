@@ -1,12 +1,10 @@
 """The demonstration: the whole flow on a live application, everything in one folder.
 
-DIR/application.yaml   what ran
-DIR/before             the recording of the unshaped run
-DIR/plan.yaml          what was planned from it
-DIR/after              the recording of the shaped run
-DIR/latency.png        latency of every cycle, before and after
-DIR/distribution.png   their distributions, with the publish slot
-DIR/comparison.json    every figure of the printed table
+DIR/application.yaml        what ran
+DIR/before, DIR/after       the recordings of the unshaped and of the shaped run
+DIR/plan.yaml               what was planned from the former
+DIR/latency.png, …          latency of every cycle, and their distributions with the publish slot
+DIR/comparison.json         every figure of the printed table
 """
 
 import shutil

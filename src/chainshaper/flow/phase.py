@@ -49,8 +49,6 @@ class Phase:
 
     at_ns: int
     spread_ns: int  # how far apart most of the wake-ups at this place lie
-    wake_ups: int
-    cycles: int  # that were watched
 
 
 def measure_phase(
@@ -68,10 +66,9 @@ def measure_phase(
         if (phase := find_phase(found, cycle_ns, cycles)) is not None:
             return phase
     raise OperationError(
-        f"thread {tid} of process {pid} was watched for {duration_text(cycles * cycle_ns)} "
-        f"and does not wake up once in every {duration_text(cycle_ns)} ({len(found)} "
-        "wake-ups): is the chain running, with the period of the plan? Its phase can also be "
-        "given (--phase)"
+        f"thread {tid} of process {pid} was watched for {duration_text(cycles * cycle_ns)} and does"
+        f" not wake up once in every {duration_text(cycle_ns)} ({len(found)} wake-ups): is the"
+        " chain running, with the period of the plan? Its phase can also be given (--phase)"
     )
 
 
@@ -144,7 +141,7 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
             longest_rest = rest
             # The first of each cycle: what follows it is the same thread going on.
             low, at, high = np.percentile(here[: max(1, seen)], (10, 50, 90))
-            best = Phase(int(at) % cycle_ns, int(high - low), len(here), cycles)
+            best = Phase(int(at) % cycle_ns, int(high - low))
     return best
 
 

@@ -580,8 +580,8 @@ def shape_application(
         from chainshaper.flow.apply import slots_followed
         from chainshaper.flow.threads import followed_chains
 
-        joint, followed = followed_chains(joint, "fifo", max_latency_ns)
-        enforcement = partial(slots_followed, joint, followed.reaches_ns, enforcement)
+        joint, reaches_ns, _ = followed_chains(joint, "fifo", max_latency_ns)
+        enforcement = partial(slots_followed, joint, reaches_ns, enforcement)
     return run_application(
         splice_application(application, joint),
         output,

@@ -57,10 +57,8 @@ from chainshaper.values.recording import (
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
 Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[Process]], bool]]
-"""Changes how the application's threads run for as long as its context lasts.
-
-What it gives is called about once a second with the application's processes, and says whether all
-is as it shall be; events from before that are left out of the tables.
+"""Changes how the application's threads run for as long as its context lasts. What it gives is
+called about once a second with the processes, and says whether all is as it shall be from now on.
 """
 
 TRACE_FOLDER = "trace"

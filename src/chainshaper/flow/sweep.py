@@ -11,9 +11,8 @@ Paths lead through mappings by key and through lists by number, from 0. Values a
 so a whole part of a description may be one: ``{uniform: [5ms, 10ms]}``.
 
 A point is what a careful person would do by hand: simulate the application with its chain in front
-of all others (the profile), plan, splice, simulate again. The run that is planned from and the run
-that is judged draw their execution times with different seeds, so a margin is tried against
-latencies that the plan has not seen, and all points of one seed are judged by the same ones.
+of all others (the profile), plan, splice, simulate again. The run that is judged draws execution
+times with a seed of its own: a margin is tried against latencies that the plan has not seen.
 """
 
 import dataclasses

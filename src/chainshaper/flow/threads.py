@@ -10,13 +10,13 @@ import platform
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
@@ -310,18 +310,11 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
         )
 
 
-class Followed(NamedTuple):
-    """How far the slots of chains may be moved (ns), by their places; why those of others stay."""
-
-    reaches_ns: Mapping[int, tuple[int, int]]
-    notes: tuple[str, ...]
-
-
 def followed_chains(
     plan: ApplicationPlan, back_end: str, max_latency_ns: int | None = None
-) -> tuple[ApplicationPlan, Followed]:
-    """The chains whose slots can follow their latencies, to no later end than ``max_latency_ns``,
-    which stands in the plan then. Raises InputError: no slots can.
+) -> tuple[ApplicationPlan, dict[int, tuple[int, int]], list[str]]:
+    """The plan, with ``max_latency_ns`` in it; how far slots that can follow their latencies may
+    be moved (ns), by their chains' places; why others stay. Raises InputError: none can.
     """
     chains, reaches, why_not = list(plan.chains), dict[int, tuple[int, int]](), list[str]()
     for place, chain in enumerate(plan.chains):
@@ -346,7 +339,7 @@ def followed_chains(
             reaches[place] = found
     if not reaches:
         raise InputError("; ".join(why_not))
-    return combined(chains), Followed(reaches, tuple(why_not))
+    return combined(chains), reaches, why_not
 
 
 def server_table(plan: ApplicationPlan) -> ServerTable:
