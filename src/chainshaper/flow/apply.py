@@ -177,7 +177,7 @@ class _Run:
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
     telling: list[Telling] = field(default_factory=list)
-    anchor_ns: int = 0
+    anchor_ns: int = 0  # from when on slots count, where they have been moved to by now
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     followers: dict[int, SlotFollower] = field(default_factory=dict)  # by their chains' places
     moved_ns: dict[int, int] = field(default_factory=dict)  # by how much their slots are
@@ -319,7 +319,7 @@ class _Run:
     def arm(self, servers: BackEnd, progress: Callable[[float, str], None]) -> None:
         """Put the threads into the servers, and close these."""
         anchor, cycle_ns = self.anchor_ns, self.plan.cycle_ns
-        self.tell(anchor, dict.fromkeys(range(len(self.plan.chains)), 0))
+        self.tell(dict.fromkeys(range(len(self.plan.chains)), 0))
         while not self.end_telling() and not (self.stop.wait(0.05) or self.command_ended):
             progress(1.0, "telling shaping nodes where cycles begin")
         self.assign(servers)
@@ -329,10 +329,10 @@ class _Run:
             (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
         self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
 
-    def begins(self, place: int, anchor_ns: int) -> int:
+    def begins(self, place: int) -> int:
         """Where the chain at this place begins in its cycles."""
         chain = self.plan.chains[place]
-        return (anchor_ns + chain.offset_ns - self.early(place)) % chain.cycle_ns
+        return (self.anchor_ns + chain.offset_ns - self.early(place)) % chain.cycle_ns
 
     def early(self, place: int) -> int:
         """How long before its slot a chain begins: with its timer, unless a server stops it."""
@@ -345,11 +345,11 @@ class _Run:
         waits = first.slots[0][0] > 0 or first.slots[-1][1] < chain.cycle_ns
         return 0 if waits else self.waits_ns[place]
 
-    def tell(self, anchor_ns: int, moved_ns: Mapping[int, int]) -> None:
+    def tell(self, moved_ns: Mapping[int, int]) -> None:
         """Begin to give shaping nodes of these chains where cycles, moved by so much, begin."""
         for place, by_ns in moved_ns.items():
             chain = self.plan.chains[place]
-            begins = (self.begins(place, anchor_ns) + by_ns) % chain.cycle_ns
+            begins = (self.begins(place) + by_ns) % chain.cycle_ns
             self.telling.append(tell_phase(shaping_nodes(chain), self.found, begins))
 
     def end_telling(self) -> bool:
@@ -374,13 +374,13 @@ class _Run:
             moves = {**self.moved_ns, place: moved_ns}
             plan = open_until_done(with_slots_moved(self.given, moves), self.waits_ns)
             before, table = threads.server_table(self.plan), threads.server_table(plan)
-            cycle_ns, anchor_ns = self.plan.chains[place].cycle_ns, self.state.anchor_ns or 0
+            cycle_ns = self.plan.chains[place].cycle_ns
             since = time.monotonic_ns() + 2 * cycle_ns
             if table != before and isinstance(self.servers, Freezer):
-                self.servers.change(table, anchor_ns)
+                self.servers.change(table, self.anchor_ns)
                 since = (self.servers.in_force_from() or since) - cycle_ns // 4
             self.plan, self.moved_ns = plan, moves
-        return since + (self.begins(place, anchor_ns) - since) % cycle_ns - cycle_ns // 2
+            return since + (self.begins(place) - since) % cycle_ns - cycle_ns // 2
 
     def show_moves(self) -> None:
         """The state shows where slots are by now, and what does not follow any more."""
@@ -440,7 +440,7 @@ class _Run:
             new = {k: ns for k, ns in moved.items() if abs(ns - sent.get(k, 0)) > PHASE_BOUND_NS}
             if new and not self.telling:
                 sent.update(new)
-                self.tell(self.state.anchor_ns or 0, {k: ns - followed_ns for k, ns in new.items()})
+                self.tell({k: ns - followed_ns for k, ns in new.items()})
                 notes = [
                     f"the beginning of {chain_name(self.plan.chains[place])} has moved by"
                     f" {duration_text(ns)} since the plan was put in force; shaping nodes get it,"
@@ -461,7 +461,7 @@ class _Run:
         Not where nothing gates, nor from a given phase, which need not be a timer's. Of several
         chains, whose timers have one clock, that with the shortest wait for its slot is followed.
         """
-        anchor_ns, waits = self.state.anchor_ns or 0, self.waits_ns
+        anchor_ns, waits = self.anchor_ns, self.waits_ns
         if not gates(self.choice.name) or not waits:
             yield from repeat(0)
         first = waits.index(min(waits))
@@ -482,6 +482,7 @@ class _Run:
                 try:
                     with self.arming:
                         servers.arm(moved_ns)
+                        self.anchor_ns = moved_ns
                 except OperationError:
                     if not self.stop.is_set():
                         raise
@@ -489,7 +490,7 @@ class _Run:
                     continue
                 self.show(anchor_ns=moved_ns)
                 for place, one in enumerate(drifts):
-                    one.expect(self.begins(place, moved_ns))
+                    one.expect(self.begins(place))
             yield track.opens_ns
 
     def drift_watches(self) -> list[DriftWatch]:
@@ -508,7 +509,7 @@ class _Run:
             if origin.tid not in watches:
                 watches[origin.tid] = DriftWatch(
                     *(origin.pid, origin.tid, chain.cycle_ns),
-                    self.begins(place, self.state.anchor_ns or 0),
+                    self.begins(place),
                     next(own, ()),
                     cores=set(available_cores()) - cores,
                 )

@@ -57,7 +57,7 @@ def profiling_condition(
     could be changed or put back.
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
-    cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
+    cores = check_profiling([core] if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     homes = {(core, before.get(node, 0)) for node, core in core_of.items()} or {(cores[0], 0)}
     servers = {(c, k): ReservationServer(f"core {c}, {k}", c, 1 + k, ()) for c, k in homes}
     recorded = recorded_processes(like)[0] if like is not None else ()
@@ -103,18 +103,18 @@ def profiling_condition(
         yield see_to_it
 
 
-def check_profiling(core: int | Sequence[int] | None = None) -> Sequence[int]:
+def check_profiling(cores: Sequence[int] | None) -> Sequence[int]:
     """The cores on which executors will run. Raises InputError: a core is named twice.
     PlatformError: no such core, or SCHED_FIFO is not permitted.
     """
-    if isinstance(core, Sequence) and len(set(core)) < len(core):
+    cores = cores or available_cores()[-1:]
+    if len(set(cores)) < len(cores):
         raise InputError("--cores names a core twice: name each once")
     if not may_use_fifo():
         raise PlatformError(
             "profiling needs SCHED_FIFO: run as root, or give your user an rtprio limit of 98 in "
             "/etc/security/limits.conf; without, `chainshaper record` records as things are"
         )
-    cores = (core,) if isinstance(core, int) else core or available_cores()[-1:]
     check_cores(dict.fromkeys(cores, "the chain"))
     return cores
 
