@@ -132,8 +132,7 @@ def _profile_of(
     period = _period(analysis, period_ns)
     simulated = _simulated(flow, analysis)
     nodes = dict.fromkeys(stage.node for stage in stages)
-    running, named = _running(flow, stages)
-    cores, priority = _executors(recording, graph, running)
+    running, named, cores, priority = _executors(recording, flow, graph, stages)
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
     instances = _instances_apart_from(flow, disturbed)
     measured = every if all_disturbed else calm
@@ -416,11 +415,9 @@ def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFra
     """Finished instances that began in none of these traversals, with their response time. Of those
     without an end (rclpy), the last publication is it.
     """
-    left = flow.publications.drop_nulls("instance").group_by("instance")
-    ended = flow.instances.join(
-        left.agg(left=pl.col("time").max()), on="instance", how="left", maintain_order="left"
-    )
-    until = pl.coalesce("end", pl.when("assumed").then("left"))
+    last = flow.publications.group_by("instance").agg(last=pl.col("time").max())
+    ended = flow.instances.join(last, on="instance", how="left", maintain_order="left")
+    until = pl.coalesce("end", pl.when("assumed").then("last"))
     seen = ended.with_columns(end=until).drop_nulls("end")
     began = seen["start"].to_numpy()
     # An instance that begins just as a traversal ends is hit by it as well.
@@ -437,14 +434,13 @@ def _together(graph: ApplicationGraph, nodes: Collection[str]) -> tuple[tuple[st
     return tuple(tuple(own) for own in hosts.values() if own[1:] and not {*own}.isdisjoint(nodes))
 
 
-def _running(
-    flow: DataFlow, stages: Sequence[_Stage]
-) -> tuple[list[Executor], dict[str, tuple[tuple[str, ...], ...]]]:
+def _executors(
+    recording: Recording, flow: DataFlow, graph: ApplicationGraph, stages: Sequence[_Stage]
+) -> tuple[list[Executor], dict[str, tuple[tuple[str, ...], ...]], dict[str, int], dict[str, int]]:
     """The executors that run the chain and its branches; of nodes with several, their callbacks, if
-    these have names of their own.
+    these have names of their own; core and SCHED_FIFO priority, if known, of every node's executor.
     """
-    every = executors(flow)
-    members = {number for stage in stages for number in stage.members}
+    every, members = executors(flow), {number for stage in stages for number in stage.members}
     running = [one for one in every if not members.isdisjoint(one.callbacks)]
     named = {}
     for node in {stage.node for stage in stages}:
@@ -452,20 +448,16 @@ def _running(
         own = tuple(one for one, by in zip(names, every, strict=True) if one and by in running)
         if own and sum(map(bool, names)) > 1 and max(Counter(joined(*names)).values()) == 1:
             named[node] = own
-    return running, named
-
-
-def _executors(
-    recording: Recording, graph: ApplicationGraph, running: Sequence[Executor]
-) -> tuple[dict[str, int], dict[str, int]]:
-    """Core and SCHED_FIFO priority, if known, of every node's executor, of several the chain's."""
     ours = {(one.pid, tid) for one in running for tid in one.threads}
     threads = sorted(recording.info.threads, key=lambda one: (one.pid, one.tid) in ours)
-    by_pid = {thread.pid: thread for thread in threads if thread.role == "executor"}
+    by_pid = {one.pid: one for one in threads if one.role == "executor"}  # of several, ours
     found = {node.name: by_pid[node.pid] for node in graph.nodes if node.pid in by_pid}
+    cores = {name: one.cores[0] for name, one in found.items() if len(one.cores) == 1}
     return (
-        {name: thread.cores[0] for name, thread in found.items() if len(thread.cores) == 1},
-        {name: thread.priority for name, thread in found.items() if thread.priority},
+        running,
+        named,
+        cores,
+        {name: one.priority for name, one in found.items() if one.priority},
     )
 
 

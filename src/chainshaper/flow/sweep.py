@@ -163,20 +163,16 @@ def sweep(
                 for number, row in coming:
                     add(number, row)
                     progress(len(rows) / len(points), f"{len(points)} points")
-        frame = _frame(grid, points, [rows[number] for number in range(len(points))])
+        axes = [_axis(name, [values[name] for values in points]) for name in grid.axes]
+        same = {"cycles": grid.cycles, "seed": grid.application.seed}
+        own = [pl.lit(n, pl.Int64).alias(name) for name, n in same.items() if name not in grid.axes]
+        figures = pl.DataFrame([dict(rows[n]) for n in range(len(points))], schema=FIGURES)
+        frame = pl.DataFrame(axes).with_columns(own).hstack(figures)
         content = io.BytesIO()
         frame.write_parquet(content)
         write_whole(output, [content.getvalue()])
         rows_file.unlink()
     return frame
-
-
-def _frame(grid: Grid, points: Sequence[Values], rows: Sequence[Row]) -> pl.DataFrame:
-    axes = [_axis(name, [values[name] for values in points]) for name in grid.axes]
-    same = {"cycles": grid.cycles, "seed": grid.application.seed}
-    own = [pl.lit(n, pl.Int64).alias(name) for name, n in same.items() if name not in grid.axes]
-    figures = pl.DataFrame([dict(row) for row in rows], schema=FIGURES)
-    return pl.DataFrame(axes).with_columns(own).hstack(figures)
 
 
 def _axis(name: str, column: Sequence[Any]) -> pl.Series:
