@@ -44,7 +44,6 @@ if TYPE_CHECKING:
     from chainshaper.flow.launch_splicing import ThrottledInput as ThrottledInput
     from chainshaper.flow.launch_splicing import splice_launch_files as splice_launch_files
     from chainshaper.flow.launch_splicing import splice_throttlers as splice_throttlers
-    from chainshaper.flow.launch_splicing import undo_splice as undo_splice
     from chainshaper.flow.plan import plan_recording as plan_recording
     from chainshaper.flow.plan import profile_chains as profile_chains
     from chainshaper.flow.plan import shape_application as shape_application
@@ -78,6 +77,7 @@ if TYPE_CHECKING:
     from chainshaper.sources.gate_log import read_gate_log as read_gate_log
     from chainshaper.splicing.shaping_process import write_shaping_process as write_shaping_process
     from chainshaper.splicing.shaping_process import write_throttler as write_throttler
+    from chainshaper.splicing.spliced_launch import undo_splice as undo_splice
     from chainshaper.values.errors import ChainshaperError as ChainshaperError
     from chainshaper.values.errors import InputError as InputError
     from chainshaper.values.errors import OperationError as OperationError

@@ -127,9 +127,9 @@ def test_a_chain_begins_with_its_timer_unless_its_server_is_closed_then(
     plan = whole(chain.model_copy(update={"servers": (server,), "cycle_ns": 100 * MS}))
     here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None)
     run = _Run(plan, plan, Choice("freezer", ""), here, (), frozenset(), Event())
-    run.waits_ns = [3 * MS]
+    run.waits_ns, run.anchor_ns = [3 * MS], 50 * MS
     assert run.early(0) == early_ns
-    assert run.begins(0, 50 * MS) == 50 * MS - early_ns
+    assert run.begins(0) == 50 * MS - early_ns
 
 
 @pytest.mark.parametrize(("end", "slots"), [(30, ((0, 30 * MS),)), (100, ())])

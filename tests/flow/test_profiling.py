@@ -168,7 +168,7 @@ def test_an_executor_that_had_several_threads_has_them_again() -> None:
 
 def test_a_core_that_is_not_there_is_refused() -> None:
     with pytest.raises(PlatformError, match="core 4000, which the chain asks for"):
-        check_profiling(4000)
+        check_profiling([4000])
 
 
 def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Path) -> None:

@@ -217,7 +217,7 @@ class BrokenTracer:
 
     removed = 0
 
-    def __init__(self, _source: str, folder: Path, *_: object, **_how: object) -> None:
+    def __init__(self, _source: None, folder: Path, *_: object) -> None:
         self.folder = folder
 
     def start(self) -> Mapping[str, str]:
@@ -240,7 +240,7 @@ class BrokenTracer:
 def test_a_trace_that_cannot_be_read_is_kept_and_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(record, "_tracer", BrokenTracer)
+    monkeypatch.setattr(record, "_tracer", lambda *given, **_: (BrokenTracer(*given), ()))
     with pytest.raises(OperationError) as caught:
         record.record_command(tmp_path / "rec", ["sleep", "60"])
     (kept,) = tmp_path.iterdir()

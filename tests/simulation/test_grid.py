@@ -113,12 +113,12 @@ def test_points_that_differ_in_the_plan_only_share_a_profile() -> None:
     }
     grid = grid_of(quick_chain(), axes, cycles=1)
     found = {
-        (values["seed"], frozenset(str(values["policy"]) for _, values in group.points)): (
-            group.profiled,
-            len(group.points),
+        (values["seed"], frozenset(str(values["policy"]) for _, values in group)): (
+            profiled,
+            len(group),
         )
-        for group in groups_of(grid, enumerate(points_of(grid)))
-        for _, values in group.points[:1]
+        for profiled, group in groups_of(grid, enumerate(points_of(grid)))
+        for _, values in group[:1]
     }
     # Callbacks planned one by one need more of a recording.
     sizes = {

@@ -14,11 +14,10 @@ import yaml
 from launch_cases import NDT, ROBOTS, plan_for
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
-from chainshaper.flow.launch_splicing import undo_splice
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan import publish_slots, revised
 from chainshaper.splicing.shaping_process import zero_copy_lost
-from chainshaper.splicing.spliced_launch import parse_launch_command
+from chainshaper.splicing.spliced_launch import parse_launch_command, undo_splice
 from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.recording import Recording, open_recording
 

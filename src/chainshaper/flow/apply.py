@@ -2,12 +2,11 @@
 
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
-Nothing of the application is changed but where and when its threads run, and every change stands in
-a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run, a signal or a crash, puts it
-back. Servers are armed only when all nodes run, and released before a command of ours is to end,
-since a stopped thread cannot. A thread that appears later gets what the plan says at the next look.
-A shaping node is its own server, unless the plan says otherwise (`shaping_thread`): its thread gets
-a priority and a core, and no slots.
+Only where and when threads run is changed, and every change stands in a journal first
+(:mod:`chainshaper.linux.runs`): whatever ends the run, a signal or a crash, puts it back. Servers
+are armed only when all nodes run, and released before a command of ours is to end, since a stopped
+thread cannot. A thread that appears later gets what the plan says at the next look. A shaping node
+is its own server, unless the plan says otherwise (`shaping_thread`): it has no slots.
 """
 
 import contextlib
@@ -16,13 +15,13 @@ import os
 import subprocess
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import repeat
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement import undoing
@@ -35,7 +34,7 @@ from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProc
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
-from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
+from chainshaper.flow.phase import DriftWatch, Telling, tell_phase
 from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
@@ -102,15 +101,13 @@ def apply_plan(
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
     (None: those of all chains are measured). With ``adapt`` slots follow the latencies of what
     runs, to no later end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of
-    the very processes, or of an earlier run of their programs. Only
-    processes of ``users`` (names or numbers; default: who launched us, and root) are nodes of the
-    plan. ``watch`` gets the state every second; ``folder`` is where runs stand (default:
-    `/run/chainshaper`).
+    the very processes, or of an earlier run of their programs. Only processes of ``users`` (names
+    or numbers; default: who launched us, and root) are nodes of the plan. ``watch`` gets the state
+    every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
 
     Raises:
-        InputError: the plan names no threads, or has offsets, which priorities alone cannot carry
-            out; or a publisher does not publish as it asks, or follows `/clock` where slots count
-            from stamps; or no slot can follow its latencies; or there is no such user.
+        InputError: there is no such user, or the plan cannot be carried out: it names no threads,
+            or asks for what the back end, a publisher or the chains' stamps cannot do.
         PlatformError: the machine lacks a core or the back end, or we a privilege.
         OperationError: another run governs a core or node, a node does not appear or is ambiguous,
             the chain has no regular beginning, the kernel refuses something, the servers failed,
@@ -121,15 +118,13 @@ def apply_plan(
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
     threads.refuse_unfit(given, choice.name)
+    reaches_ns, why_not = dict[int, tuple[int, int]](), list[str]()
     if adapt:
-        given, followed = threads.followed_chains(given, choice.name, max_latency_ns)
-    else:
-        followed = threads.Followed({}, ())
+        given, reaches_ns, why_not = threads.followed_chains(given, choice.name, max_latency_ns)
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
-    recorded: tuple[RecordedProcess, ...] = ()
-    if recording is not None:  # looked up once: that takes longer than looking at processes
-        recorded, _ = threads.recorded_processes(recording)
+    # Looked up once: that takes longer than looking at processes.
+    recorded = () if recording is None else threads.recorded_processes(recording)[0]
     stop = stop or threading.Event()
     cores = {server.core for server in given.servers}
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
@@ -149,8 +144,8 @@ def apply_plan(
         table = threads.server_table(run.plan)
         run.servers = make_back_end(choice.name, table, journal, run.go_on)
         run.arm(run.servers, progress)
-        run.note(*followed.notes)
-        run.start_followers(followed.reaches_ns)
+        run.note(*why_not)
+        run.start_followers(reaches_ns)
         run.watch_over(run.servers, watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
@@ -160,15 +155,6 @@ def apply_plan(
         raise OperationError(f"{run.state.failure}; {ending}")
     run.note(*strangers)
     return Applied(run.state, run.command.returncode if run.command else None)
-
-
-def _without_gates(missing: Collection[str]) -> str:
-    return (
-        f"the plan's shaping node {', '.join(sorted(missing))} is not running, all other nodes are:"
-        " start the application with it (`chainshaper splice plan.yaml LAUNCH... -o DIR`; of a"
-        " described application, `chainshaper shape APP.yaml plan.yaml -o REC`), or plan without"
-        " one (--policy server-per-chain)"
-    )
 
 
 def _go_on(stop: threading.Event) -> None:
@@ -191,7 +177,7 @@ class _Run:
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
     telling: list[Telling] = field(default_factory=list)
-    anchor_ns: int = 0
+    anchor_ns: int = 0  # from when on slots count, where they have been moved to by now
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     followers: dict[int, SlotFollower] = field(default_factory=dict)  # by their chains' places
     moved_ns: dict[int, int] = field(default_factory=dict)  # by how much their slots are
@@ -211,8 +197,21 @@ class _Run:
         """See whether the run is to come into force still. Raises OperationError: it is to end."""
         _go_on(self.stop)
 
-    def note(self, *notes: str) -> None:
-        self.state = replace(self.state, notes=(*self.state.notes, *notes))
+    def show(self, **changes: Any) -> None:
+        self.state = replace(self.state, **changes)
+
+    def show_servers(self, **changes: Mapping[str, Any]) -> None:
+        """Set fields of the servers' states, each from what it is by the server's name."""
+        servers = (
+            replace(one, **{field: of[one.name] for field, of in changes.items()})
+            for one in self.state.servers
+        )
+        self.show(servers=tuple(servers))
+
+    def note(self, *notes: str, instead: Collection[str] = ()) -> None:
+        """Add notes, each once; ``instead`` of others."""
+        others = (one for one in self.state.notes if one not in instead)
+        self.show(notes=tuple(dict.fromkeys((*others, *notes))))
 
     def find(self) -> Allocation:
         return threads.find_threads(self.plan, recorded=self.recorded, users=self.users)
@@ -228,16 +227,23 @@ class _Run:
                 allocation.server_members(self.plan, self.found)
                 looks += 1
             except OperationError:
-                looks, missing = 0, self.missing()
-                gates = {node.thread.node for node in self.given.shaping_nodes}
+                looks, gates = 0, {node.thread.node for node in self.given.shaping_nodes}
+                planned = {one.node for server in self.given.servers for one in server.threads}
+                missing = planned - {node for one in self.found.threads for node in one.nodes}
+                named = ", ".join(sorted(missing))
                 others_ns = waited if missing - gates else others_ns
                 over = self.command_ended or waited >= min(wait_ns, others_ns + GATE_START_NS)
                 if over and missing and missing <= gates:
-                    raise OperationError(_without_gates(missing)) from None
+                    raise OperationError(
+                        f"the plan's shaping node {named} is not running, all other nodes are:"
+                        " start the application with it (`chainshaper splice plan.yaml LAUNCH... -o"
+                        " DIR`; of a described application, `chainshaper shape APP.yaml plan.yaml"
+                        " -o REC`), or plan without one (--policy server-per-chain)"
+                    ) from None
                 if self.command_ended and self.command is not None:
                     raise OperationError(
                         f"the command ended with code {self.command.returncode} before all nodes "
-                        f"of the plan were running: {', '.join(sorted(missing)) or 'all'} were not"
+                        f"of the plan were running: {named or 'all'} were not"
                     ) from None
                 if waited >= wait_ns:
                     raise
@@ -247,11 +253,6 @@ class _Run:
             before = self.found
             progress(min(1.0, waited / wait_ns), "finding the nodes")
             self.stop.wait(min(_LOOK_S, (wait_ns - waited) / 1e9))
-
-    def missing(self) -> set[str]:
-        """The nodes of servers that are not running."""
-        running = {node for one in self.found.threads for node in one.nodes}
-        return {one.node for server in self.given.servers for one in server.threads} - running
 
     def schedule(self) -> None:
         """Give threads their priorities and cores, as far as the back end leaves that to us."""
@@ -275,26 +276,37 @@ class _Run:
 
     def find_anchor(self, phase_ns: int | None, progress: Callable[[float, str], None]) -> None:
         """Measure where chains begin, and see from when on their slots count."""
+
+        def measured(share: float) -> None:
+            self.go_on()
+            progress(share, "measuring where in a cycle the chain begins")
+
         if phase_ns is None:
-            phases = self.measure_phases(progress)
+            phases = threads.chain_phases(self.plan, self.found, measured)
+            self.note(
+                *(
+                    f"the beginning of {chain_name(chain)} varies by"
+                    f" {duration_text(phase.spread_ns)} from cycle to cycle: it is started by"
+                    " something less regular than a timer"
+                    for chain, phase in zip(self.plan.chains, phases, strict=True)
+                    if phase.spread_ns > LEAD_NS
+                )
+            )
             self.anchor_ns = threads.common_anchor(self.given, phases)
             self.waits_ns = [
                 (self.anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
                 for chain, phase in zip(self.given.chains, phases, strict=True)
             ]
-            spread = max(phase.spread_ns for phase in phases)
-            self.state = replace(self.state, phase_spread_ns=spread)
+            self.show(phase_spread_ns=max(phase.spread_ns for phase in phases))
         else:
             anchor_ns = phase_ns + LEAD_NS - self.given.chains[0].offset_ns
             self.anchor_ns = anchor_ns % self.given.cycle_ns
             if gates(self.choice.name):
                 self.note("slots stay where --phase puts them, also when the chain's timer drifts")
         self.plan = open_until_done(self.given, self.waits_ns)
-        table, keeper = threads.server_table(self.plan), self.choice.name
-        if not gates(keeper):
-            keeper = "none: priority only"
-        kept_by = {server.name: keeper for server in table.servers}
-        servers = tuple(
+        keeper = self.choice.name if gates(self.choice.name) else "none: priority only"
+        kept_by = {one.name: keeper for one in threads.server_table(self.plan).servers}
+        servers = (
             ServerState(
                 *(one.name, one.core, one.priority, one.slots, ()),
                 kept_by=kept_by.get(one.name, "gate"),
@@ -302,52 +314,28 @@ class _Run:
             )
             for one in self.plan.servers
         )
-        self.state = replace(self.state, servers=servers)
+        self.show(servers=tuple(servers))
 
     def arm(self, servers: BackEnd, progress: Callable[[float, str], None]) -> None:
         """Put the threads into the servers, and close these."""
         anchor, cycle_ns = self.anchor_ns, self.plan.cycle_ns
-        self.tell(anchor)
-        while self.still_telling() and not (self.stop.wait(0.05) or self.command_ended):
+        self.tell(dict.fromkeys(range(len(self.plan.chains)), 0))
+        while not self.end_telling() and not (self.stop.wait(0.05) or self.command_ended):
             progress(1.0, "telling shaping nodes where cycles begin")
-        self.end_telling()
         self.assign(servers)
         servers.arm(anchor)
         since = servers.in_force_from() or time.monotonic_ns()
         with contextlib.suppress(OSError):  # a full /run ends no plan; recordings lack it then
             (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
-        self.state = replace(
-            self.state,
-            anchor_ns=anchor,
-            in_force_ns=since + (anchor - since) % cycle_ns,
-        )
+        self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
 
-    def measure_phases(self, progress: Callable[[float, str], None]) -> list[Phase]:
-        """Where in its cycle each chain begins."""
-
-        def measured(share: float) -> None:
-            self.go_on()
-            progress(share, "measuring where in a cycle the chain begins")
-
-        phases = threads.chain_phases(self.plan, self.found, measured)
-        for chain, phase in zip(self.plan.chains, phases, strict=True):
-            if phase.spread_ns > LEAD_NS:
-                self.note(
-                    f"the beginning of {chain_name(chain)} varies by"
-                    f" {duration_text(phase.spread_ns)} from cycle to cycle: it is started by"
-                    " something less regular than a timer"
-                )
-        return phases
-
-    def begins(self, place: int, anchor_ns: int) -> int:
+    def begins(self, place: int) -> int:
         """Where the chain at this place begins in its cycles."""
         chain = self.plan.chains[place]
-        return (anchor_ns + chain.offset_ns - self.early(place)) % chain.cycle_ns
+        return (self.anchor_ns + chain.offset_ns - self.early(place)) % chain.cycle_ns
 
     def early(self, place: int) -> int:
-        """How long before its slot a chain begins: with its timer, unless a server stops it until
-        then, which is one that is closed when the cycle ends.
-        """
+        """How long before its slot a chain begins: with its timer, unless a server stops it."""
         chain = self.plan.chains[place]
         if not gates(self.choice.name):
             return LEAD_NS
@@ -357,53 +345,48 @@ class _Run:
         waits = first.slots[0][0] > 0 or first.slots[-1][1] < chain.cycle_ns
         return 0 if waits else self.waits_ns[place]
 
-    def tell(self, anchor_ns: int, moved_ns: Mapping[int, int] | None = None) -> None:
-        """Begin to give shaping nodes where cycles begin: all, or of chains that have moved."""
-        for place, chain in enumerate(self.plan.chains):
-            if moved_ns is None or place in moved_ns:
-                begins = self.begins(place, anchor_ns) + (moved_ns or {}).get(place, 0)
-                telling = tell_phase(shaping_nodes(chain), self.found, begins % chain.cycle_ns)
-                self.telling.append(telling)
+    def tell(self, moved_ns: Mapping[int, int]) -> None:
+        """Begin to give shaping nodes of these chains where cycles, moved by so much, begin."""
+        for place, by_ns in moved_ns.items():
+            chain = self.plan.chains[place]
+            begins = (self.begins(place) + by_ns) % chain.cycle_ns
+            self.telling.append(tell_phase(shaping_nodes(chain), self.found, begins))
 
-    def still_telling(self) -> bool:
-        return not all(telling.is_over() for telling in self.telling)
+    def end_telling(self) -> bool:
+        """Whether shaping nodes know where cycles begin, or never will, which is noted."""
+        is_over = all(one.is_over() for one in self.telling)
+        if is_over:
+            self.note(*(said for one in self.telling for said in one.end()))
+            self.telling.clear()
+        return is_over
 
     def start_followers(self, reaches_ns: Mapping[int, tuple[int, int]]) -> None:
         """Have the slots of chains follow the latencies, each within its reach."""
         cores = set(available_cores()) - {server.core for server in self.plan.servers}
+        pids = [one.thread.pid for one in self.found.threads]
         for place, reach_ns in reaches_ns.items():
-            pids = [one.thread.pid for one in self.found.threads]
-            self.followers[place] = SlotFollower(
-                self.given.chains[place],
-                *(pids, reach_ns, partial(self.move_slots, place)),
-                cores=cores,
-            )
+            chain, move = self.given.chains[place], partial(self.move_slots, place)
+            self.followers[place] = SlotFollower(chain, pids, reach_ns, move, cores=cores)
 
     def move_slots(self, place: int, moved_ns: int) -> int:
-        """Move a chain's slots in the servers, if any of theirs change; from when on the gate has
-        to: half a cycle before the chain begins its first cycle with them.
-        """
+        """Move a chain's slots in the servers, where they change; from when on the gate has to."""
         with self.arming:
             moves = {**self.moved_ns, place: moved_ns}
             plan = open_until_done(with_slots_moved(self.given, moves), self.waits_ns)
             before, table = threads.server_table(self.plan), threads.server_table(plan)
-            cycle_ns, anchor_ns = self.plan.chains[place].cycle_ns, self.state.anchor_ns or 0
+            cycle_ns = self.plan.chains[place].cycle_ns
             since = time.monotonic_ns() + 2 * cycle_ns
             if table != before and isinstance(self.servers, Freezer):
-                self.servers.change(table, anchor_ns)
+                self.servers.change(table, self.anchor_ns)
                 since = (self.servers.in_force_from() or since) - cycle_ns // 4
             self.plan, self.moved_ns = plan, moves
-        return since + (self.begins(place, anchor_ns) - since) % cycle_ns - cycle_ns // 2
+            return since + (self.begins(place) - since) % cycle_ns - cycle_ns // 2
 
     def show_moves(self) -> None:
         """The state shows where slots are by now, and what does not follow any more."""
-        slots = {server.name: server.slots for server in self.plan.servers}
+        self.show_servers(slots={server.name: server.slots for server in self.plan.servers})
         moves = [move for one in self.followers.values() for move in one.moves]
-        self.state = replace(
-            self.state,
-            servers=tuple(replace(one, slots=slots[one.name]) for one in self.state.servers),
-            moves=tuple(sorted(moves, key=lambda move: move.from_ns)),
-        )
+        self.show(moves=tuple(sorted(moves, key=lambda move: move.from_ns)))
         for place, follower in tuple(self.followers.items()):
             if follower.failure is not None:
                 del self.followers[place]
@@ -415,38 +398,32 @@ class _Run:
         themselves = {thread.node for thread in self.plan.free_threads}
         already = {one.name: one.threads for one in self.state.servers}
         members = allocation.server_members(self.plan, self.found)
-        for name, group in members.items():
-            for member in group:
-                self.go_on()
-                tid = member.thread.tid
-                if tid not in already[name] and themselves.isdisjoint(member.nodes):
-                    with self.arming:
-                        servers.assign(tid, name)
-        self.set_threads({n: tuple(m.thread.tid for m in group) for n, group in members.items()})
-
-    def set_threads(self, tids: dict[str, tuple[int, ...]]) -> None:
-        known = tuple(replace(one, threads=tids[one.name]) for one in self.state.servers)
-        self.state = replace(self.state, servers=known)
+        for name, one in ((name, one) for name, group in members.items() for one in group):
+            self.go_on()
+            if one.thread.tid not in already[name] and themselves.isdisjoint(one.nodes):
+                with self.arming:
+                    servers.assign(one.thread.tid, name)
+        tids = {name: tuple(one.thread.tid for one in group) for name, group in members.items()}
+        self.show_servers(threads=tids)
 
     def watch_over(self, servers: BackEnd, watch: Callable[[RunState], None]) -> None:
         """Watch over the run until it is to end; the state is then as it was last."""
-        drifts, sent, said = self.drift_watches(), dict[int, int](), tuple[str, ...]()
+        drifts, sent, said = self.drift_watches(), dict[int, int](), list[str]()
         following = self.follow(servers, drifts)
         latest: tuple[NodeThread, ...] = ()
         unsaved = untaken = ""
         while True:
             is_over = self.command_ended or self.stop.is_set()
             followed_ns = next(following)
-            seen = {k: one.surely_ns for k, one in enumerate(drifts)}
+            seen = {k: ns for k, one in enumerate(drifts) if (ns := one.surely_ns) is not None}
             for k, ns in seen.items():
-                if ns is not None and (drifts[k].latest_ns or 0) - ns > PHASE_BOUND_NS:
-                    drifts[k].look_soon = True
-            moved = {k: ns + followed_ns for k, ns in seen.items() if ns is not None}
+                drifts[k].look_soon |= (drifts[k].latest_ns or 0) - ns > PHASE_BOUND_NS
+            moved = {k: ns + followed_ns for k, ns in seen.items()}
             self.end_telling()
             self.show_moves()
             self.look_at(servers, max(moved.values(), key=abs, default=None))
             if is_over := is_over or self.state.failure is not None:
-                self.state = replace(self.state, ended_ns=time.monotonic_ns())
+                self.show(ended_ns=time.monotonic_ns())
             trouble = filter(None, (unsaved, untaken))
             shown = replace(self.state, notes=(*self.state.notes, *trouble))  # while it lasts
             unsaved = ""
@@ -463,15 +440,15 @@ class _Run:
             new = {k: ns for k, ns in moved.items() if abs(ns - sent.get(k, 0)) > PHASE_BOUND_NS}
             if new and not self.telling:
                 sent.update(new)
-                self.tell(self.state.anchor_ns or 0, {k: ns - followed_ns for k, ns in new.items()})
-                others = [note for note in self.state.notes if note not in said]
-                said = tuple(
+                self.tell({k: ns - followed_ns for k, ns in new.items()})
+                notes = [
                     f"the beginning of {chain_name(self.plan.chains[place])} has moved by"
                     f" {duration_text(ns)} since the plan was put in force; shaping nodes get it,"
                     " and outputs without a stamp follow from the next cycle"
                     for place, ns in sent.items()
-                )
-                self.state = replace(self.state, notes=(*others, *said))
+                ]
+                self.note(*notes, instead=said)
+                said = notes
             if self.stop.wait(_LOOK_S):
                 continue
             if self.guardians is not None:
@@ -481,66 +458,62 @@ class _Run:
     def follow(self, servers: BackEnd, drifts: Sequence[DriftWatch]) -> Iterator[int]:
         """Move the slots with the chain's timer; yields how far they have moved (ns).
 
-        Not where nothing gates, nor from a phase that was given, which need not be a timer's. Of
-        several chains the one with the shortest wait for its slot is followed: the timers of one
-        machine have one clock. Where outputs count from the cycle and not from their stamp, slots
-        stay where they are until the timer is seen behind their opening.
+        Not where nothing gates, nor from a given phase, which need not be a timer's. Of several
+        chains, whose timers have one clock, that with the shortest wait for its slot is followed.
         """
-        anchor_ns, waits = self.state.anchor_ns or 0, self.waits_ns
+        anchor_ns, waits = self.anchor_ns, self.waits_ns
         if not gates(self.choice.name) or not waits:
             yield from repeat(0)
-        first = min(range(len(drifts)), key=lambda place: waits[place])
+        first = waits.index(min(waits))
+        drift, cycle_ns = drifts[first], self.plan.chains[first].cycle_ns
         stamped = all(chain.anchor == "stamp" for chain in self.plan.chains)
-        track = TimerTrack(
-            waits[first], time.monotonic_ns(), self.plan.chains[first].cycle_ns, looks=stamped
-        )
-        seen = 0
+        track = TimerTrack(waits[first], time.monotonic_ns(), cycle_ns, looks=stamped)
+        looks = 0
         while True:
             before_ns = track.opens_ns
-            if drifts[first].looks > seen:
-                seen = drifts[first].looks
+            if drift.looks > looks:
+                looks = drift.looks
                 early = self.early(first)  # nothing stops it: one look alone may just be late
-                seen_ns = drifts[first].surely_ns if early else drifts[first].latest_ns
+                seen_ns = drift.surely_ns if early else drift.latest_ns
                 track.saw((seen_ns or 0) - early, time.monotonic_ns())
-                drifts[first].look_soon = track.is_unsure
+                drift.look_soon = track.is_unsure
             if track.opens_ns != before_ns:
                 moved_ns = (anchor_ns + track.opens_ns) % self.plan.cycle_ns
                 try:
                     with self.arming:
                         servers.arm(moved_ns)
+                        self.anchor_ns = moved_ns
                 except OperationError:
                     if not self.stop.is_set():
                         raise
                     yield before_ns  # asked to end meanwhile, which is no failure
                     continue
-                self.state = replace(self.state, anchor_ns=moved_ns)
-                for place, drift in enumerate(drifts):
-                    drift.expect(self.begins(place, moved_ns))
+                self.show(anchor_ns=moved_ns)
+                for place, one in enumerate(drifts):
+                    one.expect(self.begins(place))
             yield track.opens_ns
 
     def drift_watches(self) -> list[DriftWatch]:
         """Watches over where chains begin, one for each first thread."""
         gated, cores = gates(self.choice.name), {server.core for server in self.plan.servers}
         watches: dict[int, DriftWatch] = {}
-        found = []
         origins = threads.first_threads(self.plan, self.found)
         for place, (chain, origin) in enumerate(zip(self.plan.chains, origins, strict=True)):
+            own = (
+                one.slots
+                for one in chain.servers
+                for state in self.state.servers
+                if gated and state.name == one.name and origin.tid in state.threads
+                if not self.early(place)  # else nothing stops it, and short runs count too
+            )
             if origin.tid not in watches:
-                own = (
-                    one.slots
-                    for one in chain.servers
-                    for state in self.state.servers
-                    if gated and state.name == one.name and origin.tid in state.threads
-                    if not self.early(place)  # else nothing stops it, and short runs count too
-                )
                 watches[origin.tid] = DriftWatch(
                     *(origin.pid, origin.tid, chain.cycle_ns),
-                    self.begins(place, self.state.anchor_ns or 0),
+                    self.begins(place),
                     next(own, ()),
                     cores=set(available_cores()) - cores,
                 )
-            found.append(watches[origin.tid])
-        return found
+        return [watches[origin.tid] for origin in origins]
 
     def look_at(self, servers: BackEnd, drift_ns: int | None) -> None:
         """What the servers have done so far, and why the plan is no longer in force, if so."""
@@ -551,10 +524,8 @@ class _Run:
         ours = self.command is not None or self.stop.is_set()
         if failure is None and not ours and not any(one.threads for one in self.state.servers):
             failure = "the application has ended: no thread of the plan's nodes is left"
-        known = tuple(
-            replace(one, counters=counters.get(one.name, _NOTHING)) for one in self.state.servers
-        )
-        self.state = replace(self.state, servers=known, drift_ns=drift_ns, failure=failure)
+        self.show_servers(counters=defaultdict(lambda: _NOTHING, counters))
+        self.show(drift_ns=drift_ns, failure=failure)
 
     def look_again(
         self, servers: BackEnd, latest: tuple[NodeThread, ...]
@@ -567,9 +538,10 @@ class _Run:
         new, ended = allocation.new_and_ended(before, now)
         self.name_fleeting(latest, ended)
         self.name_strangers(now)
-        there = {one.thread.tid for one in now.threads}
+        gone = {one.thread.tid for one in ended}
         servers_now = self.state.servers
-        self.set_threads({s.name: tuple(t for t in s.threads if t in there) for s in servers_now})
+        left = {one.name: tuple(t for t in one.threads if t not in gone) for one in servers_now}
+        self.show_servers(threads=left)
         self.found = now
         try:
             note_descendants(self.journal)
@@ -585,27 +557,19 @@ class _Run:
     def name_strangers(self, found: Allocation) -> None:
         """One line about strangers who say they are nodes: the latest replaces the one before."""
         if found.strangers is not None:
-            notes = self.state.notes
-            others = (note for note in notes if not note.startswith(allocation.LEFT_ALONE))
-            self.state = replace(self.state, notes=(*others, found.strangers))
+            said = [one for one in self.state.notes if one.startswith(allocation.LEFT_ALONE)]
+            self.note(found.strangers, instead=said)
 
     def name_fleeting(self, latest: Sequence[NodeThread], ended: Sequence[NodeThread]) -> None:
         """Name the processes whose threads come and go: what ended since it was new."""
         gone = {one.thread.identity for one in ended}
         counted = Counter(one.thread.pid for one in latest if one.thread.identity in gone)
-        said = (
-            f"threads of process {pid} come and go: each has the class, cores and cgroup of the "
-            "thread that started it, and is left so"
-            for pid, times in counted.items()
-            if times >= _FLEETING
-        )
-        self.state = replace(self.state, notes=tuple(dict.fromkeys((*self.state.notes, *said))))
-
-    def end_telling(self) -> None:
-        """Note what went wrong with telling the shaping nodes, once that is over."""
-        if not self.still_telling():
-            telling, self.telling = self.telling, []
-            self.note(*(said for one in telling for said in one.end()))
+        for pid, times in counted.items():
+            if times >= _FLEETING:
+                self.note(
+                    f"threads of process {pid} come and go: each has the class, cores and cgroup of"
+                    " the thread that started it, and is left so"
+                )
 
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""
@@ -625,33 +589,27 @@ class _Run:
 
 
 def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
-    """The servers without which a plan does not work, and whom they have to gate.
-
-    Those of asynchronous publishers, and the stages of a pipeline: one that begins early would run
-    beside the instance before it. Shaping nodes keep to their slots themselves.
+    """The servers without which a plan does not work, and whom they have to gate: asynchronous
+    publishers, and the stages of a pipeline, which would run beside the instance before.
     """
     gates = {node.thread for node in plan.shaping_nodes}
     pipelines = [chain for chain in plan.chains if chain.policy == "pipelined"]
     staged = {one for chain in pipelines for server in chain.servers for one in server.threads}
-    found = [
-        (server, [one for one in server.threads if one.role == "publisher" or one in staged])
+    return [
+        (server, own)
         for server in open_until_done(plan).servers
         if gates.isdisjoint(server.threads)
+        if (own := [one for one in server.threads if one.role == "publisher" or one in staged])
     ]
-    return [(server, threads) for server, threads in found if threads]
 
 
 @contextlib.contextmanager
 def threads_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None]:
-    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only.
+    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only (paper,
+    section 3.2.1, design 1).
 
-    For the live workload (paper, section 3.2.1, design 1): which process each node is, and when
-    cycles start, is known. All other threads run on.
-
-    Raises:
-        PlatformError: threads cannot be frozen here.
-        OperationError: another run governs one of the cores or nodes, a node has no such thread,
-            or the servers failed meanwhile.
+    Raises PlatformError: threads cannot be frozen here. OperationError: another run governs one of
+    the cores or nodes, a node has no such thread, or the servers failed meanwhile.
     """
     choice = choose_back_end("freezer")  # the others want threads of the fair class
     planned = gated_threads(plan)
@@ -660,10 +618,9 @@ def threads_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None
     with run_claimed(cores, {one.node for _, own in planned for one in own}) as journal:
         servers = make_back_end(choice.name, table, journal)
         try:
-            for server, own in planned:
-                for one in own:
-                    for tid in _threads_of(one, nodes):
-                        servers.assign(tid, server.name)
+            for server, one in ((server, one) for server, own in planned for one in own):
+                for tid in _threads_of(one, nodes):
+                    servers.assign(tid, server.name)
             servers.arm(nodes.start_ns if plan.moves_timers else nodes.anchor_ns)
             yield
             failure = servers.failure()
@@ -680,10 +637,8 @@ def slots_followed(
     enforcement: "Enforcement | None",
     nodes: "StartedNodes",
 ) -> Iterator[None]:
-    """Inside, slots of the live workload's gates follow its latencies, within their reach.
-
-    Beside what else is in force. Raises OperationError: one does not follow to the end; and what
-    ``enforcement`` raises.
+    """Inside, slots of the live workload's gates follow its latencies, within their reach, beside
+    ``enforcement``. Raises what that does; OperationError: one does not follow to the end.
     """
     anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
 
@@ -698,8 +653,7 @@ def slots_followed(
         for place, reach_ns in reaches_ns.items():
             chain, pids = plan.chains[place], nodes.pids.values()
             followers.append(SlotFollower(chain, pids, reach_ns, partial(from_when, chain)))
-        for follower in followers:
-            until.callback(follower.end)
+            until.callback(followers[-1].end)
         yield
     for follower in followers:
         if follower.failure is not None:
@@ -709,11 +663,11 @@ def slots_followed(
 def _threads_of(wanted: Thread, nodes: "StartedNodes") -> list[int]:
     pid = nodes.pids.get(wanted.node)
     found = [t.tid for t in list_threads(pid) if t.role == wanted.role] if pid is not None else []
-    if found:
-        return found
-    if wanted.role == "executor":
+    if not found and wanted.role == "executor":
         raise OperationError(f"{wanted.node} of the plan is no node of the application")
-    raise OperationError(
-        f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
-        "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
-    )
+    if not found:
+        raise OperationError(
+            f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
+            "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
+        )
+    return found

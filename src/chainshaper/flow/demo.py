@@ -1,17 +1,14 @@
 """The demonstration: the whole flow on a live application, everything in one folder.
 
-DIR/application.yaml   what ran
-DIR/before             the recording of the unshaped run
-DIR/plan.yaml          what was planned from it
-DIR/after              the recording of the shaped run
-DIR/latency.png        latency of every cycle, before and after
-DIR/distribution.png   their distributions, with the publish slot
-DIR/comparison.json    every figure of the printed table
+DIR/application.yaml        what ran
+DIR/before, DIR/after       the recordings of the unshaped and of the shaped run
+DIR/plan.yaml               what was planned from the former
+DIR/latency.png, …          latency of every cycle, and their distributions with the publish slot
+DIR/comparison.json         every figure of the printed table
 """
 
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
@@ -28,8 +25,6 @@ from chainshaper.values.recording import refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 from chainshaper.workload.description import load_application
 from chainshaper.workload.live import Progress, run_application
-
-__all__ = ["DemoResult", "run_demo", "synthetic_chain"]
 
 _STANDARD = PlanRequest()
 
@@ -63,12 +58,8 @@ def run_demo(
 ) -> DemoResult:
     """Run an application, plan, shape, run again and compare.
 
-    ``planned`` gets the plan before it is used, to say what is doubtful about it.
-
-    Raises:
-        InputError: ``folder`` exists and is not empty, or the application is not right.
-        PlatformError, OperationError: a step failed; complete recordings stay; without one
-            nothing is left.
+    Raises InputError: ``folder`` exists and is not empty, or the application is not right.
+    PlatformError, OperationError: a step failed; complete recordings stay, without one nothing.
     """
     folder = refuse_existing(folder)
     path = synthetic_chain() if application is None else Path(application)
@@ -78,10 +69,19 @@ def run_demo(
     def part(start: float, title: str) -> Progress:
         return lambda done, what: progress(start + 0.48 * done, f"{title}, {what}")
 
-    with _prepared(folder, path):
-        before = run_application(
-            description, folder / "before", progress=part(0.0, "unshaped run"), **how
-        )
+    made, copy = not folder.exists(), folder / "application.yaml"
+    report = part(0.0, "unshaped run")
+    try:
+        folder.mkdir(exist_ok=True)
+        shutil.copyfile(path, copy)
+        before = run_application(description, folder / "before", progress=report, **how)
+    except OSError as error:
+        raise OperationError(f"{folder}: cannot be written: {error}") from error
+    finally:
+        if not (folder / "before").exists():  # nothing came to stand beside it
+            copy.unlink(missing_ok=True)
+            if made and folder.exists():
+                folder.rmdir()
     progress(0.48, "planning")
     plan = plan_recording(before, request=request)
     save_plan(plan, folder / "plan.yaml")
@@ -98,21 +98,3 @@ def run_demo(
         comparison=comparison,
         notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes])),
     )
-
-
-@contextmanager
-def _prepared(folder: Path, application: Path) -> Iterator[None]:
-    """The folder with the application in it; gone again when nothing comes to stand beside it."""
-    made = not folder.exists()
-    copy = folder / "application.yaml"
-    try:
-        folder.mkdir(exist_ok=True)
-        shutil.copyfile(application, copy)
-        yield
-    except OSError as error:
-        raise OperationError(f"{folder}: cannot be written: {error}") from error
-    finally:
-        if not (folder / "before").exists():
-            copy.unlink(missing_ok=True)
-            if made and folder.exists():
-                folder.rmdir()

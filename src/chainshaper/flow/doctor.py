@@ -20,8 +20,6 @@ from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle
 from chainshaper.linux.threads import foreign_realtime_processes
 from chainshaper.values.recording import Check, MachineReport, State
 
-__all__ = ["examine_machine"]
-
 
 def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
     """Examine this machine; the stalls take ``watch_ns``."""
@@ -51,9 +49,8 @@ def _scheduling_checks(realtime: bool) -> Iterator[Check]:
     unlimited = os.geteuid() == 0 or lockable == resource.RLIM_INFINITY
     purpose, good = "no page faults while a gate waits", "permitted" if unlimited else None
     remedy = "give your user an unlimited memlock limit in /etc/security/limits.conf"
-    yield _check(
-        "memory locking", purpose, good, "limited", f"up to {lockable // 1024} KiB", remedy
-    )
+    found = f"up to {lockable // 1024} KiB"
+    yield _check("memory locking", purpose, good, "limited", found, remedy)
     purpose, good = "undisturbed measurements", None if others else "none"
     remedy = "end them while you measure, unless they belong to the application"
     name, found = "other real-time processes", ", ".join(others)
@@ -90,26 +87,26 @@ def _bpftrace() -> Check:
         run = subprocess.run(
             trial, capture_output=True, text=True, check=False, timeout=30, env=environment
         )
-        if run.returncode == 0:
-            return Check(name, "good", path, purpose)
+        good = path if run.returncode == 0 else None
         problems = [line for line in run.stderr.splitlines() if "RLIMIT_MEMLOCK" not in line]
     except subprocess.TimeoutExpired:
-        problems = ["it did not end within 30 s"]
+        good, problems = None, ["it did not end within 30 s"]
     remedy = "mount -t tracefs tracefs /sys/kernel/tracing"
     if Path("/sys/kernel/tracing/events").is_dir():
         remedy = "see what bpftrace says: a kernel with BTF and uprobes is needed"
     found = f"does not work: {problems[0] if problems else 'no reason given'}"
-    return _check(name, purpose, None, "limited", found, remedy)
+    return _check(name, purpose, good, "limited", found, remedy)
 
 
 def _dds() -> Check:
-    found: str | None = None
-    problem = ""
+    found, problem = None, ""
     try:
-        found = importlib.metadata.version("cyclonedds")
+        version = importlib.metadata.version("cyclonedds")
         from chainshaper.workload import dds  # noqa: F401 - loading it is the check
+
+        found = version
     except Exception as error:
-        found, problem = None, str(error)
+        problem = str(error)
     remedy = (
         "ROS 2 applications need none; else use Python 3.10 to 3.13 on x86-64, for which a wheel "
         "exists, or `pip install cyclonedds` with CYCLONEDDS_HOME naming a Cyclone DDS 11"
@@ -142,6 +139,8 @@ def _check(  # noqa: PLR0917 - a check's columns
     name: str, purpose: str, good: str | None, state: State, found: str, remedy: str
 ) -> Check:
     """``good`` is what was found; None: the check's state, what was found, and the remedy."""
-    if good is not None:
-        return Check(name, "good", good, purpose)
-    return Check(name, state, found, purpose, remedy)
+    return (
+        Check(name, state, found, purpose, remedy)
+        if good is None
+        else Check(name, "good", good, purpose)
+    )

@@ -2,11 +2,10 @@
 
 A chain that a sensor starts has the sensor's clock: 50 ppm off, it has moved by a whole cycle of
 100 ms after half an hour. Its servers' slots have to move with it, so that they open shortly after
-the timer has expired. When it expires cannot be seen while its thread waits for the slot: the
-thread begins as the slot opens, however long before that the timer was. Only a timer that expires
-in the open slot shows where it is. So the slots open a little before the timer is expected, once in
-a while, just to see; in between they move at the rate that was found. Outputs are not moved by
-this: they count from the stamp of their own cycle.
+the timer has expired. A thread that waits for its slot begins as that opens: only a timer that
+expires in the open slot shows where it is. So the slots open a little before the timer is expected,
+once in a while, just to see; in between they move at the rate that was found. Outputs do not move:
+they count from the stamp of their own cycle.
 
 On a busy machine a thread begins late without its timer. So slots soon open still earlier once
 more: the timer stays where it is, while a thread that only begins late moves with the opening. What
@@ -45,9 +44,8 @@ MOST_RATE = 500e-6  # of a quartz, and of timers that a program counts itself
 class TimerTrack:
     """Where a timer expires, and where slots open for it; ns behind the first such opening.
 
-    ``lead_ns`` is how long before the opening the timer is to expire. It was seen to expire at the
-    times (CLOCK_MONOTONIC) and places of ``sightings``. Unless it ``looks``, the slots never open
-    before the timer to see it.
+    ``lead_ns`` is how long before the opening the timer is to expire. ``sightings`` are when
+    (CLOCK_MONOTONIC) and where it did. Unless it ``looks``, slots never open before it to see it.
     """
 
     lead_ns: int
@@ -81,9 +79,7 @@ class TimerTrack:
         return place + round(self.rate * (now_ns - at))
 
     def saw(self, begins_ns: int, now_ns: int) -> int:
-        """Where slots are to open from now on, the thread having begun so long behind their
-        opening.
-        """
+        """Where slots open from now on: the thread has begun so long behind their opening."""
         expires_ns, expected = self.opens_ns + begins_ns, self.expected(now_ns)
         perhaps_ns, self._perhaps_ns = self._perhaps_ns, None
         furthest = self._furthest(now_ns - self.sightings[-1][0])
@@ -141,8 +137,7 @@ class SlotFollower:
 
     ``pids`` are processes of which one may be the gate, ``reach_ns`` is how far slots may be moved.
     ``put_in_force`` has servers move theirs by so much, and says from when on the gate has to.
-    Following ends by itself where that fails, or the gate does. Raises OperationError: see
-    :class:`.FollowedOutput`.
+    It may end by itself, with a ``failure``. Raises OperationError: see :class:`.FollowedOutput`.
     """
 
     def __init__(

@@ -20,27 +20,20 @@ from chainshaper.analysis.chains import close_names
 from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.flow.plan import inputs_of
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.sources import open_source
 from chainshaper.sources.lttng.trace import table_name
 from chainshaper.values.application import INTERNAL_TOPICS
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
-from chainshaper.values.recording import (
-    Recording,
-    RecordingInfo,
-    event_counts,
-    write_recording,
-)
+from chainshaper.values.recording import Recording, RecordingInfo, event_counts, write_recording
 from chainshaper.values.yaml_file import AS_YAML, wrong_values_refused
+from chainshaper.verify.measure import opened
 from chainshaper.workload.description import Application
 
 
 def list_chains(
     source: Recording | DataFlow, start: str | None = None, end: str | None = None, limit: int = 100
 ) -> ChainEnumeration:
-    """The chains of a recording, the heaviest by mean response times among them, as
-    :func:`~chainshaper.analysis.chains.enumerate_chains` gives them.
-    """
+    """The chains of a recording, and the heaviest of them by mean response times."""
     if isinstance(source, Recording):
         source = data_flow(source.events, source.info.clock_offset_ns)
     statistics = callback_statistics(source).drop_nulls("response_ns")
@@ -50,31 +43,26 @@ def list_chains(
 
 
 def named_chain(file: str | Path, name: str | None = None) -> str:
-    """The chain that a CARET architecture file calls ``name``, as we write it.
-
-    Raises InputError: no such path in the file, or several and no ``name``.
-    """
+    """The chain that a CARET architecture file calls ``name``, which only one path needs not."""
     paths = load_named_paths(file)
-    if name is None and len(paths) == 1:
-        return next(iter(paths.values()))
+    known = ", ".join(paths) or "none"
+    if name is None and len(paths) != 1:
+        raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
+    name = next(iter(paths)) if name is None else name
     if name in paths:
         return paths[name]
-    known = ", ".join(paths) or "none"
-    if name is None:
-        raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
     close = close_names(name, paths)
     hint = f"did you mean {' or '.join(close)}?" if close else f"its named_paths: {known}"
     raise InputError(f"{file}: no path is named {name!r}; {hint}")
 
 
 def convert_recording(recording: Recording | str | Path, output: str | Path) -> Recording:
-    """Write a trace as a recording of ours, with all events that the analysis knows: every figure
-    stays the same to the nanosecond. A note names the other events.
+    """Write a trace as a recording of ours: every figure stays the same to the nanosecond. A note
+    names the events that the analysis does not know.
 
     Raises InputError: ``output`` exists already, or no event is known.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
+    recording = opened(recording)
     if not len(recording.events):
         raise InputError(f"{recording.path}: no event in it is one that chainshaper knows")
     return write_recording(output, recording.events, with_trace_events(recording))
@@ -89,26 +77,24 @@ def with_trace_events(recording: Recording) -> RecordingInfo:
     left = [name for name in counts if table_name(name) not in recording.events]
     notes = info.notes
     if left:
-        count = sum(counts[name] for name in left)
-        note = f"{count} events of kinds that chainshaper makes no use of were left out: "
-        notes += (f"{note}{', '.join(left)}.",)
+        count = (
+            f"{sum(counts[name] for name in left)} events of kinds that chainshaper makes no use"
+        )
+        notes += (f"{count} of were left out: {', '.join(left)}.",)
     return info.model_copy(update={"trace_events": counts, "notes": notes})
 
 
-QUANTILES = 20
-"""Of a callback's times: so many stand for all in a description."""
+QUANTILES = 20  # of a callback's times: so many stand for all in a description
 
 
 def application_file(recording: Recording | str | Path, chain: str | None = None) -> str:
     """The description of an application (YAML) as a recording shows it, to simulate and to run.
 
-    Callbacks execute as long as they did, by quantiles (without execution times: their response
-    times); what no node of it publishes comes from a timer. ``chain`` defaults to the heaviest.
-
-    Raises InputError: no chain is in it, or no description can be made of it.
+    Callbacks execute as long as they did, by quantiles; what no node of it publishes comes from a
+    timer. ``chain`` defaults to the heaviest. Raises InputError: no chain is in it, or no
+    description can be made of it.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
+    recording = opened(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     graph, heaviest = graph_of(flow), list_chains(flow).heaviest
     if heaviest is None:
@@ -117,9 +103,8 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
     nodes: dict[str, Any] = {}
     seen: set[int] = set()
     for one in graph.callbacks:
-        if one.id in seen or one.kind not in ("timer", "subscription"):
-            continue
-        if one.topic in INTERNAL_TOPICS:
+        ours = one.kind in ("timer", "subscription") and one.topic not in INTERNAL_TOPICS
+        if one.id in seen or not ours:
             continue
         topics = [topic for topic in one.publishes if topic not in INTERNAL_TOPICS]
         members = inputs_of(graph, one, topics[0]) if topics else (one.id,)
@@ -156,8 +141,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
 
 def describe_application(recording: Recording | str | Path) -> ApplicationDescription:
     """The application that a recording or trace shows: its graph and its services."""
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
+    recording = opened(recording)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     return ApplicationDescription(
         graph=graph_of(flow),

@@ -5,11 +5,10 @@
                                                                 recorded
 
 Each step is what the verb of its name does, and leaves its result in the folder. The first, short
-recording tells which chains there are, which nodes a chain has and which of these run at the same
+recording shows which chains there are, which nodes a chain has and which of these run at the same
 time; the second measures it under the paper's profiling condition (section 2.4), as far as that is
 permitted. Of several chains each is measured as if it were alone, as it is planned: chains that
-would delay each other, on a core or in a node, have recordings of their own. Throttlers stand in
-front of everything.
+would delay each other have recordings of their own. Throttlers stand in front of everything.
 """
 
 import sys
@@ -64,9 +63,6 @@ from chainshaper.verify.measure import Comparison, compare_recordings
 FIRST_LOOK_NS = 10_000_000_000  # long enough for everything to have started and run
 NOT_PERMITTED = "measured under ordinary scheduling: SCHED_FIFO is not permitted."
 
-Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]
-"""Asked which of the chains that were found is meant."""
-
 
 @dataclass(frozen=True)
 class ShapedLaunch:
@@ -81,6 +77,9 @@ class ShapedLaunch:
     application: ApplicationPlan
     comparisons: tuple[Comparison, ...]  # of every chain and sink
     cores: Mapping[str, int]  # where each node's executor ran
+
+
+Choose: TypeAlias = Callable[[ApplicationGraph, ChainEnumeration], str]  # which chain is meant
 
 
 def shape_launch(
@@ -111,29 +110,28 @@ def shape_launch(
 
     ``chain`` is the one to shape, or several; without it, ``choose`` is asked. ``sinks`` are chains
     to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that get them
-    by way of a throttler, ``period_ns`` is that of chains that no timer starts, and
-    ``mode_recordings``, ``since_ns`` and ``until_ns`` are for :func:`.profile_chains`.
-    ``request.cores`` are where executors run (default: the last core, and others that are worth
-    it). The application is launched three times, briefly, and for ``duration_ns`` before and after;
-    more often, where chains are measured one by one. ``planned`` gets the plan before it is used,
-    to say what is doubtful about it. ``stop`` ends the step that is under way, and with it
-    everything. ``adapt``, ``max_latency_ns`` and ``users`` are for :func:`.apply_plan`.
+    by way of a throttler. ``request.cores`` are where executors run (default: the last core, and
+    others that are worth it). The application is launched three times, briefly, and for
+    ``duration_ns`` before and after; more often, where chains are measured one by one. ``planned``
+    gets the plan before it is used, to say what is doubtful about it. ``stop`` ends everything. The
+    rest is for :func:`.profile_chains` and :func:`.apply_plan`.
 
     Raises:
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
             does not fit: no such chain, a launch file with a mistake …
-        PlatformError: there is no such core. PlatformError, OperationError: a step failed; what the
-            steps before it left stays.
+        PlatformError, OperationError: there is no such core, or a step failed; what the steps
+            before it left stays.
     """
     launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
-    known: Any = {"modes": request.modes, "since_ns": since_ns, "until_ns": until_ns}
-    known["mode_recordings"] = mode_recordings or {}
+    known: Any = {
+        **{"period_ns": period_ns, "since_ns": since_ns, "until_ns": until_ns},
+        **{"modes": request.modes, "mode_recordings": mode_recordings or {}},
+    }
     _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
     if node != "python":
         check_build_tools()
-    folder, stop = refuse_existing(folder), stop or threading.Event()
-    taken = run_users(users)
+    folder, stop, taken = refuse_existing(folder), stop or threading.Event(), run_users(users)
     folder.mkdir(exist_ok=True)
 
     def record(name: str, words: Sequence[str], lasting_ns: int, **how: Any) -> Recording:
@@ -143,15 +141,16 @@ def shape_launch(
             source=source,
             duration_ns=lasting_ns,
             command_stdout=sys.stderr.fileno(),
+            watch_stalls=name != "first",
             stop=stop,
             progress=lambda share, what: progress(share, f"{name}: {what}"),
             **how,
         )
         if stop.is_set() or done.exit_code is not None:
-            how_it_ended = "was stopped" if done.exit_code is None else "ended by itself"
+            ended = "was stopped" if done.exit_code is None else "ended by itself"
             raise OperationError(
-                f"the application {how_it_ended} during the recording {done.recording.path}, "
-                "which stays; nothing was shaped"
+                f"the application {ended} during the recording {done.recording.path}, which stays;"
+                " nothing was shaped"
             )
         return done.recording
 
@@ -167,28 +166,27 @@ def shape_launch(
     wanted = (*chains, *sinks)
     seen, core_of = profiled_cores(first, wanted, request, period_ns)
     _refuse_at_first_look(seen, len(chains), request)
-    permitted = may_use_fifo()  # else it is measured under ordinary scheduling
+    permitted = may_use_fifo()
     found, measured = ([] if permitted else [NOT_PERMITTED]), dict[int, tuple[Recording, Profile]]()
     for number, places in enumerate(undelayed(seen, core_of), start=1):
         own = [wanted[place] for place in places]
         cores = {node: core_of[node] for node in chain_nodes(first, *own)}
+        condition = profiling_condition(
+            *(cores, cores), like=first, chains=own, before=stages_before(seen, request)
+        )
         before = record(
             *("before" if number == 1 else f"before_{number}", shaped, duration_ns),
-            scheduling=profiling_condition(
-                *(cores, cores), like=first, chains=own, before=stages_before(seen, request)
-            )
-            if permitted
-            else None,
+            scheduling=condition if permitted else None,
             chain=own[0],
-            watch_stalls=True,
         )
         found += before.info.notes
-        profiles = profile_chains(before, own, period_ns=period_ns, **known)
+        profiles = profile_chains(before, own, **known)
         measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
     progress(0.0, "planning")
     plan, remarks = _planned([measured[k][1] for k in range(len(wanted))], len(chains), request)
     save_application_plan(plan, folder / "plan.yaml")
     planned(plan if len(plan.chains) > 1 else plan.chains[0])
+    found += remarks
     splicing = None
     if plan.shaping_nodes:
         splicing = splice_launch_files(
@@ -197,25 +195,22 @@ def shape_launch(
             arguments=launch.arguments,
             recording=first,
         )
-        file = next(iter(splicing.launch.values()))
-        shaped = [*setup, *_sourced(splicing), *launch.with_file(file)]
+        found += splicing.notes
+        shaped = [*setup, *_sourced(splicing), *launch.with_file(*set(splicing.launch.values()))]
     after = record(
         *("after", shaped, duration_ns),
         scheduling=plan_in_force(
-            *(plan, back_end, first, taken, applied := list[str]()),
-            adapt=adapt,
-            max_latency_ns=max_latency_ns,
+            *(plan, back_end, first, taken, found), adapt=adapt, max_latency_ns=max_latency_ns
         ),
         plan=plan,
         gate_logs=() if splicing is None else splicing.logs,
         chain=chains[0],
-        watch_stalls=True,
     )
     progress(0.0, "comparing")
     comparisons = [compare_recordings([measured[k][0], after], one) for k, one in enumerate(wanted)]
     for k, comparison in enumerate(comparisons):
         write_comparison(comparison, folder / f"chain_{k + 1}" if k else folder)
-    found += [*remarks, *(() if splicing is None else splicing.notes), *applied, *after.info.notes]
+    found += after.info.notes
     return ShapedLaunch(
         folder=folder,
         chain=chains[0],
@@ -277,10 +272,8 @@ def _chosen(first: Recording, choose: Choose | None) -> str:
             f"{first.path}: no chain was seen: do its callbacks publish, and do others take that?"
         )
     if choose is None:
-        raise InputError(
-            "which chain is meant? Name it with --chain: "
-            + ", ".join(one.spec for one in found.chains[:5])
-        )
+        known = ", ".join(one.spec for one in found.chains[:5])
+        raise InputError(f"which chain is meant? Name it with --chain: {known}")
     return choose(graph_of(flow), found)
 
 
@@ -301,24 +294,13 @@ def plan_in_force(
     notes: list[str],
     **how: Any,
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
-    """The plan in force on what runs; what it gives says whether all servers have opened.
-
-    A thread of its own does what `chainshaper apply` does, until the context ends; ``notes`` are
-    what it has to say then; ``how`` goes to :func:`.apply_plan`.
+    """The plan in force on what runs, by a thread that does what `chainshaper apply` does (``how``)
+    until the context ends, which adds its ``notes``; it gives whether all servers have opened.
     """
     stop, states = threading.Event(), list[RunState]()
+    how |= {"back_end": back_end, "recording": recording, "users": users, "wait_ns": START_NS}
     with ThreadPoolExecutor(1, "apply") as beside:
-        applied = beside.submit(
-            apply_plan,
-            plan,
-            back_end=back_end,
-            recording=recording,
-            wait_ns=START_NS,
-            users=users,
-            stop=stop,
-            watch=states.append,
-            **how,
-        )
+        applied = beside.submit(apply_plan, plan, **how, stop=stop, watch=states.append)
 
         def opened(_: Sequence[Process]) -> bool:
             if applied.done():

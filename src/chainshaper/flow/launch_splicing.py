@@ -1,18 +1,16 @@
 """Splicing nodes into launch files: the paper's Republisher Editor and Throttler (4.2, 5.1).
 
-Nothing of the user's is edited, copied or parsed: a launch file is written that includes the
-user's, starts our nodes, and redirects a topic where `ros2 launch` starts the node that has it
-(:mod:`chainshaper.splicing.redirection`).
-
-A shaping node stands behind an output: its publisher is redirected, and subscribers notice nothing.
-A throttler stands before an input: its subscribers are redirected, because what publishes it, a
-player or a driver, often is started elsewhere.
+Nothing of the user's is edited, copied or parsed: a launch file is written that includes theirs,
+starts our nodes, and redirects a topic where `ros2 launch` starts the node that has it
+(:mod:`chainshaper.splicing.redirection`). Before a shaping node it is the publisher that is
+redirected, behind a throttler the subscribers: a player or a driver often is started elsewhere.
 """
 
 import difflib
 import json
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
@@ -42,7 +40,6 @@ from chainshaper.splicing.spliced_launch import (
     launch_text,
     new_folder,
     original_words,
-    remove_folder,
     usable,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -57,7 +54,7 @@ THROTTLER_PRIORITY = 85  # of SCHED_FIFO, until `apply` puts it into its server
 DRY_RUN_S = 120.0  # how long a dry run may take
 
 _Names: TypeAlias = Mapping[str, Sequence[str]]
-_Written: TypeAlias = tuple[list[ShapingProcess], list[Redirect], dict[str, str]]
+_Written: TypeAlias = tuple[list[ShapingProcess], dict[str, str]]  # and the environment to add
 
 
 @dataclass(frozen=True)
@@ -77,10 +74,9 @@ class Splicing:
 
 
 class ThrottledInput(Part):
-    """A topic that is to reach its ``subscriber`` once every ``period_ns``, at the most.
+    """A topic that is to reach its ``subscriber`` (None: all) once every ``period_ns`` at most.
 
-    Without a ``subscriber`` all of them are meant, as a recording knows them. The ``rule`` says
-    which messages reach it, and when (:mod:`chainshaper.gate.throttling`).
+    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.gate.throttling`).
     """
 
     topic: FullName
@@ -103,11 +99,10 @@ def splice_launch_files(
 ) -> Splicing:
     """Write a launch file that starts the plan's shaping nodes and launch files, into a new folder.
 
-    ``launch_files`` may be the words of `ros2 run …` as well. ``recording`` is one of the
-    application: it tells who publishes a topic and of which type it is, as far as the plan does
-    not. ``fallback`` goes before the plan's. A folder that was spliced before and not changed since
-    is replaced. With ``dry_run`` nothing is written: the launch files are carried out in our own
-    ROS 2 environment with launch ``arguments``, except that no process is started.
+    ``launch_files`` may be the words of `ros2 run …` as well. ``recording`` tells who publishes a
+    topic and of which type it is, as far as the plan does not. ``fallback`` goes before the plan's.
+    A folder that was spliced before and not changed since is replaced. With ``dry_run`` nothing is
+    written: our own ROS 2 carries out the launch files with ``arguments``, but starts no process.
 
     Raises:
         InputError: the plan shapes nothing, or does not say who publishes; no launch file; the
@@ -122,51 +117,49 @@ def splice_launch_files(
     if without := [chain for chain in joint.chains if chain.shaping_node is None]:
         raise nothing_to_splice(without[0])
     folder = usable(Path(output))
-    publishers = _endpoints(recording, "publisher")
-    every = [(chain, node) for chain in joint.chains for node in shaping_nodes(chain)]
-    nodes = [(chain, one) for chain, one in every if not one.in_process]
-    gates = [(chain, one) for chain, one in every if one.in_process]
+    known = _endpoints(recording, "publisher")
+    every = [
+        (chain, one, _publisher(chain, one, known))
+        for chain in joint.chains
+        for one in shaping_nodes(chain)
+    ]
     redirects = [
         Redirect(
-            *("publisher", one.output, one.input, (_publisher(chain, one, publishers),)),
+            *("publisher", one.output, one.input, (publisher,)),
             added=(f"/{one.name}", f"/{one.name}{STANDBY}"),
         )
-        for chain, one in nodes
+        for _, one, publisher in every
+        if not one.in_process
     ]
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
     logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
 
     def written(into: Path) -> _Written:
-        made = [
-            write_shaping_process(
+        made, blocks = list[ShapingProcess](), list[str]()
+        for chain, one, publisher in every:
+            if one.in_process:
+                blocks.append(gate_settings(chain, one, publisher, logs[one.name]))
+                continue
+            process = write_shaping_process(
                 *(chain, one, node, folder / NODES),
                 message_type=message_type or types.get(one.output),
                 log=logs[one.name],
                 into=into,
             )
-            for chain, one in nodes
-        ]
-        for redirect, process in zip(redirects, made, strict=True):
-            redirect.component = process.component
-        blocks = [
-            gate_settings(chain, one, _publisher(chain, one, publishers), logs[one.name])
-            for chain, one in gates
-        ] + [delivery_settings(one) for _, one in every]
+            redirects[len(made)].component = process.component
+            made.append(process)
+        blocks += [delivery_settings(one) for _, one, _ in every]
         if not any(blocks):
-            return made, redirects, {}
+            return made, {}
         into.mkdir(parents=True, exist_ok=True)
         (into / "gates").write_text("".join(blocks), encoding="utf-8")
-        loaded = {"LD_PRELOAD": str(gate_library()), GATES: str(folder / NODES / "gates")}
-        return made, redirects, loaded
+        return made, {"LD_PRELOAD": str(gate_library()), GATES: str(folder / NODES / "gates")}
 
     dry = dict(arguments or {}) if dry_run else None
-    spliced = _spliced(launch_files, folder, written, throttled=False, dry=dry)
-    standbys = [
-        logs[process.name].with_stem(process.standby.name)
-        for process in spliced.processes
-        if process.standby is not None
-    ]
+    spliced = _spliced(launch_files, folder, redirects, written, throttled=False, dry=dry)
+    pairs = [(logs[one.name], one.standby) for one in spliced.processes]
+    standbys = (log.with_stem(standby.name) for log, standby in pairs if standby is not None)
     return replace(spliced, logs=(*logs.values(), *standbys))
 
 
@@ -183,14 +176,8 @@ def splice_throttlers(
     """Write a launch file whose nodes get these inputs by way of a throttler.
 
     It takes ``/points`` and republishes it as ``/points_throttled``, where the subscribers listen
-    now. Inputs with the same period and rule have one throttler, as in the paper. A plan is spliced
-    into such a launch file later, since it is made from a recording of it. The rest is as for
-    :func:`splice_launch_files`.
-
-    Raises:
-        InputError: who subscribes to a topic is not known; and what :func:`splice_launch_files`
-            refuses.
-        OperationError, PlatformError: as for :func:`splice_launch_files`.
+    now. Inputs with the same period and rule have one throttler, as in the paper. The rest is as
+    for :func:`splice_launch_files`. Raises InputError: who subscribes is not known.
     """
     if not inputs:
         raise InputError("no input to throttle: name one, such as /points_raw=100ms")
@@ -208,67 +195,57 @@ def splice_throttlers(
         nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
         topics[one.topic] = tuple(dict.fromkeys(nodes))
 
+    names = [THROTTLER, *(f"{THROTTLER}_{number}" for number in range(2, len(alike) + 1))]
+    redirects = [
+        Redirect("subscription", topic, f"{topic}_throttled", nodes, (f"/{name}",))
+        for name, topics in zip(names, alike.values(), strict=True)
+        for topic, nodes in topics.items()
+    ]
+
     def written(into: Path) -> _Written:
-        made, redirects = [], []
-        for number, ((period_ns, rule), topics) in enumerate(alike.items(), start=1):
-            name = THROTTLER if number == 1 else f"{THROTTLER}_{number}"
-            targets = {topic: f"{topic}_throttled" for topic in topics}
-            made.append(
-                write_throttler(
-                    *(targets, period_ns, node, folder / NODES),
-                    rule=rule,
-                    name=name,
-                    fifo_priority=THROTTLER_PRIORITY,
-                    into=into,
-                )
+        made = [
+            write_throttler(
+                {topic: f"{topic}_throttled" for topic in topics},
+                *(period_ns, node, folder / NODES),
+                rule=rule,
+                name=name,
+                fifo_priority=THROTTLER_PRIORITY,
+                into=into,
             )
-            redirects += [
-                Redirect("subscription", topic, targets[topic], nodes, (f"/{name}",))
-                for topic, nodes in topics.items()
-            ]
-        return made, redirects, {}
+            for name, ((period_ns, rule), topics) in zip(names, alike.items(), strict=True)
+        ]
+        return made, {}
 
     dry = dict(arguments or {}) if dry_run else None
-    return _spliced(launch_files, folder, written, throttled=True, dry=dry)
-
-
-def undo_splice(folder: str | Path) -> None:
-    """Remove what :func:`splice_launch_files` wrote, unless it was changed since.
-
-    Raises:
-        InputError: it is not such a folder, or something in it was changed or added.
-        OperationError: it cannot be removed.
-    """
-    remove_folder(Path(folder))
+    return _spliced(launch_files, folder, redirects, written, throttled=True, dry=dry)
 
 
 def _spliced(
     launch_files: Sequence[str | Path],
     folder: Path,
+    redirects: Sequence[Redirect],
     written: Callable[[Path], _Written],
     *,
     throttled: bool,
     dry: dict[str, str] | None,
 ) -> Splicing:
-    """The folder, or with launch arguments for a ``dry`` run none.
-
-    ``written`` writes our nodes, and says what is redirected to them.
-    """
+    """The folder, or with launch arguments for a ``dry`` run none; ``written`` writes our nodes."""
     given = [str(word) for word in launch_files]
     words = original_words(given, throttled=not throttled)
     files = [Path(given[3])] if is_run(given) else [Path(word).absolute() for word in given]
     name = launch_file_name(words)
     copy, found = folder / name, []
-    if dry is not None:
-        with tempfile.TemporaryDirectory() as nowhere:
-            made, redirects, environment = written(Path(nowhere))
+    place: AbstractContextManager[str | Path] = (
+        new_folder(folder, {name: words}, throttled=throttled)
+        if dry is None
+        else tempfile.TemporaryDirectory()
+    )
+    with place as partial:
+        made, environment = written(Path(partial, NODES))
         text = launch_text(words, made, redirects, environment)
+        Path(partial, name).write_text(text, encoding="utf-8")
+    if dry is not None:
         found = _tried(words, redirects, dry)
-    else:
-        with new_folder(folder, {name: words}, throttled=throttled) as partial:
-            made, redirects, environment = written(partial / NODES)
-            text = launch_text(words, made, redirects, environment)
-            (partial / name).write_text(text, encoding="utf-8")
     diff = difflib.unified_diff([], text.splitlines(keepends=True), "/dev/null", str(copy))
     return Splicing(
         folder=folder,
@@ -320,11 +297,10 @@ def _endpoints(recording: "Recording | None", kind: str) -> _Names | None:
     from chainshaper.analysis.graph import application_graph
 
     graph = application_graph(recording.events)
-    found = graph.publishers if kind == "publisher" else graph.subscribers
-    nodes = {topic: list(names) for topic, names in found.items()}
+    nodes = dict(graph.publishers if kind == "publisher" else graph.subscribers)
     for one in recording.info.endpoints:
-        if one.kind == kind and one.node not in nodes.setdefault(one.topic, []):
-            nodes[one.topic].append(one.node)
+        if one.kind == kind:
+            nodes[one.topic] = tuple(dict.fromkeys((*nodes.get(one.topic, ()), one.node)))
     return nodes
 
 

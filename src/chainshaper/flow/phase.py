@@ -7,8 +7,8 @@ the second for how long it was ready before that. The wake-ups that come once in
 same place are the timer's; of several such places the one after the longest rest is the beginning.
 
 Outputs without a stamp are released by the cycle, whose beginning no message carries: shaping nodes
-in ROS 2 get it as a parameter. That takes ROS 2 a second or two, in a process of its own, as the
-user of the nodes' processes and in one's environment; as whom we may not run, in ours.
+in ROS 2 get it as a parameter. That takes a second or two, in a process of its own, as the user of
+the nodes' processes and in one's environment; as whom we may not run, in ours.
 """
 
 import contextlib
@@ -32,7 +32,7 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 
 if TYPE_CHECKING:
-    from chainshaper.sources.ros import Environment, Script
+    from chainshaper.sources.ros import Script
 
 
 POLL_NS = 250_000
@@ -45,16 +45,10 @@ _PATIENCE_S = 20  # ROS 2 has found the nodes by then, however busy the machine 
 
 @dataclass(frozen=True)
 class Phase:
-    """Where in a cycle a thread begins: ``at_ns`` after multiples of it, on CLOCK_MONOTONIC.
-
-    ``spread_ns`` is how far apart most of the ``wake_ups`` at this place lie, in ``cycles`` that
-    were watched.
-    """
+    """Where in a cycle a thread begins: ``at_ns`` after multiples of it, on CLOCK_MONOTONIC."""
 
     at_ns: int
-    spread_ns: int
-    wake_ups: int
-    cycles: int
+    spread_ns: int  # how far apart most of the wake-ups at this place lie
 
 
 def measure_phase(
@@ -65,7 +59,6 @@ def measure_phase(
     progress: Callable[[float], None] = lambda _: None,
 ) -> Phase:
     """Watch a thread for some cycles and find its phase; again, where it was disturbed meanwhile.
-
     Raises OperationError: it ended, or does not wake up regularly.
     """
     for _ in range(MOST_TRIES):
@@ -73,10 +66,9 @@ def measure_phase(
         if (phase := find_phase(found, cycle_ns, cycles)) is not None:
             return phase
     raise OperationError(
-        f"thread {tid} of process {pid} was watched for {duration_text(cycles * cycle_ns)} "
-        f"and does not wake up once in every {duration_text(cycle_ns)} ({len(found)} "
-        "wake-ups): is the chain running, with the period of the plan? Its phase can also be "
-        "given (--phase)"
+        f"thread {tid} of process {pid} was watched for {duration_text(cycles * cycle_ns)} and does"
+        f" not wake up once in every {duration_text(cycle_ns)} ({len(found)} wake-ups): is the"
+        " chain running, with the period of the plan? Its phase can also be given (--phase)"
     )
 
 
@@ -89,11 +81,11 @@ def watch_wake_ups(
     least_ns: int = 0,
     rest_ns: Callable[[int], int] = lambda _: 0,
 ) -> npt.NDArray[np.int64]:
-    """When a thread became ready to run, each time it did (ns of CLOCK_MONOTONIC).
+    """When a thread became ready to run (ns of CLOCK_MONOTONIC): the later of two looks, minus the
+    time that it waited for its core. Raises OperationError: it has ended.
 
-    That is the later of two looks, minus the time that the thread waited for its core. Wake-ups
-    after which it ran for less than ``least_ns`` are left out. ``rest_ns`` says at any time for how
-    long not to look. Raises OperationError: the thread has ended.
+    Wake-ups after which it ran for less than ``least_ns`` are left out. ``rest_ns`` says at any
+    time for how long not to look.
     """
     # When it woke up (0: a rest begins, or the end), and how long it had run by then.
     found: list[tuple[int, int]] = []
@@ -135,12 +127,10 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
 
     None when there is no place that has some in four of five cycles.
     """
-    width = max(1, cycle_ns // 50)
-    places = np.sort(wake_ups % cycle_ns)
+    width, places = max(1, cycle_ns // 50), np.sort(wake_ups % cycle_ns)
     # A circle has no first place: the first two turns of it have every neighbour.
     turned = np.concatenate([places, places + cycle_ns])
-    best: Phase | None = None
-    longest_rest = -1
+    best, longest_rest = None, -1
     for number, place in enumerate(places):
         here = turned[number : int(np.searchsorted(turned, place + width, side="right"))]
         inside = (wake_ups - place) % cycle_ns <= width
@@ -151,7 +141,7 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
             longest_rest = rest
             # The first of each cycle: what follows it is the same thread going on.
             low, at, high = np.percentile(here[: max(1, seen)], (10, 50, 90))
-            best = Phase(int(at) % cycle_ns, int(high - low), len(here), cycles)
+            best = Phase(int(at) % cycle_ns, int(high - low))
     return best
 
 
@@ -183,14 +173,13 @@ class DriftWatch:
     ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
     ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
     thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
-    takes a tenth of a core: it is done on ``cores``, if there are any, and only ``NEAR`` where the
+    takes a tenth of a core: it is done on ``cores``, if there are any, and only near where the
     thread began last. A thread that is not seen there any more is looked for in the whole cycle.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
     CYCLES = 8
-    NEAR = 0.04
-    """So much of the cycle before and after."""
+    NEAR = 0.04  # so much of the cycle before and after
 
     def __init__(
         self,
@@ -204,8 +193,7 @@ class DriftWatch:
     ) -> None:
         self.latest_ns: int | None = None
         self._before_ns = 0  # what the look before saw
-        self.looks = 0
-        self.look_soon = False
+        self.looks, self.look_soon = 0, False
         self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
         self._slots, self._cores = slots, cores
         threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
@@ -255,7 +243,7 @@ class DriftWatch:
 
 @contextlib.contextmanager
 def _undisturbed() -> Iterator[None]:
-    """The calling thread at a high priority, where it is permitted: it sleeps nearly always."""
+    """The calling thread, which sleeps nearly always, at a high priority if that is permitted."""
     before = state_of(0)
     become_fifo(WATCHER_PRIORITY)
     try:
@@ -266,9 +254,8 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that get the phase by a script, since ``begun`` (s of CLOCK_MONOTONIC).
-
-    ``script`` is None where no node is to get it, or it was ``refused``.
+    """Nodes that get the phase by a ``script`` (None: none is to, or it was ``refused``), since
+    ``begun`` (s of CLOCK_MONOTONIC).
     """
 
     nodes: tuple[str, ...]
@@ -288,22 +275,19 @@ class Telling:
             late = not self.script.is_over()
             _, problem = self.script.end()
             problem = f"ROS 2 did not answer within {_PATIENCE_S} s" if late else problem
-        if problem is None:
-            return ()
-        return (
-            f"{', '.join(self.nodes)} did not get where cycles begin ({problem}): outputs "
-            "without a stamp of their chain's beginning will not be in time",
+        said = (
+            f"{', '.join(self.nodes)} did not get where cycles begin ({problem}): outputs without a"
+            " stamp of their chain's beginning will not be in time"
         )
+        return () if problem is None else (said,)
 
 
-NO_NODE = Telling((), None, 0.0)
-"""No node is to get a phase."""
+NO_NODE = Telling((), None, 0.0)  # none is to get a phase
 
 
 def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int) -> Telling:
-    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle.
-
-    The nodes of a chain are in one domain: any of them has the environment in which all are found.
+    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle: they are in one
+    domain, any has the environment in which all are found.
     """
     names = [node.thread.node for node in nodes]
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
@@ -311,36 +295,29 @@ def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int)
         return NO_NODE
     asked = tuple(pids)
     # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
-    from chainshaper.sources.ros import script as ros_script
-    from chainshaper.sources.ros import start_with_rclpy
+    from chainshaper.sources import ros
+
+    def has_ros(environment: ros.Environment) -> bool:
+        return "AMENT_PREFIX_PATH" in environment.variables
+
+    def environment_for(pid: int) -> ros.Environment:
+        try:
+            return ros.environment_of(pid)
+        except OperationError:  # nothing of the node's may be run
+            if has_ros(own := ros.own_environment()):
+                return own
+            raise
 
     try:
         for node in nodes:
             if node.in_process and node.thread.node in pids:
                 ask_phase(node.output, {pids.pop(node.thread.node)}, phase_ns)
-        environments = {node: _environment_for(pid) for node, pid in pids.items()}
-        ours = tuple(node for node, one in environments.items() if _is_ros(one))
+        environments = {node: environment_for(pid) for node, pid in pids.items()}
+        ours = tuple(node for node, one in environments.items() if has_ros(one))
         if not ours:  # they are the live workload's
             return NO_NODE
         arguments = ("parameter", "phase_ns", str(phase_ns), *ours)
-        script = start_with_rclpy(environments[ours[0]], ros_script.__file__, *arguments)
+        script = ros.start_with_rclpy(environments[ours[0]], ros.script.__file__, *arguments)
     except OperationError as error:
         return Telling(asked, None, 0.0, str(error))
     return Telling(ours, script, time.monotonic())
-
-
-def _environment_for(pid: int) -> "Environment":
-    """The environment of a node, or ours where nothing of the node's may be run."""
-    from chainshaper.sources.ros import environment_of, own_environment
-
-    try:
-        return environment_of(pid)
-    except OperationError:
-        ours = own_environment()
-        if _is_ros(ours):
-            return ours
-        raise
-
-
-def _is_ros(environment: "Environment") -> bool:
-    return "AMENT_PREFIX_PATH" in environment.variables

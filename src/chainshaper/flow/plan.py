@@ -6,14 +6,14 @@ followed backwards here, from every input of a synchronising callback to what st
 node with which the chain begins: what feeds a subscription there is not planned for.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain as joined
 from pathlib import Path
 from types import MappingProxyType
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,6 @@ from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.margins import read_latencies
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.planning.request import DEFAULT_CORE
-from chainshaper.sources import open_source
 from chainshaper.splicing.application import splice_application
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
@@ -36,15 +35,12 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
-from chainshaper.verify.measure import chain_of, longest_stall
+from chainshaper.verify.measure import chain_of, longest_stall, opened
 from chainshaper.workload.description import Application, node_name
 from chainshaper.workload.live import Enforcement, Progress, run_application, timing_of
 
-__all__ = ["plan_recording", "profile_chains", "shape_application"]
-
 DEFAULT_PRIORITY = 80
 _STANDARD = PlanRequest()
-
 _SAME_SPEED = 0.02  # so far may /clock be from the speed of time
 
 
@@ -61,18 +57,16 @@ def profile_chains(
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
     ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
-    names. Latencies and all other times but ``every_latency_ns`` are over cycles that the machine
-    did not disturb: a stall is not part of the chain's latency, but its output is late
-    nevertheless. Only where fewer than two were undisturbed, they are over all. Of ``modes``, each
-    has a profile of its own: of its recording or file of latencies in ``mode_recordings``, or of
-    the cycles that began in it, where the description of what ran says when that was. What happened
-    before ``since_ns`` of the recording, or from ``until_ns`` on, is left out.
+    names. All times but ``every_latency_ns`` are over cycles that the machine did not disturb (of
+    fewer than two: over all): a stall is not part of the chain's latency, but its output is late
+    nevertheless. Of ``modes``, each has a profile of its own: of its recording or file of latencies
+    in ``mode_recordings``, or of the cycles that began in it, by the description of what ran. What
+    happened before ``since_ns`` of the recording, or from ``until_ns`` on, is left out.
 
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
     """
-    if not isinstance(recording, Recording):
-        recording = open_source(recording)
+    recording = opened(recording)
     starts = events.table(recording.events, "callback_start")["time"]
     begun = int(starts.min() or 0)  # type: ignore[arg-type]
     if since_ns or until_ns is not None:
@@ -138,13 +132,13 @@ def _profile_of(
     period = _period(analysis, period_ns)
     simulated = _simulated(flow, analysis)
     nodes = dict.fromkeys(stage.node for stage in stages)
-    running, named = _running(flow, stages)
-    cores, priority = _executors(recording, graph, running)
+    running, named, cores, priority = _executors(recording, flow, graph, stages)
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
     instances = _instances_apart_from(flow, disturbed)
     measured = every if all_disturbed else calm
     branches = {n for stage in stages for n in stage.members} - {*chain.callbacks}
     steps = _steps(flow, analysis, cores, {*planned, *chain.callbacks} - branches)
+    sends = events.table(flow.events, "asynchronous_send")
     return Profile(
         latencies_ns=measured["latency_ns"].to_numpy().astype(np.int64),
         every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
@@ -159,7 +153,11 @@ def _profile_of(
         executors=named,
         cores=cores,
         together=_together(graph, nodes),
-        receivers=_receivers(graph, chain, nodes),
+        receivers=tuple(  # tools such as `ros2 topic echo`, which come and go, have hidden names
+            node
+            for node in graph.subscribers.get(chain.topics[-1], ())
+            if node not in nodes and not node.rpartition("/")[2].startswith("_")
+        ),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         steps_ns=steps[measured["traversal"].to_numpy()],
         every_step_ns=steps[every["traversal"].to_numpy()],
@@ -170,12 +168,9 @@ def _profile_of(
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),
         utilisation=_utilisation(flow, graph, core_of, running),
-        longest_send_ns=_longest_send(flow),
-        longest_publication_ns=_longest_publication(flow, stages[-1].node, chain.topics[-1]),
+        longest_send_ns=_longest_calm(flow, sends.filter(pl.col("outcome") == "sent")),
         lost_events=sum(recording.info.lost.values()) or None,
-        asynchronous=_publishes_asynchronously(recording, stages[-1].node),
-        intra_process=_goes_without_dds(flow, stages[-1].node, chain.topics[-1]),
-        output_depth=_output_depth(flow, stages[-1].node, chain.topics[-1]),
+        **_writer(recording, flow, stages[-1].node, chain.topics[-1]),
         simulated=simulated,
         all_disturbed=all_disturbed or None,
     )
@@ -184,10 +179,8 @@ def _profile_of(
 def _modes_in_force(
     recording: Recording, flow: DataFlow, starts: pl.Series, modes: Modes
 ) -> pl.Series:
-    """The mode in which each cycle began, as gates count them; null where that is not known.
-
-    No event has it, but the description of what ran has what its timers announce in turn. Of a
-    recording that lacks events nothing is sure.
+    """The mode in which each cycle began, as gates count them, by the description of what ran; null
+    where that is not known, or the recording lacks events.
     """
     named: list[tuple[int, str]] = []
     described = recording.info.application
@@ -221,13 +214,17 @@ def _period(analysis: LatencyAnalysis, given: int | None) -> int:
     period = given if first.period_ns is None else first.period_ns
     if period is not None:
         return period
-    starts = analysis.traversals["start"].unique().sort().to_numpy()
-    seen = f" (starts are {duration_text(int(np.median(np.diff(starts))))} apart, mostly)"
+    apart = _between_starts(analysis)
+    seen = "" if apart is None else f" (starts are {duration_text(int(apart))} apart, mostly)"
     raise InputError(
         f"chain {analysis.chain.spec} starts at {first.label}, which is no timer, so its period is"
-        f" not known{seen if len(starts) > 1 else ''}: add --period, or begin the chain at the"
-        " timer callback that starts it"
+        f" not known{seen}: add --period, or begin the chain at the timer callback that starts it"
     )
+
+
+def _between_starts(analysis: LatencyAnalysis) -> float | None:
+    starts = analysis.traversals["start"].unique().sort()
+    return float(np.median(np.diff(starts.to_numpy()))) if len(starts) > 1 else None
 
 
 def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
@@ -235,25 +232,21 @@ def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
     callbacks = [analysis.graph.callbacks[number] for number in analysis.chain.callbacks]
     follow = set(flow.takes.filter(topic="/clock")["node"])
     found = tuple(dict.fromkeys(one.node for one in callbacks if one.node in follow))
-    first, starts = callbacks[0], analysis.traversals["start"].unique().sort().to_numpy()
-    if first.node in found and first.period_ns is not None and len(starts) > 1:
-        apart = float(np.median(np.diff(starts)))
-        if not 1 - _SAME_SPEED < (speed := first.period_ns / apart) < 1 + _SAME_SPEED:
-            raise InputError(
-                f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
-                f" timer of {duration_text(first.period_ns)} expires every"
-                f" {duration_text(round(apart / 1e5) * 100_000)}. Replay at that speed (`ros2 bag"
-                " play --rate 1.0`), or start the nodes with use_sim_time:=false"
-            )
+    first, apart = callbacks[0], _between_starts(analysis)
+    speed = first.period_ns / apart if first.node in found and first.period_ns and apart else 1.0
+    if abs(speed - 1) >= _SAME_SPEED:
+        raise InputError(
+            f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
+            f" timer of {duration_text(first.period_ns or 0)} expires every"
+            f" {duration_text(round(int(apart or 0), -5))}. Replay at that speed (`ros2 bag play"
+            " --rate 1.0`), or start the nodes with use_sim_time:=false"
+        )
     return found
 
 
 @dataclass(frozen=True)
 class _Stage:
-    """One step of the graph: a callback, or the inputs of a synchronising one, as one.
-
-    ``after`` are the places of the stages that it waits for.
-    """
+    """One step of the graph: a callback, or the inputs of a synchronising one."""
 
     node: str
     topic: str
@@ -261,8 +254,7 @@ class _Stage:
     after: tuple[int, ...]
 
 
-_Key = tuple[tuple[int, ...], str]
-"""A stage while it is looked for: its callbacks, and the topic it publishes."""
+_Key = tuple[tuple[int, ...], str]  # of a stage: its callbacks, and the topic it publishes
 
 
 def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
@@ -302,7 +294,7 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     def level_of(key: _Key) -> int:
         if key not in level:
             level[key] = 0  # ends a loop
-            level[key] = 1 + max((level_of(one) for one in needs[key]), default=-1)
+            level[key] = max((1 + level_of(one) for one in needs[key]), default=0)
         return level[key]
 
     order = sorted(needs, key=lambda key: (level_of(key), key not in along, key))
@@ -319,20 +311,18 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
 
 def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> frozenset[str]:
     """The topics that the chain's output waits for, those before its first callback included."""
-    found = {stage.topic for stage in stages}
-    first = graph.callbacks[chain.callbacks[0]].trigger
-    ahead = set() if first is None else {first}
+    found: set[str | None] = {stage.topic for stage in stages}
+    ahead = {graph.callbacks[chain.callbacks[0]].trigger}
     while ahead:
         found |= ahead
-        writers = [
-            (callback, topic)
-            for callback in graph.callbacks
-            for topic in ahead.intersection(callback.publishes)
-        ]
-        inputs = [number for one, topic in writers for number in inputs_of(graph, one, topic)]
-        read = {graph.callbacks[number].trigger for number in inputs}
-        ahead = {topic for topic in read if topic is not None} - found
-    return frozenset(found - {chain.topics[-1]})
+        inputs = {
+            number
+            for writer in graph.callbacks
+            for topic in {*writer.publishes} & ahead
+            for number in inputs_of(graph, writer, topic)
+        }
+        ahead = {graph.callbacks[number].trigger for number in inputs} - found
+    return frozenset(topic for topic in found - {chain.topics[-1]} if topic is not None)
 
 
 def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
@@ -361,9 +351,8 @@ def inputs_of(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[
 
 
 def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) -> CallbackTimes:
-    """Response times of a stage: those of the instances that publish.
-
-    At a synchronising callback the other inputs' instances come before, in the same slot.
+    """Response times of a stage: of the instances that publish, behind those of the other inputs of
+    a synchronising callback, in the same slot.
     """
     published = flow.publications.filter(pl.col("topic") == stage.topic)["instance"].drop_nulls()
     publishes = pl.col("instance").is_in(published.implode())
@@ -388,17 +377,12 @@ def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) ->
 
 
 def _steps(
-    flow: DataFlow,
-    analysis: LatencyAnalysis,
-    core_of: dict[str, int],
-    planned: Collection[int],
+    flow: DataFlow, analysis: LatencyAnalysis, core_of: dict[str, int], planned: Collection[int]
 ) -> npt.NDArray[np.int64]:
     """What each callback of the chain took, a row per traversal's number: from the message before
-    it to its own, without the time for which other instances of the chain, and ``planned``
-    callbacks of others, had its core while it waited. It waits as long as the recording's quickest
-    message at least.
-
-    With those that overlapped out of it, a row's sum is the latency of an instance that is alone.
+    it to its own, without the time for which other ``planned`` callbacks had its core while it
+    waited, which it does as long as the recording's quickest message at least. A row's sum is the
+    latency of an instance that is alone.
     """
     chain, graph = analysis.chain, analysis.graph
     ran = flow.instances.drop_nulls("end").sort("start")
@@ -428,15 +412,12 @@ def _steps(
 
 
 def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:
-    """Finished instances, with their response time, that began in none of these traversals.
-
-    Where no event says that one ended (rclpy), it did with its last publication.
+    """Finished instances that began in none of these traversals, with their response time. Of those
+    without an end (rclpy), the last publication is it.
     """
-    left = flow.publications.drop_nulls("instance").group_by("instance")
-    ended = flow.instances.join(
-        left.agg(left=pl.col("time").max()), on="instance", how="left", maintain_order="left"
-    )
-    until = pl.coalesce("end", pl.when("assumed").then("left"))
+    last = flow.publications.group_by("instance").agg(last=pl.col("time").max())
+    ended = flow.instances.join(last, on="instance", how="left", maintain_order="left")
+    until = pl.coalesce("end", pl.when("assumed").then("last"))
     seen = ended.with_columns(end=until).drop_nulls("end")
     began = seen["start"].to_numpy()
     # An instance that begins just as a traversal ends is hit by it as well.
@@ -447,35 +428,19 @@ def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFra
 
 def _together(graph: ApplicationGraph, nodes: Collection[str]) -> tuple[tuple[str, ...], ...]:
     """The processes that host several nodes, these among them: they may share an executor."""
-    hosts: dict[int, list[str]] = {}
+    hosts = defaultdict[int, list[str]](list)
     for one in graph.nodes:
-        hosts.setdefault(one.pid, []).append(one.name)
-    return tuple(
-        tuple(own) for own in hosts.values() if len(own) > 1 and not set(own).isdisjoint(nodes)
-    )
+        hosts[one.pid].append(one.name)
+    return tuple(tuple(own) for own in hosts.values() if own[1:] and not {*own}.isdisjoint(nodes))
 
 
-def _receivers(graph: ApplicationGraph, chain: Chain, nodes: Collection[str]) -> tuple[str, ...]:
-    """Who subscribes to the chain's output, and has no part in the chain.
-
-    Nodes with a hidden name are tools such as `ros2 topic echo`, which come and go.
+def _executors(
+    recording: Recording, flow: DataFlow, graph: ApplicationGraph, stages: Sequence[_Stage]
+) -> tuple[list[Executor], dict[str, tuple[tuple[str, ...], ...]], dict[str, int], dict[str, int]]:
+    """The executors that run the chain and its branches; of nodes with several, their callbacks, if
+    these have names of their own; core and SCHED_FIFO priority, if known, of every node's executor.
     """
-    return tuple(
-        node
-        for node in graph.subscribers.get(chain.topics[-1], ())
-        if node not in nodes and not node.rpartition("/")[2].startswith("_")
-    )
-
-
-def _running(
-    flow: DataFlow, stages: Sequence[_Stage]
-) -> tuple[list[Executor], dict[str, tuple[tuple[str, ...], ...]]]:
-    """The executors that run the chain and its branches; of nodes with several, their callbacks.
-
-    Where two executors have callbacks of one name, nothing tells them apart in another run.
-    """
-    every = executors(flow)
-    members = {number for stage in stages for number in stage.members}
+    every, members = executors(flow), {number for stage in stages for number in stage.members}
     running = [one for one in every if not members.isdisjoint(one.callbacks)]
     named = {}
     for node in {stage.node for stage in stages}:
@@ -483,59 +448,55 @@ def _running(
         own = tuple(one for one, by in zip(names, every, strict=True) if one and by in running)
         if own and sum(map(bool, names)) > 1 and max(Counter(joined(*names)).values()) == 1:
             named[node] = own
-    return running, named
-
-
-def _executors(
-    recording: Recording, graph: ApplicationGraph, running: Sequence[Executor]
-) -> tuple[dict[str, int], dict[str, int]]:
-    """Core and SCHED_FIFO priority of every node's executor, where the recording knows them.
-
-    Of several in a process that which runs the chain is meant.
-    """
     ours = {(one.pid, tid) for one in running for tid in one.threads}
     threads = sorted(recording.info.threads, key=lambda one: (one.pid, one.tid) in ours)
-    by_pid = {thread.pid: thread for thread in threads if thread.role == "executor"}
+    by_pid = {one.pid: one for one in threads if one.role == "executor"}  # of several, ours
     found = {node.name: by_pid[node.pid] for node in graph.nodes if node.pid in by_pid}
+    cores = {name: one.cores[0] for name, one in found.items() if len(one.cores) == 1}
     return (
-        {name: thread.cores[0] for name, thread in found.items() if len(thread.cores) == 1},
-        {name: thread.priority for name, thread in found.items() if thread.priority},
+        running,
+        named,
+        cores,
+        {name: one.priority for name, one in found.items() if one.priority},
     )
 
 
-def _longest_send(flow: DataFlow) -> int | None:
-    """How long asynchronous publishers were busy sending one message, at most (ns).
-
-    Without sends that a stall of the machine fell into: it says nothing about sending.
-    """
-    sends = events.table(flow.events, "asynchronous_send").filter(pl.col("outcome") == "sent")
-    if not sends.height:
-        return None
-    return _longest_calm(flow, sends)
-
-
-def _longest_publication(flow: DataFlow, node: str, topic: str) -> int | None:
-    """How long a synchronous publisher's thread took to publish one output, at most (ns).
+def _writer(recording: Recording, flow: DataFlow, node: str, topic: str) -> dict[str, Any]:
+    """What is seen of who writes the chain's output, under the names of a profile.
 
     No event says when a publication was over: not after the end of its callback, the next that the
     callback made, and when all subscribers had the message. A shaping node's will take as long.
+    Whether a thread of the process publishes shows where DDS threads have names; Cyclone DDS has
+    none: there the thread that publishes also sends.
     """
-    following, taken = pl.col("time").shift(-1).over("instance"), pl.col("time").max()
-    ended = flow.instances.select("instance", "end")
-    readers = flow.takes.drop_nulls("publication").group_by("publication").agg(taken=taken)
+    own, time = (pl.col("topic") == topic) & (pl.col("node") == node), pl.col("time")
+    readers = flow.takes.drop_nulls("publication").group_by("publication").agg(taken=time.max())
     sent = (
-        flow.publications.drop_nulls("instance")
-        .with_columns(following=following)
-        .filter((pl.col("topic") == topic) & (pl.col("node") == node))
-        .join(ended, on="instance", how="left")
+        flow.publications.with_columns(following=time.shift(-1).over("instance"))
+        .filter(own)
+        .join(flow.instances.select("instance", "end").drop_nulls(), on="instance")
         .join(readers, on="publication", how="left")
-        .filter(pl.col("end").is_not_null())
-        .select("time", duration=pl.min_horizontal("end", "following", "taken") - pl.col("time"))
+        .select("time", duration=pl.min_horizontal("end", "following", "taken") - time)
     )
-    return _longest_calm(flow, sent) if sent.height else None
+    handed = flow.takes.filter("intra_process").join(
+        flow.publications.filter(own), on="publication", how="semi"
+    )
+    writers = flow.objects.publishers.filter(own).select("pid", publisher_handle="handle")
+    created = events.table(flow.events, "rcl_publisher_init", ["queue_depth"])
+    depths = created.join(writers, on=["pid", "publisher_handle"])["queue_depth"]
+    threads = recording.info.threads
+    pids = {thread.pid for thread in threads if thread.node == node}
+    roles = {thread.role for thread in threads if thread.pid in pids}
+    sends_itself = False if recording.info.rmw == "rmw_cyclonedds_cpp" else None
+    return {
+        "longest_publication_ns": _longest_calm(flow, sent),
+        "asynchronous": "publisher" in roles if "dds" in roles else sends_itself,
+        "intra_process": True if handed.height else None,
+        "output_depth": depths.filter(depths > 0).min(),
+    }
 
 
-def _longest_calm(flow: DataFlow, lasted: pl.DataFrame) -> int:
+def _longest_calm(flow: DataFlow, lasted: pl.DataFrame) -> int | None:
     """The longest ``duration`` from a ``time`` on; of those that no stall fell into, if any."""
     stalls = events.table(flow.events, "machine_stall")
     (began, ended), (stalled, over) = (
@@ -543,53 +504,17 @@ def _longest_calm(flow: DataFlow, lasted: pl.DataFrame) -> int:
         for one in (lasted, stalls)
     )
     calm = lasted.filter(~pl.Series(overlapping(began, ended, stalled, over)))
-    return int((calm if calm.height else lasted)["duration"].max())  # type: ignore[arg-type]
-
-
-def _publishes_asynchronously(recording: Recording, node: str) -> bool | None:
-    """Whether a node's process has a publisher's thread; None where DDS threads have no names.
-
-    Cyclone DDS has none: there the thread that publishes also sends.
-    """
-    threads = recording.info.threads
-    pids = {thread.pid for thread in threads if thread.node == node}
-    roles = {thread.role for thread in threads if thread.pid in pids}
-    if "dds" not in roles:
-        return False if recording.info.rmw == "rmw_cyclonedds_cpp" else None
-    return "publisher" in roles
-
-
-def _goes_without_dds(flow: DataFlow, node: str, topic: str) -> Literal[True] | None:
-    """Whether messages of a node's topic are handed to subscribers of the same process."""
-    sent = flow.publications.filter((pl.col("topic") == topic) & (pl.col("node") == node))
-    own = pl.col("publication").is_in(sent["publication"].implode())
-    return True if flow.takes.filter(own & pl.col("intra_process")).height else None
-
-
-def _output_depth(flow: DataFlow, node: str, topic: str) -> int | None:
-    """The history (keep last) of the writer of the chain's output."""
-    writers = flow.objects.publishers.filter((pl.col("node") == node) & (pl.col("topic") == topic))
-    depths = (
-        events.table(flow.events, "rcl_publisher_init", ["queue_depth"])
-        .join(writers.select("pid", publisher_handle="handle"), on=["pid", "publisher_handle"])
-        .filter(pl.col("queue_depth") > 0)["queue_depth"]
-    )
-    return int(depths.min()) if depths.len() else None  # type: ignore[arg-type]
+    return (calm if calm.height else lasted)["duration"].max()  # type: ignore[return-value]
 
 
 def _utilisation(
-    flow: DataFlow,
-    graph: ApplicationGraph,
-    core_of: dict[str, int],
-    running: Sequence[Executor],
+    flow: DataFlow, graph: ApplicationGraph, core_of: dict[str, int], running: Sequence[Executor]
 ) -> float | None:
     """The largest share of a core that the executors of the chain take."""
     theirs = {number for one in running for number in one.callbacks}
     own = (one for one in graph.callbacks if one.node in core_of and one.id in theirs)
     core = {one.id: core_of[one.node] for one in own}
-    ran = flow.instances.filter(
-        pl.col("callback_id").is_in(list(core)) & pl.col("execution_ns").is_not_null()
-    )
+    ran = flow.instances.filter(pl.col("callback_id").is_in(list(core))).drop_nulls("execution_ns")
     if not ran.height:
         return None
     lasted = int(ran["end"].max()) - int(ran["start"].min())  # type: ignore[arg-type]
@@ -608,9 +533,8 @@ def plan_recording(
 ) -> Plan:
     """Plan a recorded chain: single-band shaping (eq. 1, 4) unless ``request`` says otherwise.
 
-    ``sinks`` are chains to further outputs of the same graph.
-
-    Raises: as :func:`profile_chains` and :func:`chainshaper.planning.plan_chain`.
+    ``sinks`` are chains to further outputs of the same graph. Raises: as :func:`profile_chains` and
+    :func:`chainshaper.planning.plan_chain`.
     """
     wanted = (chain, *sinks)
     profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
@@ -632,14 +556,12 @@ def shape_application(
 ) -> Recording:
     """Splice the plan's shaping nodes into an application, run it and record it.
 
-    ``enforcement`` puts the plan's servers in force while it runs. A shaping node does without; the
-    thread of an asynchronous publisher, and the stages of a pipeline, are gated unless
-    ``enforcement`` does so (:func:`chainshaper.flow.apply.threads_gated`). With ``adapt`` slots
-    follow the latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
+    ``enforcement`` puts the plan's servers in force while it runs; without, the thread of an
+    asynchronous publisher and the stages of a pipeline are gated. With ``adapt`` slots follow the
+    latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
 
-    Raises InputError: the plan does not fit the application, or no slot can follow; and what
-    :func:`~chainshaper.workload.live.run_application` raises. PlatformError: the plan gates
-    threads, and threads cannot be frozen here.
+    Raises InputError: the plan does not fit the application, or no slot can follow; PlatformError:
+    threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
     """
     joint = whole(plan)
     if enforcement is None:
@@ -650,8 +572,8 @@ def shape_application(
         from chainshaper.flow.apply import slots_followed
         from chainshaper.flow.threads import followed_chains
 
-        joint, followed = followed_chains(joint, "fifo", max_latency_ns)
-        enforcement = partial(slots_followed, joint, followed.reaches_ns, enforcement)
+        joint, reaches_ns, _ = followed_chains(joint, "fifo", max_latency_ns)
+        enforcement = partial(slots_followed, joint, reaches_ns, enforcement)
     return run_application(
         splice_application(application, joint),
         output,

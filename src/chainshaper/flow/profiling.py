@@ -2,8 +2,7 @@
 
 The executors of the nodes of the chain, and of the branches that it waits for, run under SCHED_FIFO
 at a high priority, on one core or distributed over several (:mod:`chainshaper.planning.cores`),
-their DDS threads above them on the others, so that nothing else disturbs the chain. Threads are
-changed as `apply` changes them; those that appear later get theirs at the next look.
+their DDS threads above them on the others. Threads that appear later get theirs at the next look.
 """
 
 import time
@@ -17,12 +16,7 @@ from chainshaper.analysis import data_flow, find_chain, graph_of
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
-from chainshaper.enforcement.threads import (
-    Allocation,
-    NodeThread,
-    allocate,
-    scheduling_around,
-)
+from chainshaper.enforcement.threads import Allocation, NodeThread, allocate, scheduling_around
 from chainshaper.flow.plan import graph_stages, profile_chains
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
@@ -36,8 +30,7 @@ from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording
 
 START_NS = 30_000_000_000  # so long the nodes have to appear
-WORTH = 0.05
-"""A further core is taken unasked if it takes this share off the latencies."""
+WORTH = 0.05  # a further core is taken unasked if it takes this share off the latencies
 
 
 @contextmanager
@@ -54,22 +47,24 @@ def profiling_condition(
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
     ``core`` is where the executors run (default: the last that we may use), or the core of each of
-    ``nodes``, which those that share a process have in common, ``before`` how many stages of
-    a pipeline are more urgent there, as a plan has it. ``folder`` is where journals are (default:
-    `/run/chainshaper`). An earlier recording of the application that this one is ``like``
-    says which components a container has, and which executors several threads; ``chains`` in it
-    begin as a plan has them begin (:mod:`chainshaper.enforcement.threads`).
+    ``nodes``, ``before`` how many stages of a pipeline are more urgent there, as a plan has it.
+    ``folder`` is where journals are (default: `/run/chainshaper`). An earlier recording that this
+    one is ``like`` says which components a container has, and which executors several threads;
+    ``chains`` in it begin as a plan has them begin.
 
     Raises InputError: no such chain. PlatformError: no such core, or SCHED_FIFO is not permitted.
-    OperationError: `apply` governs one of the nodes, or the core; not all could be put back. And
-    where it is called: a node does not appear, or the kernel refuses something.
+    OperationError: `apply` governs one of the nodes, or the core; a node does not appear; not all
+    could be changed or put back.
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
-    cores = check_profiling(core if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
+    cores = check_profiling([core] if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     homes = {(core, before.get(node, 0)) for node, core in core_of.items()} or {(cores[0], 0)}
     servers = {(c, k): ReservationServer(f"core {c}, {k}", c, 1 + k, ()) for c, k in homes}
     recorded = recorded_processes(like)[0] if like is not None else ()
-    first = _first_nodes(like, chains) if like is not None else ()
+    first: set[str] = set()
+    if like is not None and chains:
+        graph = _graph(like)
+        first = {graph.callbacks[find_chain(graph, one).callbacks[0]].node for one in chains}
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
 
     def see_to_it(processes: Sequence[Process]) -> bool:
@@ -94,51 +89,41 @@ def profiling_condition(
         around = scheduling_around(
             *(at_home, servers.values(), found, available_cores()), clear=clear, first=first
         )
-        new = [one for one in around if one.thread.thread.identity not in done]
         # One after the other, as under SCHED_FIFO in the paper: no turns.
-        changes = [(one.thread.thread, replace(one.wanted, takes_turns=False)) for one in new]
-        change_all(journal, changes)
-        done.update(thread.identity for thread, _ in changes)
+        new = [
+            (one.thread.thread, replace(one.wanted, takes_turns=False))
+            for one in around
+            if one.thread.thread.identity not in done
+        ]
+        change_all(journal, new)
+        done.update(thread.identity for thread, _ in new)
         return not new
 
     with run_claimed(cores, nodes, folder) as journal:
         yield see_to_it
 
 
-def check_profiling(core: int | Sequence[int] | None = None) -> Sequence[int]:
-    """The cores on which executors will run, once it is sure that they may.
-
-    Raises InputError: a core is named twice. PlatformError: no such core, or SCHED_FIFO is not
-    permitted.
+def check_profiling(cores: Sequence[int] | None) -> Sequence[int]:
+    """The cores on which executors will run. Raises InputError: a core is named twice.
+    PlatformError: no such core, or SCHED_FIFO is not permitted.
     """
-    if isinstance(core, Sequence) and len(set(core)) < len(core):
+    cores = cores or available_cores()[-1:]
+    if len(set(cores)) < len(cores):
         raise InputError("--cores names a core twice: name each once")
     if not may_use_fifo():
         raise PlatformError(
             "profiling needs SCHED_FIFO: run as root, or give your user an rtprio limit of 98 in "
             "/etc/security/limits.conf; without, `chainshaper record` records as things are"
         )
-    cores = (core,) if isinstance(core, int) else core or available_cores()[-1:]
     check_cores(dict.fromkeys(cores, "the chain"))
     return cores
 
 
 def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
-    """The nodes of chains, and of the branches that they wait for, in an earlier recording.
-
-    Raises InputError: no such chain.
-    """
+    """The nodes of recorded chains, and of the branches that they wait for."""
     graph = _graph(recording)
     stages = (graph_stages(graph, find_chain(graph, chain)) for chain in chains)
     return tuple(dict.fromkeys(stage.node for one in stages for stage in one))
-
-
-def _first_nodes(recording: Recording, chains: Sequence[str]) -> set[str]:
-    """The nodes that begin chains."""
-    graph = _graph(recording) if chains else None
-    return {
-        graph.callbacks[find_chain(graph, chain).callbacks[0]].node for chain in chains if graph
-    }
 
 
 def _graph(recording: Recording) -> ApplicationGraph:
@@ -146,19 +131,13 @@ def _graph(recording: Recording) -> ApplicationGraph:
 
 
 def profiled_cores(
-    recording: Recording,
-    chains: Sequence[str],
-    request: PlanRequest,
-    period_ns: int | None = None,
+    recording: Recording, chains: Sequence[str], request: PlanRequest, period_ns: int | None = None
 ) -> tuple[tuple[Profile, ...], dict[str, int]]:
     """What an earlier recording shows of chains, and on which cores to profile their executors.
 
-    Without ``request.cores`` these are found: the last, and others as far as they are worth it. On
-    machines of three cores and more, the first is left to DDS threads. One chain of which too
-    little is to be seen runs on the last core.
-
-    Raises InputError: no such chain, or several of which too little is to be seen. PlatformError:
-        no such core. OperationError: as :func:`.profile_chains`.
+    Without ``request.cores`` these are the last, and others as far as they are worth it; of three
+    cores and more, the first is left to DDS threads. One chain of which too little is to be seen
+    runs on the last core. Raises: as :func:`.profile_chains`; PlatformError: no such core.
     """
     available = available_cores()
     found = (available[1:] if len(available) > 2 else available)[::-1]
@@ -174,37 +153,31 @@ def profiled_cores(
 
 
 def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[int]]:
-    """The places of chains, together where one recording can measure each as if it were alone.
-
-    Chains that begin together are one graph; others delay each other where they share a core.
+    """The places of chains, together where one recording can measure each as if it were alone: of
+    one graph, or sharing no core.
     """
     found: list[tuple[list[int], set[int]]] = []
     for group in beginning_together(seen):
         cores = {core_of[node] for place in group for node in seen[place].core_of}
-        apart = next((one for one in found if not one[1] & cores), ([], set()))
-        if not apart[0]:
-            found.append(apart)
-        apart[0].extend(group)
-        apart[1].update(cores)
+        for places, taken in found:
+            if taken.isdisjoint(cores):
+                places.extend(group)
+                taken.update(cores)
+                break
+        else:
+            found.append((list(group), cores))
     return [places for places, _ in found] or [[0]]
 
 
 def executors_of(
-    found: Allocation,
-    nodes: frozenset[str],
-    processes: Sequence[Process],
+    found: Allocation, nodes: frozenset[str], processes: Sequence[Process]
 ) -> list[NodeThread]:
-    """The threads that execute these nodes, or publish for them; of all nodes if none are named.
-
-    What has started other nodes is left out: `ros2 launch` is a node as well, and in no chain.
+    """The threads that execute these nodes, or publish for them; if none are named, of all but
+    `ros2 launch` and the like, which is a node as well, and in no chain.
     """
+    running = [one for one in found.threads if one.thread.role in ("executor", "publisher")]
+    if nodes:
+        return [one for one in running if not nodes.isdisjoint(one.nodes)]
     owners = {one.thread.pid for one in found.threads if one.nodes}
     launchers = {one.parent for one in processes if one.pid in owners}
-
-    def is_meant(one: NodeThread) -> bool:
-        if nodes:
-            return not nodes.isdisjoint(one.nodes)
-        return bool(one.nodes) and one.thread.pid not in launchers
-
-    running = (one for one in found.threads if one.thread.role in ("executor", "publisher"))
-    return [one for one in running if is_meant(one)]
+    return [one for one in running if one.nodes and one.thread.pid not in launchers]

@@ -3,10 +3,9 @@
     tracing on ─► application starts ─► threads looked at, now and then ─► tracing off
                                         ─► types and QoS asked for ─► application ends ─► recording
 
-Tracing begins first, because an object emits its name once, when it is created. Types and QoS are
-asked for when tracing is over: discovery costs every node some time. What the tracer wrote stays
-with the recording, as `trace/`. Whatever ends the run, its recording is whole; nothing is left
-running, nor changed.
+Tracing begins first, because an object emits its name once, when it is created; types and QoS are
+asked for when it is over: discovery costs every node some time. Whatever ends the run, its
+recording is whole; nothing is left running, nor changed.
 """
 
 import platform
@@ -45,12 +44,7 @@ from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.sources.system import own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import (
-    ChainshaperError,
-    InputError,
-    OperationError,
-    PlatformError,
-)
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
 from chainshaper.values.files import open_to_all
 from chainshaper.values.recording import (
     EndpointInfo,
@@ -63,10 +57,8 @@ from chainshaper.values.recording import (
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
 Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[Process]], bool]]
-"""Changes how the application's threads run for as long as its context lasts.
-
-What it gives is called about once a second with the application's processes, and says whether all
-is as it shall be; events from before that are left out of the tables.
+"""Changes how the application's threads run for as long as its context lasts. What it gives is
+called about once a second with the processes, and says whether all is as it shall be from now on.
 """
 
 TRACE_FOLDER = "trace"
@@ -87,35 +79,33 @@ class Recorded:
 
 @dataclass
 class _Run:
-    """An application that is recorded, and what was seen of it.
-
-    ``environment`` is a node's. ``in_force_ns`` is when the scheduling that was asked for was,
-    ``governed`` are plans that others put in force meanwhile (`chainshaper apply`).
-    """
+    """An application that is recorded, and what was seen of it."""
 
     tracer: Tracer
     folder: Path
+    words: Sequence[str]  # of the command
     duration_ns: int | None
+    scheduling: Scheduling | None
     stop: threading.Event
     progress: Callable[[float, str], None]
     users: frozenset[int]
-    pids: Sequence[int] = ()
-    gate_logs: Sequence[Path] = ()
+    pids: Sequence[int]
+    gate_logs: Sequence[Path]
+    notes: tuple[str, ...]
     command: "subprocess.Popen[bytes] | None" = None
     schedule: Callable[[Sequence[Process]], bool] | None = None
     begun_ns: int = 0
     ended_ns: int = 0
     processes: tuple[Process, ...] = ()
     strangers: str | None = None
-    environment: Environment | None = None
+    environment: Environment | None = None  # a node's
     no_environment_because: str = "no process was seen that looks like a node"
     endpoints: tuple[EndpointInfo, ...] = ()
     no_qos_because: str | None = None
-    in_force_ns: int | None = None
-    governed: tuple[Governed, ...] = ()
+    in_force_ns: int | None = None  # when the scheduling that was asked for was
+    governed: tuple[Governed, ...] = ()  # plans that others put in force meanwhile
     stalls: StallWatch = field(default_factory=StallWatch)
     exit_code: int | None = None
-    notes: tuple[str, ...] = ()
 
 
 def record_command(
@@ -141,11 +131,10 @@ def record_command(
     ``command`` is started, and ended with the recording; it prints to ``command_stdout``. Without
     one, `ebpf` and `preload` attach to ``pids`` and their descendants, or to all that ``users`` run
     (names or numbers; default: who launched us, and root). Without ``source`` it is `preload`, or
-    `lttng` where the library cannot be had; a note says why then. ``buffer`` is the size of LTTng's
-    buffer of a core in bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in
-    force; ``gate_logs`` are where its shaping nodes note what they do. ``watch_stalls`` has a
-    sleeper on every core notice when the machine stands still (2 % of it). ``progress`` gets the
-    share that is done, as far as that is known, and what is being done.
+    `lttng` where the library cannot be had. ``buffer`` is the size of LTTng's buffer of a core in
+    bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in force; ``gate_logs``
+    are where its shaping nodes note what they do. ``watch_stalls`` has a sleeper on every core
+    notice when the machine stands still (2 % of it).
 
     Raises:
         InputError: ``output`` exists, there is no such command or process, or no such source.
@@ -162,19 +151,21 @@ def record_command(
     except OSError as error:
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
-        source, because = (source, ()) if source else _usual_source(command, buffer)
-        tracer = _tracer(source, folder, command, pids, buffer, users=taken)
-        stop = stop or threading.Event()
-        run = _Run(tracer, folder, duration_ns, stop, progress, taken, pids, gate_logs)
-        run.notes = because
-        for note in because:
+        tracer, notes = _tracer(source, folder, command, pids, buffer, users=taken)
+        how = (command, duration_ns, scheduling, stop or threading.Event(), progress, taken, pids)
+        run = _Run(tracer, folder, *how, gate_logs, notes)
+        for note in notes:
             progress(0.0, note)
-        _trace(run, command, command_stdout, scheduling, watch_stalls=watch_stalls)
+        _trace(run, command_stdout, watch_stalls=watch_stalls)
         progress(1.0, "reading the events")
         try:
-            recording = _written(output, run, command, chain, plan)
+            recording = _written(output, run, chain, plan)
         except ChainshaperError as error:
-            raise OperationError(f"{error}{_what_is_left(run, output)}") from error
+            said = "".join(f"; {note.rstrip('.')}" for note in run.notes)
+            if any(folder.iterdir()):
+                left = folder.rename(output.with_name(folder.name.lstrip(".")))
+                said += f"; what was traced stays in {left}"
+            raise OperationError(f"{error}{said}") from error
         if any(folder.iterdir()):
             open_to_all(folder)
             folder.rename(recording.path / TRACE_FOLDER)
@@ -183,37 +174,33 @@ def record_command(
     return Recorded(recording, run.exit_code)
 
 
-def _usual_source(command: Sequence[str], buffer: int | None) -> tuple[str, tuple[str, ...]]:
-    """Who records where that was not said, and why it is not the library in front of ROS 2.
-
-    Raises PlatformError: neither the library nor LTTng is there.
-    """
-    from chainshaper.sources.preload import installed_library
-
-    if buffer is not None or not command:  # both are LTTng's to answer
-        return "lttng", ()
-    try:
-        installed_library()
-    except PlatformError as error:
-        if shutil.which("lttng") is None:
-            raise
-        return "lttng", (f"LTTng recorded: {error}.",)
-    return "preload", ()
-
-
 def _tracer(
-    source: str,
+    source: str | None,
     folder: Path,
     command: Sequence[str],
     pids: Sequence[int],
     buffer: int | None,
     *,
     users: frozenset[int],
-) -> Tracer:
+) -> tuple[Tracer, tuple[str, ...]]:
+    """Who records; where that was not said, why it is not the library in front of ROS 2."""
+    notes: tuple[str, ...] = ()
+    if source is None and (buffer is not None or not command):
+        source = "lttng"  # both are LTTng's to answer
+    elif source is None:
+        from chainshaper.sources.preload import installed_library
+
+        source = "preload"
+        try:
+            installed_library()
+        except PlatformError as error:
+            if shutil.which("lttng") is None:
+                raise
+            source, notes = "lttng", (f"LTTng recorded: {error}.",)
     if source == "lttng":
         from chainshaper.sources.lttng import LttngSession
 
-        return LttngSession(folder, command, pids, buffer, users)
+        return LttngSession(folder, command, pids, buffer, users), notes
     if source not in ("ebpf", "preload"):
         raise InputError(f"{source!r} is no source of events: name lttng, preload or ebpf")
     if buffer is not None:
@@ -223,35 +210,27 @@ def _tracer(
     if source == "preload":
         from chainshaper.sources.preload import PreloadTracer
 
-        return PreloadTracer(folder, command, pids, users)
+        return PreloadTracer(folder, command, pids, users), ()
     from chainshaper.sources.ebpf import EbpfTracer
 
-    return EbpfTracer(folder, command, pids, users)
+    return EbpfTracer(folder, command, pids, users), ()
 
 
-def _trace(
-    run: _Run,
-    command: Sequence[str],
-    stdout: int | None,
-    scheduling: Scheduling | None,
-    *,
-    watch_stalls: bool,
-) -> None:
-    """The run itself: from the beginning of tracing to the end of the application."""
+def _trace(run: _Run, stdout: int | None, *, watch_stalls: bool) -> None:
     with ExitStack() as undo:
         if watch_stalls:
             run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
         undo.callback(run.tracer.remove)
         run.progress(0.0, "starting to trace")
         environment = run.tracer.start()
-        if command:
-            run.command = start_command(command, environment, stdout)
+        if run.words:
+            run.command = start_command(run.words, environment, stdout)
             undo.callback(end_command, run.command)
             run.pids = (run.command.pid,)
-        if scheduling is not None:
-            run.schedule = undo.enter_context(scheduling)
+        if run.scheduling is not None:
+            run.schedule = undo.enter_context(run.scheduling)
         run.begun_ns = time.monotonic_ns()
-        if scheduling is None:
+        if run.scheduling is None:
             run.stalls.begin()
         _watch(run)
         run.ended_ns = time.monotonic_ns()
@@ -269,21 +248,21 @@ def _trace(
 
 
 def _watch(run: _Run) -> None:
-    """Look at the application now and then, until it, its time or the tracer ends.
-
-    Its time begins when the scheduling that was asked for is in force.
+    """Look at the application now and then, until it, its time or the tracer ends; its time begins
+    when the scheduling that was asked for is in force.
     """
-    next_look = run.begun_ns + _FIRST_LOOK_NS
+    next_look = _FIRST_LOOK_NS
     while True:
-        lasted = time.monotonic_ns() - run.begun_ns
+        now = time.monotonic_ns()
+        lasted = now - run.begun_ns
         awaits_force = run.schedule is not None and run.in_force_ns is None
-        counted = 0 if awaits_force else lasted - ((run.in_force_ns or run.begun_ns) - run.begun_ns)
+        counted = 0 if awaits_force else now - (run.in_force_ns or run.begun_ns)
         if run.command is not None and run.command.poll() is not None:
             run.exit_code = run.command.returncode
             return
         over = run.stop.is_set() or (run.duration_ns is not None and counted >= run.duration_ns)
         over |= awaits_force and lasted >= _LONGEST_UNTIL_IN_FORCE_NS
-        if over or lasted >= next_look - run.begun_ns:
+        if over or lasted >= next_look:
             failure = run.tracer.failure()
             if failure is None and shutil.disk_usage(run.folder).free < SPARE_DISK:
                 failure = f"the disk of {run.folder.parent} is full"
@@ -293,7 +272,7 @@ def _watch(run: _Run) -> None:
             if over or failure is not None or (run.command is None and not run.processes):
                 return
             pause = _FIRST_LOOK_NS if run.schedule else max(_FIRST_LOOK_NS, lasted)
-            next_look = run.begun_ns + lasted + min(_LONGEST_PAUSE_NS, pause)
+            next_look = lasted + min(_LONGEST_PAUSE_NS, pause)
         share = 0.0 if run.duration_ns is None else counted / run.duration_ns
         doing = "waiting until the scheduling is in force" if awaits_force else "recording"
         run.progress(min(1.0, share), f"{doing}; Ctrl-C ends it")
@@ -304,33 +283,27 @@ def _look(run: _Run) -> None:
     """Which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
-        family = descendants(parent_of, *run.pids) & parent_of.keys()
-        processes = list_processes(family)
+        run.processes = list_processes(descendants(parent_of, *run.pids) & parent_of.keys())
     else:
-        everybody = find_applications(list_processes())
-        processes = tuple(one for one in everybody if one.user in run.users)
-        run.strangers = strangers_text(everybody, run.users) or run.strangers
-    run.processes = processes
-    pids = {one.pid for one in processes}
+        found = find_applications(list_processes())
+        run.processes = tuple(one for one in found if one.user in run.users)
+        run.strangers = strangers_text(found, run.users) or run.strangers
+    pids = {one.pid for one in run.processes}
     run.governed = governing(pids, time.monotonic_ns(), run.governed)
     # The node that was started last, not its launcher, nor what only carries its command line.
-    nodes = sorted(find_applications(processes), key=lambda one: (one.participates, one.pid))
+    nodes = sorted(find_applications(run.processes), key=lambda one: (one.participates, one.pid))
     if nodes:
         try:
             run.environment = environment_of(nodes[-1].pid)
         except OperationError as error:
             run.no_environment_because = str(error)
-    if run.schedule is not None and run.schedule(processes) and run.in_force_ns is None:
+    if run.schedule is not None and run.schedule(run.processes) and run.in_force_ns is None:
         # What was before is left out, so stalls are watched from here on.
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
 
 
 def _written(
-    output: Path,
-    run: _Run,
-    command: Sequence[str],
-    chain: str | None,
-    plan: Plan | ApplicationPlan | None,
+    output: Path, run: _Run, chain: str | None, plan: Plan | ApplicationPlan | None
 ) -> Recording:
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
@@ -362,10 +335,10 @@ def _written(
         "kernel": platform.release(),
         "distribution": variables.get("ROS_DISTRO") or info.distribution,
         "rmw": variables.get("RMW_IMPLEMENTATION") or info.rmw,
-        "command": tuple(command),
+        "command": tuple(run.words),
         "threads": threads,
         "endpoints": _known_endpoints(tables, run.endpoints),
-        "realtime": True if run.schedule is not None else in_real_time,
+        "realtime": run.schedule is not None or in_real_time,
         "stall_meter": run.stalls.info,
         "chain": chain,
         "plan": None if plan is None else plan_values(whole(plan)),
@@ -379,10 +352,8 @@ def _written(
 
 
 def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tuple[ThreadInfo, ...]:
-    """The threads of the nodes among ``processes``, numbered as in the recording.
-
-    Nodes are the processes that the recording saw one in; where it saw none, those that take part
-    in DDS. A thread that works for several nodes (a component container's) is given to none.
+    """The threads of the nodes among ``processes`` (without nodes, of those in DDS), numbered as in
+    the recording. One that works for several nodes (a container's) is given to none.
     """
     recorded, _ = recorded_processes(recording)
     pids = {seen.pid for seen in recorded}
@@ -408,10 +379,7 @@ def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tup
 def _known_endpoints(
     tables: events.EventTables, asked: Sequence[EndpointInfo]
 ) -> tuple[EndpointInfo, ...]:
-    """The graph's endpoints with their depths from the trace, then those that only it saw.
-
-    Several of one node, topic and kind are taken in the order in which they were created.
-    """
+    """The graph's endpoints with their depths from the trace, in order, then those only it saw."""
     objects = resolve_objects(tables)
     traced: list[EndpointInfo] = []
     for kind, owners in (
@@ -433,13 +401,3 @@ def _known_endpoints(
             depth = depth or same[0].depth
         found.append(one.model_copy(update={"depth": depth}))
     return (*found, *traced)
-
-
-def _what_is_left(run: _Run, output: Path) -> str:
-    """What to add to a message when there is no recording: what else went wrong, the trace."""
-    said = "".join(f"; {note.rstrip('.')}" for note in run.notes)
-    if any(run.folder.iterdir()):
-        kept = output.with_name(run.folder.name.lstrip("."))
-        run.folder.rename(kept)
-        said += f"; what was traced stays in {kept}"
-    return said

@@ -11,9 +11,8 @@ Paths lead through mappings by key and through lists by number, from 0. Values a
 so a whole part of a description may be one: ``{uniform: [5ms, 10ms]}``.
 
 A point is what a careful person would do by hand: simulate the application with its chain in front
-of all others (the profile), plan, splice, simulate again. The run that is planned from and the run
-that is judged draw their execution times with different seeds, so a margin is tried against
-latencies that the plan has not seen, and all points of one seed are judged by the same ones.
+of all others (the profile), plan, splice, simulate again. The run that is judged draws execution
+times with a seed of its own: a margin is tried against latencies that the plan has not seen.
 """
 
 import dataclasses
@@ -28,7 +27,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from itertools import product
 from math import prod
@@ -53,33 +52,22 @@ from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
-from chainshaper.workload.description import (
-    Application,
-    application_as_written,
-    origin_timer,
-)
+from chainshaper.workload.description import Application, application_as_written, origin_timer
 
-__all__ = ["parse_axis", "rows_beside", "sweep"]
-
-Values: TypeAlias = Mapping[str, Any]
-"""One value for every axis: a point."""
+Values: TypeAlias = Mapping[str, Any]  # one for every axis: a point
 Row: TypeAlias = Mapping[str, Any]
 Progress: TypeAlias = Callable[[float, str], None]
 _Model = TypeVar("_Model", bound=BaseModel)
 
 INTERFERENCE = "interference"
 PLAN = "plan."
-UNPLANNED = "none"
-"""The policy of a point whose application runs as it is described."""
+UNPLANNED = "none"  # the policy of a point whose application runs as it is described
 MOST_POINTS = 1_000_000
 BY_CALLBACK = ("server-per-callback", "pipelined")
 STRUCTURE_CYCLES = 100  # enough of a recording to see who publishes what where
 MOST_RECORDED = 100_000
-URGENT = 90
-"""A chain is profiled at this priority where it is not more urgent than all others anyway."""
-OTHER_RUN = 1 << 32
-"""Added to a seed for the run that is judged; seeds that people count up never meet it."""
-
+URGENT = 90  # a chain's profile has this priority where it is not the most urgent anyway
+OTHER_RUN = 1 << 32  # on top of the seed for the judged run: seeds counted up never meet it
 _REQUEST = TypeAdapter(PlanRequest)
 _WISHES = {
     field.name.removesuffix("_ns"): field.name
@@ -109,19 +97,15 @@ FIGURES: dict[str, Any] = {
 """The columns of a row behind those of the axes.
 
 ``profile_…`` are L̲, the average and L̄ that the plan rests on, ``predicted_…`` the plan's own
-(eq. 5). All others are of the judged run, in which ``incomplete`` instances of the chain gave no
-output, and ``late`` ones gave it behind the last slot it was due in (or later than the plan says,
-where there are no slots). ``per_band`` has the bands, with the outputs that left in their slots;
-``band_jitter_ns`` is the widest of their jitters. ``error`` says why there is nothing else.
-``seconds`` is the computing time, without that of the profile, which points share.
+(eq. 5). All others are of the judged run: ``incomplete`` instances of the chain gave no output,
+``late`` ones behind the last slot (without slots: later than the plan says); ``band_jitter_ns`` is
+the widest of those ``per_band``. ``seconds`` were computed, the profile, which points share, apart.
 """
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Every combination of the axes' values for one application, each simulated for ``cycles``
-    periods of the chain. ``plan`` is in force in all of them; without one each point is planned.
-    """
+    """What :func:`sweep` is asked for: every combination of the axes' values is a point."""
 
     application: Application
     plan: Plan | None
@@ -139,7 +123,7 @@ def sweep(
     seed: int | None = None,
     workers: int | None = None,
     scheduler: str | None = None,
-    progress: Progress | None = None,
+    progress: Progress = lambda *_: None,
 ) -> pl.DataFrame:
     """Simulate an application at every combination of some values, planned and shaped for each.
 
@@ -172,15 +156,18 @@ def sweep(
     }
     with finished_rows(rows_file, about) as (rows, add):
         missing = [(number, values) for number, values in enumerate(points) if number not in rows]
-        most = min(workers or len(available_cores()), max(1, len(missing)))
-        if missing and progress is not None:
+        if missing:
+            most = min(workers or len(available_cores()), len(missing))
             progress(len(rows) / len(points), f"{len(points)} points")
-        with closing(rows_of(grid, missing, most, scheduler)) as coming:
-            for number, row in coming if missing else ():
-                add(number, row)
-                if progress is not None:
+            with closing(rows_of(grid, missing, most, scheduler)) as coming:
+                for number, row in coming:
+                    add(number, row)
                     progress(len(rows) / len(points), f"{len(points)} points")
-        frame = _frame(grid, points, [rows[number] for number in range(len(points))])
+        axes = [_axis(name, [values[name] for values in points]) for name in grid.axes]
+        same = {"cycles": grid.cycles, "seed": grid.application.seed}
+        own = [pl.lit(n, pl.Int64).alias(name) for name, n in same.items() if name not in grid.axes]
+        figures = pl.DataFrame([dict(rows[n]) for n in range(len(points))], schema=FIGURES)
+        frame = pl.DataFrame(axes).with_columns(own).hstack(figures)
         content = io.BytesIO()
         frame.write_parquet(content)
         write_whole(output, [content.getvalue()])
@@ -188,31 +175,21 @@ def sweep(
     return frame
 
 
-def _frame(grid: Grid, points: Sequence[Values], rows: Sequence[Row]) -> pl.DataFrame:
-    axes = [_axis(name, values, points) for name, values in grid.axes.items()]
-    own = [pl.Series("cycles", [grid.cycles] * len(points), dtype=pl.Int64)]
-    if "seed" not in grid.axes:
-        own.append(pl.Series("seed", [grid.application.seed] * len(points), dtype=pl.Int64))
-    figures = pl.DataFrame([dict(row) for row in rows], schema=FIGURES)
-    return pl.DataFrame([*axes, *own]).hstack(figures)
-
-
-def _axis(name: str, values: Sequence[Any], points: Sequence[Values]) -> pl.Series:
+def _axis(name: str, column: Sequence[Any]) -> pl.Series:
     """An axis as a column: nanoseconds, numbers, truth values, or else texts as YAML has them."""
-    column = [values_of_point[name] for values_of_point in points]
-    if is_duration(name, values):
+    if is_duration(name, column):
         times = [parse_duration(v) if isinstance(v, str) else v for v in column]
         return pl.Series(f"{name}_ns", times, dtype=pl.Int64)
-    kinds = {type(value) for value in values if value is not None}
+    kinds = {type(value) for value in column if value is not None}
     for dtype, those in ((pl.Boolean, {bool}), (pl.Int64, {int}), (pl.Float64, {int, float})):
         if kinds and kinds <= those:
             return pl.Series(name, column, dtype=dtype)
-    texts = [
-        value
-        if value is None or isinstance(value, str)
-        else yaml.safe_dump(value, default_flow_style=True, width=1000).split("\n")[0]
-        for value in column
-    ]
+
+    def text(value: Any) -> str:
+        flow = yaml.safe_dump(value, default_flow_style=True, width=1000)
+        return value if isinstance(value, str) else flow.split("\n")[0]
+
+    texts = [None if value is None else text(value) for value in column]
     return pl.Series(name, texts, dtype=pl.String)
 
 
@@ -220,10 +197,7 @@ def _axis(name: str, values: Sequence[Any], points: Sequence[Values]) -> pl.Seri
 
 
 def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
-    """An axis as it is written: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none,shaped``.
-
-    Raises InputError: it is not of this form.
-    """
+    """An axis as it is written: ``bands=1..5``, ``epsilon=0,1ms``, ``policy=none,shaped``."""
     name, _, values = text.partition("=")
     try:
         root = compose(f"[{values}]", "value")
@@ -260,10 +234,7 @@ def grid_of(
     cycles: int,
     seed: int | None = None,
 ) -> Grid:
-    """A grid, once it is sure that each value of each axis means something.
-
-    Raises InputError: an axis that is unknown or empty, or a value that it cannot have.
-    """
+    """A grid. Raises InputError: an unknown or empty axis, or a value that it cannot have."""
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
     if cycles < 1:
@@ -285,12 +256,10 @@ def grid_of(
     if (points := prod(map(len, named.values()))) > MOST_POINTS:
         raise InputError(f"{points} points: give fewer values, for {MOST_POINTS} points at most")
     first = {name: values[0] for name, values in named.items()}
-    for name, values in named.items():
-        for value in values:
-            point = {**first, name: value}
-            application_at(grid, point)
-            plan_at(grid, point)
-            request_at(grid, point)
+    for point in ({**first, name: value} for name, values in named.items() for value in values):
+        application_at(grid, point)
+        plan_at(grid, point)
+        request_at(grid, point)
     return grid
 
 
@@ -312,34 +281,27 @@ def _refuse_unknown(name: str, plan: Plan | None) -> None:
     if plan is None and name.startswith(PLAN):
         raise InputError(f"axis {name} is a value of a plan's file: give the plan, too")
     keys = [field.removesuffix("_ns") for field in Application.model_fields]
-    first = name.partition(".")[0]
+    first, others = name.partition(".")[0], [*_WISHES, INTERFERENCE]
     if _changes_application(name) and first not in (*keys, INTERFERENCE):
-        near = difflib.get_close_matches(first, [*_WISHES, *keys, INTERFERENCE], n=1)
+        near = difflib.get_close_matches(first, [*others, *keys], n=1)
         raise InputError(
             f"axis {name}: no such thing{f', did you mean {near[0]}?' if near else ''} There are"
-            f" {', '.join([*_WISHES, INTERFERENCE])}, plan.PATH with a plan, and values of the"
-            f" description, by paths that begin with {', '.join(keys)}"
+            f" {', '.join(others)}, plan.PATH with a plan, and values of the description, by paths"
+            f" that begin with {', '.join(keys)}"
         )
 
 
 def is_duration(name: str, values: Sequence[Any]) -> bool:
     """Whether an axis has durations only: all with units, but for zeros."""
-    if _WISHES.get(name, "").endswith("_ns"):
-        return True
-    texts = [value for value in values if value not in (0, None)]
-    try:
-        for text in texts:
-            parse_duration(text if isinstance(text, str) else "")
-    except InputError:
-        return False
-    return bool(texts)
+    durations = []
+    with suppress(InputError):
+        texts = {str(value) for value in values if value not in (0, None)}
+        durations = [parse_duration(text) for text in texts]
+    return bool(durations) or _WISHES.get(name, "").endswith("_ns")
 
 
 def application_at(grid: Grid, values: Values) -> Application:
-    """The application of a point.
-
-    Raises InputError: it cannot be; the values and the reason are named.
-    """
+    """The application of a point. Raises InputError: it cannot be."""
     changes = {name: value for name, value in values.items() if _changes_application(name)}
     if not changes:
         return grid.application
@@ -347,47 +309,42 @@ def application_at(grid: Grid, values: Values) -> Application:
     if (load := changes.get(INTERFERENCE)) is not None:
         _, timer = origin_timer(grid.application)
         described = _interfered(described, timer.timer_ns or 0, _nanoseconds(INTERFERENCE, load))
-    for name, value in changes.items():
-        if name != INTERFERENCE:
-            described = _replaced(described, name.split("."), value)
-    return _validated(Application, described, changes)
+    return _changed(Application, described, changes, without=INTERFERENCE)
 
 
 def plan_at(grid: Grid, values: Values) -> Plan | None:
-    """The given plan with the point's values in it; None without one.
-
-    Raises InputError: that is no plan.
-    """
+    """The given plan with the point's values in it, if any. Raises InputError: that is no plan."""
     changes = {name: value for name, value in values.items() if name.startswith(PLAN)}
     if grid.plan is None or not changes:
         return grid.plan
-    written: Any = grid.plan.model_dump(mode="json", by_alias=True, context=AS_YAML)
-    for name, value in changes.items():
-        written = _replaced(written, name.removeprefix(PLAN).split("."), value)
-    return _validated(Plan, written, changes)
+    written = grid.plan.model_dump(mode="json", by_alias=True, context=AS_YAML)
+    return _changed(Plan, written, changes)
 
 
 def request_at(grid: Grid, values: Values) -> PlanRequest | None:
-    """What is wished of a point's plan; None where none is made.
-
-    Raises InputError: a value that no such wish can have.
-    """
+    """What is wished of a point's plan, if one is made. Raises InputError: no such wish can be."""
     if grid.plan is not None or values.get("policy") == UNPLANNED:
         return None
     wishes: dict[str, Any] = {"seed": values.get("seed", grid.application.seed)}
-    for name, value in values.items():
-        field = _WISHES.get(name)
-        if field is not None:
-            wishes[field] = _nanoseconds(name, value) if field.endswith("_ns") else value
+    for name in values.keys() & _WISHES.keys():
+        field, value = _WISHES[name], values[name]
+        wishes[field] = _nanoseconds(name, value) if field.endswith("_ns") else value
     try:
         return _REQUEST.validate_json(json.dumps(wishes), strict=True)
     except ValidationError as error:
-        wrong = error.errors()[0]
-        name = str(wrong["loc"][0])
-        raise InputError(
-            f"axis {name.removesuffix('_ns')}: {wishes.get(name)!r} is no value of it:"
-            f" {wrong['msg']}"
-        ) from error
+        wrong, name = error.errors()[0], str(error.errors()[0]["loc"][0])
+        said = f"axis {name.removesuffix('_ns')}: {wishes.get(name)!r} is no value of it"
+        raise InputError(f"{said}: {wrong['msg']}") from error
+
+
+def _changed(model: type[_Model], data: Any, changes: Values, without: str = "") -> _Model:
+    """A model's plain data with values replaced by their paths, validated."""
+    for name, value in changes.items():
+        if name != without:
+            data = _replaced(data, name.removeprefix(PLAN).split("."), value)
+    said = ", ".join(f"{name}={value}" for name, value in changes.items())
+    with wrong_values_refused(model, f"{said}: "):
+        return model.model_validate_json(json.dumps(data), context=AS_YAML)
 
 
 def _replaced(data: Any, path: list[str], value: Any) -> Any:
@@ -395,18 +352,15 @@ def _replaced(data: Any, path: list[str], value: Any) -> Any:
     if not path:
         return value
     key, *rest = path
-    if isinstance(data, list) and key.isdecimal() and int(key) < len(data):
-        number = int(key)
-        return [*data[:number], _replaced(data[number], rest, value), *data[number + 1 :]]
+    if isinstance(data, list) and key.isdecimal() and (at := int(key)) < len(data):
+        return [*data[:at], _replaced(data[at], rest, value), *data[at + 1 :]]
     mapping = data if isinstance(data, dict) else {}
     return {**mapping, key: _replaced(mapping.get(key), rest, value)}
 
 
 def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> dict[str, Any]:
-    """The description with a load beside the chain, as in section 2.5.
-
-    Once a period, for between half the time and all of it, at the lowest priority on the
-    executors' core. A node of that name that is described has everything else as described.
+    """The description with a load beside the chain, as in section 2.5: once a period, for between
+    half the time and all of it, at the lowest priority on the executors' core.
     """
     own = described["nodes"].get(INTERFERENCE, {})
     first, *others = own.get("callbacks", [{"timer": format_duration(period_ns)}])
@@ -414,19 +368,6 @@ def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> d
     callbacks = [{**first, "execution": {"uniform": times}}, *others]
     node = {"priority": 1, "dds_priority": 1, **own, "callbacks": callbacks}
     return {**described, "nodes": {**described["nodes"], INTERFERENCE: node}}
-
-
-def _validated(model: type[_Model], data: Any, changes: Values) -> _Model:
-    said = ", ".join(f"{name}={value}" for name, value in changes.items())
-    with wrong_values_refused(model, f"{said}: "):
-        return model.model_validate(_as_read(data), context=AS_YAML)
-
-
-def _as_read(value: Any) -> Any:
-    """Plain data as a file is read: sequences are tuples."""
-    if isinstance(value, dict):
-        return {key: _as_read(one) for key, one in value.items()}
-    return tuple(map(_as_read, value)) if isinstance(value, list | tuple) else value
 
 
 def _nanoseconds(name: str, value: Any) -> Any:
@@ -441,10 +382,8 @@ def _nanoseconds(name: str, value: Any) -> Any:
 
 
 def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> Profile | str:
-    """The measurements that a point is planned from, or why there are none.
-
-    Where callbacks are planned one by one, response times of as many cycles are needed, 100,000 at
-    most, which takes events.
+    """The measurements that a point is planned from, or why there are none. Response times of
+    callbacks, which are needed where these are planned one by one, take events.
     """
     try:
         application = _urgent(application_at(grid, values))
@@ -472,68 +411,58 @@ def _urgent(application: Application) -> Application:
     others = [priority[name] for name in application.nodes if name not in chain]
     if min(priority[name] for name in chain) > max(others, default=0):
         return application
-    urgent = {n: URGENT if n in chain else min(priority[n], URGENT - 1) for n in application.nodes}
-    nodes = {
-        name: node.model_copy(update={"priority": urgent[name]})
-        for name, node in application.nodes.items()
-    }
+    nodes = dict(application.nodes)
+    for name, node in application.nodes.items():
+        urgent = URGENT if name in chain else min(priority[name], URGENT - 1)
+        nodes[name] = node.model_copy(update={"priority": urgent})
     return application.model_copy(update={"nodes": nodes})
 
 
 def row_at(
     grid: Grid, values: Values, profile: Profile | str | None, progress: Progress | None = None
 ) -> dict[str, Any]:
-    """The figures of one point, under the names of :data:`FIGURES`.
-
-    ``profile`` None: no plan is made. An impossible point raises nothing, its row has the reason.
-    """
+    """The :data:`FIGURES` of one point, planned from a ``profile``, if any; or why it cannot be."""
     began = time.perf_counter()
     figures: dict[str, Any] = dict.fromkeys(FIGURES)
     try:
         if isinstance(profile, str):
             raise InputError(profile)
-        figures |= _judged(grid, values, profile, progress)
+        application, plan = application_at(grid, values), plan_at(grid, values)
+        request = request_at(grid, values)
+        if profile is not None and request is not None:
+            plan = plan_chain(profile, request)
+        latencies = simulate_latencies(
+            application,
+            plan,
+            cycles=grid.cycles,
+            seed=application.seed + OTHER_RUN,
+            progress=progress,
+        )
+        complete = latencies[latencies >= 0]
+        measured = latency_statistics(complete, incomplete=latencies.size - complete.size)
+        figures |= {name: getattr(measured, name) for name in ("count", "incomplete", *_OF_RUN)}
+        figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
+        figures |= {} if plan is None else _beside(plan, complete)
     except ChainshaperError as error:
         figures["error"] = str(error)
     return {**figures, "seconds": round(time.perf_counter() - began, 6)}
-
-
-def _judged(
-    grid: Grid, values: Values, profile: Profile | None, progress: Progress | None
-) -> dict[str, Any]:
-    application, plan = application_at(grid, values), plan_at(grid, values)
-    request = request_at(grid, values)
-    if profile is not None and request is not None:
-        plan = plan_chain(profile, request)
-    seed = application.seed + OTHER_RUN
-    latencies = simulate_latencies(
-        application, plan, cycles=grid.cycles, seed=seed, progress=progress
-    )
-    complete = latencies[latencies >= 0]
-    measured = latency_statistics(complete, incomplete=latencies.size - complete.size)
-    figures = {name: getattr(measured, name) for name in ("count", "incomplete", *_OF_RUN)}
-    figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
-    return figures if plan is None else {**figures, **_beside(plan, complete)}
 
 
 def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
     """What the plan says, and what became of its bands."""
     delay = cycles_until_output(plan) * plan.cycle_ns
     slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
-    shares = plan.predicted.shares
+    shares: Sequence[float | None] = plan.predicted.shares
+    if len(shares) != len(slots):  # slots were edited in number
+        shares = [None] * len(slots)
+    # An output belongs to the last slot that had started when it left, if it is not late.
+    until = [start for start, _ in slots[1:]] + [end for _, end in slots[-1:]]
     bands = []
-    for number, (start, end) in enumerate(slots):
-        # An output belongs to the last slot that had started when it left, if it is not late.
-        until = slots[number + 1][0] if slots[number + 1 :] else end
-        inside = latencies[(latencies >= start) & (latencies < until)]
-        band = {
-            "start_ns": start,
-            "end_ns": end,
-            "predicted_share": shares[number] if len(shares) == len(slots) else None,
-            "share": inside.size / latencies.size if latencies.size else None,
-            "jitter_ns": int(inside.max() - inside.min()) if inside.size else None,
-        }
-        bands.append(band)
+    for (start, end), before, share in zip(slots, until, shares, strict=True):
+        inside = latencies[(latencies >= start) & (latencies < before)]
+        jitter = int(np.ptp(inside)) if inside.size else None
+        seen = inside.size / latencies.size if latencies.size else None
+        bands.append(dict(zip(_BAND, (start, end, share, seen, jitter), strict=True)))
     latest = slots[-1][1] - 1 if slots else plan.predicted.max_ns
     jitters = [band["jitter_ns"] for band in bands if band["jitter_ns"] is not None]
     evidence, predicted = plan.evidence, plan.predicted
@@ -553,68 +482,57 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
 # Who computes ----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Group:
-    """Points, by their numbers, that share a profile; ``profiled``: or need none."""
-
-    profiled: bool
-    points: tuple[tuple[int, Values], ...]
+Points: TypeAlias = list[tuple[int, Values]]  # by their numbers
 
 
-def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> list[Group]:
-    """Points in groups of one profile each, in their order."""
-    groups: dict[str, list[tuple[int, Values]]] = {}
+def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> Iterator[tuple[bool, Points]]:
+    """Points that share a profile, and whether they need one."""
+    groups: dict[tuple[bool, bool, str], Points] = {}
     for number, values in points:
         profiled = request_at(grid, values) is not None
         application = {name: value for name, value in values.items() if _changes_application(name)}
-        per_callback = values.get("policy") in BY_CALLBACK
-        key = json.dumps([profiled, profiled and per_callback, application])
+        per_callback = profiled and values.get("policy") in BY_CALLBACK
+        key = (profiled, per_callback, json.dumps(application))
         groups.setdefault(key, []).append((number, values))
-    return [Group(json.loads(key)[0], tuple(points)) for key, points in groups.items()]
+    return ((profiled, own) for (profiled, *_), own in groups.items())
 
 
 def rows_of(
     grid: Grid, points: Iterable[tuple[int, Values]], workers: int, scheduler: str | None = None
 ) -> Generator[tuple[int, Row], None, None]:
-    """Rows by the numbers of their points, as they are finished.
-
-    ``workers`` threads compute, or a Dask cluster, where points of a worker that dies are computed
-    by others; a row does not depend on who computes it. Points that differ in nothing measured
-    share a profile; those whose profile is there come first, so that few are in memory at a time.
-
-    Raises: as :func:`~chainshaper.linux.computing.engine`.
-    """
-    coming = iter(groups_of(grid, points))
+    """Rows by their points' numbers, as they are finished; few profiles are in memory at once."""
+    coming = groups_of(grid, points)
     ready: deque[tuple[int, Values, Any]] = deque()
-    pending: dict[Any, Group | int] = {}
+    pending: dict[Any, Points | int] = {}
     with engine(workers, scheduler, "a sweep", "; finished rows stay") as computing:
         while True:
             while len(pending) < computing.under_way:
                 if ready:
                     number, values, profile = ready.popleft()
                     pending[computing.submit(row_at, grid, values, profile)] = number
-                elif (group := next(coming, None)) is None:
-                    break
-                elif group.profiled:
-                    pending[computing.submit(profile_at, grid, group.points[0][1])] = group
+                    continue
+                profiled, group = next(coming, (False, []))
+                if profiled:
+                    pending[computing.submit(profile_at, grid, group[0][1])] = group
+                elif group:
+                    ready.extend((number, values, None) for number, values in group)
                 else:
-                    ready.extend((number, values, None) for number, values in group.points)
+                    break
             if not pending:
                 return
             future = computing.finished()
             result, of = future.result(), pending.pop(future)
-            if isinstance(of, Group):
-                ready.extend((number, values, future) for number, values in of.points)
-            else:
+            if isinstance(of, int):
                 yield of, result
+            else:
+                ready.extend((number, values, future) for number, values in of)
 
 
 # Where finished rows stand ---------------------------------------------------------------------
 
 
-def rows_beside(output: str | Path) -> Path:
+def rows_beside(output: Path) -> Path:
     """Where the finished rows of a sweep stand until it is whole."""
-    output = Path(output)
     return output.with_name(output.name + ".rows")
 
 
@@ -625,11 +543,10 @@ def finished_rows(
     """The rows that are finished, by the number of their point, and how to add one.
 
     One line of JSON a row, behind a first line that says what is swept (``about``, plain data).
-    Each is on disk before the next; a crash leaves half a line at most, which is removed. A file
-    without rows is removed.
+    Each is on disk before the next; a crash leaves half a line at most, which is removed.
 
-    Raises InputError: the file is of another sweep; the message names what differs. OperationError:
-    another process works on it, or it cannot be read or written.
+    Raises InputError: the file is of another sweep. OperationError: another process works on it, or
+    it cannot be read or written.
     """
     about = json.loads(json.dumps(about))
     try:
@@ -641,16 +558,20 @@ def finished_rows(
                     f"{path}: another process works on this sweep: wait for it, or name another"
                     " output"
                 ) from error
-            finished = _read(file, path, about)
-            if finished is None:
-                _append(file, about)
-            rows = dict(finished or {})
+            rows = _read(file, path, about)
+
+            def append(value: Mapping[str, Any]) -> None:
+                file.write(json.dumps(value) + "\n")
+                file.flush()
+                os.fsync(file.fileno())
 
             def add(number: int, row: Row) -> None:
                 rows[number] = row  # first: an interruption must not take it for an empty file
-                _append(file, {"number": number, "row": row})
+                append({"number": number, "row": row})
 
             try:
+                if not path.stat().st_size:
+                    append(about)
                 yield rows, add
             finally:
                 if not rows:
@@ -662,17 +583,14 @@ def finished_rows(
         ) from error
 
 
-def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row] | None:
-    """The rows of whole lines; what is behind them is cut off. None: the file is new."""
+def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]:
+    """The rows of whole lines; what is behind them is cut off."""
     file.seek(0)
     text = file.read()
     whole = text[: text.rfind("\n") + 1]
-    if len(whole) < len(text):
-        os.truncate(file.fileno(), len(whole.encode()))
-    if not whole:
-        return None
+    file.truncate(len(whole.encode()))
     try:
-        first, *rows = map(json.loads, whole.splitlines())
+        first, *rows = map(json.loads, whole.splitlines() or [json.dumps(about)])
         finished = {row["number"]: row["row"] for row in rows}
         changed = [name for name in about if first[name] != about[name]]
     except (ValueError, KeyError, TypeError) as error:
@@ -685,9 +603,3 @@ def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]
             " changed since. Undo that to go on with them, name another output, or remove the file"
         )
     return finished
-
-
-def _append(file: IO[str], value: Mapping[str, Any]) -> None:
-    file.write(json.dumps(value) + "\n")
-    file.flush()
-    os.fsync(file.fileno())

@@ -1,22 +1,22 @@
 """The threads of a running application, and what carrying out a plan would change of them.
 
-The functions behind `chainshaper threads` and `chainshaper apply --dry-run`; nothing is changed.
-What /proc shows is joined with what a recording of the same processes saw, as far as they are still
-the same. LTTng numbers processes and threads as these do themselves, in their own pid namespace.
-Which nodes a process has, its creation events say; which threads execute, the callbacks they ran.
+The functions behind `chainshaper threads` and `chainshaper apply --dry-run`. What /proc shows is
+joined with what a recording of the same processes saw, which LTTng numbers as these do themselves,
+in their own pid namespace. Which nodes a process has, its creation events say; which threads
+execute, the callbacks they ran.
 """
 
 import platform
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
@@ -66,8 +66,7 @@ if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
 
 
-LEAD_NS = 2_000_000
-"""The cycle starts so long after the chain's timer expires (DESIGN section 6)."""
+LEAD_NS = 2_000_000  # the cycle starts so long after the chain's timer expires (DESIGN section 6)
 
 
 def find_threads(
@@ -85,8 +84,7 @@ def find_threads(
     processes of ``users`` (names or numbers; default: who launched us, and root) are nodes; a
     process that is asked for is, whoever runs it.
 
-    Raises:
-        InputError: there is no such process, or no such user.
+    Raises InputError: there is no such process, or no such user.
     """
     processes, taken = list_processes(), run_users(users)
     notes: tuple[str, ...] = ()
@@ -96,54 +94,37 @@ def find_threads(
         recorded, notes = recorded_processes(recording)
     if isinstance(where, int):
         family = descendants({process.pid: process.parent for process in processes}, where)
-        chosen = tuple(process for process in processes if process.pid in family)
+        chosen = [process for process in processes if process.pid in family]
         if not any(process.pid == where for process in chosen):
             raise InputError(f"no process {where}: it has ended, or is the kernel's own")
         taken |= {process.user for process in chosen if process.user is not None}
     else:
+        plan = None if where is None else whole(where)
+        gates, servers = (plan.shaping_nodes, plan.servers) if plan is not None else ((), ())
         found = allocate(find_applications(processes), recorded, processes, taken)
-        if where is not None:
-            gates = whole(where).shaping_nodes
-        found = allocation.with_gates(found, gates)
-        running = defaultdict[int, set[str]](set)
-        for one in found.threads:
-            running[one.thread.pid].update(one.nodes)
-        servers: tuple[Server, ...] = ()
-        hosted = None
-        if where is not None:  # receivers need not run
-            joint = whole(where)
-            servers = joint.servers
-            hosted = {receiver for gate in gates for receiver in gate.receivers}
-            hosted |= {thread.node for server in servers for thread in server.threads} | ROUTERS
-        chosen = tuple(
-            process
-            for process in processes
-            if process.user in taken
-            and (
-                running[process.pid] & hosted
-                if hosted is not None
-                else running[process.pid] or process.participates
-            )
-        )
+        nodes = defaultdict[int, set[str]](set)
+        for one in allocation.with_gates(found, gates).threads:
+            nodes[one.thread.pid].update(one.nodes)
+        planned = {thread.node: server.name for server in servers for thread in server.threads}
+        hosted, chosen = None, [p for p in processes if nodes[p.pid] or p.participates]
+        if plan is not None:  # receivers need not run
+            hosted = ROUTERS.union(planned, *(gate.receivers for gate in gates))
+            chosen = [process for process in processes if nodes[process.pid] & hosted]
+        chosen = [process for process in chosen if process.user in taken]
         strangers = allocation.strangers_text(processes, taken, hosted)
-        notes += _missing(set().union(*running.values()), servers)
-        if where is None and not chosen:
+        running = sorted(set().union(*nodes.values()))
+        known = (
+            f"is not running, or cannot be recognised; running: {', '.join(running) or 'no node'}"
+        )
+        missing = [(node, server) for node, server in planned.items() if node not in running]
+        notes += tuple(f"node {node} of server {server} {known}" for node, server in missing)
+        if plan is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
     found = allocation.with_gates(allocate(chosen, recorded, processes, taken), gates)
     if recorded and not any(one.nodes_known_by == "recording" for one in found.threads):
         notes += ("none of these processes is in the recording: they were started after it",)
     notes += found.notes + (() if strangers is None else (strangers,))
     return replace(found, notes=notes, strangers=strangers)
-
-
-def _missing(running: set[str], servers: Iterable[Server]) -> tuple[str, ...]:
-    nodes = {thread.node: server.name for server in servers for thread in server.threads}
-    return tuple(
-        f"node {node} of server {server} is not running, or cannot be recognised; running: "
-        f"{', '.join(sorted(running)) or 'no node'}"
-        for node, server in nodes.items()
-        if node not in running
-    )
 
 
 def recorded_processes(
@@ -175,7 +156,6 @@ def recorded_processes(
     for pid, node in created.unique(maintain_order=True).iter_rows():
         nodes.setdefault(pid, []).append(node)
     threads = defaultdict[int, dict[int, RecordedThread]](dict)
-    comms = {(one.pid, one.tid): one.comm for one in info.threads}
     for one in info.threads:
         own = (one.node,) if one.node else ()
         role = cast(ThreadRole, one.role)
@@ -183,11 +163,11 @@ def recorded_processes(
         nodes.setdefault(one.pid, list(own))
     ran = executors(data_flow(tables, info.clock_offset_ns))
     several = Counter(one.pid for one in ran)
-    for executor in ran:
-        apart = executor.names if several[executor.pid] > 1 else ()
-        for tid, ran_of in executor.threads.items():
-            comm = comms.get((executor.pid, tid), "")
-            threads[executor.pid][tid] = RecordedThread(tid, "executor", ran_of, comm, apart)
+    for pid, ran_of, _, names_of in ran:
+        apart = names_of if several[pid] > 1 else ()
+        for tid, nodes_of in ran_of.items():
+            comm = threads[pid][tid].comm if tid in threads[pid] else ""
+            threads[pid][tid] = RecordedThread(tid, "executor", nodes_of, comm, apart)
     here = info.pid_namespace == own_pid_namespace()
     found = (
         RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid], here)
@@ -198,10 +178,7 @@ def recorded_processes(
 
 
 def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
-    """Refuse slots that count from stamps of nodes that follow `/clock`, as their commands say.
-
-    Raises InputError: there is such a node.
-    """
+    """Raises InputError: slots count from stamps of nodes that, by commands, follow `/clock`."""
     stamped = [one for one in plan.chains if one.anchor == "stamp" and shaping_nodes(one)]
     servers = [server for one in stamped for server in one.servers]
     nodes = {thread.node for server in servers for thread in server.threads}
@@ -226,11 +203,8 @@ def check_publishers(
 ) -> list[str]:
     """Look whether processes publish as a plan that gates publishers' threads asks (design 1).
 
-    What a plan shows by itself was checked when it was read, and that the threads are there by
-    :func:`.server_members`. A recording knows the writers, the environment of a process how Fast
-    DDS is to publish. Returns what a person must know, one sentence each.
-
-    Raises InputError: as :func:`.check_publication`.
+    A recording knows the writers, the environment of a process how Fast DDS is to publish. Returns
+    what a person must know, one sentence each. Raises InputError: as :func:`.check_publication`.
     """
     gating = [chain for chain in plan.chains if any(publisher_servers(chain))]
     if not gating or recording is None:
@@ -248,7 +222,6 @@ def check_publishers(
 
 def _asynchronous(pid: int) -> dict[str, bool]:
     """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others, if known.
-
     In Fast DDS's files of profiles a topic's own counts, or the default one; else synchronous.
     """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
@@ -278,7 +251,7 @@ def _asynchronous(pid: int) -> dict[str, bool]:
 
 @dataclass(frozen=True)
 class Changes:
-    """What a plan would change: threads, or the commands of LITMUS^RT's tools."""
+    """What a plan would change: threads, or with the commands of LITMUS^RT's tools."""
 
     back_end: str
     reason: str
@@ -295,11 +268,8 @@ def planned_changes(
     phase_ns: int | None = None,
     users: Collection[str | int] = (),
 ) -> Changes:
-    """What :func:`.apply_plan` would do; nothing is changed.
-
-    LITMUS^RT's commands are given on any kernel, with ``TID:NODE`` for threads that do not run.
-
-    Raises: as :func:`.apply_plan`.
+    """What :func:`.apply_plan` would do, with the same errors. LITMUS^RT's commands are given on
+    any kernel, with ``TID:NODE`` for threads that do not run.
     """
     plan = open_until_done(whole(plan))
     table = server_table(plan)
@@ -311,27 +281,22 @@ def planned_changes(
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         return Changes(choice.name, choice.reason, threads, (), found.notes)
-    notes = found.notes
+    notes, anchor_ns = found.notes, 0 if phase_ns is None else phase_ns + LEAD_NS
     try:
         members: dict[str, list[int | str]] = {
             name: [member.thread.tid for member in group]
             for name, group in allocation.server_members(plan, found).items()
         }
         if phase_ns is None:
-            phases = chain_phases(plan, found)
-            phase_ns = common_anchor(plan, phases) - LEAD_NS
+            anchor_ns = common_anchor(plan, chain_phases(plan, found))
     except OperationError:
         members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
         notes += ("slots are counted from a beginning that is measured when the chain runs",)
-    anchor = 0 if phase_ns is None else phase_ns + LEAD_NS
-    return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor), notes)
+    return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor_ns), notes)
 
 
 def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
-    """Refuse a plan of which this back end cannot carry out all. Raises InputError: offsets, where
-    nothing stops a chain until its cycle starts; servers of one priority that take turns, where
-    only threads of one server do.
-    """
+    """Raises InputError: this back end cannot carry out all of the plan."""
     if not gates(back_end) and any(chain.offset_ns for chain in plan.chains):
         raise InputError(
             f"the back end {back_end} sets priorities only, and chains whose cycles start at"
@@ -345,20 +310,11 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
         )
 
 
-class Followed(NamedTuple):
-    """How far the slots of chains may be moved (ns), by their places; why those of others stay."""
-
-    reaches_ns: Mapping[int, tuple[int, int]]
-    notes: tuple[str, ...]
-
-
 def followed_chains(
     plan: ApplicationPlan, back_end: str, max_latency_ns: int | None = None
-) -> tuple[ApplicationPlan, Followed]:
-    """The chains whose slots can follow their latencies, to no later end than ``max_latency_ns``.
-
-    That stands in the plan then. Raises InputError: no slots can, and why; or they end behind it as
-    planned.
+) -> tuple[ApplicationPlan, dict[int, tuple[int, int]], list[str]]:
+    """The plan, with ``max_latency_ns`` in it; how far slots that can follow their latencies may
+    be moved (ns), by their chains' places; why others stay. Raises InputError: none can.
     """
     chains, reaches, why_not = list(plan.chains), dict[int, tuple[int, int]](), list[str]()
     for place, chain in enumerate(plan.chains):
@@ -383,14 +339,11 @@ def followed_chains(
             reaches[place] = found
     if not reaches:
         raise InputError("; ".join(why_not))
-    return combined(chains), Followed(reaches, tuple(why_not))
+    return combined(chains), reaches, why_not
 
 
 def server_table(plan: ApplicationPlan) -> ServerTable:
-    """The servers of a plan whose threads a back end has to keep inside their slots.
-
-    Raises OperationError: there are none.
-    """
+    """The servers of a plan whose threads a back end has to keep inside their slots."""
     servers = [s for s in plan.servers if set(s.threads) - plan.free_threads]
     if not servers:
         raise OperationError(
@@ -407,16 +360,8 @@ def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
 
 
 def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
-    """The running thread that begins each chain (:func:`.first_planned`).
-
-    Raises OperationError: no server of a chain holds an executor, or see :func:`.server_members`.
-    """
+    """The running thread that begins each chain."""
     allocation.server_members(plan, found)  # none is in two servers
-    of_thread = {
-        planned: [one.thread for one in allocation.threads_for(planned, found)]
-        for server in plan.servers
-        for planned in server.threads
-    }
     begin: list[Thread] = []
     for chain in plan.chains:
         planned = allocation.first_planned(chain)
@@ -425,51 +370,38 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
                 f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
                 " cycle the chain begins: give its phase (--phase)"
             )
-        begin.append(of_thread[planned][0])
+        begin.append(allocation.threads_for(planned, found)[0].thread)
     return begin
 
 
 def chain_phases(
     plan: ApplicationPlan, found: Allocation, progress: Callable[[float], None] = lambda _: None
 ) -> list[Phase]:
-    """Where in its cycle each chain begins, watched one after the other.
-
-    Raises OperationError: as :func:`first_threads` and :func:`.measure_phase`.
-    """
-    phases: dict[tuple[int, int], Phase] = {}
-    origins = first_threads(plan, found)
-    for number, (chain, origin) in enumerate(zip(plan.chains, origins, strict=True)):
-        place = (origin.tid, chain.cycle_ns)  # chains of one graph begin alike
-        if place not in phases:
-            phases[place] = measure_phase(
-                *(origin.pid, origin.tid, chain.cycle_ns),
-                progress=partial(_share_of, progress, number, len(plan.chains)),
-            )
-    return [phases[o.tid, c.cycle_ns] for c, o in zip(plan.chains, origins, strict=True)]
-
-
-def _share_of(progress: Callable[[float], None], done: int, parts: int, share: float) -> None:
-    progress((done + share) / parts)
+    """Where in its cycle each chain begins, watched one after the other."""
+    wanted = [
+        (origin.pid, origin.tid, chain.cycle_ns)
+        for chain, origin in zip(plan.chains, first_threads(plan, found), strict=True)
+    ]
+    phases: dict[tuple[int, int, int], Phase] = {}
+    parts = dict.fromkeys(wanted)  # chains of one graph begin alike
+    for number, one in enumerate(parts):
+        report = partial(lambda number, share: progress((number + share) / len(parts)), number)
+        phases[one] = measure_phase(*one, progress=report)
+    return [phases[one] for one in wanted]
 
 
 def common_anchor(plan: ApplicationPlan, phases: Sequence[Phase]) -> int:
-    """The instant of CLOCK_MONOTONIC, modulo the hyper-period, from which all cycles count.
-
-    A chain whose first thread waits in a server begins when its slot opens. Timers expire when
-    they do: the instant is chosen such that every slot opens :data:`LEAD_NS` after its chain's
-    timer at least, and that the longest of these waits is as short as can be.
+    """The instant of CLOCK_MONOTONIC, modulo the hyper-period, from which all cycles count: every
+    slot opens :data:`LEAD_NS` after its chain's timer at least, and the longest of these waits is
+    as short as can be.
     """
     hyper = plan.cycle_ns
     wanted = [
         (phase.at_ns + LEAD_NS - chain.offset_ns, chain.cycle_ns)
         for chain, phase in zip(plan.chains, phases, strict=True)
     ]
-
-    def longest_wait(anchor_ns: int) -> int:
-        return max((anchor_ns - first) % cycle for first, cycle in wanted)
-
     # Waits only grow with the anchor, but where one starts again: the best is at such a place.
     candidates = {
         (first + n * cycle) % hyper for first, cycle in wanted for n in range(hyper // cycle)
     }
-    return min(sorted(candidates), key=longest_wait)
+    return min(sorted(candidates), key=lambda at: max((at - one) % cycle for one, cycle in wanted))

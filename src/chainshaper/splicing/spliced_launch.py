@@ -316,13 +316,13 @@ def _moved_aside(folder: Path) -> Path:
     return folder.rename(aside)
 
 
-def remove_folder(folder: Path) -> None:
-    """Remove a folder of ours, all of it or nothing.
+def undo_splice(folder: str | Path) -> None:
+    """Remove what splicing wrote, all of it or nothing.
 
     Raises InputError: it is not ours, or something in it was changed or added since.
     OperationError: it cannot be removed.
     """
-    folder = folder.absolute()
+    folder = Path(folder).absolute()
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, so there is nothing to undo")
     _refuse_changed(folder, "not removed: move away what you need, and remove the rest")

@@ -126,10 +126,11 @@ def measure_latency(
     ``plan`` is the plan in force, for recordings that do not know it themselves; ``flow`` the
     recording's data flow, where that has been resolved already.
     """
-    return _measured(_opened(recording), (chain,), plan, flow)[0]
+    return _measured(opened(recording), (chain,), plan, flow)[0]
 
 
-def _opened(recording: Recording | str | Path) -> Recording:
+def opened(recording: Recording | str | Path) -> Recording:
+    """A recording as it is, or opened where it lies."""
     return recording if isinstance(recording, Recording) else open_source(recording)
 
 
@@ -238,14 +239,14 @@ def compare_chains(
     """
     if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
-    opened = [_opened(recording) for recording in recordings]
-    joint = _plan_of(opened[-1], plan)
+    every = [opened(recording) for recording in recordings]
+    joint = _plan_of(every[-1], plan)
     chains = [] if joint is None or chain is not None else [one.chain.spec for one in joint.chains]
     chains = chains if len(chains) > 1 else [chain or next(iter(chains), None)]
     columns = []
-    for number, recording in enumerate(opened, start=1):
-        progress((number - 1) / len(opened), f"analysing {recording.path}")
-        columns.append(_measured(recording, chains, plan if number == len(opened) else None))
+    for number, recording in enumerate(every, start=1):
+        progress((number - 1) / len(every), f"analysing {recording.path}")
+        columns.append(_measured(recording, chains, plan if number == len(every) else None))
     return tuple(Comparison(own[0].analysis.chain.spec, own) for own in zip(*columns, strict=True))
 
 
