@@ -173,7 +173,7 @@ class Shaping:
         # On Humble the log lacks the source timestamp.
         shape = self._shape_uninformed if HUMBLE else self._shape
         self._input = create_subscription(node, self._type, "input", shape, asked, raw=True)
-        self._taken_again = take_event(self._input)
+        self._take = take_event(self._input)
         self._await_receivers(node, publisher)
 
     def _go_on(self) -> None:
@@ -225,7 +225,8 @@ class Shaping:
             if not waiting or (served and self._shaper.nothing_due()):
                 break
             oldest, self._its_turn = waiting[0], True
-            self._taken_again(oldest.about)
+            if not HUMBLE:  # others were taken since, and a callback is for the last that was
+                self._take(id(self._input), oldest.about or 0)
             self._input.callback(oldest.payload, *([] if HUMBLE else [{}]))
             self._its_turn, served = False, True
         return bool(waiting)
