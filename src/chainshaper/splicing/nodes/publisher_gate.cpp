@@ -250,7 +250,10 @@ private:
   }
 
   void run() {
-    become_realtime();
+    pthread_setname_np(pthread_self(), settings_.thread.c_str());
+    schedule(settings_.parameters, [this](const char * what, const char * remedy) {
+      say("%s: %s: %s; %s", settings_.output.c_str(), what, std::strerror(errno), remedy);
+    });
     try {
       for (;;) {
         if (shaper_.queue.waiting.empty())
@@ -263,24 +266,6 @@ private:
     } catch (const Over &) {
       return;
     }
-  }
-
-  void become_realtime() {
-    const auto & parameters = settings_.parameters;
-    pthread_setname_np(pthread_self(), settings_.thread.c_str());
-    sched_param wanted{};
-    wanted.sched_priority = static_cast<int>(parameters.fifo_priority);
-    if (parameters.fifo_priority > 0 &&
-        sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) != 0)
-      say("%s: SCHED_FIFO is refused: %s; give the user an rtprio limit of 98",
-          settings_.output.c_str(), std::strerror(errno));
-    if (parameters.core < 0) return;
-    cpu_set_t cores;
-    CPU_ZERO(&cores);
-    CPU_SET(static_cast<std::size_t>(parameters.core), &cores);
-    if (sched_setaffinity(0, sizeof(cores), &cores) != 0)
-      say("%s: core %d is refused: %s", settings_.output.c_str(),
-          static_cast<int>(parameters.core), std::strerror(errno));
   }
 
   // Take all that has come, and what has changed.
@@ -402,9 +387,8 @@ void shape(const RmwNode * node, const RmwPublisher * publisher, const void * ty
     const auto wanted = static_cast<std::size_t>(settings.parameters.depth);
     const auto depth = wanted > 0 ? wanted : std::max<std::size_t>(schema::depth, qos.depth);
     auto output = std::make_unique<Output>(settings, node, publisher, type_support, depth);
-    Output * none = nullptr;
     for (auto & one : outputs)
-      if (none = nullptr; one.compare_exchange_strong(none, output.get())) {
+      if (Output * none = nullptr; one.compare_exchange_strong(none, output.get())) {
         output.release();
         return;
       }

@@ -162,14 +162,11 @@ namespace {
 using namespace chainshaper;  // NOLINT
 
 // Where DDS threads deliver the output: the first core that is ours to use and has no server.
-std::optional<std::size_t> delivery_core(const std::vector<std::int64_t> & taken) {
+Maybe delivery_core(const std::vector<std::int64_t> & taken) {
   cpu_set_t ours;
   if (taken.empty() || sched_getaffinity(0, sizeof(ours), &ours) != 0) return std::nullopt;
-  for (std::size_t core = 0; core < CPU_SETSIZE; ++core) {
-    const auto number = static_cast<std::int64_t>(core);
-    if (CPU_ISSET(core, &ours) && std::find(taken.begin(), taken.end(), number) == taken.end())
-      return core;
-  }
+  for (std::int64_t core = 0; core < CPU_SETSIZE; ++core)
+    if (CPU_ISSET(static_cast<std::size_t>(core), &ours) && !place_of(taken, core)) return core;
   return std::nullopt;
 }
 

@@ -5,6 +5,7 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <sched.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
@@ -31,8 +32,8 @@ struct Slot {
   std::int64_t end;
 };
 
-template <typename Words>
-std::optional<std::size_t> place_of(const Words & words, const std::string & word) {
+template <typename Words, typename Word>
+std::optional<std::size_t> place_of(const Words & words, const Word & word) {
   const auto found = std::find(words.begin(), words.end(), word);
   if (found == words.end()) return std::nullopt;
   return static_cast<std::size_t>(found - words.begin());
@@ -388,6 +389,29 @@ inline std::int64_t watch_until(std::int64_t deadline_ns) {
   std::int64_t now = monotonic_ns();
   while (now < deadline_ns) now = monotonic_ns();
   return now;
+}
+
+// Give the calling thread SCHED_FIFO with a priority, or a core to itself; false (and errno): refused.
+inline bool set_fifo(std::int64_t priority) {
+  sched_param wanted{};
+  wanted.sched_priority = static_cast<int>(priority);
+  return sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) == 0;
+}
+
+inline bool set_core(std::int64_t core) {
+  cpu_set_t cores;
+  CPU_ZERO(&cores);
+  CPU_SET(static_cast<std::size_t>(core), &cores);
+  return sched_setaffinity(0, sizeof(cores), &cores) == 0;
+}
+
+// Both, as the parameters say; `warn` gets what is refused, and the remedy.
+template <typename Warn>
+void schedule(const Parameters & parameters, Warn warn) {
+  if (parameters.fifo_priority > 0 && !set_fifo(parameters.fifo_priority))
+    warn("SCHED_FIFO is refused", "give the user an rtprio limit of 98");
+  if (parameters.core >= 0 && !set_core(parameters.core))
+    warn("the core is refused", "name another in the plan");
 }
 
 inline std::int64_t clock_offset() {

@@ -49,7 +49,7 @@ public:
     if (why) ++dropped[static_cast<std::size_t>(*why)];
     lost_by_dds += static_cast<std::uint64_t>(waiting.lost.value_or(0));
     if (!writer_.joinable()) return;
-    size_ = 0;
+    line_.clear();
     row(awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
         waiting.arrival_ns, release.origin_ns, release.at_ns, release.slot, release.cycles_waited,
         anchor_names[static_cast<std::size_t>(release.anchor)],
@@ -57,8 +57,9 @@ public:
         release.mode ? gate.modes->names[*release.mode].c_str() : "", published_ns, stalled_ns,
         why ? dropped_names[static_cast<std::size_t>(*why)] : "", waiting.lost, rows,
         release.moved_ns);
-    line_[size_ - 1] = '\n';  // in place of the last comma
-    if (::write(ends_[1], line_.data(), size_) != static_cast<ssize_t>(size_)) ++unlogged;
+    line_.back() = '\n';  // in place of the last comma
+    if (::write(ends_[1], line_.data(), line_.size()) != static_cast<ssize_t>(line_.size()))
+      ++unlogged;
   }
 
   // What is lost so far, in words; empty: nothing.
@@ -132,23 +133,16 @@ private:
 
   template <typename Number>
   void add(const Number & number) {
-    print("%lld,", static_cast<long long>(number));  // NOLINT(runtime/int)
+    line_ += std::to_string(number) + ',';
   }
 
-  void add(const char * text) { print("%s,", text); }
-
-  template <typename Value>
-  void print(const char * how, Value value) {
-    const int written = std::snprintf(line_.data() + size_, line_.size() - size_, how, value);
-    size_ = std::min(line_.size() - 1, size_ + static_cast<std::size_t>(written));
-  }
+  void add(const char * text) { line_ += std::string(text) + ','; }
 
   std::string path_;
   std::int64_t most_bytes_{0};
   int ends_[2]{-1, -1};
   std::thread writer_;
-  std::array<char, 512> line_{};
-  std::size_t size_{0};
+  std::string line_;
 };
 
 }  // namespace chainshaper

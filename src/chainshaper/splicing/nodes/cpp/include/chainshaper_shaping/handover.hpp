@@ -71,8 +71,6 @@ public:
     return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
   }
 
-  void note_released(std::int64_t key) { add(Field::released, schema::released, key); }
-
   // Put a number into the ring at this place.
   void add(Field count, std::int64_t ring, std::int64_t value) {
     const auto number = get(count);
@@ -193,24 +191,15 @@ public:
     return std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
   }
 
-  Maybe phase_ns() const {
-    if (page_->get(Field::phase_known) == 0) return std::nullopt;
-    return page_->get(Field::phase_ns);
-  }
-
-  std::optional<std::size_t> mode() const {
-    const auto number = page_->get(Field::mode);
-    return number > 0 ? std::optional<std::size_t>(number - 1) : std::nullopt;
-  }
-
   // Have cycles of a gate begin where they did for the one before it, in its mode.
   template <typename Shaper>
   void go_on(Shaper & shaper) const {
     const auto & gate = shaper.queue.gate;
-    if (const auto phase = phase_ns())
-      shaper.set_phase(*phase, monotonic_ns() - gate.cycle_ns);  // from now on, not the next cycle
-    if (const auto last = mode(); gate.modes && last && *last < gate.modes->names.size())
-      shaper.announce(gate.modes->names[*last], 0);
+    if (page_->get(Field::phase_known) != 0)  // from now on, not the next cycle
+      shaper.set_phase(page_->get(Field::phase_ns), monotonic_ns() - gate.cycle_ns);
+    const auto mode = static_cast<std::size_t>(page_->get(Field::mode));  // from 1; 0: none
+    if (gate.modes && mode > 0 && mode <= gate.modes->names.size())
+      shaper.announce(gate.modes->names[mode - 1], 0);
   }
 
   bool take(std::int64_t key) {
@@ -248,14 +237,14 @@ public:
   }
 
   void done(std::int64_t key) {
-    page_->note_released(key);
+    drop(key);
     page_->set(Field::until_ns, monotonic_ns());
     page_->set(Field::failed_starts, 0);
     if (page_->is_current()) return;
     try {
       auto next = open_page(name_, topic_, folders_);
       for (const auto one : page_->noted(schema::released))
-        next->note_released(one);  // a standby that lags has to know them
+        next->add(Field::released, schema::released, one);  // a standby that lags has to know them
       page_ = std::move(next);
       in_force_ = false;
       seen_ = -1;
@@ -266,7 +255,7 @@ public:
   }
 
   // A message that was received has no room any more, and is never published.
-  void drop(std::int64_t key) { page_->note_released(key); }
+  void drop(std::int64_t key) { page_->add(Field::released, schema::released, key); }
 
   // Where cycles are asked to begin, once each time; none: as they do.
   Maybe asked_phase_ns() {
