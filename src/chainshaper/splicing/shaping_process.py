@@ -335,7 +335,7 @@ def _add_part(path: Path, parts: dict[Path, str]) -> None:
 
 GATES = "CHAINSHAPER_GATES"
 """The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
-_GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp")
+_GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp", "in_front_of_rmw.hpp")
 _GATE_FILE = "libchainshaper_gate.so"
 _GATE_OPTIONS = ("-O2", "-std=c++17", "-shared", "-fPIC", "-static-libstdc++", "-static-libgcc")
 _EXPORTED = "{ global: rmw_*; ros_trace_*; local: *; };\n"
@@ -343,25 +343,23 @@ _EXPORTED = "{ global: rmw_*; ros_trace_*; local: *; };\n"
 
 def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
     """The block of an output in the file that :data:`GATES` names, a line for each value."""
-    values: dict[str, Any] = {
+    values = {
         "output": node.output,
         "input": node.input,
         "node": node.name,
         "publisher": publisher,
         "thread": gate_thread_name(node.name),
+        "handover": _page_name(node, log),
     }
-    values |= shaping_parameters(plan, node, log) | {"handover": _page_name(node, log)}
-    return settings_text(values)
+    return settings_text(values | shaping_parameters(plan, node, log))
 
 
 def delivery_settings(node: ShapingNode) -> str:
     """The block of an output that is handed to its receivers at a constant time; none: empty."""
     if node.delivery_ns is None:
         return ""
-    receivers = list(node.receivers)
-    return settings_text(
-        {"output": node.output, "delivery_ns": node.delivery_ns, "receiver": receivers}
-    )
+    values = {"output": node.output, "delivery_ns": node.delivery_ns}
+    return settings_text({**values, "receiver": list(node.receivers)})
 
 
 def settings_text(values: Mapping[str, Any]) -> str:
@@ -375,25 +373,18 @@ def gate_library() -> Path:
 
     Raises PlatformError: there is no C++ compiler, or as :func:`.in_cache`.
     """
-    programs = [_NODES / name for name in _GATE_SOURCES]
-    shared = _NODES / "in_front_of_rmw.hpp"
-    headers = {shared.name: shared.read_text()} | {
-        path: text for path, text in generic_package().items() if path.endswith(".hpp")
-    }
+    sources = [_NODES / name for name in _GATE_SOURCES]
+    programs = [str(path) for path in sources if path.suffix == ".cpp"]
+    headers = {path: text for path, text in generic_package().items() if path.endswith(".hpp")}
 
     def build(folder: Path) -> Path:
-        files = {**headers, "exported.map": _EXPORTED}
-        _write(folder, files)
-        included = (
-            f"-I{folder}",
-            f"-I{folder / 'include'}",
-            f"-Wl,--version-script={folder / 'exported.map'}",
-        )
-        words = (*_GATE_OPTIONS, *included, *map(str, programs), "-ldl", "-lpthread")
+        _write(folder, {**headers, "exported.map": _EXPORTED})
+        linked = (f"-Wl,--version-script={folder / 'exported.map'}", "-ldl", "-lpthread")
+        words = (*_GATE_OPTIONS, f"-I{folder / 'include'}", *programs, *linked)
         options = "--publication in-process", "--publication synchronous"
         return compile_library("c++", words, folder / _GATE_FILE, options)
 
-    return in_cache(_GATE_FILE, [*(one.read_text() for one in programs), *headers.values()], build)
+    return in_cache(_GATE_FILE, [*(one.read_text() for one in sources), *headers.values()], build)
 
 
 # Packages in C++ ----------------------------------------------------------------------------------

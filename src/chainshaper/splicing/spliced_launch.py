@@ -59,7 +59,8 @@ def generate_launch_description():
     spec = importlib.util.spec_from_file_location("redirection", path)
     redirection = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(redirection)
-    return redirection.launch_description(LAUNCH_FILES, PROCESSES, REDIRECTS, ENVIRONMENT)
+    redirects = [redirection.Redirect(**one) for one in REDIRECTS]
+    return redirection.launch_description(LAUNCH_FILES, PROCESSES, redirects, ENVIRONMENT)
 '''
 
 

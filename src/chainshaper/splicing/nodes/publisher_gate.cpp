@@ -75,23 +75,16 @@ struct Settings {
     output = first_of(values, "output"), input = first_of(values, "input");
     node = first_of(values, "node"), thread = first_of(values, "thread");
     parameters.each([&](const char * name, auto & value) {
-      const auto found = values.find(name);
-      if (found != values.end()) assign(value, found->second);
+      if (const auto found = values.find(name); found != values.end())
+        for (const auto & word : found->second) assign(value, word);
     });
   }
 
-  static void assign(std::string & value, const std::vector<std::string> & words) {
-    value = words.front();
-  }
-  static void assign(std::int64_t & value, const std::vector<std::string> & words) {
-    value = std::stoll(words.front());
-  }
-  static void assign(std::vector<std::string> & value, const std::vector<std::string> & words) {
-    value = words;
-  }
-  static void assign(std::vector<std::int64_t> & value, const std::vector<std::string> & words) {
-    value.clear();
-    for (const auto & word : words) value.push_back(std::stoll(word));
+  static void assign(std::string & value, const std::string & word) { value = word; }
+  static void assign(std::int64_t & value, const std::string & word) { value = std::stoll(word); }
+  template <typename Value>
+  static void assign(std::vector<Value> & values, const std::string & word) {
+    assign(values.emplace_back(), word);
   }
 
   std::string output, input, node, thread;
@@ -384,8 +377,7 @@ void shape(const RmwNode * node, const RmwPublisher * publisher, const void * ty
     if (!block || !usable()) return;
     const Settings settings(*block);
     [[maybe_unused]] static const int once = pthread_atfork(nullptr, nullptr, in_child);
-    const auto wanted = static_cast<std::size_t>(settings.parameters.depth);
-    const auto depth = wanted > 0 ? wanted : std::max<std::size_t>(schema::depth, qos.depth);
+    const auto depth = depth_of(settings.parameters, qos.depth);
     auto output = std::make_unique<Output>(settings, node, publisher, type_support, depth);
     for (auto & one : outputs)
       if (Output * none = nullptr; one.compare_exchange_strong(none, output.get())) {

@@ -136,13 +136,12 @@ def set_up(node: Node) -> Callable[[], bool]:
             wait(10.0)
     standby.page["silent"] = int(silent)
 
+    def without_info(payload: bytes) -> None:  # so what the shaping node holds is lost with it
+        standby.arrived(payload, None)
+
     def with_info(payload: bytes, message_info: Any) -> None:
         standby.arrived(payload, message_info["source_timestamp"])
 
-    def without_info(payload: bytes) -> None:
-        standby.arrived(payload, None)
-
-    # On Humble what the shaping node holds is lost with it.
     callback = without_info if HUMBLE else with_info
     node.create_subscription(message_type, "input", callback, asked, raw=True)
     threading.Thread(target=watch, args=(node, standby), name="watch", daemon=True).start()

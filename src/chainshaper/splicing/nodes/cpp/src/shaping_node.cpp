@@ -203,12 +203,6 @@ void take_again(const rclcpp::SubscriptionBase & subscription, const void * mess
   }
 }
 
-// How many messages may wait, by default as many as in the publisher's history.
-std::size_t depth_of(const Parameters & parameters, const Offer & offer) {
-  if (parameters.depth > 0) return static_cast<std::size_t>(parameters.depth);
-  return std::max<std::size_t>(schema::depth, offer.publisher.depth());
-}
-
 rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
   if (qos.history() == rclcpp::HistoryPolicy::KeepLast) qos.keep_last(std::max(depth, qos.depth()));
   return qos;
@@ -229,7 +223,7 @@ public:
         turn_(std::move(turn)),
         readiness_(node, delivery_core(parameters_.server_cores), parameters_.pause_ns),
         shaper_(
-            gate_of(parameters_, depth_of(parameters_, offer)), parameters_.spin_ns,
+            gate_of(parameters_, depth_of(parameters_, offer.publisher.depth())), parameters_.spin_ns,
             [this](std::int64_t release_ns) { readiness_.get_ready(release_ns); },
             [this] { look(); },
             [this](const Release & release, std::int64_t phase_ns) {
@@ -251,7 +245,7 @@ public:
           result.successful = true;
           return result;
         });
-    const auto depth = depth_of(parameters_, offer);
+    const auto depth = shaper_.queue.gate.depth;
     const bool latched =
         offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
     output_ = make_publisher(node, offer.type,

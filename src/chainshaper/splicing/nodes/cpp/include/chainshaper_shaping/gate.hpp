@@ -161,6 +161,12 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   return gate;
 }
 
+// How many messages may wait: by default as many as in the publisher's history.
+inline std::size_t depth_of(const Parameters & parameters, std::size_t history) {
+  if (parameters.depth > 0) return static_cast<std::size_t>(parameters.depth);
+  return std::max<std::size_t>(schema::depth, history);
+}
+
 // As Python's: never negative.
 inline std::int64_t modulo(std::int64_t value, std::int64_t cycle_ns) {
   const std::int64_t rest = value % cycle_ns;
