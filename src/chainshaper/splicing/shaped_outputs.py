@@ -150,11 +150,11 @@ def _page_of(topic: str, pids: Collection[int]) -> Page:
 class FollowedOutput:
     """An output whose latencies are read, and whose slots are moved, until it is closed.
 
-    Raises OperationError: no shaping node of it runs, several do, or another run moves its slots.
+    ``pids`` are processes that it may be of, where several have a gate for it. Raises
+    OperationError: no shaping node of it runs, several do, or another run moves its slots.
     """
 
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
-        """``pids`` are processes that it may be of, where several have a gate for it."""
         self._page = _page_of(topic, pids)
         if not self._page.is_locked(MOVING):  # by how much a run before moved them is over
             self._page.put("moved_from_ns", 0)

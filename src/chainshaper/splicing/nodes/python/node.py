@@ -21,7 +21,7 @@ from contextlib import suppress
 from typing import Any
 
 import rclpy
-from rclpy.clock import Clock
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -91,21 +91,21 @@ def offered_by(info: Any, node: Node) -> QoSProfile:
     ``output_depth``.
     """
     offered = info.qos_profile
-
-    def known(field: str, either: Any, usual: Any) -> Any:
-        return either if getattr(offered, field) == either else usual
-
-    history, reliability = QoSHistoryPolicy, QoSReliabilityPolicy
-    durability, liveliness = QoSDurabilityPolicy, QoSLivelinessPolicy
+    known = {
+        "history": (QoSHistoryPolicy.KEEP_ALL, QoSHistoryPolicy.KEEP_LAST),
+        "reliability": (QoSReliabilityPolicy.BEST_EFFORT, QoSReliabilityPolicy.RELIABLE),
+        "durability": (QoSDurabilityPolicy.TRANSIENT_LOCAL, QoSDurabilityPolicy.VOLATILE),
+        "liveliness": (QoSLivelinessPolicy.MANUAL_BY_TOPIC, QoSLivelinessPolicy.AUTOMATIC),
+    }
     return QoSProfile(
-        history=known("history", history.KEEP_ALL, history.KEEP_LAST),
         depth=offered.depth or parameters_of(node).output_depth,
-        reliability=known("reliability", reliability.BEST_EFFORT, reliability.RELIABLE),
-        durability=known("durability", durability.TRANSIENT_LOCAL, durability.VOLATILE),
         lifespan=offered.lifespan,
         deadline=offered.deadline,
-        liveliness=known("liveliness", liveliness.MANUAL_BY_TOPIC, liveliness.AUTOMATIC),
         liveliness_lease_duration=offered.liveliness_lease_duration,
+        **{
+            name: either if getattr(offered, name) == either else usual
+            for name, (either, usual) in known.items()
+        },
     )
 
 
@@ -130,11 +130,10 @@ def room_of(node: Node, info: Any) -> tuple[int, QoSProfile, QoSProfile]:
 
 
 def become_realtime(node: Node) -> None:
-    """Lock the memory, and give the calling thread its core and SCHED_FIFO priority.
+    """Lock the memory, and give the calling thread its core and SCHED_FIFO priority, as permitted.
 
-    They are the parameters ``core`` and ``fifo_priority``. To be called when all endpoints exist:
-    threads inherit, and those of DDS must not; later ones do not get the class. What is not
-    permitted is warned of.
+    To be called when all endpoints exist: threads inherit, and those of DDS must not; later ones do
+    not get the class.
     """
     parameters = parameters_of(node)
     core, priority = parameters.core, parameters.fifo_priority
@@ -283,9 +282,9 @@ def create_subscription(
     return subscription
 
 
-def create_timer(node: Node, period_ns: int, callback: Callable[[], None], clock: Clock) -> None:
-    """`Node.create_timer`, with the events of rclcpp's."""
-    traced = _traced(callback)
+def create_timer(node: Node, period_ns: int, callback: Callable[[], None]) -> None:
+    """`Node.create_timer` on CLOCK_MONOTONIC, with the events of rclcpp's."""
+    traced, clock = _traced(callback), Clock(clock_type=ClockType.STEADY_TIME)
     # rclpy takes seconds and cuts off behind the nanosecond.
     timer = node.create_timer((period_ns + 0.5) / 1e9, traced, clock=clock)
     emit("rclcpp_timer_callback_added", timer.handle.pointer, id(traced))
@@ -316,7 +315,6 @@ def publish_function(publisher: Any) -> Callable[[bytes], None]:
 # counted.
 
 LOG_HEADER = f"{','.join(LOG_COLUMNS)}\n".encode()
-PIPE_BYTES = 1 << 20
 SAID_EVERY_NS = 10_000_000_000
 
 
@@ -386,7 +384,7 @@ class GateLog:
         writer, self._pipe = started_beside(_write_rows, path, LOG_HEADER, most_bytes)
         os.set_blocking(self._pipe, False)
         with suppress(OSError):  # more than a user may have
-            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, 1 << 20)
         atexit.register(self._end, writer)
 
     def _end(self, writer: "subprocess.Popen[bytes]") -> None:
@@ -399,10 +397,8 @@ class GateLog:
     def write(
         self, outcome: Outcome, published: int | None = None, stalled: int | None = None
     ) -> None:
-        """Note what became of a message.
-
-        ``published`` is when publishing returned, ``stalled`` for how long the machine stood still
-        behind the release (ns, None: not known).
+        """Note what became of a message: when publishing returned, and for how long the machine
+        stood still behind the release (ns, None: not known).
         """
         release, message = outcome.release, outcome.message
         self._rows += 1

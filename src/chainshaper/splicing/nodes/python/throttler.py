@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from chainshaper.gate.decision import sleep_until
@@ -96,9 +95,8 @@ def set_up(node: Node) -> Callable[[], bool]:
     # A timer keeps the phase at which it was made, on the same clock.
     since = time.monotonic_ns() - phase
     sleep_until(phase + (since // period + 1) * period)
-    steady = Clock(clock_type=ClockType.STEADY_TIME)
     for channel in channels:
-        create_timer(node, period, channel.publish, steady)
+        create_timer(node, period, channel.publish)
     return lambda: False
 
 

@@ -463,14 +463,12 @@ public:
     next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
   }
 
-  // False: that is where the slots are, or they would leave the cycle.
-  bool move_slots(std::int64_t by_ns, std::int64_t from_ns) {
+  // Nothing where that is where the slots are, or they would leave the cycle.
+  void move_slots(std::int64_t by_ns, std::int64_t from_ns) {
     auto & moves = queue.moves;
-    if (by_ns == (moves.empty() ? 0 : moves.back().second) || !queue.gate.may_move(by_ns))
-      return false;
+    if (by_ns == (moves.empty() ? 0 : moves.back().second) || !queue.gate.may_move(by_ns)) return;
     moves.emplace_back(from_ns, by_ns);
     if (moves.size() > schema::changes) moves.pop_front();
-    return true;
   }
 
   // False: there is no mode like it.
@@ -562,8 +560,8 @@ public:
     queue.free_ns = monotonic_ns();
   }
 
+  // Of a message that was released.
   std::int64_t time_lost(const Outcome<Message> & outcome) {
-    if (!outcome.release.at_ns) return 0;
     const std::int64_t others = others_ran_ns() - waited_ns_;
     const std::int64_t since_ns = std::max(*outcome.release.at_ns, turn_ns_);
     return std::max<std::int64_t>(0, outcome.awake_ns - since_ns - others);

@@ -8,6 +8,7 @@
 #include <sys/mman.h>
 #include <sys/stat.h>
 
+#include <cmath>
 #include <cstring>
 #include <memory>
 
@@ -187,8 +188,7 @@ public:
 
   double wait_s() const {
     const auto failed = failed_before() - schema::back_off_after;
-    if (failed < 0) return 0.0;
-    return std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
+    return failed < 0 ? 0.0 : std::min(10.0, std::ldexp(0.5, static_cast<int>(failed)));
   }
 
   // Have cycles of a gate begin where they did for the one before it, in its mode.
