@@ -5,8 +5,7 @@
 // and the arguments of these functions are the same in all of them. Where ROS 2 is another one,
 // everything passes as if we were not here, and a line on stderr says so.
 
-#ifndef CHAINSHAPER__IN_FRONT_OF_RMW_HPP_
-#define CHAINSHAPER__IN_FRONT_OF_RMW_HPP_
+#pragma once
 
 #include <dlfcn.h>
 
@@ -163,5 +162,3 @@ std::optional<Block> block_of(const std::string & topic, const RmwNode & node, W
 }
 
 }  // namespace
-
-#endif  // CHAINSHAPER__IN_FRONT_OF_RMW_HPP_

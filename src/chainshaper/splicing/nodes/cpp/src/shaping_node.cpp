@@ -64,8 +64,6 @@ auto subscribe(rclcpp::Node & node, const std::string &, const rclcpp::QoS & qos
   return node.create_subscription<Message>("input", qos, taken, options);
 }
 
-#ifdef CHAINSHAPER_COMPONENT
-
 // What a publisher of this process sent to subscribers of others as well, the executor leaves out.
 struct Open : Input {
   using Input::matches_any_intra_process_publishers;
@@ -78,6 +76,8 @@ bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
   }
   return false;
 }
+
+#ifdef CHAINSHAPER_COMPONENT
 
 // What a ring buffer of rclcpp gives its subscription.
 using Within = std::pair<std::shared_ptr<const Message>, Pointer>;
@@ -100,10 +100,6 @@ void execute(Input & input, const Pointer &, bool within, const rclcpp::MessageI
 void publish(Publisher & output, Pointer & message) { output.publish(std::move(message)); }
 
 #else
-
-bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
-  return input.take(message, info);
-}
 
 Pointer take_within(Input &) { return nullptr; }
 

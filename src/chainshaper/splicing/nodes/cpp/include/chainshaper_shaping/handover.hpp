@@ -52,9 +52,16 @@ public:
     close(file_);
   }
 
-  std::int64_t get(Field field) const { return read(static_cast<std::size_t>(field)); }
-  void set(Field field, std::int64_t value) { write(static_cast<std::size_t>(field), value); }
-  void add(Field field, std::int64_t more = 1) { set(field, get(field) + more); }
+  // The number at a place; another process writes there as well.
+  std::int64_t get(std::size_t place) const {
+    return __atomic_load_n(static_cast<const std::int64_t *>(memory_) + place, __ATOMIC_SEQ_CST);
+  }
+
+  void set(std::size_t place, std::int64_t value) {
+    __atomic_store_n(static_cast<std::int64_t *>(memory_) + place, value, __ATOMIC_SEQ_CST);
+  }
+
+  void add(std::size_t place, std::int64_t more = 1) { set(place, get(place) + more); }
 
   // Take a byte of the file, if no process has it; see whether another one has it.
   bool lock(off_t byte) {
@@ -73,9 +80,9 @@ public:
   }
 
   // Put a number into the ring at this place.
-  void add(Field count, std::int64_t ring, std::int64_t value) {
+  void note(std::size_t count, std::int64_t ring, std::int64_t value) {
     const auto number = get(count);
-    write(static_cast<std::size_t>(ring + number % schema::ring), value);
+    set(static_cast<std::size_t>(ring + number % schema::ring), value);
     set(count, number + 1);
   }
 
@@ -84,7 +91,7 @@ public:
     std::vector<std::int64_t> found;
     found.reserve(schema::ring);
     for (std::size_t place = 0; place < schema::ring; ++place)
-      found.push_back(read(ring + place));
+      found.push_back(get(ring + place));
     std::sort(found.begin(), found.end());
     return found;
   }
@@ -99,15 +106,6 @@ private:
     wanted.l_start = byte;
     wanted.l_len = 1;
     return wanted;
-  }
-
-  // Another process writes there as well.
-  std::int64_t read(std::size_t place) const {
-    return __atomic_load_n(static_cast<const std::int64_t *>(memory_) + place, __ATOMIC_SEQ_CST);
-  }
-
-  void write(std::size_t place, std::int64_t value) {
-    __atomic_store_n(static_cast<std::int64_t *>(memory_) + place, value, __ATOMIC_SEQ_CST);
   }
 
   std::string path_;
@@ -244,7 +242,7 @@ public:
     try {
       auto next = open_page(name_, topic_, folders_);
       for (const auto one : page_->noted(schema::released))
-        next->add(Field::released, schema::released, one);  // a standby that lags has to know them
+        next->note(Field::released, schema::released, one);  // a standby that lags has to know them
       page_ = std::move(next);
       in_force_ = false;
       seen_ = -1;
@@ -255,7 +253,7 @@ public:
   }
 
   // A message that was received has no room any more, and is never published.
-  void drop(std::int64_t key) { page_->add(Field::released, schema::released, key); }
+  void drop(std::int64_t key) { page_->note(Field::released, schema::released, key); }
 
   // Where cycles are asked to begin, once each time; none: as they do.
   Maybe asked_phase_ns() {
@@ -275,11 +273,9 @@ public:
   }
 
   void count(std::optional<Dropped> dropped, Maybe lost, bool late, Maybe latency_ns = {}) {
-    if (latency_ns) page_->add(Field::measured, schema::measured, *latency_ns);
-    const auto reason = [](Dropped why) {  // they stand in the page in their order
-      return static_cast<Field>(static_cast<int>(Field::replaced) + static_cast<int>(why));
-    };
-    page_->add(dropped ? reason(*dropped) : Field::published);
+    if (latency_ns) page_->note(Field::measured, schema::measured, *latency_ns);
+    // Reasons stand in the page in their order.
+    page_->add(dropped ? Field::replaced + static_cast<std::size_t>(*dropped) : Field::published);
     page_->add(Field::lost_by_dds, lost.value_or(0));
     page_->add(Field::late, late ? 1 : 0);
   }
