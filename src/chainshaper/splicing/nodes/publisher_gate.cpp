@@ -244,8 +244,8 @@ private:
 
   void run() {
     pthread_setname_np(pthread_self(), settings_.thread.c_str());
-    schedule(settings_.parameters, [this](const char * what, const char * remedy) {
-      say("%s: %s: %s; %s", settings_.output.c_str(), what, std::strerror(errno), remedy);
+    schedule(settings_.parameters, [this](const std::string & what, const char * remedy) {
+      say("%s: %s: %s; %s", settings_.output.c_str(), what.c_str(), std::strerror(errno), remedy);
     });
     try {
       for (;;) {

@@ -219,7 +219,8 @@ public:
         turn_(std::move(turn)),
         readiness_(node, delivery_core(parameters_.server_cores), parameters_.pause_ns),
         shaper_(
-            gate_of(parameters_, depth_of(parameters_, offer.publisher.depth())), parameters_.spin_ns,
+            gate_of(parameters_, depth_of(parameters_, offer.publisher.depth())),
+            parameters_.spin_ns,
             [this](std::int64_t release_ns) { readiness_.get_ready(release_ns); },
             [this] { look(); },
             [this](const Release & release, std::int64_t phase_ns) {

@@ -397,7 +397,7 @@ inline std::int64_t watch_until(std::int64_t deadline_ns) {
   return now;
 }
 
-// Give the calling thread SCHED_FIFO with a priority, or a core to itself; false (and errno): refused.
+// Give the calling thread SCHED_FIFO with a priority, or a core; false (and errno): it is refused.
 inline bool set_fifo(std::int64_t priority) {
   sched_param wanted{};
   wanted.sched_priority = static_cast<int>(priority);
@@ -417,7 +417,7 @@ void schedule(const Parameters & parameters, Warn warn) {
   if (parameters.fifo_priority > 0 && !set_fifo(parameters.fifo_priority))
     warn("SCHED_FIFO is refused", "give the user an rtprio limit of 98");
   if (parameters.core >= 0 && !set_core(parameters.core))
-    warn("the core is refused", "name another in the plan");
+    warn("core " + std::to_string(parameters.core) + " is refused", "name another in the plan");
 }
 
 inline std::int64_t clock_offset() {

@@ -110,9 +110,9 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
 // ours. To be called when all endpoints exist: threads inherit, and those of DDS must not; later
 // ones do not get the class.
 inline void become_realtime(rclcpp::Node & node) {
-  const auto warn = [&](const char * what, const char * remedy) {
-    RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", what, std::strerror(errno),
-                remedy);
+  const auto warn = [&](const std::string & what, const char * remedy) {
+    RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", what.c_str(),
+                std::strerror(errno), remedy);
   };
   if (unloaded == nullptr && mlockall(MCL_CURRENT | MCL_FUTURE) != 0)
     warn("memory cannot be locked", "give the user a memlock limit of unlimited");
