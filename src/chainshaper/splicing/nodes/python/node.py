@@ -206,16 +206,15 @@ _ARGUMENTS = {  # so many has each event, all of them integers, pointers or text
 
 @functools.cache
 def _events() -> dict[str, Any]:
-    """The functions of events by name; none where the library is not loaded.
+    """The functions of all events; none where the library is not loaded, or lacks one.
 
     What stands in front of it for the whole process (LD_PRELOAD) comes first, and hands events on.
     """
     functions: dict[str, Any] = {}
     for place in ("libtracetools.so", None):
-        with suppress(OSError):
+        with suppress(OSError, AttributeError):
             library = ctypes.CDLL(place, mode=os.RTLD_NOLOAD)
-            found = {name: getattr(library, f"ros_trace_{name}", None) for name in _ARGUMENTS}
-            functions |= {name: one for name, one in found.items() if one is not None}
+            functions = {name: getattr(library, f"ros_trace_{name}") for name in _ARGUMENTS}
     for name, function in functions.items():
         function.argtypes, function.restype = (ctypes.c_void_p,) * _ARGUMENTS[name], None
     return functions
@@ -223,8 +222,8 @@ def _events() -> dict[str, Any]:
 
 def emit(name: str, *values: int | bytes) -> None:
     """Emit an event."""
-    if function := _events().get(name):
-        function(*values)
+    if functions := _events():
+        functions[name](*values)
 
 
 def _traced(callback: Callable[..., None]) -> Callable[..., None]:

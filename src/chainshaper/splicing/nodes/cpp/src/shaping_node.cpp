@@ -77,12 +77,10 @@ bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
   return false;
 }
 
-#ifdef CHAINSHAPER_COMPONENT
-
 // What a ring buffer of rclcpp gives its subscription.
 using Within = std::pair<std::shared_ptr<const Message>, Pointer>;
 
-// The oldest message that came without DDS, or none.
+// The oldest message that came without DDS, which only a component's may, or none.
 Pointer take_within(Input & input) {
   const auto waitable = input.get_intra_process_waitable();
   const auto data = waitable ? waitable->take_data() : nullptr;
@@ -97,19 +95,10 @@ void execute(Input & input, const Pointer &, bool within, const rclcpp::MessageI
   input.handle_message(nothing, info);
 }
 
+#ifdef CHAINSHAPER_COMPONENT
 void publish(Publisher & output, Pointer & message) { output.publish(std::move(message)); }
-
 #else
-
-Pointer take_within(Input &) { return nullptr; }
-
-void execute(Input & input, const Pointer & message, bool, const rclcpp::MessageInfo & info) {
-  std::shared_ptr<void> untyped = message;
-  input.handle_message(untyped, info);
-}
-
 void publish(Publisher & output, const Pointer & message) { output.publish(*message); }
-
 #endif
 
 }  // namespace
@@ -192,11 +181,8 @@ void take_again(const rclcpp::SubscriptionBase & subscription, const void * mess
                 Maybe source_timestamp) {
   using Emit = void (*)(const void *, const void *, std::int64_t, bool);
   static const auto emit = reinterpret_cast<Emit>(dlsym(RTLD_DEFAULT, "ros_trace_rmw_take"));
-  if (emit != nullptr) {
-    const auto handle = subscription.get_subscription_handle();
-    emit(rcl_subscription_get_rmw_handle(handle.get()), message, source_timestamp.value_or(0),
-         true);
-  }
+  const auto handle = rcl_subscription_get_rmw_handle(subscription.get_subscription_handle().get());
+  if (emit != nullptr) emit(handle, message, source_timestamp.value_or(0), true);
 }
 
 rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
@@ -395,13 +381,10 @@ private:
     const std::int64_t now = monotonic_ns();
     if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) return;
     const std::string losses = log_.losses();
-    if (losses != said_) {
-      RCLCPP_WARN(node_.get_logger(), "of %llu messages so far: %s",
-                  static_cast<unsigned long long>(log_.rows),
-                  losses.c_str());  // NOLINT(runtime/int)
-      said_ = losses;
-      said_ns_ = now;
-    }
+    if (losses == said_) return;
+    RCLCPP_WARN(node_.get_logger(), "of %zu messages so far: %s", log_.rows, losses.c_str());
+    said_ = losses;
+    said_ns_ = now;
   }
 
   rclcpp::Node & node_;

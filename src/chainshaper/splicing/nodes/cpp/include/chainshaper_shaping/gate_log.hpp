@@ -47,7 +47,7 @@ public:
     const auto & [waiting, release, awake_ns, why] = outcome;
     ++rows;
     if (why) ++dropped[static_cast<std::size_t>(*why)];
-    lost_by_dds += static_cast<std::uint64_t>(waiting.lost.value_or(0));
+    lost_by_dds += static_cast<std::size_t>(waiting.lost.value_or(0));
     if (!writer_.joinable()) return;
     line_.clear();
     row(awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
@@ -65,7 +65,7 @@ public:
   // What is lost so far, in words; empty: nothing.
   std::string losses() const {
     std::string said;
-    const auto add = [&](std::uint64_t count, const char * why) {
+    const auto add = [&](std::size_t count, const char * why) {
       if (count > 0) said += (said.empty() ? "" : ", ") + std::to_string(count) + " " + why;
     };
     for (std::size_t i = 0; i < dropped.size(); ++i) add(dropped[i], dropped_names[i]);
@@ -74,10 +74,10 @@ public:
     return said;
   }
 
-  std::uint64_t rows{0};
-  std::array<std::uint64_t, dropped_names.size()> dropped{};
-  std::uint64_t lost_by_dds{0};
-  std::uint64_t unlogged{0};
+  std::size_t rows{0};
+  std::array<std::size_t, dropped_names.size()> dropped{};
+  std::size_t lost_by_dds{0};
+  std::size_t unlogged{0};
 
 private:
   void write_lines() {
