@@ -75,10 +75,7 @@ def wait_for_publisher(node: Node, topic: str) -> Any:
 
 
 def message_class(type_name: str) -> Any:
-    """The class of a type such as ``sensor_msgs/msg/Image``; rclpy cannot do without.
-
-    ModuleNotFoundError: its package is not installed here.
-    """
+    """The class of a type such as ``sensor_msgs/msg/Image``; rclpy cannot do without."""
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
@@ -86,9 +83,8 @@ def message_class(type_name: str) -> Any:
 def offered_by(info: Any, node: Node) -> QoSProfile:
     """The quality of service of a publisher, for the one that stands in for it.
 
-    Discovery does not always tell everything: unknown reliability is taken to be reliable, unknown
-    durability volatile, unknown liveliness automatic, and an unknown history keeps the last
-    ``output_depth``.
+    Discovery does not know everything: what is unknown is taken to be usual, and the history to
+    keep the last ``output_depth``.
     """
     offered = info.qos_profile
     known = {
