@@ -73,10 +73,8 @@ class Modes:
 
     def __post_init__(self) -> None:
         if self.default not in self.bands:
-            known = ", ".join(self.bands)
-            raise ValueError(
-                f"the default mode {self.default!r} has no band: choose one of {known}"
-            )
+            choose = f"choose one of {', '.join(self.bands)}"
+            raise ValueError(f"the default mode {self.default!r} has no band: {choose}")
         if self.late not in LATE:
             raise ValueError(f"late {self.late!r}: choose one of {', '.join(LATE)}")
 
@@ -172,6 +170,10 @@ class Release:
     def start_ns(self, cycle_ns: int) -> int:
         """When the cycle starts in which the message leaves."""
         return self.origin_ns + self.cycles_waited * cycle_ns
+
+
+def _withheld(release: Release) -> Release:
+    return replace(release, at_ns=None, slot=None)
 
 
 def release_of(
@@ -299,10 +301,7 @@ class NodeParameters:
         )
 
 
-SAME = (
-    *("cycle_ns", "anchor", "phase_ns", "overrun", "due_cycles", "messages"),
-    "into_open_slot",
-)
+SAME = ("cycle_ns", "anchor", "phase_ns", "overrun", "due_cycles", "messages", "into_open_slot")
 """What a gate, its parameters and its description have alike, under these names."""
 
 
@@ -310,14 +309,10 @@ def gate_parameters(gate: Gate, mode_topic: str = "") -> dict[str, Any]:
     """The parameters that describe a gate, whose modes are announced on that topic."""
     known: dict[str, Any] = {"slots_ns": [bound for slot in gate.slots for bound in slot]}
     known |= {name: getattr(gate, name) for name in SAME}
-    if gate.modes is not None:
-        known |= {
-            "mode_topic": mode_topic,
-            "mode_names": list(gate.modes.bands),
-            "mode_slots": list(gate.modes.bands.values()),
-            "mode_default": gate.modes.default,
-            "mode_late": gate.modes.late,
-        }
+    if (modes := gate.modes) is not None:
+        bands = {"mode_names": [*modes.bands], "mode_slots": [*modes.bands.values()]}
+        late = {"mode_default": modes.default, "mode_late": modes.late}
+        known |= {"mode_topic": mode_topic, **bands, **late}
     return known
 
 
@@ -361,12 +356,10 @@ _TIMER_ABSTIME, _EINTR = 1, 4
 
 def sleep_until(deadline_ns: int) -> None:
     """Sleep until an instant of CLOCK_MONOTONIC, however late the sleep itself begins."""
-    request = _Timespec(*divmod(max(0, deadline_ns), 1_000_000_000))
+    request = ctypes.byref(_Timespec(*divmod(max(0, deadline_ns), 1_000_000_000)))
     error = _EINTR  # a signal ends the sleep early; the deadline stays the same
     while error == _EINTR:
-        error = _libc.clock_nanosleep(
-            time.CLOCK_MONOTONIC, _TIMER_ABSTIME, ctypes.byref(request), None
-        )
+        error = _libc.clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, request, None)
     if error:
         raise OSError(error, f"clock_nanosleep: {os.strerror(error)}")
 
@@ -381,15 +374,13 @@ def watch_until(deadline_ns: int) -> int:
 
 def clock_offset() -> int:
     """CLOCK_REALTIME minus CLOCK_MONOTONIC in ns, to a fraction of a microsecond."""
-    best_width, best = None, 0
+    measured = []  # how long each took, and what it found
     for _ in range(5):
         before, realtime, after = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-        width = after - before
-        if best_width is None or width < best_width:
-            best_width, best = width, realtime - (before + after) // 2
-        if width < 2_000:  # a longer bracket means that something came between
+        measured.append((after - before, realtime - (before + after) // 2))
+        if after - before < 2_000:  # a longer bracket means that something came between
             break
-    return best
+    return min(measured)[1]
 
 
 # Messages that wait -------------------------------------------------------------------------------
@@ -488,17 +479,16 @@ class Queue:
             self._left = self._leaving
 
     def _release(self, message: Waiting, ready_ns: int) -> Release:
-        arrival, stamp, phase = message.arrival_ns, message.stamp_ns, message.phase_ns
-        known = {"ready_ns": ready_ns, "phase_ns": phase}
-        return release_of(self.gate, arrival, stamp, self.changes, **known, moves=self.moves)
+        return release_of(
+            *(self.gate, message.arrival_ns, message.stamp_ns, self.changes),
+            ready_ns=ready_ns,
+            phase_ns=message.phase_ns,
+            moves=self.moves,
+        )
 
     def _same_cycle(self, release: Release, start_ns: int) -> bool:
         """Stamps are not quite periodic: cycles are the same less than half a cycle apart."""
         return 2 * abs(release.start_ns(self.gate.cycle_ns) - start_ns) < self.gate.cycle_ns
-
-
-def _withheld(release: Release) -> Release:
-    return replace(release, at_ns=None, slot=None)
 
 
 class Shaper:
@@ -539,15 +529,13 @@ class Shaper:
         """Cycles begin elsewhere, from the first such beginning after ``now_ns`` on."""
         self._next_phase = (now_ns + (phase_ns - now_ns) % self.gate.cycle_ns, phase_ns)
 
-    def move_slots(self, by_ns: int, from_ns: int) -> bool:
+    def move_slots(self, by_ns: int, from_ns: int) -> None:
         """Slots of cycles that begin at ``from_ns`` or later are moved by so much from where the
-        gate has them; False: that is where they are, or they would leave the cycle.
+        gate has them, unless that is where they are, or they would leave the cycle.
         """
         moves = self.queue.moves
-        if by_ns == (moves[-1][1] if moves else 0) or not self.gate.may_move(by_ns):
-            return False
-        moves.append((from_ns, by_ns))
-        return True
+        if by_ns != (moves[-1][1] if moves else 0) and self.gate.may_move(by_ns):
+            moves.append((from_ns, by_ns))
 
     def switch(self, mode: str | None, now_ns: int) -> bool:
         """A mode is announced, in force from the next cycle on; False: there is none like it."""
@@ -650,9 +638,7 @@ class Shaper:
         """How much of the delay from a release until now, right after publishing, no thread used:
         interrupts, or a core that was taken away from the whole system (ns).
         """
-        if release.at_ns is None:
-            return 0
-        since_ns = max(release.at_ns, self._turn_ns)
+        since_ns = max(release.at_ns or 0, self._turn_ns)
         return max(0, until_ns - since_ns - (self._others_ran_ns() - self._waited_ns))
 
     def _others_ran_ns(self) -> int:

@@ -29,10 +29,9 @@ from chainshaper.workload.description import (
 def splice_application(application: Application, plan: Plan | ApplicationPlan) -> Application:
     """The application as the plan wants it to run; the given one is left as it is.
 
-    It is extended by the plan's shaping nodes or, where the plan gates the publisher's thread,
-    given the lifespan that the plan's treatment of overruns needs. The timers that start chains
-    expire when their cycles start: so much after the common start as the plan's offsets say. Raises
-    InputError: the plan shapes nothing, or does not fit the application.
+    The timers that start chains expire when their cycles start: so much after the common start as
+    the plan's offsets say. Raises InputError: the plan shapes nothing, or does not fit the
+    application.
     """
     joint = whole(plan)
     check_periods(application, joint)
@@ -55,10 +54,7 @@ def _refuse_strange_nodes(application: Application, joint: ApplicationPlan) -> N
 
 
 def check_periods(application: Application, joint: ApplicationPlan) -> None:
-    """Refuse a chain that does not have its plan's period in the application.
-
-    Raises InputError: so it is, or the application has no such chain.
-    """
+    """InputError: the application lacks a chain of the plan, or it has another period there."""
     for chain in joint.chains:
         _, timer = _origin(application, joint, chain)
         if timer.timer_ns != chain.chain.period_ns:
@@ -177,10 +173,9 @@ def _spliced(
     nodes[shaping.name] = _described(plan, shaping, depth, timer.phase_ns)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
-    first, *others = application.chain.split("..")
-    chain = application.chain
-    if others and first.strip() == shaping.output:  # it starts where it did
-        chain = "..".join([shaping.input, *others])
+    first, arrow, others = application.chain.partition("..")
+    starts = arrow and first.strip() == shaping.output  # it does where it did
+    chain = f"{shaping.input}..{others}" if starts else application.chain
     return application.model_copy(update={"nodes": nodes, "topics": topics, "chain": chain})
 
 

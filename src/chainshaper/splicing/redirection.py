@@ -71,9 +71,8 @@ class Redirect:
 
     def values(self) -> dict[str, Any]:
         """What a launch file says of it, and a dry run is asked."""
-        keys = ("kind", "topic", "target", "nodes", "added")
-        component = {} if self.component is None else {"component": self.component}
-        return {key: getattr(self, key) for key in keys} | component
+        keys = ("kind", "topic", "target", "nodes", "added", "component")
+        return {key: one for key in keys if (one := getattr(self, key)) is not None}
 
     def see(
         self,
@@ -273,7 +272,7 @@ def _names(names: Sequence[str]) -> str:
 def launch_description(
     files: Sequence[str],
     processes: Sequence[dict[str, Any]],
-    redirects: Sequence[dict[str, Any]],
+    redirects: Sequence[Redirect],
     environment: Mapping[str, str],
 ) -> Any:
     """What the launch file beside this module launches: our nodes, and the user's launch files.
@@ -294,31 +293,26 @@ def launch_description(
     from launch.substitutions import LaunchConfiguration
     from launch_ros.actions import Node
 
-    parts = [Redirect(**one) for one in redirects]
     within = DeclareLaunchArgument(
         WITHIN,
         default_value=str(WITHIN_S),
         description="after how many seconds a topic that was not redirected ends the launch",
     )
-    actions: list[Any] = [within, OpaqueFunction(function=_begin, args=[parts])]
+    actions: list[Any] = [within, OpaqueFunction(function=_begin, args=[redirects])]
     for name, value in environment.items():
         others = os.environ.get(name, "") if name == "LD_PRELOAD" else ""
         actions.append(SetEnvironmentVariable(name, f"{value}:{others}" if others else value))
     actions += [(Node if "package" in one else ExecuteProcess)(**one) for one in processes]
     for file in files:
         description = AnyLaunchDescriptionSource(file).get_launch_description(LaunchContext())
-        required = [
-            argument
-            for argument, includes in (
-                description.get_launch_arguments_with_include_launch_description_actions()
-            )
-            if includes is None and argument.default_value is None
-            if not argument._conditionally_included
-        ]
-        for one in required:
-            actions.append(DeclareLaunchArgument(one.name, description=one.description))
+        declared = description.get_launch_arguments_with_include_launch_description_actions()
+        handed_on = []
+        for one, includes in declared:
+            required = one.default_value is None and not one._conditionally_included
+            if includes is None and required:
+                actions.append(DeclareLaunchArgument(one.name, description=one.description))
+                handed_on.append((one.name, LaunchConfiguration(one.name)))
         source = LaunchDescriptionSource(description, file, "spliced launch file")
-        handed_on = [(one.name, LaunchConfiguration(one.name)) for one in required]
         actions.append(IncludeLaunchDescription(source, launch_arguments=handed_on))
     return LaunchDescription(actions)
 
@@ -424,14 +418,8 @@ def dry_run(
     import asyncio
 
     from launch import LaunchContext
-    from launch.actions import (
-        ExecuteProcess,
-        IncludeLaunchDescription,
-        RegisterEventHandler,
-        TimerAction,
-    )
+    from launch.actions import RegisterEventHandler, TimerAction
     from launch.actions.execute_local import ExecuteLocal
-    from launch.launch_description_sources import AnyLaunchDescriptionSource
     from launch_ros.actions import LifecycleNode, LoadComposableNodes, Node
     from launch_ros.actions import load_composable_nodes as loading
     from launch_ros.substitutions import ExecutableInPackage
@@ -455,15 +443,11 @@ def dry_run(
     RegisterEventHandler.execute = lambda action, _: action.event_handler.describe()[1]
     os.chdir(folder)
     parts = [Redirect(**one) for one in redirects]
-    redirect_from_now_on(parts)
     context = LaunchContext()
     context.extend_globals({_DRY_RUN: True})
     context._set_asyncio_loop(asyncio.new_event_loop())
-    for one in processes:
-        carry_out(ExecuteProcess(**one), context)
-    for file in files:
-        source = AnyLaunchDescriptionSource(file)
-        carry_out(IncludeLaunchDescription(source, launch_arguments=arguments.items()), context)
+    context.launch_configurations.update(arguments)
+    carry_out(launch_description(files, processes, parts, {}), context)
     return [
         {
             "topic": part.topic,

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, TypeAlias
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import TypeAdapter
 
 from chainshaper.gate.decision import DROPPED
 from chainshaper.gate.handover import (
@@ -61,37 +61,31 @@ def find_outputs(folders: Iterable[str] | None = None) -> tuple[ShapedOutput, ..
     """The outputs that this user may see, root those of all users, and in containers; one whose
     processes have both ended is none any more.
     """
-    inside: dict[str, dict[str, dict[int, int]]] = {}
+    pages: list[tuple[str, str, dict[int, int]]] = []
     if folders is None:
         folders = [*page_folders()]
         if os.geteuid() == 0:
             others = {str(path) for path in Path("/run/user").glob("*/chainshaper/outputs")}
             others |= {str(path) for path in Path("/dev/shm").glob("chainshaper-*")}  # noqa: S108
             folders += sorted(others - {*folders})
-        inside = _in_containers()
-    places: dict[str, Mapping[str, Mapping[int, int]]] = {**inside}
+        pages = _in_containers()
     for folder in folders:
         with suppress(OSError):
-            places[folder] = {name: {} for name in sorted(os.listdir(folder))}  # noqa: PTH208
+            pages += [(folder, name, {}) for name in sorted(os.listdir(folder))]  # noqa: PTH208
     found = []
-    for folder, pages in places.items():
-        for name, pid_of in pages.items():
-            with (
-                suppress(OSError, ValueError, ValidationError),
-                closing(Page(folder, name)) as page,
-            ):
-                found += _looked_at(page, pid_of)
+    for folder, name, pid_of in pages:
+        with suppress(OSError, ValueError), closing(Page(folder, name)) as page:
+            found += _looked_at(page, pid_of)
     return tuple(found)
 
 
-def _in_containers() -> dict[str, dict[str, dict[int, int]]]:
-    """Pages that processes have open whose files are others than ours, by folder and name in /proc.
+def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
+    """Pages that processes have open whose files are others than ours: folder and name in /proc.
 
     With each are its processes, by what they call themselves: a page has them so.
     """
     own = Path("/proc/self/ns/mnt").stat().st_ino
-    pages: dict[tuple[int, int], tuple[str, str]] = {}
-    found: dict[str, dict[str, dict[int, int]]] = {}
+    found: dict[tuple[int, int], tuple[str, str, dict[int, int]]] = {}
     for pid in parents():
         folder = f"/proc/{pid}/fd"
         with suppress(OSError):  # it has ended, or is another user's
@@ -101,9 +95,9 @@ def _in_containers() -> dict[str, dict[str, dict[int, int]]]:
             for name in os.listdir(folder):  # noqa: PTH208
                 if _PAGE.search(os.readlink(f"{folder}/{name}")):  # noqa: PTH115
                     file = os.stat(f"{folder}/{name}")  # noqa: PTH116
-                    at, known = pages.setdefault((file.st_dev, file.st_ino), (folder, name))
-                    found.setdefault(at, {}).setdefault(known, {})[inner] = pid
-    return found
+                    page = found.setdefault((file.st_dev, file.st_ino), (folder, name, {}))
+                    page[2][inner] = pid
+    return list(found.values())
 
 
 def output_text(output: ShapedOutput) -> str:
@@ -156,11 +150,11 @@ def _page_of(topic: str, pids: Collection[int]) -> Page:
 class FollowedOutput:
     """An output whose latencies are read, and whose slots are moved, until it is closed.
 
-    Raises OperationError: no shaping node of it runs, several do, or another run moves its slots.
+    ``pids`` are processes that it may be of, where several have a gate for it. Raises
+    OperationError: no shaping node of it runs, several do, or another run moves its slots.
     """
 
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
-        """``pids`` are processes that it may be of, where several have a gate for it."""
         self._page = _page_of(topic, pids)
         if not self._page.is_locked(MOVING):  # by how much a run before moved them is over
             self._page.put("moved_from_ns", 0)

@@ -37,10 +37,7 @@ _SOURCES = Path(__file__).parents[2]
 _NODES = Path(__file__).parent / "nodes"
 
 RESPAWN = {"respawn": True, "respawn_delay": 0.1}
-"""What a launch file says of every process that is added, in the words of all its languages.
-
-The delay (s) is for a program that ends at once, such as one that lacks a library.
-"""
+"""What a launch file says of every added process; the delay (s): it may end at once each time."""
 
 STANDBY = "_standby"  # what a standby's name has behind that of its shaping node
 SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half a cycle
@@ -98,10 +95,9 @@ def write_shaping_process(
 ) -> ShapingProcess:
     """Write a shaping node of a plan into ``folder``; what a launch file has to start.
 
-    ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``: ``typed``
-    and ``component`` are generated for it, the others find it out when they run. ``log`` is where
-    the node notes what it did with each message. Files that are there and equal are left alone.
-    Those that are to be moved to ``folder`` later are written ``into`` another one. Raises
+    ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``, for which
+    ``typed`` and ``component`` are generated. ``log`` is where the node notes what it did with each
+    message. Files that are to be moved to ``folder`` later are written ``into`` another one. Raises
     InputError: a file is there with another content; no type for a kind that needs one, or none
     that there is. OperationError: a file cannot be written.
     """
@@ -141,8 +137,6 @@ def write_shaping_process(
 def zero_copy_lost(plan: ApplicationPlan, kind: NodeKind) -> list[str]:
     """A line for each output of which a node of this kind would need copies that are not made now,
     or would be a component where none was seen to be of use.
-
-    Messages that go through DDS anyway are copied without it as well.
     """
     within = (
         f"get its messages without a copy; with --node {kind} each message is serialized and "
@@ -209,12 +203,10 @@ def write_throttler(
 
 
 def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
-    """The gate of a plan's shaping node, with room for so many messages.
-
-    Plans number bands from 1, as people do; a gate numbers its slots from 0.
-    """
+    """The gate of a plan's shaping node, with room for so many messages."""
     server = server_of(plan, node.thread)  # a plan without one for a shaping node is refused
     modes = plan.modes if node == plan.shaping_node else None
+    # Plans number bands from 1, as people do; a gate numbers its slots from 0.
     bands = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
     return Gate(
         slots=() if server is None else server.slots,
@@ -308,10 +300,7 @@ def _write(folder: Path, files: dict[str, str]) -> None:
 
 
 def python_node(executable: str) -> str:
-    """The one file of a Python node: the gate as it is, what it needs of ROS 2, and the node.
-
-    What one of these parts imports from another is there already, so such imports are left out.
-    """
+    """The one file of a Python node: the gate as it is, what it needs of ROS 2, and the node."""
     parts: dict[Path, str] = {}
     _add_part(_NODES / "python" / f"{executable}.py", parts)
     return "#!/usr/bin/env python3\n" + "\n\n".join(parts.values())
@@ -335,7 +324,7 @@ def _add_part(path: Path, parts: dict[Path, str]) -> None:
 
 GATES = "CHAINSHAPER_GATES"
 """The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
-_GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp")
+_GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp", "in_front_of_rmw.hpp")
 _GATE_FILE = "libchainshaper_gate.so"
 _GATE_OPTIONS = ("-O2", "-std=c++17", "-shared", "-fPIC", "-static-libstdc++", "-static-libgcc")
 _EXPORTED = "{ global: rmw_*; ros_trace_*; local: *; };\n"
@@ -343,25 +332,23 @@ _EXPORTED = "{ global: rmw_*; ros_trace_*; local: *; };\n"
 
 def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
     """The block of an output in the file that :data:`GATES` names, a line for each value."""
-    values: dict[str, Any] = {
+    values = {
         "output": node.output,
         "input": node.input,
         "node": node.name,
         "publisher": publisher,
         "thread": gate_thread_name(node.name),
+        "handover": _page_name(node, log),
     }
-    values |= shaping_parameters(plan, node, log) | {"handover": _page_name(node, log)}
-    return settings_text(values)
+    return settings_text(values | shaping_parameters(plan, node, log))
 
 
 def delivery_settings(node: ShapingNode) -> str:
     """The block of an output that is handed to its receivers at a constant time; none: empty."""
     if node.delivery_ns is None:
         return ""
-    receivers = list(node.receivers)
-    return settings_text(
-        {"output": node.output, "delivery_ns": node.delivery_ns, "receiver": receivers}
-    )
+    values = {"output": node.output, "delivery_ns": node.delivery_ns}
+    return settings_text({**values, "receiver": list(node.receivers)})
 
 
 def settings_text(values: Mapping[str, Any]) -> str:
@@ -375,25 +362,18 @@ def gate_library() -> Path:
 
     Raises PlatformError: there is no C++ compiler, or as :func:`.in_cache`.
     """
-    programs = [_NODES / name for name in _GATE_SOURCES]
-    shared = _NODES / "in_front_of_rmw.hpp"
-    headers = {shared.name: shared.read_text()} | {
-        path: text for path, text in generic_package().items() if path.endswith(".hpp")
-    }
+    sources = [_NODES / name for name in _GATE_SOURCES]
+    programs = [str(path) for path in sources if path.suffix == ".cpp"]
+    headers = {path: text for path, text in generic_package().items() if path.endswith(".hpp")}
 
     def build(folder: Path) -> Path:
-        files = {**headers, "exported.map": _EXPORTED}
-        _write(folder, files)
-        included = (
-            f"-I{folder}",
-            f"-I{folder / 'include'}",
-            f"-Wl,--version-script={folder / 'exported.map'}",
-        )
-        words = (*_GATE_OPTIONS, *included, *map(str, programs), "-ldl", "-lpthread")
+        _write(folder, {**headers, "exported.map": _EXPORTED})
+        linked = (f"-Wl,--version-script={folder / 'exported.map'}", "-ldl", "-lpthread")
+        words = (*_GATE_OPTIONS, f"-I{folder / 'include'}", *programs, *linked)
         options = "--publication in-process", "--publication synchronous"
         return compile_library("c++", words, folder / _GATE_FILE, options)
 
-    return in_cache(_GATE_FILE, [*(one.read_text() for one in programs), *headers.values()], build)
+    return in_cache(_GATE_FILE, [*(one.read_text() for one in sources), *headers.values()], build)
 
 
 # Packages in C++ ----------------------------------------------------------------------------------
@@ -422,10 +402,7 @@ class MessageType:
 
     @property
     def snake_name(self) -> str:
-        """As rosidl names the header: ``point_cloud2``.
-
-        Upstream: `convert_camel_case_to_lower_case_underscore` of rosidl_pycommon.
-        """
+        """As rosidl_pycommon's `convert_camel_case_to_lower_case_underscore`: ``point_cloud2``."""
         words = re.sub(r"(.)([A-Z][a-z]+)", r"\1_\2", self.name)
         return re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", words).lower()
 
@@ -568,8 +545,7 @@ def check_build_tools() -> None:
 def build_package(folder: Path) -> Path:
     """Build the packages in a folder with colcon; the file to source, ``install/setup.bash``.
 
-    Raises PlatformError: see :func:`check_build_tools`. OperationError: the build failed; the end
-    of what it said is in the message.
+    Raises PlatformError: see :func:`check_build_tools`. OperationError: the build failed.
     """
     check_build_tools()
     build = subprocess.run(

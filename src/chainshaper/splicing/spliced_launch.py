@@ -36,8 +36,7 @@ _WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter")
 _SIGNS = {  # what the text of a launch file has in it, by the end of its name
     ".py": "generate_launch_description",
     ".xml": "<launch",
-    ".yaml": r"(?m)^[\s'\"{]*launch\b",
-    ".yml": r"(?m)^[\s'\"{]*launch\b",
+    **dict.fromkeys((".yaml", ".yml"), r"(?m)^[\s'\"{]*launch\b"),
     ".launch": "launch",
 }
 _TEXT = '''"""Starts {what} with nodes added; written by `chainshaper splice`."""
@@ -59,7 +58,8 @@ def generate_launch_description():
     spec = importlib.util.spec_from_file_location("redirection", path)
     redirection = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(redirection)
-    return redirection.launch_description(LAUNCH_FILES, PROCESSES, REDIRECTS, ENVIRONMENT)
+    redirects = [redirection.Redirect(**one) for one in REDIRECTS]
+    return redirection.launch_description(LAUNCH_FILES, PROCESSES, redirects, ENVIRONMENT)
 '''
 
 
@@ -300,15 +300,16 @@ def new_folder(
 
 def _replace(folder: Path, new: Path) -> None:
     """Put a new folder in the place of an older one of ours, which comes back if that fails."""
-    aside = _moved_aside(folder) if folder.exists() else None
+    if not folder.exists():
+        new.rename(folder)
+        return
+    aside = _moved_aside(folder)
     try:
         new.rename(folder)
     except OSError:
-        if aside is not None:
-            aside.rename(folder)
+        aside.rename(folder)
         raise
-    if aside is not None:
-        shutil.rmtree(aside, ignore_errors=True)
+    shutil.rmtree(aside, ignore_errors=True)
 
 
 def _moved_aside(folder: Path) -> Path:

@@ -5,8 +5,7 @@
 // and the arguments of these functions are the same in all of them. Where ROS 2 is another one,
 // everything passes as if we were not here, and a line on stderr says so.
 
-#ifndef CHAINSHAPER__IN_FRONT_OF_RMW_HPP_
-#define CHAINSHAPER__IN_FRONT_OF_RMW_HPP_
+#pragma once
 
 #include <dlfcn.h>
 
@@ -109,10 +108,8 @@ void * behind(const char * name) {
 bool usable() {
   static const bool known = [] {
     const char * const distribution = std::getenv("ROS_DISTRO");
-    const auto is_one_of = [](const char * word, std::initializer_list<const char *> words) {
-      return word != nullptr && std::any_of(words.begin(), words.end(), [&](const char * one) {
-               return std::strcmp(one, word) == 0;
-             });
+    const auto is_one_of = [](const char * word, std::initializer_list<std::string> words) {
+      return word != nullptr && std::find(words.begin(), words.end(), word) != words.end();
     };
     const auto identify =
         reinterpret_cast<const char * (*)()>(behind("rmw_get_implementation_identifier"));
@@ -120,9 +117,9 @@ bool usable() {
     bool all = is_one_of(distribution, {"humble", "jazzy", "kilted", "lyrical", "rolling"}) &&
                is_one_of(rmw, {"rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp",
                                "rmw_zenoh_cpp", "rmw_connextdds"});
-    for (const char * name : {"rmw_serialize", "rmw_publish", "rmw_publish_serialized_message"})
+    for (const char * name : {"rmw_serialize", "rmw_publish", "rmw_publish_serialized_message",
+                              "rcutils_get_default_allocator"})
       all = all && behind(name) != nullptr;
-    all = all && behind("rcutils_get_default_allocator") != nullptr;
     if (!all)
       say("ROS 2 %s with %s is not known to the gate: outputs leave at once",
           distribution == nullptr ? "(no ROS_DISTRO)" : distribution, rmw);
@@ -165,5 +162,3 @@ std::optional<Block> block_of(const std::string & topic, const RmwNode & node, W
 }
 
 }  // namespace
-
-#endif  // CHAINSHAPER__IN_FRONT_OF_RMW_HPP_

@@ -75,23 +75,16 @@ struct Settings {
     output = first_of(values, "output"), input = first_of(values, "input");
     node = first_of(values, "node"), thread = first_of(values, "thread");
     parameters.each([&](const char * name, auto & value) {
-      const auto found = values.find(name);
-      if (found != values.end()) assign(value, found->second);
+      if (const auto found = values.find(name); found != values.end())
+        for (const auto & word : found->second) assign(value, word);
     });
   }
 
-  static void assign(std::string & value, const std::vector<std::string> & words) {
-    value = words.front();
-  }
-  static void assign(std::int64_t & value, const std::vector<std::string> & words) {
-    value = std::stoll(words.front());
-  }
-  static void assign(std::vector<std::string> & value, const std::vector<std::string> & words) {
-    value = words;
-  }
-  static void assign(std::vector<std::int64_t> & value, const std::vector<std::string> & words) {
-    value.clear();
-    for (const auto & word : words) value.push_back(std::stoll(word));
+  static void assign(std::string & value, const std::string & word) { value = word; }
+  static void assign(std::int64_t & value, const std::string & word) { value = std::stoll(word); }
+  template <typename Value>
+  static void assign(std::vector<Value> & values, const std::string & word) {
+    assign(values.emplace_back(), word);
   }
 
   std::string output, input, node, thread;
@@ -250,7 +243,10 @@ private:
   }
 
   void run() {
-    become_realtime();
+    pthread_setname_np(pthread_self(), settings_.thread.c_str());
+    schedule(settings_.parameters, [this](const std::string & what, const char * remedy) {
+      say("%s: %s: %s; %s", settings_.output.c_str(), what.c_str(), std::strerror(errno), remedy);
+    });
     try {
       for (;;) {
         if (shaper_.queue.waiting.empty())
@@ -263,24 +259,6 @@ private:
     } catch (const Over &) {
       return;
     }
-  }
-
-  void become_realtime() {
-    const auto & parameters = settings_.parameters;
-    pthread_setname_np(pthread_self(), settings_.thread.c_str());
-    sched_param wanted{};
-    wanted.sched_priority = static_cast<int>(parameters.fifo_priority);
-    if (parameters.fifo_priority > 0 &&
-        sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) != 0)
-      say("%s: SCHED_FIFO is refused: %s; give the user an rtprio limit of 98",
-          settings_.output.c_str(), std::strerror(errno));
-    if (parameters.core < 0) return;
-    cpu_set_t cores;
-    CPU_ZERO(&cores);
-    CPU_SET(static_cast<std::size_t>(parameters.core), &cores);
-    if (sched_setaffinity(0, sizeof(cores), &cores) != 0)
-      say("%s: core %d is refused: %s", settings_.output.c_str(),
-          static_cast<int>(parameters.core), std::strerror(errno));
   }
 
   // Take all that has come, and what has changed.
@@ -399,12 +377,10 @@ void shape(const RmwNode * node, const RmwPublisher * publisher, const void * ty
     if (!block || !usable()) return;
     const Settings settings(*block);
     [[maybe_unused]] static const int once = pthread_atfork(nullptr, nullptr, in_child);
-    const auto wanted = static_cast<std::size_t>(settings.parameters.depth);
-    const auto depth = wanted > 0 ? wanted : std::max<std::size_t>(schema::depth, qos.depth);
+    const auto depth = depth_of(settings.parameters, qos.depth);
     auto output = std::make_unique<Output>(settings, node, publisher, type_support, depth);
-    Output * none = nullptr;
     for (auto & one : outputs)
-      if (none = nullptr; one.compare_exchange_strong(none, output.get())) {
+      if (Output * none = nullptr; one.compare_exchange_strong(none, output.get())) {
         output.release();
         return;
       }

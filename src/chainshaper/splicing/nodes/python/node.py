@@ -4,7 +4,6 @@ said.
 """
 
 import atexit
-import contextlib
 import ctypes
 import fcntl
 import functools
@@ -22,7 +21,7 @@ from contextlib import suppress
 from typing import Any
 
 import rclpy
-from rclpy.clock import Clock
+from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -62,15 +61,11 @@ def wait(seconds: float) -> None:
 
 def wait_for_publisher(node: Node, topic: str) -> Any:
     """A topic's publisher as discovery knows it (`TopicEndpointInfo`), once there is one."""
-    logger, name = node.get_logger(), node.resolve_topic_name(topic)
-    said = False
-    while True:
-        found = [info for info in node.get_publishers_info_by_topic(topic) if info.topic_type]
-        if found:
-            break
+    logger, name, said = node.get_logger(), node.resolve_topic_name(topic), False
+    while not (found := [i for i in node.get_publishers_info_by_topic(topic) if i.topic_type]):
         if not said:
             logger.info(f"waiting for a publisher of {name}")
-            said = True
+        said = True
         wait(0.01)
     if len(found) > 1:
         logger.warning(f"{name} has {len(found)} publishers: the QoS of the first is copied")
@@ -80,10 +75,7 @@ def wait_for_publisher(node: Node, topic: str) -> Any:
 
 
 def message_class(type_name: str) -> Any:
-    """The class of a type such as ``sensor_msgs/msg/Image``; rclpy cannot do without.
-
-    ModuleNotFoundError: its package is not installed here.
-    """
+    """The class of a type such as ``sensor_msgs/msg/Image``; rclpy cannot do without."""
     package, kind, name = type_name.split("/")
     return getattr(importlib.import_module(f"{package}.{kind}"), name)
 
@@ -91,26 +83,25 @@ def message_class(type_name: str) -> Any:
 def offered_by(info: Any, node: Node) -> QoSProfile:
     """The quality of service of a publisher, for the one that stands in for it.
 
-    Discovery does not always tell everything: unknown reliability is taken to be reliable, unknown
-    durability volatile, unknown liveliness automatic, and an unknown history keeps the last
-    ``output_depth``.
+    Discovery does not know everything: what is unknown is taken to be usual, and the history to
+    keep the last ``output_depth``.
     """
     offered = info.qos_profile
-
-    def known(field: str, either: Any, usual: Any) -> Any:
-        return either if getattr(offered, field) == either else usual
-
-    history, reliability = QoSHistoryPolicy, QoSReliabilityPolicy
-    durability, liveliness = QoSDurabilityPolicy, QoSLivelinessPolicy
+    known = {
+        "history": (QoSHistoryPolicy.KEEP_ALL, QoSHistoryPolicy.KEEP_LAST),
+        "reliability": (QoSReliabilityPolicy.BEST_EFFORT, QoSReliabilityPolicy.RELIABLE),
+        "durability": (QoSDurabilityPolicy.TRANSIENT_LOCAL, QoSDurabilityPolicy.VOLATILE),
+        "liveliness": (QoSLivelinessPolicy.MANUAL_BY_TOPIC, QoSLivelinessPolicy.AUTOMATIC),
+    }
     return QoSProfile(
-        history=known("history", history.KEEP_ALL, history.KEEP_LAST),
         depth=offered.depth or parameters_of(node).output_depth,
-        reliability=known("reliability", reliability.BEST_EFFORT, reliability.RELIABLE),
-        durability=known("durability", durability.TRANSIENT_LOCAL, durability.VOLATILE),
         lifespan=offered.lifespan,
         deadline=offered.deadline,
-        liveliness=known("liveliness", liveliness.MANUAL_BY_TOPIC, liveliness.AUTOMATIC),
         liveliness_lease_duration=offered.liveliness_lease_duration,
+        **{
+            name: either if getattr(offered, name) == either else usual
+            for name, (either, usual) in known.items()
+        },
     )
 
 
@@ -135,11 +126,10 @@ def room_of(node: Node, info: Any) -> tuple[int, QoSProfile, QoSProfile]:
 
 
 def become_realtime(node: Node) -> None:
-    """Lock the memory, and give the calling thread its core and SCHED_FIFO priority.
+    """Lock the memory, and give the calling thread its core and SCHED_FIFO priority, as permitted.
 
-    They are the parameters ``core`` and ``fifo_priority``. To be called when all endpoints exist:
-    threads inherit, and those of DDS must not; later ones do not get the class. What is not
-    permitted is warned of.
+    To be called when all endpoints exist: threads inherit, and those of DDS must not; later ones do
+    not get the class.
     """
     parameters = parameters_of(node)
     core, priority = parameters.core, parameters.fifo_priority
@@ -202,62 +192,59 @@ def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bo
 # which takes a microsecond, they make LTTng write its events and uprobes fire. Where that library
 # is not loaded, or was built without tracing, no event is emitted.
 
-_POINTER = ctypes.c_void_p
-_CALLBACK_EVENTS = {
-    "rclcpp_subscription_init": (_POINTER, _POINTER),
-    "rclcpp_subscription_callback_added": (_POINTER, _POINTER),
-    "rclcpp_timer_callback_added": (_POINTER, _POINTER),
-    "rclcpp_timer_link_node": (_POINTER, _POINTER),
-    "rclcpp_callback_register": (_POINTER, ctypes.c_char_p),
-    "callback_start": (_POINTER, ctypes.c_bool),
-    "callback_end": (_POINTER,),
-}
-_MESSAGE_EVENTS = {
-    "rcl_publish": (_POINTER, _POINTER),
-    "rmw_publish": (_POINTER,),
-    "rmw_take": (_POINTER, _POINTER, ctypes.c_int64, ctypes.c_bool),
+_ARGUMENTS = {  # so many has each event, all of them integers, pointers or texts
+    **{"rclcpp_subscription_init": 2, "rclcpp_subscription_callback_added": 2},
+    **{"rclcpp_timer_callback_added": 2, "rclcpp_timer_link_node": 2},
+    **{"rclcpp_callback_register": 2, "callback_start": 2, "callback_end": 1},
+    **{"rcl_publish": 2, "rmw_publish": 1, "rmw_take": 4},
 }
 
 
-def _functions(wanted: dict[str, tuple[Any, ...]]) -> dict[str, Any]:
-    """The functions of events by name, with these types of arguments.
+@functools.cache
+def _events() -> dict[str, Any]:
+    """The functions of all events; none where the library is not loaded, or lacks one.
 
-    None where the library is not loaded, or one of them is missing. What stands in front of it for
-    the whole process (LD_PRELOAD) comes first, and hands events on.
+    What stands in front of it for the whole process (LD_PRELOAD) comes first, and hands events on.
     """
     functions: dict[str, Any] = {}
     for place in ("libtracetools.so", None):
-        with contextlib.suppress(OSError, AttributeError):
+        with suppress(OSError, AttributeError):
             library = ctypes.CDLL(place, mode=os.RTLD_NOLOAD)
-            functions = {name: getattr(library, f"ros_trace_{name}") for name in wanted}
+            functions = {name: getattr(library, f"ros_trace_{name}") for name in _ARGUMENTS}
     for name, function in functions.items():
-        function.argtypes, function.restype = wanted[name], None
+        function.argtypes, function.restype = (ctypes.c_void_p,) * _ARGUMENTS[name], None
     return functions
 
 
-def _traced(callback: Callable[..., None], emit: dict[str, Any]) -> Callable[..., None]:
+def emit(name: str, *values: int | bytes) -> None:
+    """Emit an event."""
+    if functions := _events():
+        functions[name](*values)
+
+
+def _traced(callback: Callable[..., None]) -> Callable[..., None]:
     """A callback with its events; its handle is its address."""
-    if not emit:
-        return callback
 
     @functools.wraps(callback)  # rclpy looks how many arguments it takes
     def traced(*arguments: Any) -> None:
-        emit["callback_start"](handle, False)
+        emit("callback_start", handle, False)
         try:
             callback(*arguments)
         finally:
-            emit["callback_end"](handle)
+            emit("callback_end", handle)
 
     handle = id(traced)
     return traced
 
 
-def _rmw_handle(subscription: Any) -> int:
-    rcl = ctypes.CDLL("librcl.so", mode=os.RTLD_NOLOAD)
-    rcl.rcl_subscription_get_rmw_handle.argtypes = (_POINTER,)
-    rcl.rcl_subscription_get_rmw_handle.restype = _POINTER
-    handle: int = rcl.rcl_subscription_get_rmw_handle(subscription.handle.pointer)
-    return handle
+def take_event(subscription: Any) -> Callable[[int, int], None]:
+    """What emits the event of a take: of the message at an address, with its source timestamp."""
+    if not _events():
+        return lambda *_: None
+    handle_of = ctypes.CDLL("librcl.so", mode=os.RTLD_NOLOAD).rcl_subscription_get_rmw_handle
+    handle_of.restype = ctypes.c_void_p
+    handle = handle_of(ctypes.c_void_p(subscription.handle.pointer))
+    return lambda message, source: emit("rmw_take", handle, message, source, True)
 
 
 def create_subscription(
@@ -275,62 +262,45 @@ def create_subscription(
     is not known there, stands the time of the call: the publication that the analysis looks for is
     the latest before.
     """
-    emit = _functions(_CALLBACK_EVENTS)
-    traced = _traced(callback, emit)
+    traced = _traced(callback)
     subscription = node.create_subscription(message_type, topic, traced, qos, raw=raw)
-    if emit:
-        emit["rclcpp_subscription_init"](subscription.handle.pointer, id(subscription))
-        emit["rclcpp_subscription_callback_added"](id(subscription), id(traced))
-        emit["rclcpp_callback_register"](id(traced), callback.__qualname__.encode())
-    if raw and HUMBLE and (takes := _functions(_MESSAGE_EVENTS)):
-        handle, executed = _rmw_handle(subscription), subscription.callback
+    emit("rclcpp_subscription_init", subscription.handle.pointer, id(subscription))
+    emit("rclcpp_subscription_callback_added", id(subscription), id(traced))
+    emit("rclcpp_callback_register", id(traced), callback.__qualname__.encode())
+    if raw and HUMBLE:
+        take, executed = take_event(subscription), subscription.callback
 
         def taken(payload: bytes) -> None:
-            takes["rmw_take"](handle, id(payload), time.time_ns(), True)
+            take(id(payload), time.time_ns())
             executed(payload)
 
         subscription.callback = taken
     return subscription
 
 
-def create_timer(node: Node, period_ns: int, callback: Callable[[], None], clock: Clock) -> None:
-    """`Node.create_timer`, with the events of rclcpp's."""
-    emit = _functions(_CALLBACK_EVENTS)
-    traced = _traced(callback, emit)
+def create_timer(node: Node, period_ns: int, callback: Callable[[], None]) -> None:
+    """`Node.create_timer` on CLOCK_MONOTONIC, with the events of rclcpp's."""
+    traced, clock = _traced(callback), Clock(clock_type=ClockType.STEADY_TIME)
     # rclpy takes seconds and cuts off behind the nanosecond.
     timer = node.create_timer((period_ns + 0.5) / 1e9, traced, clock=clock)
-    if emit:
-        emit["rclcpp_timer_callback_added"](timer.handle.pointer, id(traced))
-        emit["rclcpp_timer_link_node"](timer.handle.pointer, node.handle.pointer)
-        emit["rclcpp_callback_register"](id(traced), callback.__qualname__.encode())
+    emit("rclcpp_timer_callback_added", timer.handle.pointer, id(traced))
+    emit("rclcpp_timer_link_node", timer.handle.pointer, node.handle.pointer)
+    emit("rclcpp_callback_register", id(traced), callback.__qualname__.encode())
 
 
 def publish_function(publisher: Any) -> Callable[[bytes], None]:
     """`publisher.publish` for serialized messages, with its events."""
-    emit = _functions(_MESSAGE_EVENTS) if HUMBLE else {}
     publish: Callable[[bytes], None] = publisher.publish
-    if not emit:
+    if not HUMBLE:
         return publish
     handle = publisher.handle.pointer
 
     def with_events(payload: bytes) -> None:
-        emit["rcl_publish"](handle, id(payload))
-        emit["rmw_publish"](id(payload))
+        emit("rcl_publish", handle, id(payload))
+        emit("rmw_publish", id(payload))
         publish(payload)
 
     return with_events
-
-
-def take_event(subscription: Any) -> Callable[[int | None], None]:
-    """What emits the event of a take once more, when a callback is executed for its message.
-
-    Others were taken meanwhile, and a callback is for the message that was taken last.
-    """
-    emit = {} if HUMBLE else _functions(_MESSAGE_EVENTS)
-    if not emit:
-        return lambda _: None
-    handle = _rmw_handle(subscription)
-    return lambda source: emit["rmw_take"](handle, id(subscription), source or 0, True)
 
 
 # The log -----------------------------------------------------------------------------------------
@@ -341,7 +311,6 @@ def take_event(subscription: Any) -> Callable[[int | None], None]:
 # counted.
 
 LOG_HEADER = f"{','.join(LOG_COLUMNS)}\n".encode()
-PIPE_BYTES = 1 << 20
 SAID_EVERY_NS = 10_000_000_000
 
 
@@ -411,7 +380,7 @@ class GateLog:
         writer, self._pipe = started_beside(_write_rows, path, LOG_HEADER, most_bytes)
         os.set_blocking(self._pipe, False)
         with suppress(OSError):  # more than a user may have
-            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, PIPE_BYTES)
+            fcntl.fcntl(self._pipe, fcntl.F_SETPIPE_SZ, 1 << 20)
         atexit.register(self._end, writer)
 
     def _end(self, writer: "subprocess.Popen[bytes]") -> None:
@@ -424,10 +393,8 @@ class GateLog:
     def write(
         self, outcome: Outcome, published: int | None = None, stalled: int | None = None
     ) -> None:
-        """Note what became of a message.
-
-        ``published`` is when publishing returned, ``stalled`` for how long the machine stood still
-        behind the release (ns, None: not known).
+        """Note what became of a message: when publishing returned, and for how long the machine
+        stood still behind the release (ns, None: not known).
         """
         release, message = outcome.release, outcome.message
         self._rows += 1

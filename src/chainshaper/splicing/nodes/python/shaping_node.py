@@ -46,14 +46,12 @@ REHEARSAL_NS = 400_000  # none begins later before a release: the first may take
 class Readiness:
     """What follows a release takes the same time in every cycle: rehearsed, and on awake cores.
 
-    Publishing is fast while its code and data are in the processor's caches, where the chain has
-    run since. So shortly before each release a message without receivers goes the way of the real
-    one through ROS 2 and DDS, and a datagram to ourselves that through the network stack. Measured
-    on a chain of five nodes, from the release to `rmw_publish` and from there until it is sent,
-    p50 / p99.5 in µs: 66 / 163 and 99 / 171 without, 15 / 55 and 45 / 107 with it.
+    The chain has run since the last publication, so its code and data have left the processor's
+    caches. Shortly before each release a message without receivers goes the way of the real one
+    through ROS 2 and DDS, and a datagram to ourselves that through the network stack: p99.5 from
+    the release to `rmw_publish` was 55 µs with it, 163 without.
 
-    A core that sleeps takes tens of microseconds to wake up, and never the same. While
-    `/dev/cpu_dma_latency` is open, cores wake up within the microseconds written there
+    While `/dev/cpu_dma_latency` is open, cores wake up within the microseconds written there
     (Documentation/power/pm_qos_interface.rst).
     """
 
@@ -66,13 +64,13 @@ class Readiness:
         self._rehearsal = node.create_publisher(Empty, REHEARSAL_TOPIC, 1)
         self._to_itself = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._to_itself.setblocking(False)
-        self._latency = None
         with suppress(OSError):
             self._to_itself.bind(("127.0.0.1", 0))
             self._to_itself.connect(self._to_itself.getsockname())
         try:
             self._latency = os.open("/dev/cpu_dma_latency", os.O_WRONLY | os.O_CLOEXEC)
         except OSError as error:
+            self._latency = -1
             node.get_logger().warning(
                 f"/dev/cpu_dma_latency: {error.strerror}: idle cores sleep, and deliver less "
                 "regularly; run as root, or give the user the right to write it"
@@ -96,15 +94,12 @@ class Readiness:
         self._ask_for(self.AS_USUAL)
 
     def _ask_for(self, latency: bytes) -> None:
-        if self._latency is not None:
+        if self._latency >= 0:
             os.write(self._latency, latency)
 
 
 def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
-    """Subscribe to the topic of the modes, once discovery has had its time.
-
-    A mode that was announced before is delivered where it is asked for, if its publisher stores it.
-    """
+    """Subscribe to the topic of the modes, as stored by its publishers once they are discovered."""
     qos, logger = QoSProfile(depth=10), node.get_logger()
     for info in node.get_publishers_info_by_topic(topic):
         if info.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL:
@@ -125,9 +120,9 @@ def turn_of(node: Node, name: str) -> Turn | None:
     After several nodes that failed at once this one waits, so that starting over and over does not
     take a core. To be called before anything that may fail.
     """
-    logger = node.get_logger()
     if not name:
         return None
+    logger = node.get_logger()
     try:
         turn = Turn(name, node.resolve_topic_name("output"))
     except OSError as error:  # the standby has none either
@@ -161,7 +156,8 @@ class Shaping:
         self._shaper = Shaper(
             *(gate, parameters.spin_ns, self._readiness.get_ready, self._look, self._decided)
         )
-        self._go_on()
+        if self._turn is not None:
+            self._go_on(self._turn)
         self._number: int | None = None  # the publisher's, of the last message
         self._its_turn = False  # of the oldest message
         node.add_on_set_parameters_callback(self._parameters_set)
@@ -173,25 +169,20 @@ class Shaping:
         # On Humble the log lacks the source timestamp.
         shape = self._shape_uninformed if HUMBLE else self._shape
         self._input = create_subscription(node, self._type, "input", shape, asked, raw=True)
-        self._taken_again = take_event(self._input)
+        self._take = take_event(self._input)
         self._await_receivers(node, publisher)
 
-    def _go_on(self) -> None:
+    def _go_on(self, turn: Turn) -> None:
         """Have cycles begin where they did for the node before this one, in its mode."""
-        if self._turn is None:
-            return
-        self._shaper.moved = self._turn.moved
-        if self._turn.phase_ns is not None:  # from now on, not the next cycle
+        self._shaper.moved = turn.moved
+        if turn.phase_ns is not None:  # from now on, not the next cycle
             now = time.monotonic_ns() - self._shaper.gate.cycle_ns
-            self._shaper.set_phase(self._turn.phase_ns, now)
-        if 0 < (mode := self._turn.page["mode"]) <= len(self._modes):
+            self._shaper.set_phase(turn.phase_ns, now)
+        if 0 < (mode := turn.page["mode"]) <= len(self._modes):
             self._shaper.switch(self._modes[mode - 1], 0)
 
     def _parameters_set(self, parameters: Any) -> Any:
-        """``phase_ns`` may be set while the node runs, in force from the next cycle on.
-
-        The log shows it as the origin of what comes then.
-        """
+        """``phase_ns`` may be set while the node runs, in force from the next cycle on."""
         for one in parameters:
             if one.name == "phase_ns":
                 self._shaper.set_phase(one.value, time.monotonic_ns())
@@ -212,9 +203,8 @@ class Shaping:
             wait(0.01)
 
     def work_off(self) -> bool:
-        """Deal with what waits at the gate, until there is time for the node's other callbacks.
-
-        Each message is the subscription's callback's. Whether some are left.
+        """Have the subscription's callback deal with what waits at the gate, until there is time
+        for the node's other callbacks; whether some are left.
         """
         waiting, overflowed = self._shaper.queue.waiting, self._shaper.overflowed
         served = False
@@ -225,7 +215,8 @@ class Shaping:
             if not waiting or (served and self._shaper.nothing_due()):
                 break
             oldest, self._its_turn = waiting[0], True
-            self._taken_again(oldest.about)
+            if not HUMBLE:  # others were taken since, and a callback is for the last that was
+                self._take(id(self._input), oldest.about or 0)
             self._input.callback(oldest.payload, *([] if HUMBLE else [{}]))
             self._its_turn, served = False, True
         return bool(waiting)

@@ -1,13 +1,10 @@
 """The standby: passes an output on while its shaping node is not there.
 
-It receives what the shaping node receives, and publishes it on the same output, byte for byte and
-at once, while no shaping node is in force (:mod:`chainshaper.gate.handover`). With the
-fallback ``silence`` it publishes nothing, and counts what does not come. Either way it says so: in
-its log, with the columns of the gate's, by a warning, and on `/diagnostics` where the package
-diagnostic_msgs is installed.
-
-It runs in the ordinary class, and on no core that has a server where there is another, so that it
-takes nothing from a release.
+It publishes what the shaping node receives on the same output, byte for byte and at once, while
+no shaping node is in force (:mod:`chainshaper.gate.handover`). With the fallback ``silence`` it
+publishes nothing, and counts what does not come. Either way it says so: in its log, with the
+columns of the gate's, by a warning, and on `/diagnostics` where diagnostic_msgs is installed. It
+runs in the ordinary class, and on no core that has a server where there is another.
 """
 
 import importlib
@@ -77,13 +74,9 @@ def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
             "starts": page["starts"],
             "messages without it": page["bypassed"],
         }
-        status = messages.DiagnosticStatus(
-            level=bytes([level]),
-            name=f"chainshaper: {page.topic}",
-            message=text,
-            hardware_id="",
-            values=[messages.KeyValue(key=key, value=str(value)) for key, value in values.items()],
-        )
+        pairs = [messages.KeyValue(key=key, value=str(value)) for key, value in values.items()]
+        about = {"name": f"chainshaper: {page.topic}", "message": text, "hardware_id": ""}
+        status = messages.DiagnosticStatus(level=bytes([level]), values=pairs, **about)
         array = messages.DiagnosticArray(status=[status])
         array.header.stamp = node.get_clock().now().to_msg()
         with suppress(RuntimeError):  # the process is to stop
@@ -136,13 +129,12 @@ def set_up(node: Node) -> Callable[[], bool]:
             wait(10.0)
     standby.page["silent"] = int(silent)
 
+    def without_info(payload: bytes) -> None:  # so what the shaping node holds is lost with it
+        standby.arrived(payload, None)
+
     def with_info(payload: bytes, message_info: Any) -> None:
         standby.arrived(payload, message_info["source_timestamp"])
 
-    def without_info(payload: bytes) -> None:
-        standby.arrived(payload, None)
-
-    # On Humble what the shaping node holds is lost with it.
     callback = without_info if HUMBLE else with_info
     node.create_subscription(message_type, "input", callback, asked, raw=True)
     threading.Thread(target=watch, args=(node, standby), name="watch", daemon=True).start()

@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 
 from chainshaper.gate.decision import sleep_until
@@ -56,20 +55,16 @@ class Channel:
         """Publish what is new."""
         if self.newest is None:
             self.missing += 1
-            self.logger.warning(
-                f"nothing new for {self.output}; this is no. {self.missing}",
-                throttle_duration_sec=10.0,
-            )
+            text = f"nothing new for {self.output}; this is no. {self.missing}"
+            self.logger.warning(text, throttle_duration_sec=10.0)
             return
         self.send(self.newest)
         self.newest = None
         self.published += 1
 
     def __str__(self) -> str:
-        return (
-            f"{self.output}: {self.published} published, {self.missing} times nothing new, "
-            f"{self.dropped} dropped"
-        )
+        passed = f"{self.published} published, {self.missing} times nothing new"
+        return f"{self.output}: {passed}, {self.dropped} dropped"
 
 
 def set_up(node: Node) -> Callable[[], bool]:
@@ -83,22 +78,19 @@ def set_up(node: Node) -> Callable[[], bool]:
     atexit.register(lambda: print(*channels, sep="\n", flush=True))  # noqa: T201
     for source, target in zip(inputs, outputs, strict=True):
         info = wait_for_publisher(node, source)
-        offered = offered_by(info, node)
-        message_type = message_class(info.topic_type)
-        publisher = node.create_publisher(message_type, target, offered)
+        offered, message_type = offered_by(info, node), message_class(info.topic_type)
+        publish = publish_function(node.create_publisher(message_type, target, offered))
         periods = FirstOfPeriod(period) if rule == "first" else None
-        channel = Channel(target, publish_function(publisher), node.get_logger(), periods)
-        asked = asked_of(offered)
-        create_subscription(node, message_type, source, channel.take, asked, raw=True)
+        channel = Channel(target, publish, node.get_logger(), periods)
+        create_subscription(node, message_type, source, channel.take, asked_of(offered), raw=True)
         channels.append(channel)
     if rule == "first":
         return lambda: False
     # A timer keeps the phase at which it was made, on the same clock.
     since = time.monotonic_ns() - phase
     sleep_until(phase + (since // period + 1) * period)
-    steady = Clock(clock_type=ClockType.STEADY_TIME)
     for channel in channels:
-        create_timer(node, period, channel.publish, steady)
+        create_timer(node, period, channel.publish)
     return lambda: False
 
 

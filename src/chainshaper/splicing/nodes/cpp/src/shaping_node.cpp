@@ -64,8 +64,6 @@ auto subscribe(rclcpp::Node & node, const std::string &, const rclcpp::QoS & qos
   return node.create_subscription<Message>("input", qos, taken, options);
 }
 
-#ifdef CHAINSHAPER_COMPONENT
-
 // What a publisher of this process sent to subscribers of others as well, the executor leaves out.
 struct Open : Input {
   using Input::matches_any_intra_process_publishers;
@@ -82,7 +80,7 @@ bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
 // What a ring buffer of rclcpp gives its subscription.
 using Within = std::pair<std::shared_ptr<const Message>, Pointer>;
 
-// The oldest message that came without DDS, or none.
+// The oldest message that came without DDS, which only a component's may, or none.
 Pointer take_within(Input & input) {
   const auto waitable = input.get_intra_process_waitable();
   const auto data = waitable ? waitable->take_data() : nullptr;
@@ -97,23 +95,10 @@ void execute(Input & input, const Pointer &, bool within, const rclcpp::MessageI
   input.handle_message(nothing, info);
 }
 
+#ifdef CHAINSHAPER_COMPONENT
 void publish(Publisher & output, Pointer & message) { output.publish(std::move(message)); }
-
 #else
-
-bool take(Input & input, Message & message, rclcpp::MessageInfo & info) {
-  return input.take(message, info);
-}
-
-Pointer take_within(Input &) { return nullptr; }
-
-void execute(Input & input, const Pointer & message, bool, const rclcpp::MessageInfo & info) {
-  std::shared_ptr<void> untyped = message;
-  input.handle_message(untyped, info);
-}
-
 void publish(Publisher & output, const Pointer & message) { output.publish(*message); }
-
 #endif
 
 }  // namespace
@@ -162,14 +147,11 @@ namespace {
 using namespace chainshaper;  // NOLINT
 
 // Where DDS threads deliver the output: the first core that is ours to use and has no server.
-std::optional<std::size_t> delivery_core(const std::vector<std::int64_t> & taken) {
+Maybe delivery_core(const std::vector<std::int64_t> & taken) {
   cpu_set_t ours;
   if (taken.empty() || sched_getaffinity(0, sizeof(ours), &ours) != 0) return std::nullopt;
-  for (std::size_t core = 0; core < CPU_SETSIZE; ++core) {
-    const auto number = static_cast<std::int64_t>(core);
-    if (CPU_ISSET(core, &ours) && std::find(taken.begin(), taken.end(), number) == taken.end())
-      return core;
-  }
+  for (std::int64_t core = 0; core < CPU_SETSIZE; ++core)
+    if (CPU_ISSET(static_cast<std::size_t>(core), &ours) && !place_of(taken, core)) return core;
   return std::nullopt;
 }
 
@@ -199,17 +181,8 @@ void take_again(const rclcpp::SubscriptionBase & subscription, const void * mess
                 Maybe source_timestamp) {
   using Emit = void (*)(const void *, const void *, std::int64_t, bool);
   static const auto emit = reinterpret_cast<Emit>(dlsym(RTLD_DEFAULT, "ros_trace_rmw_take"));
-  if (emit != nullptr) {
-    const auto handle = subscription.get_subscription_handle();
-    emit(rcl_subscription_get_rmw_handle(handle.get()), message, source_timestamp.value_or(0),
-         true);
-  }
-}
-
-// How many messages may wait, by default as many as in the publisher's history.
-std::size_t depth_of(const Parameters & parameters, const Offer & offer) {
-  if (parameters.depth > 0) return static_cast<std::size_t>(parameters.depth);
-  return std::max<std::size_t>(schema::depth, offer.publisher.depth());
+  const auto handle = rcl_subscription_get_rmw_handle(subscription.get_subscription_handle().get());
+  if (emit != nullptr) emit(handle, message, source_timestamp.value_or(0), true);
 }
 
 rclcpp::QoS deeper(rclcpp::QoS qos, std::size_t depth) {
@@ -232,7 +205,8 @@ public:
         turn_(std::move(turn)),
         readiness_(node, delivery_core(parameters_.server_cores), parameters_.pause_ns),
         shaper_(
-            gate_of(parameters_, depth_of(parameters_, offer)), parameters_.spin_ns,
+            gate_of(parameters_, depth_of(parameters_, offer.publisher.depth())),
+            parameters_.spin_ns,
             [this](std::int64_t release_ns) { readiness_.get_ready(release_ns); },
             [this] { look(); },
             [this](const Release & release, std::int64_t phase_ns) {
@@ -254,7 +228,7 @@ public:
           result.successful = true;
           return result;
         });
-    const auto depth = depth_of(parameters_, offer);
+    const auto depth = shaper_.queue.gate.depth;
     const bool latched =
         offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
     output_ = make_publisher(node, offer.type,
@@ -407,13 +381,10 @@ private:
     const std::int64_t now = monotonic_ns();
     if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) return;
     const std::string losses = log_.losses();
-    if (losses != said_) {
-      RCLCPP_WARN(node_.get_logger(), "of %llu messages so far: %s",
-                  static_cast<unsigned long long>(log_.rows),
-                  losses.c_str());  // NOLINT(runtime/int)
-      said_ = losses;
-      said_ns_ = now;
-    }
+    if (losses == said_) return;
+    RCLCPP_WARN(node_.get_logger(), "of %zu messages so far: %s", log_.rows, losses.c_str());
+    said_ = losses;
+    said_ns_ = now;
   }
 
   rclcpp::Node & node_;

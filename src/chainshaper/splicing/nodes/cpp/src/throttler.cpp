@@ -18,31 +18,29 @@ struct Channel {
   rclcpp::TimerBase::SharedPtr timer;
   std::optional<chainshaper::FirstOfPeriod> periods;  // none: the rule is `newest`
   std::shared_ptr<const rclcpp::SerializedMessage> newest;
-  std::uint64_t published{0};
-  std::uint64_t dropped{0};
-  std::uint64_t missing{0};
-};
+  std::size_t published{0};
+  std::size_t dropped{0};
+  std::size_t missing{0};
 
-void publish(rclcpp::Node & node, Channel & channel) {
-  if (channel.newest) {
-    chainshaper::publish_serialized(*channel.publisher, *channel.newest);
-    channel.newest.reset();
-    ++channel.published;
-    return;
+  void publish(rclcpp::Node & node) {
+    if (newest) {
+      chainshaper::publish_serialized(*publisher, *newest);
+      newest.reset();
+      ++published;
+      return;
+    }
+    ++missing;
+    RCLCPP_WARN_THROTTLE(node.get_logger(), *node.get_clock(), 10'000,
+                         "nothing new for %s; this is no. %zu", output.c_str(), missing);
   }
-  ++channel.missing;
-  RCLCPP_WARN_THROTTLE(node.get_logger(), *node.get_clock(), 10'000,
-                       "nothing new for %s; this is no. %zu", channel.output.c_str(),
-                       static_cast<std::size_t>(channel.missing));
-}
 
-void take(rclcpp::Node & node, Channel & channel,
-          std::shared_ptr<const rclcpp::SerializedMessage> message) {
-  const bool passes = !channel.periods || channel.periods->passes(chainshaper::monotonic_ns());
-  channel.dropped += channel.newest || !passes ? 1 : 0;
-  channel.newest = passes ? std::move(message) : nullptr;
-  if (passes && channel.periods) publish(node, channel);
-}
+  void take(rclcpp::Node & node, std::shared_ptr<const rclcpp::SerializedMessage> message) {
+    const bool passes = !periods || periods->passes(chainshaper::monotonic_ns());
+    dropped += newest || !passes ? 1 : 0;
+    newest = passes ? std::move(message) : nullptr;
+    if (passes && periods) publish(node);
+  }
+};
 
 }  // namespace
 
@@ -68,25 +66,19 @@ int main(int argc, char ** argv) {
           channel.subscription = chainshaper::subscribe_serialized(
               node, inputs[i], offer->type, offer->subscription,
               [&node, &channel](std::shared_ptr<rclcpp::SerializedMessage> message,
-                                const rclcpp::MessageInfo &) {
-                take(node, channel, std::move(message));
-              });
+                                const rclcpp::MessageInfo &) { channel.take(node, message); });
         }
         if (first) return [] { return false; };
         // A timer keeps the phase at which it was made, on the same clock.
         const std::int64_t since = chainshaper::monotonic_ns() - parameters.phase_ns;
         chainshaper::sleep_until(parameters.phase_ns + (since / period + 1) * period);
-        for (auto & channel : channels) {
+        for (auto & channel : channels)
           channel->timer = node.create_wall_timer(std::chrono::nanoseconds(period),
-                                                  [&node, &channel] { publish(node, *channel); });
-        }
+                                                  [&node, &channel] { channel->publish(node); });
         return [] { return false; };
       });
-  for (const auto & channel : channels) {
+  for (const auto & channel : channels)
     std::printf("%s: %zu published, %zu times nothing new, %zu dropped\n",
-                channel->output.c_str(), static_cast<std::size_t>(channel->published),
-                static_cast<std::size_t>(channel->missing),
-                static_cast<std::size_t>(channel->dropped));
-  }
+                channel->output.c_str(), channel->published, channel->missing, channel->dropped);
   return code;
 }

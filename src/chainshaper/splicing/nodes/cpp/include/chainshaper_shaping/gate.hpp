@@ -5,6 +5,7 @@
 
 #include <errno.h>
 #include <fcntl.h>
+#include <sched.h>
 #include <sys/syscall.h>
 #include <time.h>
 #include <unistd.h>
@@ -31,8 +32,8 @@ struct Slot {
   std::int64_t end;
 };
 
-template <typename Words>
-std::optional<std::size_t> place_of(const Words & words, const std::string & word) {
+template <typename Words, typename Word>
+std::optional<std::size_t> place_of(const Words & words, const Word & word) {
   const auto found = std::find(words.begin(), words.end(), word);
   if (found == words.end()) return std::nullopt;
   return static_cast<std::size_t>(found - words.begin());
@@ -158,6 +159,12 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   }
   check(gate);
   return gate;
+}
+
+// How many messages may wait: by default as many as in the publisher's history.
+inline std::size_t depth_of(const Parameters & parameters, std::size_t history) {
+  if (parameters.depth > 0) return static_cast<std::size_t>(parameters.depth);
+  return std::max<std::size_t>(schema::depth, history);
 }
 
 // As Python's: never negative.
@@ -390,6 +397,29 @@ inline std::int64_t watch_until(std::int64_t deadline_ns) {
   return now;
 }
 
+// Give the calling thread SCHED_FIFO with a priority, or a core; false (and errno): it is refused.
+inline bool set_fifo(std::int64_t priority) {
+  sched_param wanted{};
+  wanted.sched_priority = static_cast<int>(priority);
+  return sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) == 0;
+}
+
+inline bool set_core(std::int64_t core) {
+  cpu_set_t cores;
+  CPU_ZERO(&cores);
+  CPU_SET(static_cast<std::size_t>(core), &cores);
+  return sched_setaffinity(0, sizeof(cores), &cores) == 0;
+}
+
+// Both, as the parameters say; `warn` gets what is refused, and the remedy.
+template <typename Warn>
+void schedule(const Parameters & parameters, Warn warn) {
+  if (parameters.fifo_priority > 0 && !set_fifo(parameters.fifo_priority))
+    warn("SCHED_FIFO is refused", "give the user an rtprio limit of 98");
+  if (parameters.core >= 0 && !set_core(parameters.core))
+    warn("core " + std::to_string(parameters.core) + " is refused", "name another in the plan");
+}
+
 inline std::int64_t clock_offset() {
   std::int64_t best_width = std::numeric_limits<std::int64_t>::max();
   std::int64_t best = 0;
@@ -433,14 +463,12 @@ public:
     next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
   }
 
-  // False: that is where the slots are, or they would leave the cycle.
-  bool move_slots(std::int64_t by_ns, std::int64_t from_ns) {
+  // Nothing where that is where the slots are, or they would leave the cycle.
+  void move_slots(std::int64_t by_ns, std::int64_t from_ns) {
     auto & moves = queue.moves;
-    if (by_ns == (moves.empty() ? 0 : moves.back().second) || !queue.gate.may_move(by_ns))
-      return false;
+    if (by_ns == (moves.empty() ? 0 : moves.back().second) || !queue.gate.may_move(by_ns)) return;
     moves.emplace_back(from_ns, by_ns);
     if (moves.size() > schema::changes) moves.pop_front();
-    return true;
   }
 
   // False: there is no mode like it.
@@ -532,8 +560,8 @@ public:
     queue.free_ns = monotonic_ns();
   }
 
+  // Of a message that was released.
   std::int64_t time_lost(const Outcome<Message> & outcome) {
-    if (!outcome.release.at_ns) return 0;
     const std::int64_t others = others_ran_ns() - waited_ns_;
     const std::int64_t since_ns = std::max(*outcome.release.at_ns, turn_ns_);
     return std::max<std::int64_t>(0, outcome.awake_ns - since_ns - others);

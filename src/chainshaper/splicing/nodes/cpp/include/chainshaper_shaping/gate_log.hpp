@@ -47,9 +47,9 @@ public:
     const auto & [waiting, release, awake_ns, why] = outcome;
     ++rows;
     if (why) ++dropped[static_cast<std::size_t>(*why)];
-    lost_by_dds += static_cast<std::uint64_t>(waiting.lost.value_or(0));
+    lost_by_dds += static_cast<std::size_t>(waiting.lost.value_or(0));
     if (!writer_.joinable()) return;
-    size_ = 0;
+    line_.clear();
     row(awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
         waiting.arrival_ns, release.origin_ns, release.at_ns, release.slot, release.cycles_waited,
         anchor_names[static_cast<std::size_t>(release.anchor)],
@@ -57,14 +57,15 @@ public:
         release.mode ? gate.modes->names[*release.mode].c_str() : "", published_ns, stalled_ns,
         why ? dropped_names[static_cast<std::size_t>(*why)] : "", waiting.lost, rows,
         release.moved_ns);
-    line_[size_ - 1] = '\n';  // in place of the last comma
-    if (::write(ends_[1], line_.data(), size_) != static_cast<ssize_t>(size_)) ++unlogged;
+    line_.back() = '\n';  // in place of the last comma
+    if (::write(ends_[1], line_.data(), line_.size()) != static_cast<ssize_t>(line_.size()))
+      ++unlogged;
   }
 
   // What is lost so far, in words; empty: nothing.
   std::string losses() const {
     std::string said;
-    const auto add = [&](std::uint64_t count, const char * why) {
+    const auto add = [&](std::size_t count, const char * why) {
       if (count > 0) said += (said.empty() ? "" : ", ") + std::to_string(count) + " " + why;
     };
     for (std::size_t i = 0; i < dropped.size(); ++i) add(dropped[i], dropped_names[i]);
@@ -73,10 +74,10 @@ public:
     return said;
   }
 
-  std::uint64_t rows{0};
-  std::array<std::uint64_t, dropped_names.size()> dropped{};
-  std::uint64_t lost_by_dds{0};
-  std::uint64_t unlogged{0};
+  std::size_t rows{0};
+  std::array<std::size_t, dropped_names.size()> dropped{};
+  std::size_t lost_by_dds{0};
+  std::size_t unlogged{0};
 
 private:
   void write_lines() {
@@ -132,23 +133,16 @@ private:
 
   template <typename Number>
   void add(const Number & number) {
-    print("%lld,", static_cast<long long>(number));  // NOLINT(runtime/int)
+    line_ += std::to_string(number) + ',';
   }
 
-  void add(const char * text) { print("%s,", text); }
-
-  template <typename Value>
-  void print(const char * how, Value value) {
-    const int written = std::snprintf(line_.data() + size_, line_.size() - size_, how, value);
-    size_ = std::min(line_.size() - 1, size_ + static_cast<std::size_t>(written));
-  }
+  void add(const char * text) { line_ += std::string(text) + ','; }
 
   std::string path_;
   std::int64_t most_bytes_{0};
   int ends_[2]{-1, -1};
   std::thread writer_;
-  std::array<char, 512> line_{};
-  std::size_t size_{0};
+  std::string line_;
 };
 
 }  // namespace chainshaper

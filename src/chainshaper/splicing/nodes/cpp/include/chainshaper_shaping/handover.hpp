@@ -8,6 +8,7 @@
 #include <sys/mman.h>
 #include <sys/stat.h>
 
+#include <cmath>
 #include <cstring>
 #include <memory>
 
@@ -51,9 +52,16 @@ public:
     close(file_);
   }
 
-  std::int64_t get(Field field) const { return read(static_cast<std::size_t>(field)); }
-  void set(Field field, std::int64_t value) { write(static_cast<std::size_t>(field), value); }
-  void add(Field field, std::int64_t more = 1) { set(field, get(field) + more); }
+  // The number at a place; another process writes there as well.
+  std::int64_t get(std::size_t place) const {
+    return __atomic_load_n(static_cast<const std::int64_t *>(memory_) + place, __ATOMIC_SEQ_CST);
+  }
+
+  void set(std::size_t place, std::int64_t value) {
+    __atomic_store_n(static_cast<std::int64_t *>(memory_) + place, value, __ATOMIC_SEQ_CST);
+  }
+
+  void add(std::size_t place, std::int64_t more = 1) { set(place, get(place) + more); }
 
   // Take a byte of the file, if no process has it; see whether another one has it.
   bool lock(off_t byte) {
@@ -71,12 +79,10 @@ public:
     return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
   }
 
-  void note_released(std::int64_t key) { add(Field::released, schema::released, key); }
-
   // Put a number into the ring at this place.
-  void add(Field count, std::int64_t ring, std::int64_t value) {
+  void note(std::size_t count, std::int64_t ring, std::int64_t value) {
     const auto number = get(count);
-    write(static_cast<std::size_t>(ring + number % schema::ring), value);
+    set(static_cast<std::size_t>(ring + number % schema::ring), value);
     set(count, number + 1);
   }
 
@@ -85,7 +91,7 @@ public:
     std::vector<std::int64_t> found;
     found.reserve(schema::ring);
     for (std::size_t place = 0; place < schema::ring; ++place)
-      found.push_back(read(ring + place));
+      found.push_back(get(ring + place));
     std::sort(found.begin(), found.end());
     return found;
   }
@@ -100,15 +106,6 @@ private:
     wanted.l_start = byte;
     wanted.l_len = 1;
     return wanted;
-  }
-
-  // Another process writes there as well.
-  std::int64_t read(std::size_t place) const {
-    return __atomic_load_n(static_cast<const std::int64_t *>(memory_) + place, __ATOMIC_SEQ_CST);
-  }
-
-  void write(std::size_t place, std::int64_t value) {
-    __atomic_store_n(static_cast<std::int64_t *>(memory_) + place, value, __ATOMIC_SEQ_CST);
   }
 
   std::string path_;
@@ -189,28 +186,18 @@ public:
 
   double wait_s() const {
     const auto failed = failed_before() - schema::back_off_after;
-    if (failed < 0) return 0.0;
-    return std::min(10.0, 0.5 * static_cast<double>(1 << std::min<std::int64_t>(failed, 5)));
-  }
-
-  Maybe phase_ns() const {
-    if (page_->get(Field::phase_known) == 0) return std::nullopt;
-    return page_->get(Field::phase_ns);
-  }
-
-  std::optional<std::size_t> mode() const {
-    const auto number = page_->get(Field::mode);
-    return number > 0 ? std::optional<std::size_t>(number - 1) : std::nullopt;
+    return failed < 0 ? 0.0 : std::min(10.0, std::ldexp(0.5, static_cast<int>(failed)));
   }
 
   // Have cycles of a gate begin where they did for the one before it, in its mode.
   template <typename Shaper>
   void go_on(Shaper & shaper) const {
     const auto & gate = shaper.queue.gate;
-    if (const auto phase = phase_ns())
-      shaper.set_phase(*phase, monotonic_ns() - gate.cycle_ns);  // from now on, not the next cycle
-    if (const auto last = mode(); gate.modes && last && *last < gate.modes->names.size())
-      shaper.announce(gate.modes->names[*last], 0);
+    if (page_->get(Field::phase_known) != 0)  // from now on, not the next cycle
+      shaper.set_phase(page_->get(Field::phase_ns), monotonic_ns() - gate.cycle_ns);
+    const auto mode = static_cast<std::size_t>(page_->get(Field::mode));  // from 1; 0: none
+    if (gate.modes && mode > 0 && mode <= gate.modes->names.size())
+      shaper.announce(gate.modes->names[mode - 1], 0);
   }
 
   bool take(std::int64_t key) {
@@ -248,14 +235,14 @@ public:
   }
 
   void done(std::int64_t key) {
-    page_->note_released(key);
+    drop(key);
     page_->set(Field::until_ns, monotonic_ns());
     page_->set(Field::failed_starts, 0);
     if (page_->is_current()) return;
     try {
       auto next = open_page(name_, topic_, folders_);
       for (const auto one : page_->noted(schema::released))
-        next->note_released(one);  // a standby that lags has to know them
+        next->note(Field::released, schema::released, one);  // a standby that lags has to know them
       page_ = std::move(next);
       in_force_ = false;
       seen_ = -1;
@@ -266,7 +253,7 @@ public:
   }
 
   // A message that was received has no room any more, and is never published.
-  void drop(std::int64_t key) { page_->note_released(key); }
+  void drop(std::int64_t key) { page_->note(Field::released, schema::released, key); }
 
   // Where cycles are asked to begin, once each time; none: as they do.
   Maybe asked_phase_ns() {
@@ -286,11 +273,9 @@ public:
   }
 
   void count(std::optional<Dropped> dropped, Maybe lost, bool late, Maybe latency_ns = {}) {
-    if (latency_ns) page_->add(Field::measured, schema::measured, *latency_ns);
-    const auto reason = [](Dropped why) {  // they stand in the page in their order
-      return static_cast<Field>(static_cast<int>(Field::replaced) + static_cast<int>(why));
-    };
-    page_->add(dropped ? reason(*dropped) : Field::published);
+    if (latency_ns) page_->note(Field::measured, schema::measured, *latency_ns);
+    // Reasons stand in the page in their order.
+    page_->add(dropped ? Field::replaced + static_cast<std::size_t>(*dropped) : Field::published);
     page_->add(Field::lost_by_dds, lost.value_or(0));
     page_->add(Field::late, late ? 1 : 0);
   }

@@ -4,7 +4,6 @@
 
 #pragma once
 
-#include <sched.h>
 #include <sys/mman.h>
 
 #include <atomic>
@@ -111,26 +110,13 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
 // ours. To be called when all endpoints exist: threads inherit, and those of DDS must not; later
 // ones do not get the class.
 inline void become_realtime(rclcpp::Node & node) {
-  const auto parameters = parameters_of(node);
-  const auto warn = [&](const char * what, const char * remedy) {
-    RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", what, std::strerror(errno),
-                remedy);
+  const auto warn = [&](const std::string & what, const char * remedy) {
+    RCLCPP_WARN(node.get_logger(), "%s: %s; it works on without: %s", what.c_str(),
+                std::strerror(errno), remedy);
   };
   if (unloaded == nullptr && mlockall(MCL_CURRENT | MCL_FUTURE) != 0)
     warn("memory cannot be locked", "give the user a memlock limit of unlimited");
-  if (parameters.fifo_priority > 0) {
-    sched_param wanted{};
-    wanted.sched_priority = static_cast<int>(parameters.fifo_priority);
-    if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) != 0)
-      warn("SCHED_FIFO is refused", "give the user an rtprio limit of 98");
-  }
-  if (parameters.core >= 0) {
-    cpu_set_t cores;
-    CPU_ZERO(&cores);
-    CPU_SET(static_cast<std::size_t>(parameters.core), &cores);
-    if (sched_setaffinity(0, sizeof(cores), &cores) != 0)
-      warn("the core is refused", "name another in the plan");
-  }
+  schedule(parameters_of(node), warn);
 }
 
 // Run a node until it is interrupted: `set_up` makes its endpoints and returns what is to be called

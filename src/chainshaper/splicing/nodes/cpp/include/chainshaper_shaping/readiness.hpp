@@ -20,7 +20,7 @@ namespace chainshaper {
 // Where SCHED_FIFO or the core is refused, it is not clear.
 class ClearCore {
 public:
-  explicit ClearCore(std::size_t core) {
+  explicit ClearCore(std::int64_t core) {
     sem_init(&more_, 0, 0);
     thread_ = std::thread([this, core] { clear(core); });
   }
@@ -40,16 +40,9 @@ public:
 private:
   static constexpr std::int64_t over = -1;
 
-  void clear(std::size_t core) {
+  void clear(std::int64_t core) {
     pthread_setname_np(pthread_self(), "clear_core");
-    sched_param lowest{};
-    lowest.sched_priority = 1;
-    cpu_set_t cores;
-    CPU_ZERO(&cores);
-    CPU_SET(core, &cores);
-    if (sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &lowest) != 0 ||
-        sched_setaffinity(0, sizeof(cores), &cores) != 0)
-      return;
+    if (!set_fifo(1) || !set_core(core)) return;
     for (;;) {
       while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
       if (until_ns_ == over) return;
@@ -65,7 +58,7 @@ private:
 class Readiness {
 public:
   // The core is where the output is delivered, for `pause_ns` after it was published.
-  Readiness(rclcpp::Node & node, std::optional<std::size_t> delivery_core, std::int64_t pause_ns)
+  Readiness(rclcpp::Node & node, Maybe delivery_core, std::int64_t pause_ns)
       : pause_ns_(pause_ns),
         rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
             "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
