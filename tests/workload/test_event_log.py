@@ -12,6 +12,7 @@ import pytest
 from chainshaper.values import events
 from chainshaper.workload.event_log import (
     ABSENT,
+    BLOCK,
     LAYOUT,
     WIDTH,
     WORDS,
@@ -24,7 +25,7 @@ from chainshaper.workload.stall_meter import NO_PACE, meter_tables
 
 
 def _process(log: EventLog, pid: int = 100, core: int | None = 1) -> ProcessLog:
-    return ProcessLog(pid, core, log.rows.tobytes(), tuple(log.objects), modes=("city", "highway"))
+    return ProcessLog(pid, core, log.rows, tuple(log.objects), modes=("city", "highway"))
 
 
 def _types(name: str, fields: tuple[str, ...]) -> dict[str, pl.DataType]:
@@ -51,6 +52,17 @@ def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[st
     if name == "asynchronous_send":
         expected["outcome"] = "overwritten"
     assert tables[name].to_dicts() == [expected]
+
+
+def test_no_array_of_a_long_log_gets_long() -> None:
+    """One of tens of megabytes grew by so many pages at a time that its thread paused for 10 ms."""
+    log = EventLog()
+    record = log.point("callback_start")
+    for time in range(3_500):
+        record(time, 7, 2 * time, 0)
+    assert [len(one) for one in log._blocks] == [BLOCK, BLOCK, BLOCK, 500 * WIDTH]
+    started = event_tables([_process(log)], from_ns=100)["callback_start"]
+    assert started.select("time", "thread_time").rows() == [(n, 2 * n) for n in range(100, 3_500)]
 
 
 def test_the_layout_says_what_the_event_tables_say() -> None:

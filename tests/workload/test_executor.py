@@ -88,7 +88,7 @@ class Bench:
     def recorded(self, event: str) -> list[list[int]]:
         """Rows of one event: time, then its fields."""
         number = list(LAYOUT).index(event)
-        rows = self.log.rows.tolist()
+        rows = memoryview(self.log.rows).cast("q").tolist()
         all_rows = [rows[i : i + WIDTH] for i in range(0, len(rows), WIDTH)]
         return [[row[1], *row[3:]] for row in all_rows if row[0] == number]
 

@@ -2,8 +2,10 @@
 
 A trace point appends a few integers to an array in locked memory, in one step, so that threads
 may share the log; names are written once, at start-up. Nothing touches a file or a pipe before
-the run is over. :func:`chainshaper.workload.live.event_tables` reads the layout back. Nothing heavy
-is imported: the pages are locked into memory. The simulator notes its objects here as well.
+the run is over. No array gets long: one that does is given so many pages at a time that after half
+an hour its thread pauses for ten milliseconds. :func:`chainshaper.workload.live.event_tables` reads
+the layout back. Nothing heavy is imported: the pages are locked into memory. The simulator notes
+its objects here as well.
 """
 
 from array import array
@@ -36,6 +38,7 @@ LAYOUT: dict[str, tuple[str, ...]] = {
 """Event names and the order of their fields; an event's number is its place in this list."""
 
 WIDTH = 15  # event number, time, thread, and up to twelve fields
+BLOCK = 1_000 * WIDTH  # numbers in an array, when the next one is begun
 
 ABSENT = -1
 """Stands for null in fields that may be."""
@@ -68,7 +71,7 @@ class EventLog:
     """
 
     def __init__(self, clock: Callable[[], int] = monotonic_ns) -> None:
-        self.rows = array("q")
+        self._blocks = [array("q")]
         self.objects: list[dict[str, Any]] = []  # the init events, which carry names
         self.new_handle: Callable[[], int] = partial(next, count(FIRST_HANDLE, 0x100))
         self._clock = clock
@@ -121,10 +124,18 @@ class EventLog:
         """A function of (time, *fields) that records one event of its thread; fields as in
         :data:`LAYOUT`."""
         number = list(LAYOUT).index(event)
-        extend = self.rows.extend
+        blocks = self._blocks
         padding = (0,) * (WIDTH - 3 - len(LAYOUT[event]))
 
         def record(time_ns: int, *fields: int) -> None:
-            extend((number, time_ns, get_native_id(), *fields, *padding))
+            block = blocks[-1]
+            block.extend((number, time_ns, get_native_id(), *fields, *padding))
+            if len(block) >= BLOCK:
+                blocks.append(array("q"))
 
         return record
+
+    @property
+    def rows(self) -> bytes:
+        """All that was recorded: :data:`WIDTH` signed 64-bit numbers for each event."""
+        return b"".join(block.tobytes() for block in self._blocks)

@@ -369,7 +369,7 @@ def main() -> None:
     send(missing=missing, memory_locked=lock_memory())
     times = receive()
     node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])
-    send_events(node.log.rows.tobytes(), objects=node.log.objects)
+    send_events(node.log.rows, objects=node.log.objects)
     wait_for_leave()
     os._exit(0)  # DDS teardown of a closed domain is of no use, and not always quick
 
