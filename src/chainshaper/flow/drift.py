@@ -7,10 +7,12 @@ expires in the open slot shows where it is. So the slots open a little before th
 once in a while, just to see; in between they move at the rate that was found. Outputs do not move:
 they count from the stamp of their own cycle.
 
-On a busy machine a thread begins late without its timer. So slots soon open still earlier once
-more: the timer stays where it is, while a thread that only begins late moves with the opening. What
-is late in spite of that is so in one direction only: the timer is the line beneath all sightings,
-the edge of their convex hull in the middle (Moon, Skelly and Towsley, INFOCOM 1999).
+A thread that its slot lets go takes a while to begin: how long usually is seen in all looks in
+which nothing else was. On a busy machine it begins later still, without its timer. So slots soon
+open still earlier once more: the timer stays where it is, while a thread that only begins late
+moves with the opening. What is late in spite of that is so in one direction only: the timer is the
+line beneath all sightings, the edge of their convex hull in the middle (Moon, Skelly and Towsley,
+INFOCOM 1999).
 
 The latencies of an output are in its gate's page of memory, and tell where its slots have to be
 (:class:`~chainshaper.planning.margins.Tail`). Slots move in the gate and in the servers with the
@@ -19,10 +21,11 @@ same cycle.
 
 import os
 import threading
+from collections import deque
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from itertools import pairwise
-from statistics import mean
+from statistics import mean, median
 
 from chainshaper.enforcement.undoing import SlotMove
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, Tail
@@ -31,12 +34,12 @@ from chainshaper.planning.plan import Adaptation, Plan, publish_slots
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.errors import OperationError
 
-SEEN_NS = 250_000  # so long behind the opening a thread begins that its timer woke, not the slot
+SEEN_NS = 250_000  # later than usual by so much, a thread was woken by its timer, not the slot
 MOVE_NS = 250_000  # slots move by no less
 AHEAD_NS = 400_000  # so long before the timer they open, to see it
 ONCE_MORE_NS = 400_000  # and so much earlier, to be sure
 SOONEST_NS, LATEST_NS = 10_000_000_000, 300_000_000_000  # from one time to the next
-SIGHTINGS = 16
+SIGHTINGS, USUAL = 16, 9
 MOST_RATE = 500e-6  # of a quartz, and of timers that a program counts itself
 
 
@@ -58,6 +61,7 @@ class TimerTrack:
     _every_ns: int = SOONEST_NS
     _perhaps_ns: int | None = None  # where it seemed to expire, if it did not come late
     _lost: int = 0  # how often it was not where it can be
+    _let_go: deque[int] = field(default_factory=lambda: deque(maxlen=USUAL))  # by slots, so late
 
     def __post_init__(self) -> None:
         self.sightings = [(self.at_ns, -self.lead_ns)]
@@ -70,8 +74,8 @@ class TimerTrack:
 
     @property
     def is_unsure(self) -> bool:
-        """Whether to look again soon, before the timer has moved."""
-        return self._perhaps_ns is not None
+        """Whether to look again soon, before the timer has moved: it is being looked for."""
+        return self._perhaps_ns is not None or self._step_ns > 0
 
     def expected(self, now_ns: int) -> int:
         """Where the timer expires now, as far as is known."""
@@ -83,15 +87,20 @@ class TimerTrack:
         expires_ns, expected = self.opens_ns + begins_ns, self.expected(now_ns)
         perhaps_ns, self._perhaps_ns = self._perhaps_ns, None
         furthest = self._furthest(now_ns - self.sightings[-1][0])
-        stayed = perhaps_ns is not None and expires_ns - perhaps_ns > -3 * ONCE_MORE_NS // 4
-        if abs(begins_ns) > SEEN_NS and abs(expires_ns - expected) > furthest:
+        stayed = perhaps_ns is not None and expires_ns - perhaps_ns > -ONCE_MORE_NS // 2
+        if not self._let_go and 0 <= begins_ns < self.lead_ns // 2:  # the timer cannot be seen yet
+            self._let_go.append(begins_ns)
+        is_late = begins_ns > SEEN_NS + median(self._let_go or [0])
+        if not is_late and begins_ns >= 0:
+            self._let_go.append(begins_ns)
+        if (is_late or begins_ns < -SEEN_NS) and abs(expires_ns - expected) > furthest:
             self._go_on(expected, lost=True)
-        elif begins_ns < -SEEN_NS or (begins_ns > SEEN_NS and stayed):  # nothing stopped it
+        elif begins_ns < -SEEN_NS or (is_late and stayed):  # nothing stopped it
             self.sightings = [*self.sightings, (now_ns, expires_ns)][-SIGHTINGS:]
             surprised = abs(expires_ns - expected) > MOVE_NS
             self._every_ns = SOONEST_NS if surprised else min(LATEST_NS, 2 * self._every_ns)
             self._go_on(self.expected(now_ns), lost=False)
-        elif begins_ns > SEEN_NS:
+        elif is_late:
             self._perhaps_ns = expires_ns
             self.opens_ns -= ONCE_MORE_NS if self.looks else 0
         elif self._step_ns:  # the timer is earlier still
