@@ -88,10 +88,9 @@ class TimerTrack:
         perhaps_ns, self._perhaps_ns = self._perhaps_ns, None
         furthest = self._furthest(now_ns - self.sightings[-1][0])
         stayed = perhaps_ns is not None and expires_ns - perhaps_ns > -ONCE_MORE_NS // 2
-        if not self._let_go and 0 <= begins_ns < self.lead_ns // 2:  # the timer cannot be seen yet
-            self._let_go.append(begins_ns)
-        is_late = begins_ns > SEEN_NS + median(self._let_go or [0])
-        if not is_late and begins_ns >= 0:
+        first = begins_ns if 0 <= begins_ns < self.lead_ns // 2 else 0  # no timer can be seen yet
+        is_late = begins_ns > SEEN_NS + median(self._let_go or [first])
+        if begins_ns >= 0 and not is_late:
             self._let_go.append(begins_ns)
         if (is_late or begins_ns < -SEEN_NS) and abs(expires_ns - expected) > furthest:
             self._go_on(expected, lost=True)
