@@ -157,9 +157,10 @@ def store(column, width, row, value):
 
 @compiled(inline=True)
 def keep(op, value, rows):
-    """Write a value to its slot's row."""
-    row = get(rows, get(op, tb.O_COUNTER))
-    store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, value)
+    """Write a value to its slot's row, if it has a slot."""
+    if get(op, tb.O_ADDRESS) != 0:
+        row = get(rows, get(op, tb.O_COUNTER))
+        store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, value)
 
 
 @compiled(inline=True)
@@ -194,8 +195,7 @@ def run_number(machine, op, base, mapped, position, regs):
     register = get(op, tb.O_REGISTER)
     if register >= 0:
         put(regs, register, np.int64(value))
-    if get(op, tb.O_ADDRESS) != 0:
-        keep(op, value, get(machine, tb.M_ROWS))
+    keep(op, value, get(machine, tb.M_ROWS))
     if flags & 4:
         advance_clock(get(machine, tb.M_STATE), value, size)
 
@@ -273,8 +273,7 @@ def run_many(machine, op, base, end, position, regs, depth):
     rows, inner = get(machine, tb.M_ROWS), get(op, tb.O_INNER)
     if inner >= 0 and get(rows, inner) + count > get(get(machine, tb.M_CAPS), inner):
         return np.int64(tb.FULL_TABLE)
-    if get(op, tb.O_ADDRESS) != 0:
-        keep(op, np.uint64(count), rows)
+    keep(op, np.uint64(count), rows)
     if code == tb.LOOP:
         put(state, tb.X_STACK + depth, count)
         return position
@@ -330,46 +329,29 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
     op, stop = ops + (get(owner, column) << 7), ops + (get(owner, column + 1) << 7)
     depth = np.int64(0)
     while op < stop:
-        code, align = get(op, tb.O_CODE), get(op, tb.O_ALIGN)
+        code, align, following = get(op, tb.O_CODE), get(op, tb.O_ALIGN), op + tb.O_ROW
         position = (position + align - 1) & -align
-        if code == tb.MOVE:
-            place = position >> 3
+        if code <= tb.MOVE:
+            start, place = position, position >> 3
             position += get(op, tb.O_SIZE)
             if position > end:
                 return np.int64(tb.TRUNCATED)
-            if place + 8 > mapped:
-                run_number(machine, op, base, mapped, position - get(op, tb.O_SIZE), regs)
-            else:
+            if code == tb.MOVE and place + 8 <= mapped:
                 store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, load_word(base + place))
-            op += tb.O_ROW
-        elif code == tb.NUMBER:
-            following = position + get(op, tb.O_SIZE)
-            if following > end:
-                return np.int64(tb.TRUNCATED)
-            run_number(machine, op, base, mapped, position, regs)
-            position = following
-            op += tb.O_ROW
-        elif code == tb.SKIP:
-            position += get(op, tb.O_SIZE)
-            if position > end:
-                return np.int64(tb.TRUNCATED)
-            op += tb.O_ROW
-        elif code in (tb.TEXT, tb.CHARACTERS):
+            elif code != tb.SKIP:
+                run_number(machine, op, base, mapped, start, regs)
+        elif code <= tb.CHARACTERS:
             position = run_text(machine, op, base, mapped, end, position, regs)
             if position < 0:
                 return position
-            op += tb.O_ROW
-        elif code in (tb.SKIP_MANY, tb.COPY, tb.LOOP):
+        elif code <= tb.LOOP:
             position = run_many(machine, op, base, end, position, regs, depth)
             if position < 0:
                 return position
-            if code != tb.LOOP:
-                op += tb.O_ROW
-            elif get(state, tb.X_STACK + depth) == 0:
-                op = ops + (get(op, tb.O_TARGET) << 7)
-            else:
+            if code == tb.LOOP and get(state, tb.X_STACK + depth) == 0:
+                following = ops + (get(op, tb.O_TARGET) << 7)
+            elif code == tb.LOOP:
                 depth += 1
-                op += tb.O_ROW
         elif code == tb.AGAIN:
             inner = get(op, tb.O_INNER)
             if inner >= 0:
@@ -378,17 +360,16 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
             left = get(state, tb.X_STACK + depth - 1) - 1
             put(state, tb.X_STACK + depth - 1, left)
             if left > 0:
-                op = ops + (get(op, tb.O_TARGET) << 7)
+                following = ops + (get(op, tb.O_TARGET) << 7)
             else:
                 depth -= 1
-                op += tb.O_ROW
         elif code == tb.SWITCH:
             chosen = choose(op, get(machine, tb.M_RANGES), regs)
             if chosen < 0:
                 return np.int64(tb.NO_OPTION)
-            if get(op, tb.O_ADDRESS) != 0:
-                keep(op, np.uint64(get(chosen, 3)), get(machine, tb.M_ROWS))
-            op = ops + (get(chosen, 2) << 7)
+            keep(op, np.uint64(get(chosen, 3)), get(machine, tb.M_ROWS))
+            following = ops + (get(chosen, 2) << 7)
         else:
-            op = ops + (get(op, tb.O_TARGET) << 7)
+            following = ops + (get(op, tb.O_TARGET) << 7)
+        op = following
     return position

@@ -110,8 +110,8 @@ A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
 ) = range(15)
 OPERATION_COLUMNS = 16
 
-SKIP, NUMBER, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP, MOVE = range(11)
-"""MOVE: a NUMBER of 8, 4, 2 or 1 bytes as they lie in the packet, one per event."""
+SKIP, NUMBER, MOVE, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP = range(11)
+"""In groups that run alike. MOVE: a NUMBER of 8, 4, 2 or 1 bytes as they lie in the packet."""
 
 # Bytes per row.
 P_ROW, S_ROW, E_ROW = 8 * PACKET_COLUMNS, 8 * STREAM_COLUMNS, 8 * EVENT_COLUMNS
