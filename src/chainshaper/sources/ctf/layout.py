@@ -423,9 +423,11 @@ class _Writer:
         return kind.size
 
     def _array(self, name: str, kind: tsdl.ArrayType, at: _Place) -> int:
-        rows, count, register = self.layout.operations, kind.length, -1
-        if isinstance(count, str):
-            count, register = 0, self._referred(count, at).register
+        rows, count, register = self.layout.operations, 0, -1
+        if isinstance(kind.length, int):
+            count = kind.length
+        else:
+            register = self._referred(kind.length, at).register
         columns = {O_ALIGN: tsdl.alignment(kind), O_REGISTER: register, O_COUNT: count}
         if tsdl.is_text(kind):
             place = self._slot(TEXT_CODES, at)
