@@ -163,7 +163,7 @@ def test_a_wheel_brings_the_library_that_works_for_its_machine(tmp_path: Path) -
     site = tmp_path / "site"
     words = ["-m", "pip", "install", "--no-deps", "--no-index", "--target", str(site), str(wheel)]
     subprocess.run([sys.executable, *words], check=True, capture_output=True)
-    program = "from chainshaper.sources.preload import installed_library, preloading\nprint(preloading(installed_library()))"
+    program = "from chainshaper.sources.preload import *\nprint(preloading(installed_library()))"
     found = subprocess.check_output(
         [sys.executable, "-c", program],
         env={**os.environ, "PYTHONPATH": str(site), "PATH": "", "HOME": str(tmp_path)},
