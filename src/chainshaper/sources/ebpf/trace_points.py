@@ -84,14 +84,14 @@ class TracingLibrary:
     version: str | None
 
     @property
-    def major(self) -> int | None:
-        """The first number of the version."""
-        return None if self.version is None else int(self.version.partition(".")[0])
+    def major(self) -> int:
+        """The first number of the version; without one it is taken to be a new one."""
+        return 8 if self.version is None else int(self.version.partition(".")[0])
 
     @property
     def handles_at_rmw(self) -> bool:
         """Whether `rmw_publish` of this version names its publisher."""
-        return self.major is None or self.major >= 8
+        return self.major >= 8
 
 
 @dataclass(frozen=True)
@@ -295,10 +295,10 @@ def _text(address: str, place: int) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Printed:
-    """The output of one run; times are ns of CLOCK_MONOTONIC.
+    """The output of one run. ``cut_names``: how many were longer than what is printed.
 
     ``handles`` are the names of handles that were in use when tracing began, ``pid, event, handle,
-    topic``; ``rmw`` is from such a one. ``cut_names``: how many were longer than what is printed.
+    topic``; ``rmw`` is from such a one.
     """
 
     tables: dict[str, pl.DataFrame]
@@ -343,17 +343,16 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
     }
     event_of = {code: point.event for code, point in enumerate(points, FIRST_POINT)}
     named = texts.filter(place=NAME_PLACE).select("time", "tid", topic="text")
-    handles = lines.filter(pl.col("code").is_in(list(event_of))).join(named, on=["time", "tid"])
-    event = pl.col("code").replace_strict(event_of, return_dtype=pl.String)
-    handle = pl.col(VALUES[0]).cast(pl.UInt64)
-    handles = handles.with_columns(pl.col("pid").cast(pl.Int32), event=event, handle=handle)
-    rmw = texts.filter(place=RMW_PLACE)["text"]
-    return Printed(
-        tables,
-        handles.select("pid", "event", "handle", "topic").unique(maintain_order=True),
-        rmw[0] if len(rmw) else None,
-        int(texts["cut"].sum()),
+    of_points = lines.filter(pl.col("code").is_in(list(event_of)))
+    handles = of_points.join(named, on=["time", "tid"]).select(
+        pl.col("pid").cast(pl.Int32),
+        event=pl.col("code").replace_strict(event_of, return_dtype=pl.String),
+        handle=pl.col(VALUES[0]).cast(pl.UInt64),
+        topic="topic",
     )
+    handles = handles.unique(maintain_order=True)
+    rmw = texts.filter(place=RMW_PLACE)["text"]
+    return Printed(tables, handles, rmw[0] if len(rmw) else None, int(texts["cut"].sum()))
 
 
 def _texts(lines: pl.DataFrame) -> pl.DataFrame:
@@ -384,9 +383,8 @@ def _table(rows: pl.DataFrame, point: TracePoint, texts: pl.DataFrame) -> pl.Dat
     for argument in point.arguments:
         column = argument.column
         if argument.kind == "text":
-            own = texts.filter(place=argument.place).select(
-                "time", "tid", pl.col("text").alias(column)
-            )
+            text = pl.col("text").alias(column)
+            own = texts.filter(place=argument.place).select("time", "tid", text)
             rows = rows.join(own, on=["time", "tid"], how="left")
         elif argument.kind == "gid":
             words = rows.select(next(values), next(values)).to_numpy().astype("<i8")
