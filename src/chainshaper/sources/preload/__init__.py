@@ -70,7 +70,7 @@ _THREAD_TIME = 2  # the value of callback_start and callback_end that is no argu
 _CALL = {"rmw_client_handle": 0, "rmw_service_handle": 0, "request": 1, "response": 1}
 _CALL |= {"client_gid": 2, "sequence_number": 4, "source_timestamp": 5}  # places of CALL's values
 
-_NAME = re.compile(r"^  (?:EVENT|TIMED|CREATION|CALL)\((\w+)", re.MULTILINE)
+_NAME = re.compile(r"^  (?:EVENT|CREATION|CALL)\((\w+)", re.MULTILINE)
 
 
 @functools.cache
