@@ -43,8 +43,7 @@ def _read_part(path: Path) -> pl.DataFrame:
         table = pl.read_csv(whole, schema={name: _TYPES[name] for name in names})
     except pl.exceptions.PolarsError as error:
         raise InputError(f"{path}: a line is not as a shaping node writes it: {error}") from error
-    unknown = [pl.lit(None, dtype=_TYPES[n]).alias(n) for n in _TYPES.keys() - set(names)]
-    return table.with_columns(unknown).select(*_TYPES)
+    return events.table({"gate_release": table}, "gate_release", _TYPES).select(*_TYPES)
 
 
 def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:

@@ -402,37 +402,23 @@ def play(tree, leaf, time, file):
 
 
 @compiled()
-def fill_columns(
-    machine, files, count, cursors, ahead, tree, leaves, packets, regs, registers, events
-):
-    """Write the wanted events of a span of all ``count`` files, merged by time.
+def fill_columns(machine, files, cursors, ahead, tree, leaves, packets, regs, registers, events):
+    """Write the wanted events of a span of all files, merged by time.
 
-    ``tree`` has twice as many nodes as ``leaves``, a power of two and at least ``count``; all its
-    times are NEVER at first, and its node 0 counts the files that were entered. ``ahead`` has AHEAD
-    rows and ``regs`` the ``registers`` of every file. Returns 0 at the end of the span,
-    FULL_DICTIONARY where the caller has to give a larger one and call again, another failure where
-    a file has changed.
+    ``tree`` has twice as many nodes as ``leaves``, a power of two; a file comes first as long as
+    none of its events is known. ``ahead`` has AHEAD rows and ``regs`` the ``registers`` of every
+    file. Returns 0 at the end of the span, FULL_DICTIONARY where the caller has to give a larger
+    one and call again, another failure where a file has changed.
     """
-    while get(tree, 0) < count:
-        file = get(tree, 0)
-        row, cursor, own = files + file * tb.F_ROW, cursors + file * tb.C_ROW, ahead + file * A_ALL
-        put(cursor, tb.C_PACKET, get(row, tb.F_PACKET) - 1)
-        status = read_ahead(machine, row, cursor, own, packets, regs + 8 * registers * file)
-        if status < 0:
-            return status
-        if status > 0:
-            play(tree, leaves + file, min(get(own, tb.A_TIME), tb.NEVER - 1), file)
-        put(tree, 0, file + 1)
     while get(tree, 2) < tb.NEVER:
-        file = get(tree, 3)
+        file, time = get(tree, 3), np.int64(tb.NEVER)
         row, cursor, own = files + file * tb.F_ROW, cursors + file * tb.C_ROW, ahead + file * A_ALL
-        entry = own + get(cursor, tb.C_PLACE) * tb.A_ROW
-        its = regs + 8 * registers * file
-        status = write_event(machine, row, cursor, entry, packets, its)
-        if status < 0:
-            return status
-        place = get(cursor, tb.C_PLACE) + 1
-        time = np.int64(tb.NEVER)
+        its, place = regs + 8 * registers * file, get(cursor, tb.C_PLACE)
+        if place < get(cursor, tb.C_COUNT):
+            status = write_event(machine, row, cursor, own + place * tb.A_ROW, packets, its)
+            if status < 0:
+                return status
+            place += 1
         if place < get(cursor, tb.C_COUNT):
             put(cursor, tb.C_PLACE, place)
             time = min(get(own + place * tb.A_ROW, tb.A_TIME), tb.NEVER - 1)

@@ -29,8 +29,8 @@ from chainshaper.sources.ctf import tsdl
 # A table's columns stand together, with what they hold behind them.
 # The machine. RANGES of variants' tags: low, high, operation to go on with, 1 + option. ROWS are
 # the row counters (COUNTERS of them), CAPS how far each may go, SAVED room for some. SLOTS is the
-# dictionary's hash table, int32, MASK + 1 of them; ENTRIES are its strings: address, length, hash,
-# last word; ROOM of them. BATCHES has per event class a count and BATCH pairs (address, row).
+# dictionary's hash table, int32, MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per
+# event class a count and BATCH pairs (address, row).
 (
     M_OPS, M_RANGES, M_STATE, M_ROWS, M_CAPS, M_SAVED, M_SLOTS, M_MASK, M_ENTRIES, M_ROOM,
     M_STREAMS, M_EVENTS, M_IDS, M_COUNTERS, M_BATCHES, MACHINE_WORDS,
@@ -254,10 +254,7 @@ class Layout:
         return self._arrays
 
     def attach(self, table: Table, time: int, cpu: int, slots: Sequence[tuple[int, int]]) -> None:
-        """Give a table's event classes the operations that write to its columns.
-
-        ``time`` and ``cpu`` (0: none) are addresses, ``slots`` addresses and bytes per row.
-        """
+        """Give a table's event classes what writes to its columns, whose addresses these are."""
         self._arrays, self.steps = {}, 0
         for event in self.tables[table]:
             row, writer = event.row, event.header.following(slots)
@@ -285,10 +282,7 @@ class Layout:
 
 
 def lay_out(folders: Sequence[tsdl.CtfFolder], wanted: Wanted) -> Layout:
-    """Lay out every stream and event class of all ``folders``.
-
-    Raises `CtfError` for types that cannot be read.
-    """
+    """Lay out every stream and event class. Raises `CtfError` for types that cannot be read."""
     layout = Layout()
     for folder in folders:
         first = len(layout.streams)
@@ -633,22 +627,22 @@ def _columns(
     contexts = {"stream.event.context": stream.event_context, "event.context": event.context}
     if event.name not in asked.names:
         return [(s, k, ()) for s, k in {**contexts, "event.fields": event.fields}.items()], []
+    members_of = {s: kind.fields if kind is not None else () for s, kind in contexts.items()}
     present: dict[str, tuple[str, str]] = {}
-    for scope, kind in contexts.items():
-        for member in kind.fields if kind is not None else ():
+    for scope, members in members_of.items():
+        for member in members:
             present.setdefault(tsdl.field_name(member.name), (scope, member.name))
     standard: dict[tuple[str, str], str] = {}
     for column in ("pid", "tid", *(["procname"] if event.name not in asked.nameless else [])):
-        for name in (column, f"v{column}") if kernel else (f"v{column}", column):
-            if name in present:
-                standard[present[name]] = column
-                break
+        names = (column, f"v{column}") if kernel else (f"v{column}", column)
+        found = next((present[name] for name in names if name in present), None)
+        if found is not None:
+            standard[found] = column
     scopes: list[_Scope] = []
     columns: list[tuple[str, tsdl.Type]] = []
-    for scope, kind in contexts.items():
-        members = kind.fields if kind is not None else ()
+    for scope, members in members_of.items():
         chosen = [m for m in members if asked.context or (scope, m.name) in standard]
-        scopes.append((scope, kind, {member.name for member in chosen}))
+        scopes.append((scope, contexts[scope], {member.name for member in chosen}))
         for member in chosen:
             name = standard.get((scope, member.name), f"context.{tsdl.field_name(member.name)}")
             columns.append((name, member.type))

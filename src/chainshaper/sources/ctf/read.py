@@ -246,14 +246,17 @@ def _fill(span: int, files: list[_File], packets: NDArray[np.int64], layout: Lay
     scratch.rows[:] = sum(file.reached[span] for file in files)
     scratch.caps[:] = sum(file.reached[span + 1] for file in files)
     cursors = np.zeros((count, tb.CURSOR_COLUMNS), np.int64)
+    cursors[:, tb.C_PACKET] = table[:, tb.F_PACKET] - 1
     ahead = np.zeros((count * tb.AHEAD, tb.AHEAD_COLUMNS), np.int64)
     leaves = 1 << (count - 1).bit_length()
     tree = np.full((2 * leaves, 2), tb.NEVER, np.int64)
-    tree[0] = 0
+    tree[leaves : leaves + count] = [(-(1 << 63), file) for file in range(count)]
+    for node in range(leaves - 1, 0, -1):
+        tree[node] = tree[2 * node]
     status = tb.FULL_DICTIONARY
     while status == tb.FULL_DICTIONARY:
         status = _fill_columns(
-            scratch.address, table.ctypes.data, count, cursors.ctypes.data, ahead.ctypes.data,
+            scratch.address, table.ctypes.data, cursors.ctypes.data, ahead.ctypes.data,
             tree.ctypes.data, leaves, packets.ctypes.data, scratch.registers.ctypes.data,
             layout.registers, len(layout.events),
         )  # fmt: skip

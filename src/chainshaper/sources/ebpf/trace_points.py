@@ -8,12 +8,11 @@ numbers, separated by tabs and in no order:
 
 * The code says which of the trace points it is, :data:`FIRST_POINT` being the first one.
 * A number or a flag is one value, a gid two: its first 16 bytes, those that mean anything.
-* A text is printed as the eight-byte words it lies in, in lines of its own (:data:`TEXT_CODE`):
-  16 × the argument's place + the line's number, how many bytes before the text the first word
-  begins, and eight words. So a name may be of any length and contain anything, unlike with `str()`.
-  Aligned words never reach into a page without the text.
+* A text is printed as the aligned eight-byte words it lies in, in lines of its own
+  (:data:`TEXT_CODE`): 16 × the argument's place + the line's number, how many bytes before the text
+  the first word begins, and eight words. So a name may contain anything, unlike with `str()`.
 * `sched_switch` (:data:`SWITCH_CODE`) is printed where a thread that has emitted events goes or
-  comes; it came unseen before the first one, so a line stands there that says nothing of who went.
+  comes; before its first one stands a line that says nothing of who went.
 
 The handles of `rmw_publish` and `rmw_take` are the addresses of structures that begin with the
 addresses of the RMW's name, of its data and of the topic's name. Before tracetools 8 the former is
@@ -85,7 +84,7 @@ class TracingLibrary:
 
     @property
     def major(self) -> int:
-        """The first number of the version; without one it is taken to be a new one."""
+        """The first number of the version: where it is not known, one of today's."""
         return 8 if self.version is None else int(self.version.partition(".")[0])
 
     @property
@@ -180,9 +179,8 @@ def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...
 def _mapped(pid: int) -> Iterator[Path]:
     """Files of that name which a process has mapped, by paths that lead there from here."""
     with suppress(OSError):  # it is gone, or another user's
-        for mapped in sorted(
-            {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
-        ):
+        paths = {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
+        for mapped in sorted(paths):
             inside = Path(f"/proc/{pid}/root{mapped}")  # as a container has it
             if inside.is_file():  # else replaced since: its new contents are not what runs
                 outside = Path(mapped)

@@ -99,13 +99,8 @@ class Lttng:
             self.close()
             raise
 
-    @property
-    def environment(self) -> dict[str, str]:
-        """What an application needs to find the daemon."""
-        return {} if self.daemon is None else {"LTTNG_HOME": str(self.home)}
-
     def ask(self, *arguments: str) -> ElementTree.Element:
-        """Run `lttng ARGUMENTS`; its answer. Raises OperationError: it fails; in its own words."""
+        """The answer of `lttng ARGUMENTS`. Raises OperationError: it fails; in its own words."""
         what = f"`{shlex.join(('lttng', *arguments))}`"
         try:
             run = subprocess.run(
@@ -243,7 +238,9 @@ class LttngSession:
         lttng.ask("start", self._new_session(lttng))
         # A process that starts waits that long (ms) for the session daemon, which may be busy.
         environment = {"LTTNG_UST_REGISTER_TIMEOUT": "30000", MARK: self._sessions[0]}
-        return {**environment, **lttng.environment}
+        if lttng.daemon is not None:
+            environment["LTTNG_HOME"] = str(lttng.home)
+        return environment
 
     def failure(self) -> str | None:
         """Look whether the daemon is there and the session loses nothing; enlarge the buffers."""
@@ -287,7 +284,7 @@ class LttngSession:
 
             trace = open_lttng_trace([self._folder])
             tables, info = _without_processes(self._strangers, trace.events, trace.info)
-        if not any(tables[name].height for name in tables):
+        if not any(table.height for table in tables.values()):
             shutil.rmtree(self._folder)  # other applications' events are in it at most
             self._folder.mkdir()
             raise OperationError(
@@ -390,12 +387,10 @@ def _without_processes(
     own = {name: frame.filter(is_own) for name, frame in tables.items()}
     names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
     note = f"processes that the command has not started are left out: {names}."
+    counts = {n if n == "sched_switch" else f"ros2:{n}": f.height for n, f in own.items()}
     facts = {
         "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
         "notes": (*info.notes, note),
-        "trace_events": {
-            name if name == "sched_switch" else f"ros2:{name}": frame.height
-            for name, frame in own.items()
-        },
+        "trace_events": counts,
     }
     return own, info.model_copy(update=facts)

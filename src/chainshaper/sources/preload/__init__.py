@@ -2,8 +2,7 @@
 
 `preload.c` is that library. It sends us the memory of its process with the process's first event,
 over a socket whose name is in no file system; that of a process that runs already is in `/proc`. A
-thread reads all memories ten times a second: a process that was killed in between has lost nothing,
-since its memory is ours as well.
+thread reads all memories ten times a second, also those of processes that were killed in between.
 
 Nothing is locked: a reader copies what is new in a ring, then looks again how much has been
 written: what may have been overwritten meanwhile is thrown away and counted as lost.
@@ -293,10 +292,7 @@ def compile_library(
 
 
 def installed_library() -> Path:
-    """The library that came with the package, or is in the user's cache, built at the first use.
-
-    Raises PlatformError: as :func:`build_library`, or others may write to the cache.
-    """
+    """The package's library, or the cache's, built at first use. Raises: as :func:`in_cache`."""
     if (shipped := SOURCE.with_name(_FILE)).exists():
         return shipped
     return in_cache(_FILE, [SOURCE.read_text()], build_library)
@@ -328,10 +324,7 @@ def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -
 
 
 def preloading(library: Path) -> str:
-    """`LD_PRELOAD` with the library in front of those that it names already.
-
-    Raises PlatformError: its path has a character that separates libraries there.
-    """
+    """`LD_PRELOAD` with the library in front of what it names. Raises PlatformError: it cannot."""
     if re.search(r"[\s:]", str(library)):
         why = f"{str(library)!r} has a space or a colon in it, so LD_PRELOAD cannot name it"
         raise PlatformError(f"{why}: {_REMEDY}")
@@ -365,10 +358,7 @@ def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[i
 
 
 class PreloadTracer:
-    """Records with the library in front: a :class:`~chainshaper.sources.Tracer`.
-
-    Without a command it follows ``pids`` and their descendants, or all of the users' that have it.
-    """
+    """Records with the library in front: a :class:`~chainshaper.sources.Tracer`."""
 
     def __init__(
         self,
