@@ -13,7 +13,7 @@ from story import OFFSET, Story
 
 from chainshaper.analysis import analyse_latency, application_graph, callback_statistics, data_flow
 from chainshaper.sources import open_source
-from chainshaper.sources.lttng.trace import NEXT_HOST
+from chainshaper.sources.system import NEXT_HOST
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 

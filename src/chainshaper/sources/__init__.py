@@ -13,8 +13,6 @@ from chainshaper.values.errors import InputError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import INFO_FILE, Recording, RecordingInfo, open_recording
 
-__all__ = ["Tracer", "open_source"]
-
 
 def open_source(
     *paths: str | Path, progress: Callable[[float, str], None] | None = None, overview: bool = False
@@ -28,13 +26,13 @@ def open_source(
     if not paths:
         raise InputError("no recording given: name a recording's or a trace's folder")
     folders = [Path(path) for path in paths]
-    is_recording = [(folder / INFO_FILE).exists() for folder in folders]
-    metadata = (path for folder in folders for path in folder.rglob("metadata"))
-    if len(folders) == 1 and (is_recording[0] or not any(path.is_file() for path in metadata)):
-        return open_recording(folders[0])
-    for folder in folders:
-        if (folder / INFO_FILE).is_file():
-            raise InputError(f"{folder} is a recording, which cannot be opened beside others")
+    recordings = [folder for folder in folders if (folder / INFO_FILE).exists()]
+    if len(folders) == 1:
+        traced = (path.is_file() for path in folders[0].rglob("metadata"))
+        if recordings or not any(traced):
+            return open_recording(folders[0])
+    elif recordings:
+        raise InputError(f"{recordings[0]} is a recording, which cannot be opened beside others")
     # The decoder is slow to import: only who opens a trace pays for it.
     from chainshaper.sources.lttng.trace import open_lttng_trace
 
@@ -47,9 +45,9 @@ class Tracer(Protocol):
         start() ─► the application runs; failure() is asked now and then ─► stop() ─► remove()
                                                                                 ─► recording()
 
-    It gets a folder of its own, empty and on the disk of the recording, whose content becomes the
-    recording's `trace/`; the application's command (empty: it runs already), and the processes to
-    attach to (empty: those that the command starts; both empty: all that run).
+    It gets an empty folder on the disk of the recording, which becomes its `trace/`; the
+    application's command (empty: it runs already), and the processes to attach to (empty: those
+    that the command starts; both empty: all that run).
     """
 
     def start(self) -> Mapping[str, str]:
@@ -59,10 +57,7 @@ class Tracer(Protocol):
         """
 
     def failure(self) -> str | None:
-        """Why nothing is traced any more, as half a sentence; None while all is well.
-
-        Asked every few seconds, so also the place to look after losses. A failure ends the run.
-        """
+        """Why nothing is traced any more, as half a sentence. Asked every few seconds."""
 
     def stop(self) -> None:
         """End tracing; everything is on disk when this returns. Raises OperationError."""

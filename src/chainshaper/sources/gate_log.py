@@ -1,8 +1,4 @@
-"""The log of a shaping node as a table: what it did with each message.
-
-A node in ROS 2 is not recorded like one of the live workload, so it notes its decisions itself:
-in lines of comma-separated values. This turns them to the event table ``gate_release``.
-"""
+"""The log of a shaping node, comma-separated values, as the event table ``gate_release``."""
 
 import contextlib
 from collections.abc import Iterable, Sequence
@@ -24,8 +20,8 @@ _TYPES = events.column_types("gate_release")
 def read_gate_log(path: str | Path) -> pl.DataFrame:
     """The event table ``gate_release`` of a shaping node's log, and of ``….1``, sorted by time.
 
-    ``callback`` is null: a node does not know its callback's handle. A last line that is not whole
-    is left out. Raises InputError: no such file, or it is no shaping node's log.
+    ``callback`` is null. A last line that is not whole is left out. Raises InputError: no such
+    file, or it is no shaping node's log.
     """
     path = Path(path)
     before = path.with_name(f"{path.name}.1")
@@ -41,16 +37,13 @@ def _read_part(path: Path) -> pl.DataFrame:
     whole = text[: text.rfind(b"\n") + 1]
     names = whole.split(b"\n", 1)[0].decode(errors="replace").split(",")
     if set(LOG_COLUMNS) - {*_LATER, *names} or set(names) - set(LOG_COLUMNS):
-        raise InputError(
-            f"{path}:1: this is not the log of a shaping node, which begins with the names of its "
-            "columns: name the file that the parameter `log` of the node names"
-        )
+        what = "this is not the log of a shaping node, which begins with the names of its columns"
+        raise InputError(f"{path}:1: {what}: name the file that the node's parameter `log` names")
     try:
         table = pl.read_csv(whole, schema={name: _TYPES[name] for name in names})
     except pl.exceptions.PolarsError as error:
         raise InputError(f"{path}: a line is not as a shaping node writes it: {error}") from error
-    unknown = [pl.lit(None, dtype=_TYPES[n]).alias(n) for n in _TYPES.keys() - set(names)]
-    return table.with_columns(unknown).select(*_TYPES)
+    return events.table({"gate_release": table}, "gate_release", _TYPES).select(*_TYPES)
 
 
 def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
@@ -80,27 +73,26 @@ def with_gate_logs(
 ) -> tuple[events.EventTables, tuple[str, ...]]:
     """Event tables with `gate_release` and stalls from the logs of shaping nodes; and notes.
 
-    Of what a node has written, the cycles count that began at ``since_ns`` or later, and whose
-    message was let go before ``until_ns`` (CLOCK_MONOTONIC). Raises InputError: no such log.
+    Cycles count that began at ``since_ns`` or later, and whose message was let go before
+    ``until_ns`` (CLOCK_MONOTONIC). Raises InputError: no such log.
     """
     there = [log for log in logs if log.is_file()]
-    notes = tuple(
+    notes = [
         f"the shaping node's log {log} is not there: it has let nothing through, or did not start."
         for log in logs
         if log not in there
-    )
+    ]
     if not there:
-        return tables, notes
+        return tables, tuple(notes)
     releases = pl.concat([read_gate_log(log) for log in there]).sort("time", maintain_order=True)
     removed, unwritten = rows_missing(releases)
+    rows = "rows of shaping nodes' logs"
     if removed:
-        notes += (
-            f"{removed} rows of shaping nodes' logs were removed to make room for newer ones.",
-        )
+        notes.append(f"{removed} {rows} were removed to make room for newer ones.")
     if unwritten:
-        notes += (
-            f"{unwritten} rows of shaping nodes' logs could not be written: what became of those "
-            "messages is not known. See to room on the disk.",
+        notes.append(
+            f"{unwritten} {rows} could not be written: what became of those messages is not known. "
+            "See to room on the disk."
         )
     releases = releases.filter(pl.col("origin") >= since_ns, pl.col("time") < until_ns)
     seen = releases.filter(pl.col("stalled") >= STALL_NS).select(
@@ -108,4 +100,4 @@ def with_gate_logs(
     )
     stalls = pl.concat([events.table(tables, "machine_stall"), seen], how="diagonal")
     stalls = stalls.sort("time", maintain_order=True)
-    return {**tables, "gate_release": releases, "machine_stall": stalls}, notes
+    return {**tables, "gate_release": releases, "machine_stall": stalls}, tuple(notes)

@@ -6,17 +6,12 @@ Upstream: changelogs of tracetools; https://www.dds-foundation.org/dds-rtps-vend
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
-from chainshaper.values.events import NODE_NAME, EventTables
+import polars as pl
 
-__all__ = [
-    "NEXT_HOST",
-    "distribution_of",
-    "own_pid_namespace",
-    "processes_of",
-    "rmw_of_gids",
-    "rmw_of_threads",
-]
+from chainshaper.values.events import NODE_NAME, EventTables, table
+from chainshaper.values.recording import RecordingInfo
 
 NEXT_HOST = 10_000_000
 """Added to numbers of processes and threads that others may have; Linux goes up to 4,194,304."""
@@ -40,6 +35,26 @@ _THREADS = {
 }
 
 
+def info_of(
+    source: str,
+    tables: EventTables,
+    versions: Iterable[str | None],
+    names: Mapping[int, str],
+    lost: int,
+    **facts: Any,
+) -> RecordingInfo:
+    """What we trace: ``versions`` of tracetools, ``names`` of processes without nodes."""
+    known = pl.DataFrame({"version": [one for one in versions if one][:1]})
+    return RecordingInfo(
+        source=source,
+        distribution=distribution_of({"rcl_init": known}, {}),
+        rmw=facts.pop("rmw", None) or rmw_of_gids(tables),
+        processes=processes_of(tables, names),
+        lost={"lost_events": lost},
+        **facts,
+    )
+
+
 def own_pid_namespace() -> int:
     """The pid namespace whose numbers we see processes under (its inode)."""
     return Path("/proc/self/ns/pid").stat().st_ino
@@ -48,10 +63,9 @@ def own_pid_namespace() -> int:
 def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]) -> str | None:
     """The ROS 2 distribution as `ROS_DISTRO` has it (``jazzy``), None if nothing tells.
 
-    ``fields`` are the declared events' fields, with the length of arrays. CARET's `caret_init`
-    says it, or `rcl_init` by the version of tracetools. Else declared fields prove it:
-    `rmw_publish` has a source timestamp since Jazzy, a gid 16 bytes instead of 24 since Kilted,
-    intra-process events came with Iron.
+    CARET's `caret_init` says it, or `rcl_init` by the version of tracetools. Else the declared
+    events' ``fields``, with the length of arrays: `rmw_publish` has a source timestamp since Jazzy,
+    a gid 16 bytes instead of 24 since Kilted, intra-process events came with Iron.
     """
     said = _first(tables, "caret_init", "distribution")
     if said is not None:
@@ -70,10 +84,9 @@ def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]
 
 def _first(tables: EventTables, event: str, field: str) -> str | None:
     """The first value of an event's field, if it is known."""
-    frame = tables.get(event)
-    if frame is None or field not in frame.columns:
-        return None
-    return next((str(value) for value in frame[field].head(1).drop_nulls()), None)
+    frame = tables.get(event, pl.DataFrame())
+    found = frame[field].head(1).drop_nulls() if field in frame.columns else ()
+    return next(map(str, found), None)
 
 
 def rmw_of_gids(tables: EventTables) -> str | None:
@@ -85,28 +98,21 @@ def rmw_of_gids(tables: EventTables) -> str | None:
     if named is not None:
         return named
     for event in ("rmw_publisher_init", "rmw_subscription_init"):
-        endpoints = tables.get(event)
-        if endpoints is not None and endpoints.height and "gid" in endpoints.columns:
-            gids = endpoints["gid"].drop_nulls().head(1000)
-            names = {_VENDORS.get(tuple(gid[:2])) for gid in gids}
-            if len(names) == 1:
-                return names.pop()
+        gids = table(tables, event, ["gid"])["gid"].drop_nulls().head(1000)
+        names = {_VENDORS.get(tuple(gid[:2])) for gid in gids}
+        if len(names) == 1:
+            return names.pop()
     return None
 
 
 def rmw_of_threads(names: Iterable[str]) -> str | None:
     """The RMW from the names of threads; Fast DDS names its own from 2.13 on."""
     known = list(names)
-    matching = (rmw for rmw, pattern in _THREADS.items() if any(map(pattern.match, known)))
-    return next(matching, None)
+    return next((rmw for rmw, one in _THREADS.items() if any(map(one.match, known))), None)
 
 
 def processes_of(tables: EventTables, commands: Mapping[int, str]) -> dict[int, str]:
     """Process → the nodes it created, else its ``commands`` entry (what the tracer calls it)."""
-    processes = dict(commands)
-    nodes = tables.get("rcl_node_init")
-    if nodes is not None and nodes.height:
-        named = nodes.select("pid", node=NODE_NAME).drop_nulls()
-        for pid, node in named.unique(maintain_order=True).group_by("pid").agg("node").iter_rows():
-            processes[pid] = ", ".join(node)
-    return dict(sorted(processes.items()))
+    named = table(tables, "rcl_node_init").select("pid", node=NODE_NAME).drop_nulls()
+    nodes = named.unique(maintain_order=True).group_by("pid").agg(pl.col("node").str.join(", "))
+    return dict(sorted({**commands, **dict(nodes.iter_rows())}.items()))

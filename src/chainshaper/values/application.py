@@ -9,9 +9,6 @@ from typing import Literal, TypeAlias
 
 from chainshaper.values.durations import format_duration
 
-__all__ = ["INTERNAL_SERVICES", "INTERNAL_TOPICS", "REQUEST", "RESPONSE", "ApplicationGraph"]
-__all__ += ["Callback", "CallbackKind", "Chain", "Node", "trigger_text"]
-
 INTERNAL_TOPICS = frozenset(("/parameter_events", "/rosout", "/clock", "/_chainshaper_rehearsal"))
 """Topics that every node has for itself, or every shaping node: they connect no computation."""
 
@@ -31,9 +28,7 @@ publications were seen (``handle`` 0: a thread of the node's own)."""
 
 
 def trigger_text(topic: str | None, period_ns: int | None) -> str:
-    """What starts a callback: its topic, or ``every 100ms``. It is the same in every run, and what
-    the callbacks of a node are told apart by; empty where neither is known.
-    """
+    """What starts a callback, in every run alike: its topic, or ``every 100ms``; else empty."""
     return topic or "" if period_ns is None else f"every {format_duration(period_ns)}"
 
 

@@ -9,8 +9,6 @@ from decimal import Decimal
 
 from chainshaper.values.errors import InputError
 
-__all__ = ["duration_text", "format_duration", "milliseconds", "parse_duration"]
-
 NS_PER_UNIT = {"ns": 1, "us": 1_000, "µs": 1_000, "ms": 1_000_000, "s": 1_000_000_000}
 _DURATION = re.compile(r"\s*([+-]?\d+(?:\.\d*)?|[+-]?\.\d+)\s*(ns|us|µs|ms|s)\s*")
 
@@ -26,9 +24,8 @@ def parse_duration(text: str) -> int:
         return 0
     match = _DURATION.fullmatch(text)
     if match is None:
-        raise InputError(
-            f"{text!r} is not a duration: write a number and a unit (ns, us, ms, s), such as 250us"
-        )
+        remedy = "write a number and a unit (ns, us, ms, s), such as 250us"
+        raise InputError(f"{text!r} is not a duration: {remedy}")
     nanoseconds = Decimal(match[1]) * NS_PER_UNIT[match[2]]
     if nanoseconds != int(nanoseconds):
         raise InputError(f"{text!r} is finer than a nanosecond, the resolution of every clock here")
@@ -36,10 +33,7 @@ def parse_duration(text: str) -> int:
 
 
 def format_duration(nanoseconds: int) -> str:
-    """The shortest exact text of a duration, for files and options: ``59ms``.
-
-    :func:`parse_duration` reads it back unchanged.
-    """
+    """The shortest exact text for files and options, as `parse_duration` reads it: ``59ms``."""
     return duration_text(nanoseconds).replace(" ", "")
 
 

@@ -14,9 +14,6 @@ import importlib
 import re
 from typing import Any
 
-__all__ = ["ChainshaperError", "InputError", "OperationError", "PlatformError"]
-__all__ += ["escape", "extra_library", "shown"]
-
 
 class ChainshaperError(Exception):
     """Any failure that chainshaper foresaw; its message is complete for a person."""
@@ -26,8 +23,6 @@ class ChainshaperError(Exception):
 
 class OperationError(ChainshaperError):
     """The operation failed although the request was valid: a node died, the disk is full."""
-
-    exit_code = 1
 
 
 class InputError(ChainshaperError):
@@ -43,7 +38,7 @@ class PlatformError(ChainshaperError):
 
 
 def extra_library(name: str, purpose: str, extra: str | None = None) -> Any:
-    """Import a library that only some uses need, or one module of it, which an ``extra`` installs.
+    """Import a library, or one module of it, that only some uses need and an ``extra`` installs.
 
     Raises PlatformError: it is not installed; says what it is needed for and how to get it.
     """
@@ -52,10 +47,8 @@ def extra_library(name: str, purpose: str, extra: str | None = None) -> Any:
     except ImportError as error:
         package = name.partition(".")[0]
         wanted = package if extra is None else f"'chainshaper[{extra}]'"
-        raise PlatformError(
-            f"{purpose} needs the Python package {package} ({error}): install it with"
-            f" `pip install {wanted}`"
-        ) from error
+        what = f"{purpose} needs the Python package {package} ({error})"
+        raise PlatformError(f"{what}: install it with `pip install {wanted}`") from error
 
 
 _UNSAFE = re.compile(

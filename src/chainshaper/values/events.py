@@ -4,7 +4,7 @@ They are the events of `ros2_tracing` (tracetools 8.x, Jazzy, `tracetools.h`) un
 and fields, and the kernel's `sched:sched_switch`. Every table has the columns of
 :data:`COMMON_COLUMNS` followed by the event's own fields:
 
-* ``time``: nanoseconds of CLOCK_MONOTONIC. Add the recording's ``clock_offset_ns`` for wall-clock
+* ``time``: nanoseconds of CLOCK_MONOTONIC; with the recording's ``clock_offset_ns`` wall-clock
   time, which is what DDS source timestamps are.
 * ``pid``, ``tid``: process and thread, as the kernel numbers them in the traced container.
 * ``cpu``: the core, null where the source does not know it.
@@ -217,10 +217,7 @@ NODE_NAME = pl.col("namespace").fill_null("").str.strip_chars_end("/") + "/" + p
 
 
 def happened(tables: EventTables, since_ns: int, until_ns: int | None = None) -> EventTables:
-    """The events from one instant to another, and the creation of all objects.
-
-    A gate's decision belongs to the cycle that it was about: one that began before is left out.
-    """
+    """The events of a time, those of gates by when the cycle began; and all objects' creation."""
     found = dict(tables)
     for name, frame in tables.items():
         if name not in CREATION:
@@ -236,15 +233,10 @@ def empty(name: str) -> pl.DataFrame:
 
 
 def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.DataFrame:
-    """The table of event ``name``, empty when absent, with ``columns`` present (null if unknown).
-
-    So code asks for the columns it can use, whatever a distribution or tracer did not record.
-    """
+    """The table of event ``name``, empty when absent, with ``columns``, null if unknown."""
     frame, known = tables[name] if name in tables else empty(name), column_types(name)
-    missing = [column for column in columns if column not in frame.columns]
-    if not missing:
-        return frame
-    return frame.with_columns(pl.lit(None, dtype=known[column]).alias(column) for column in missing)
+    nulls = [pl.lit(None, known[one]).alias(one) for one in columns if one not in frame.columns]
+    return frame.with_columns(nulls) if nulls else frame
 
 
 def column_types(name: str) -> dict[str, pl.DataType]:
@@ -280,10 +272,7 @@ def castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
 
 
 def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
-    """A frame with the types of its event's table.
-
-    Raises polars.exceptions.PolarsError: a value does not fit, or a row has no time.
-    """
+    """A frame with the types of its event's table. Raises PolarsError: a value does not fit."""
     if "cpu" not in frame.columns:
         frame = frame.with_columns(cpu=pl.lit(None, COMMON_COLUMNS["cpu"]))
     frame = frame.with_columns(

@@ -15,8 +15,6 @@ from pathlib import Path
 
 from chainshaper.values.errors import InputError, OperationError
 
-__all__ = ["free_place", "new_file", "open_to_all", "why_distrusted", "write_whole"]
-
 
 def why_distrusted(path: str | Path) -> str | None:
     """Why others may change a file, a folder or what leads there; None if they cannot."""
@@ -59,11 +57,10 @@ def free_place(path: Path, taken: bool) -> Path:
     Raises InputError: it is taken, or its folder does not exist.
     """
     if taken:
-        raise InputError(
-            f"{path} exists already and is not overwritten: name another, or remove it"
-        )
-    if not path.absolute().parent.is_dir():
-        raise InputError(f"{path.absolute().parent}: no such folder to write {path.name} into")
+        remedy = "name another, or remove it"
+        raise InputError(f"{path} exists already and is not overwritten: {remedy}")
+    if not (folder := path.absolute().parent).is_dir():
+        raise InputError(f"{folder}: no such folder to write {path.name} into")
     return path
 
 

@@ -1,8 +1,7 @@
 """A recording on disk: a folder with one Parquet file per event table and a `recording.json`.
 
-The folder is written beside its final place and renamed when it is complete, so a recording that
-exists is whole. `recording.json` has the conditions of the run, what was lost, and a checksum of
-every other file, which is compared when the file is read.
+The folder is written beside its final place and renamed when it is complete. `recording.json` has
+the conditions of the run, what was lost, and a checksum of every other file.
 """
 
 import io
@@ -30,6 +29,7 @@ FORMAT = 1
 MOST_ROWS = 1_000_000
 MOST_ROWS_PER_BYTE = 16
 """A file has no more rows than both together; events as regular as a clock take four bytes each."""
+_OR_AGAIN = ", or record the run again"
 Integer: TypeAlias = Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)]
 
 
@@ -69,8 +69,8 @@ class EndpointInfo(BaseModel, frozen=True):
 class StallMeterInfo(BaseModel, frozen=True):
     """How the machine was watched: a sleeper on every core of ``cores`` (ns throughout).
 
-    Stalls shorter than ``threshold_ns`` are not recorded. ``median_lateness_ns`` is an ordinary
-    wake-up's on each core. Where ``realtime`` is false, stalls may be ordinary scheduling.
+    ``median_lateness_ns`` is an ordinary wake-up's on each core. Where ``realtime`` is false,
+    stalls may be ordinary scheduling.
     """
 
     cores: tuple[Integer, ...]
@@ -92,10 +92,9 @@ class RecordingInfo(BaseModel, frozen=True):
     """The facts of a recording that are not events.
 
     ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME. ``lost`` counts events
-    that are known to be missing, by reason. ``realtime`` says whether SCHED_FIFO was in force
-    for every thread that was to have it, ``notes`` what a reader of the figures must know.
-    ``trace_events`` counts all events of the trace that it was converted from, by full name.
-    Processes and threads have the numbers of ``pid_namespace`` (its inode); None: each its own.
+    that are known to be missing, by reason. ``realtime``: SCHED_FIFO was in force for every thread
+    that was to have it. ``trace_events`` counts all events of a trace that was converted. Processes
+    and threads have the numbers of ``pid_namespace`` (its inode); None: each its own.
     """
 
     format: Integer = FORMAT
@@ -144,10 +143,8 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
         }
         known = {str(file.relative_to(path)) for files in self._files.values() for file in files}
         if missing := sorted(checksums.keys() - known):
-            raise InputError(
-                f"{path / missing[0]}: no such file, but {INFO_FILE} names it: copy the recording"
-                " whole, or record the run again"
-            )
+            reason = f"no such file, but {INFO_FILE} names it"
+            raise InputError(f"{path / missing[0]}: {reason}: copy the recording whole{_OR_AGAIN}")
         for name, files in self._files.items():
             for file in files:
                 with _readable(file), file.open("rb") as stream:
@@ -164,10 +161,8 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
                 rows = lazy.select(pl.len()).collect().item()
                 size = sum(part.getbuffer().nbytes for part in parts)
                 if rows > MOST_ROWS + MOST_ROWS_PER_BYTE * size:
-                    raise InputError(
-                        f"{file}: {rows} rows in {size} bytes are more than any run has; record"
-                        " the run again"
-                    )
+                    many = f"{rows} rows in {size} bytes are more than any run has"
+                    raise InputError(f"{file}: {many}; record the run again")
                 table = as_table(lazy.collect(), name)
             self._read[name] = table.sort("time", maintain_order=True)
         return self._read[name]
@@ -176,11 +171,9 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
         """A file's bytes, once it is sure that they are what was written."""
         content = file.read_bytes()
         expected = self._checksums.get(str(file.relative_to(self._path)))
-        if expected is not None and expected != _checksum(content):
-            raise InputError(
-                f"{file}: damaged: its checksum is {_checksum(content)}, {INFO_FILE} says"
-                f" {expected}; copy the recording again, or record the run again"
-            )
+        if expected is not None and expected != (found := _checksum(content)):
+            damage = f"damaged: its checksum is {found}, {INFO_FILE} says {expected}"
+            raise InputError(f"{file}: {damage}; copy the recording again{_OR_AGAIN}")
         return content
 
     def __iter__(self) -> Iterator[str]:
@@ -196,10 +189,8 @@ def _readable(file: Path) -> Iterator[Path]:
     try:
         yield file
     except (pl.exceptions.PolarsError, pl.exceptions.PanicException, OSError) as error:
-        reason = " ".join(str(error).split())
-        raise InputError(
-            f"{file}: not a readable event table ({reason}); record the run again"
-        ) from error
+        reason = f"not a readable event table ({' '.join(str(error).split())})"
+        raise InputError(f"{file}: {reason}; record the run again") from error
 
 
 def _checksum(content: bytes | memoryview) -> str:
@@ -209,8 +200,7 @@ def _checksum(content: bytes | memoryview) -> str:
 def event_counts(recording: Recording) -> pl.DataFrame:
     """How often each event happened: ``event, count``, ordered by event.
 
-    A tracer's events have their provider in front (``ros2:callback_start``), also those that the
-    analysis makes no use of; where we recorded ourselves, events are the tables.
+    A tracer's events have their provider in front (``ros2:callback_start``), also unused ones.
     """
     counts = getattr(recording.events, "counts", recording.info.trace_events)
     if not counts:
@@ -248,9 +238,8 @@ def open_recording(path: str | Path) -> Recording:
     # The format first: what else a newer one holds is not ours to judge.
     format_ = values.get("format", FORMAT) if isinstance(values, dict) else FORMAT
     if format_ != FORMAT:
-        raise InputError(
-            f"{file}: format {format_}, this chainshaper reads format {FORMAT}; update it"
-        )
+        reason = f"format {format_}, this chainshaper reads format {FORMAT}"
+        raise InputError(f"{file}: {reason}; update it")
     with wrong_values_refused(RecordingInfo, f"{file}: not a recording's description: "):
         info = RecordingInfo.model_validate_json(json.dumps(values), strict=True)
     return Recording(path, info, _TablesOnDisk(path, info.checksums or {}))
@@ -274,10 +263,8 @@ def write_recording(
     """Write a recording, whole or not at all, and open it.
 
     ``tables`` may come in parts, one after the other in time, for a recording that is larger than
-    memory. A table of several parts is a folder of Parquet files, which readers take for one.
-
-    Raises InputError: ``path`` exists already. OperationError: it cannot be written (disk full, no
-    permission); nothing is left behind.
+    memory: a table of several parts is a folder of Parquet files. Raises InputError: ``path``
+    exists already. OperationError: it cannot be written.
     """
     path = refuse_existing(path)
     try:
@@ -309,10 +296,8 @@ def _next_part(file: Path, checksums: dict[str, str]) -> Path:
 
 
 def _write_table(file: Path, frame: pl.DataFrame) -> str:
-    """Write a file; returns its checksum."""
-    # By way of memory: writing to a file itself, Polars reports a full disk as a file that is out
-    # of specification.
-    content = io.BytesIO()
+    """Write a file; its checksum."""
+    content = io.BytesIO()  # written directly, Polars reports a full disk as a wrong file
     frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
     with file.open("xb") as stream:
         stream.write(content.getbuffer())

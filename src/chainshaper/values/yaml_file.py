@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Annotated, TypeAlias, TypeVar
+from typing import Annotated, Any, TypeAlias, TypeVar
 
 import yaml
 from pydantic import (
@@ -78,10 +78,8 @@ def _above_zero(value: int) -> int:
 
 def _full_name(value: str) -> str:
     if not re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", value):
-        raise ValueError(
-            f"{value!r} is not a full ROS 2 name: write /name or /namespace/name, of letters,"
-            " digits and underscores, no part beginning with a digit"
-        )
+        remedy = "write /name or /namespace/name, of letters, digits and underscores"
+        raise ValueError(f"{value!r} is not a full ROS 2 name: {remedy}, no digit leading a part")
     return value
 
 
@@ -92,10 +90,7 @@ FullName = Annotated[str, AfterValidator(_full_name)]
 
 
 class Part(BaseModel):
-    """A part of a YAML file: frozen, strict, no unknown keys.
-
-    Fields that end in ``_ns`` stand in YAML without the suffix, their values with a unit.
-    """
+    """A part of a YAML file; its fields in ``_ns`` have units there instead of the suffix."""
 
     model_config = ConfigDict(
         frozen=True,
@@ -129,10 +124,8 @@ def read_model(
 ) -> Model | Other:
     """A YAML file as a Pydantic model; ``made_by`` completes the sentence "such a file is …".
 
-    ``otherwise`` is the model of a file that has a certain key.
-
-    Raises InputError: no such file, not YAML, or wrong values; each is named with its line, key,
-    reason and remedy.
+    ``otherwise`` is the model of a file that has a certain key. Raises InputError: no such file,
+    not YAML, or wrong values, each with its line, key, reason and remedy.
     """
     path = Path(path)
     root = compose(read_text(path, made_by), path)
@@ -155,10 +148,7 @@ def read_model(
 
 
 def read_text(path: Path, made_by: str) -> str:
-    """The text of a file that a person writes.
-
-    Raises InputError: it cannot be read, is no text in UTF-8, or larger than any such file.
-    """
+    """The text of a file that a person writes. Raises InputError: not readable, or no such text."""
     such = f"such a file is {made_by}"
     try:
         with path.open("rb") as file:
@@ -193,10 +183,7 @@ class _Loader(yaml.SafeLoader):
 
 
 def compose(text: str, name: str | Path) -> yaml.Node | None:
-    """The YAML nodes of a text, which ``name`` stands for in messages; None of an empty one.
-
-    Raises InputError: it is not YAML, or nested too deeply; the line is named.
-    """
+    """The YAML nodes of a text, called ``name`` in messages. Raises InputError: it is not YAML."""
     try:
         return yaml.compose(text, Loader=_Loader)
     except yaml.MarkedYAMLError as error:
@@ -215,16 +202,14 @@ def _scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
     """A scalar's value. Dates and other things that no file of ours has are texts.
 
     Raises ValueError: its tag says that it is something that it is not (``!!int ""``), or a number
-    is too large for any use; in words.
+    is too large for any use.
     """
     try:
         value = _SCALARS.construct_object(node)
     except Exception as error:
         # PyYAML's constructors raise whatever int, re or a dictionary does.
-        implicit = _SCALARS.resolve(  # type: ignore[no-untyped-call]
-            yaml.ScalarNode, node.value, (True, False)
-        )
-        if node.tag == implicit:
+        resolve: Any = _SCALARS.resolve
+        if node.tag == resolve(yaml.ScalarNode, node.value, (True, False)):
             return str(node.value)  # nothing in the file claims what it is: a malformed date
         tag = node.tag.replace("tag:yaml.org,2002:", "!!")
         raise ValueError(f"{node.value!r} is no {tag}: write the value without a tag") from error
@@ -247,10 +232,7 @@ class PlainData:
     _seen: set[int] = field(default_factory=set)
 
     def of(self, node: yaml.Node, where: _Path = ()) -> object:
-        """The value of a node that stands at a place.
-
-        Raises InputError: a value that cannot be, or a key that stands twice; the line is named.
-        """
+        """The value of a node at a place. Raises InputError: it cannot be, or has a key twice."""
         self.lines[where] = node.start_mark.line + 1
         if isinstance(node, yaml.ScalarNode):
             try:
@@ -261,8 +243,8 @@ class PlainData:
             reason = "refers to this by a YAML alias (*name): write the value out"
             raise self._wrong(node, where, reason)
         if len(self.lines) > MOST_VALUES or len(where) > DEEPEST:
-            reason = f"with its aliases (*name) the file has more than {MOST_VALUES} values: write"
-            raise self._wrong(node, where, f"{reason} it without them")
+            reason = f"more than {MOST_VALUES} values, with its aliases (*name): write it without"
+            raise self._wrong(node, where, f"the file has {reason} them")
         self._seen.add(id(node))
         if isinstance(node, yaml.SequenceNode):
             return tuple(self.of(item, (*where, number)) for number, item in enumerate(node.value))
@@ -299,10 +281,7 @@ class PlainData:
 
 @contextmanager
 def wrong_values_refused(model: type[BaseModel], what: str = "") -> Iterator[None]:
-    """Inside, values that a model may not have end in one InputError that names each of them.
-
-    ``what`` stands before them, and says what they are of.
-    """
+    """Inside, values that a model may not have end in one InputError that begins with ``what``."""
     try:
         yield
     except ValidationError as error:

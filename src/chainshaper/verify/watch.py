@@ -36,11 +36,10 @@ from chainshaper.sources.preload import (
     TracedProcess,
     creation_tables,
     event_tables,
-    info_of,
     joined_tables,
     memories,
 )
-from chainshaper.sources.system import processes_of
+from chainshaper.sources.system import info_of, own_pid_namespace, processes_of
 from chainshaper.splicing.shaped_outputs import find_outputs
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, extra_library
@@ -401,8 +400,10 @@ class Watch:
         tables = self._tables(now - RECORDER_NS)
         if not tables:
             raise OperationError(f"{output} is not written: no event has been seen yet")
-        versions = [library.version for _, _, library in self._created.values()]
+        versions = (library.version for _, _, library in self._created.values())
         facts: dict[str, Any] = {
+            "clock_offset_ns": self._clock_offset_ns,
+            "pid_namespace": own_pid_namespace(),
             "chain": self.chains[0].text if self.chains else None,
             "notes": (
                 "the last seconds before it was asked for; objects from before them are there",
@@ -411,8 +412,7 @@ class Watch:
         if self.plan is not None:
             facts["plan"] = plan_values(self.plan)
             facts["in_force"] = InForceInfo(since_ns=now - RECORDER_NS)
-        info = info_of(tables, versions, self._clock_offset_ns, self.lost, {})
-        info = info.model_copy(update=facts)
+        info = info_of("preload", tables, versions, {}, self.lost, **facts)
         return write_recording(output, tables, info)
 
 

@@ -1,13 +1,12 @@
 """The compiled interpreter: runs operations over a packet's bits (CTF 1.8, section 4).
 
 Positions are bits from the start of a packet. Every operation checks the end of the packet's
-content before it reads, and every load the number of bytes mapped behind the packet's start; a
-failed check ends the run with a negative code of `layout`. Texts go to a dictionary, in which
-every different string is once.
+content before it reads, and every load the bytes mapped behind the packet's start; a failed check
+ends the run with a negative code of `layout`. Texts go to a dictionary, each different one once.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
-# ruff: noqa: PLR0911, PLR0912, PLR0915, PLR0917
+# ruff: noqa: PLR0912, PLR0917
 
 import numpy as np
 
@@ -42,10 +41,7 @@ def word_at(base, at, mapped):
 
 @compiled(inline=True)
 def digest_text(base, at, limit, mapped):
-    """Read a text in [at, limit) up to its first NUL or the limit.
-
-    Returns (length, its hash, its last word with zeros behind it).
-    """
+    """Length, hash and last word (zeros behind it) of a text that ends at a NUL or ``limit``."""
     digest, word, place, zeros = tb.FACTOR, tb.U0, at, tb.U0
     while zeros == tb.U0:
         word = word_at(base, place, mapped)
@@ -71,8 +67,7 @@ def slot_at(slots, place):
 def intern(machine, place, length, digest, word):
     """The dictionary code of the string at an address, or -1 where the dictionary is full.
 
-    Entries are rows (address, length, hash, last word); the hash table is open, with as many
-    places as a power of two.
+    Entries are rows (address, length, hash, last word); the hash table is open.
     """
     slots, mask = get(machine, tb.M_SLOTS), get(machine, tb.M_MASK)
     entries = get(machine, tb.M_ENTRIES)
@@ -85,10 +80,8 @@ def intern(machine, place, length, digest, word):
             and get(entry, 1) == length
             and get(entry, 3) == np.int64(word)
         ):
-            index = length * 0
-            while index + 8 < length and load_word(get(entry, 0) + index) == load_word(
-                place + index
-            ):
+            index, known = length * 0, get(entry, 0)
+            while index + 8 < length and load_word(known + index) == load_word(place + index):
                 index += 8
             if index + 8 >= length:
                 return code
@@ -157,9 +150,10 @@ def store(column, width, row, value):
 
 @compiled(inline=True)
 def keep(op, value, rows):
-    """Write a value to its slot's row."""
-    row = get(rows, get(op, tb.O_COUNTER))
-    store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, value)
+    """Write a value to its slot's row, if it has a slot."""
+    if get(op, tb.O_ADDRESS) != 0:
+        row = get(rows, get(op, tb.O_COUNTER))
+        store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, value)
 
 
 @compiled(inline=True)
@@ -194,8 +188,7 @@ def run_number(machine, op, base, mapped, position, regs):
     register = get(op, tb.O_REGISTER)
     if register >= 0:
         put(regs, register, np.int64(value))
-    if get(op, tb.O_ADDRESS) != 0:
-        keep(op, value, get(machine, tb.M_ROWS))
+    keep(op, value, get(machine, tb.M_ROWS))
     if flags & 4:
         advance_clock(get(machine, tb.M_STATE), value, size)
 
@@ -256,9 +249,9 @@ def choose(op, ranges, regs):
 
 @compiled()
 def run_many(machine, op, base, end, position, regs, depth):
-    """Begin a SKIP_MANY, COPY or LOOP; returns the position behind the first two or a failure.
+    """Run a SKIP_MANY or COPY, or begin a LOOP, whose turns go on the stack at ``depth``.
 
-    A loop's number of turns goes on the stack at ``depth``.
+    Returns the position behind it or a failure.
     """
     code, register = get(op, tb.O_CODE), get(op, tb.O_REGISTER)
     count = get(op, tb.O_COUNT) if register < 0 else get(regs, register)
@@ -273,8 +266,7 @@ def run_many(machine, op, base, end, position, regs, depth):
     rows, inner = get(machine, tb.M_ROWS), get(op, tb.O_INNER)
     if inner >= 0 and get(rows, inner) + count > get(get(machine, tb.M_CAPS), inner):
         return np.int64(tb.FULL_TABLE)
-    if get(op, tb.O_ADDRESS) != 0:
-        keep(op, np.uint64(count), rows)
+    keep(op, np.uint64(count), rows)
     if code == tb.LOOP:
         put(state, tb.X_STACK + depth, count)
         return position
@@ -287,11 +279,10 @@ def run_many(machine, op, base, end, position, regs, depth):
 
 @compiled()
 def move_batch(machine, event, batch):
-    """Run the operations of a class of events of constant layout, one operation at a time.
+    """Run the operations of a class of events of constant layout, each over the whole ``batch``.
 
-    ``batch`` is the number of events and their (address, row); behind the bytes of each, eight
-    more may be loaded.  One operation over many events has no branches to guess and
-    nothing to wait for.  Returns 0 or FULL_DICTIONARY, after which all is to be done again.
+    So there are no branches to guess and nothing to wait for. Eight bytes behind each event may be
+    loaded. Returns 0 or FULL_DICTIONARY, after which all is to be done again.
     """
     count, ops, size = get(batch, 0), get(machine, tb.M_OPS), get(event, tb.E_SIZE) >> 3
     first, last = get(event, tb.E_FILL), get(event, tb.E_FILL_STOP)
@@ -323,53 +314,35 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
 
     Their first and the one after their last stand in the ``column`` of ``owner`` and the next.
     ``base`` is the address of the packet, ``mapped`` the bytes that may be loaded from there,
-    ``end`` the end of the content in bits, ``regs`` the address of the registers,
-    ``row`` that of the table that the event goes to.
+    ``end`` the end of the content in bits, ``row`` that of the table that the event goes to.
     """
     ops, state = get(machine, tb.M_OPS), get(machine, tb.M_STATE)
     op, stop = ops + (get(owner, column) << 7), ops + (get(owner, column + 1) << 7)
     depth = np.int64(0)
     while op < stop:
-        code, align = get(op, tb.O_CODE), get(op, tb.O_ALIGN)
+        code, align, following = get(op, tb.O_CODE), get(op, tb.O_ALIGN), op + tb.O_ROW
         position = (position + align - 1) & -align
-        if code == tb.MOVE:
-            place = position >> 3
+        if code <= tb.MOVE:
+            start, place = position, position >> 3
             position += get(op, tb.O_SIZE)
             if position > end:
                 return np.int64(tb.TRUNCATED)
-            if place + 8 > mapped:
-                run_number(machine, op, base, mapped, position - get(op, tb.O_SIZE), regs)
-            else:
+            if code == tb.MOVE and place + 8 <= mapped:
                 store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, load_word(base + place))
-            op += tb.O_ROW
-        elif code == tb.NUMBER:
-            following = position + get(op, tb.O_SIZE)
-            if following > end:
-                return np.int64(tb.TRUNCATED)
-            run_number(machine, op, base, mapped, position, regs)
-            position = following
-            op += tb.O_ROW
-        elif code == tb.SKIP:
-            position += get(op, tb.O_SIZE)
-            if position > end:
-                return np.int64(tb.TRUNCATED)
-            op += tb.O_ROW
-        elif code in (tb.TEXT, tb.CHARACTERS):
+            elif code != tb.SKIP:
+                run_number(machine, op, base, mapped, start, regs)
+        elif code <= tb.CHARACTERS:
             position = run_text(machine, op, base, mapped, end, position, regs)
             if position < 0:
                 return position
-            op += tb.O_ROW
-        elif code in (tb.SKIP_MANY, tb.COPY, tb.LOOP):
+        elif code <= tb.LOOP:
             position = run_many(machine, op, base, end, position, regs, depth)
             if position < 0:
                 return position
-            if code != tb.LOOP:
-                op += tb.O_ROW
-            elif get(state, tb.X_STACK + depth) == 0:
-                op = ops + (get(op, tb.O_TARGET) << 7)
-            else:
+            if code == tb.LOOP and get(state, tb.X_STACK + depth) == 0:
+                following = ops + (get(op, tb.O_TARGET) << 7)
+            elif code == tb.LOOP:
                 depth += 1
-                op += tb.O_ROW
         elif code == tb.AGAIN:
             inner = get(op, tb.O_INNER)
             if inner >= 0:
@@ -378,17 +351,16 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
             left = get(state, tb.X_STACK + depth - 1) - 1
             put(state, tb.X_STACK + depth - 1, left)
             if left > 0:
-                op = ops + (get(op, tb.O_TARGET) << 7)
+                following = ops + (get(op, tb.O_TARGET) << 7)
             else:
                 depth -= 1
-                op += tb.O_ROW
         elif code == tb.SWITCH:
             chosen = choose(op, get(machine, tb.M_RANGES), regs)
             if chosen < 0:
                 return np.int64(tb.NO_OPTION)
-            if get(op, tb.O_ADDRESS) != 0:
-                keep(op, np.uint64(get(chosen, 3)), get(machine, tb.M_ROWS))
-            op = ops + (get(chosen, 2) << 7)
+            keep(op, np.uint64(get(chosen, 3)), get(machine, tb.M_ROWS))
+            following = ops + (get(chosen, 2) << 7)
         else:
-            op = ops + (get(op, tb.O_TARGET) << 7)
+            following = ops + (get(op, tb.O_TARGET) << 7)
+        op = following
     return position

@@ -1,7 +1,6 @@
 """The compiled passes over a trace: find packets, count events, merge streams and write columns.
 
-They run without Python's lock. `layout` says what they are given, `layout` what the operations
-mean.
+They run without Python's lock. `layout` says what they are given.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
@@ -34,26 +33,11 @@ def known_or(known, register, regs, default):
 
 
 @compiled()
-def note_packet(packet, offset, mapped, stream, known, regs, end):
-    """Fill a row of the table of packets."""
-    bits = known_or(known, tb.R_PACKET, regs, mapped * 8)
-    put(packet, tb.P_BYTE, offset)
-    put(packet, tb.P_BYTES, min(bits >> 3, mapped))
-    put(packet, tb.P_END, min(end, mapped * 8))
-    put(packet, tb.P_STREAM, stream)
-    for index in range(6):  # from INSTANCE to CPU, as their registers stand
-        number = known_or(known, tb.R_INSTANCE + index, regs, np.int64(-1))
-        put(packet, tb.P_INSTANCE + index, number)
-    put(packet, tb.P_ERROR, np.int64(0))
-
-
-@compiled()
 def scan_packets(machine, regs, base, size, packets, room, reached, first, last):
-    """Find the packets of a file from where an earlier call stopped (section 5).
+    """Find the packets of a file from where an earlier call stopped (section 5); the status.
 
-    ``reached`` are two numbers that advance: the offset in the file and the packets found.  The
-    folder's stream classes are the rows [first, last).  Returns the status; a packet that the
-    file cuts short is listed with status CUT.
+    ``reached`` are two numbers that advance: the offset in the file and the packets found. The
+    folder's stream classes are the rows [first, last). A packet that is CUT short is listed.
     """
     streams, state = get(machine, tb.M_STREAMS), get(machine, tb.M_STATE)
     leading = streams + first * tb.S_ROW
@@ -94,7 +78,14 @@ def scan_packets(machine, regs, base, size, packets, room, reached, first, last)
         content = known_or(known, tb.R_CONTENT, regs, bits)
         if bits <= 0 or bits & 7 or content < position or content > bits:
             return np.int64(tb.BAD_SIZE)
-        note_packet(packets + found * tb.P_ROW, offset, mapped, stream, known, regs, content)
+        packet = packets + found * tb.P_ROW
+        put(packet, tb.P_BYTE, offset)
+        put(packet, tb.P_BYTES, min(bits >> 3, mapped))
+        put(packet, tb.P_END, min(content, mapped * 8))
+        put(packet, tb.P_STREAM, stream)
+        for index in range(6):  # from INSTANCE to CPU, as their registers stand
+            number = known_or(known, tb.R_INSTANCE + index, regs, np.int64(-1))
+            put(packet, tb.P_INSTANCE + index, number)
         put(reached, 1, found + 1)
         if bits >> 3 > mapped:
             return np.int64(tb.CUT)
@@ -186,13 +177,12 @@ def copy_numbers(target, source, count):
 def walk_events(
     machine, regs, base, size, packets, first, last, counts, borders, border, spans, marks
 ):
-    """Step through every event of the ``packets`` [first, last) of a file.
+    """Step through every event of the ``packets`` [first, last) of a file; the next border.
 
-    Advances ``counts`` per event class and the row counters per level.  ``borders`` are
-    ``spans`` instants (ns, ascending), those before number ``border`` being done; for each, the
-    row of ``marks`` gets the first event at or after it (packet, position, clock) and the row
-    counters before it.  Returns the next border.  An event that cannot be read ends its packet:
-    the packet's END becomes that event's position, ERROR the failure, ERROR_AT where.
+    Advances ``counts`` per event class and the row counters per level. ``borders`` are ``spans``
+    instants (ns, ascending), those before number ``border`` being done; for each, the row of
+    ``marks`` gets the first event at or after it (packet, position, clock) and the row counters
+    before it. An event that cannot be read ends its packet: END becomes that event's position.
     """
     state, rows, saved = get(machine, tb.M_STATE), get(machine, tb.M_ROWS), get(machine, tb.M_SAVED)
     events, counters = get(machine, tb.M_EVENTS), get(machine, tb.M_COUNTERS)
@@ -251,8 +241,8 @@ def walk_events(
 def next_packet(machine, file, packets, index, regs):
     """Open the first packet from ``index`` on that has events in the file's span.
 
-    Returns (packet, position of its first event, end of its events in the span); position -1
-    for the span's end, a failure below that.
+    Returns (packet, position of its first event, end of its events in the span); the position is
+    -1 at the span's end, a failure below that.
     """
     last = get(file, tb.F_LAST_PACKET)
     while index < last or (index == last and get(file, tb.F_LAST_POSITION) >= 0):
@@ -276,9 +266,9 @@ def next_packet(machine, file, packets, index, regs):
 def read_ahead(machine, file, cursor, ahead, packets, regs):
     """Find the next wanted events of a file: how many, 0 at the span's end.
 
-    Fills the file's part of the table ``ahead`` up to the end of a packet, whose registers then
-    hold for all of them, or to an event whose length only reading it will tell. Negative where
-    the file no longer is what it was when its events were counted.
+    Fills the file's part of the table ``ahead`` up to the end of a packet, whose registers go with
+    all of them, or to an event whose length only reading it will tell. Negative where the file is
+    not what it was when its events were counted.
     """
     state, events = get(machine, tb.M_STATE), get(machine, tb.M_EVENTS)
     put(state, tb.X_CLOCK, get(cursor, tb.C_CLOCK))
@@ -328,9 +318,9 @@ def read_ahead(machine, file, cursor, ahead, packets, regs):
 
 @compiled()
 def write_apart(machine, event, file, cursor, packets, regs, row):
-    """Write an event whose length is not known before: 0 or a failure, after which it is undone.
+    """Write an event whose length is not known before, the last one that was read ahead.
 
-    It is the last that was read ahead, so that its file goes on behind it.
+    Returns 0 or a failure, after which it is undone.
     """
     state, levels = get(machine, tb.M_STATE), get(event, tb.E_LEVELS)
     counters = get(machine, tb.M_ROWS) + 8 * get(event, tb.E_COUNTER)
@@ -339,9 +329,9 @@ def write_apart(machine, event, file, cursor, packets, regs, row):
     packet = packets + get(cursor, tb.C_PACKET) * tb.P_ROW
     at = get(packet, tb.P_BYTE)
     put(state, tb.X_CLOCK, get(cursor, tb.C_CLOCK))
-    base, size, end = get(file, tb.F_BASE), get(file, tb.F_SIZE), get(packet, tb.P_END)
+    base, mapped, end = get(file, tb.F_BASE) + at, get(file, tb.F_SIZE) - at, get(packet, tb.P_END)
     position = get(cursor, tb.C_POSITION)
-    position = execute(machine, event, tb.E_FILL, base + at, size - at, end, position, regs, row)
+    position = execute(machine, event, tb.E_FILL, base, mapped, end, position, regs, row)
     if position < 0:
         if levels > 1:
             copy_numbers(counters, get(machine, tb.M_SAVED), levels)
@@ -362,12 +352,9 @@ def write_event(machine, file, cursor, entry, packets, regs):
         return np.int64(tb.FULL_TABLE)
     if address != 0:
         batch = get(machine, tb.M_BATCHES) + number * tb.B_ROW
+        if get(batch, 0) == tb.BATCH and move_batch(machine, event, batch) < 0:
+            return np.int64(tb.FULL_DICTIONARY)
         count = get(batch, 0)
-        if count == tb.BATCH:
-            status = move_batch(machine, event, batch)
-            if status < 0:
-                return status
-            count = np.int64(0)
         put(batch, 2 * count + 1, address)
         put(batch, 2 * count + 2, row)
         put(batch, 0, count + 1)
@@ -387,11 +374,9 @@ def finish_batches(machine, events):
     """Write what is left in the batches of all event classes; 0 or FULL_DICTIONARY."""
     for number in range(events):
         batch = get(machine, tb.M_BATCHES) + number * tb.B_ROW
-        if get(batch, 0) > 0:
-            event = get(machine, tb.M_EVENTS) + number * tb.E_ROW
-            status = move_batch(machine, event, batch)
-            if status < 0:
-                return status
+        event = get(machine, tb.M_EVENTS) + number * tb.E_ROW
+        if get(batch, 0) > 0 and move_batch(machine, event, batch) < 0:
+            return np.int64(tb.FULL_DICTIONARY)
     return np.int64(0)
 
 
@@ -417,37 +402,23 @@ def play(tree, leaf, time, file):
 
 
 @compiled()
-def fill_columns(
-    machine, files, count, cursors, ahead, tree, leaves, packets, regs, registers, events
-):
-    """Write the wanted events of a span of all ``count`` files, merged by time.
+def fill_columns(machine, files, cursors, ahead, tree, leaves, packets, regs, registers, events):
+    """Write the wanted events of a span of all files, merged by time.
 
-    ``tree`` has twice as many nodes as ``leaves``, a power of two and at least ``count``; all
-    its times are NEVER at first, and its node 0 counts the files that were entered. ``ahead``
-    has AHEAD rows and ``regs`` the ``registers`` of every file; there are ``events`` event
-    classes. Returns 0 at the end of the span, FULL_DICTIONARY where the caller has to give a
-    larger dictionary and call again, another failure where a file changed under our hands.
+    ``tree`` has twice as many nodes as ``leaves``, a power of two; a file comes first as long as
+    none of its events is known. ``ahead`` has AHEAD rows and ``regs`` the ``registers`` of every
+    file. Returns 0 at the end of the span, FULL_DICTIONARY where the caller has to give a larger
+    one and call again, another failure where a file has changed.
     """
-    while get(tree, 0) < count:
-        file = get(tree, 0)
-        row, cursor, own = files + file * tb.F_ROW, cursors + file * tb.C_ROW, ahead + file * A_ALL
-        put(cursor, tb.C_PACKET, get(row, tb.F_PACKET) - 1)
-        status = read_ahead(machine, row, cursor, own, packets, regs + 8 * registers * file)
-        if status < 0:
-            return status
-        if status > 0:
-            play(tree, leaves + file, min(get(own, tb.A_TIME), tb.NEVER - 1), file)
-        put(tree, 0, file + 1)
     while get(tree, 2) < tb.NEVER:
-        file = get(tree, 3)
+        file, time = get(tree, 3), np.int64(tb.NEVER)
         row, cursor, own = files + file * tb.F_ROW, cursors + file * tb.C_ROW, ahead + file * A_ALL
-        entry = own + get(cursor, tb.C_PLACE) * tb.A_ROW
-        its = regs + 8 * registers * file
-        status = write_event(machine, row, cursor, entry, packets, its)
-        if status < 0:
-            return status
-        place = get(cursor, tb.C_PLACE) + 1
-        time = np.int64(tb.NEVER)
+        its, place = regs + 8 * registers * file, get(cursor, tb.C_PLACE)
+        if place < get(cursor, tb.C_COUNT):
+            status = write_event(machine, row, cursor, own + place * tb.A_ROW, packets, its)
+            if status < 0:
+                return status
+            place += 1
         if place < get(cursor, tb.C_COUNT):
             put(cursor, tb.C_PLACE, place)
             time = min(get(own + place * tb.A_ROW, tb.A_TIME), tb.NEVER - 1)

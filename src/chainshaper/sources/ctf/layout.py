@@ -1,15 +1,14 @@
 """From a trace's metadata to the tables that the compiled kernels read.
 
-Tables are of int64, a row per thing: a packet, a stream class, an event class, a stream file, a
-cursor in it, an event that was read ahead, an operation. A kernel gets the address of the one
-whose words (``M_…``) are the addresses of the others: Numba counts references to arrays at every
-call, at several times the cost of reading an event.
+Tables are of int64, a row per thing. A kernel gets the address of the one whose words (``M_…``) are
+the addresses of the others: Numba counts references to arrays at every call, at several times the
+cost of reading an event.
 
 `lay_out` turns the types of all events into operations. Runs of fixed size that are not asked for
 become one SKIP, so that an event that is not wanted costs one addition. Values go to *slots*, one
-flat array each. A slot belongs to a *level*: level 0 has one row per event; every array or
-sequence opens a level of its own, with one row per element. Slots and levels are numbered in the
-order in which a column's type is walked, here and where columns are made of them.
+flat array each. A slot belongs to a *level*: level 0 has one row per event, each array or sequence
+opens one with a row per element. Slots and levels are numbered in the order in which a column's
+type is walked, here and where columns are made of them.
 """
 
 # ruff: noqa: PLR0917 - what is known of a trace on the way down its metadata
@@ -30,8 +29,8 @@ from chainshaper.sources.ctf import tsdl
 # A table's columns stand together, with what they hold behind them.
 # The machine. RANGES of variants' tags: low, high, operation to go on with, 1 + option. ROWS are
 # the row counters (COUNTERS of them), CAPS how far each may go, SAVED room for some. SLOTS is the
-# dictionary's hash table, int32, MASK + 1 of them; ENTRIES are its strings: address, length, hash,
-# last word; ROOM of them. BATCHES has per event class a count and BATCH pairs (address, row).
+# dictionary's hash table, int32, MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per
+# event class a count and BATCH pairs (address, row).
 (
     M_OPS, M_RANGES, M_STATE, M_ROWS, M_CAPS, M_SAVED, M_SLOTS, M_MASK, M_ENTRIES, M_ROOM,
     M_STREAMS, M_EVENTS, M_IDS, M_COUNTERS, M_BATCHES, MACHINE_WORDS,
@@ -110,8 +109,8 @@ A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
 ) = range(15)
 OPERATION_COLUMNS = 16
 
-SKIP, NUMBER, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP, MOVE = range(11)
-"""MOVE: a NUMBER of 8, 4, 2 or 1 bytes as they lie in the packet, one per event."""
+SKIP, NUMBER, MOVE, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP = range(11)
+"""In groups that run alike. MOVE: a NUMBER of 8, 4, 2 or 1 bytes as they lie in the packet."""
 
 # Bytes per row.
 P_ROW, S_ROW, E_ROW = 8 * PACKET_COLUMNS, 8 * STREAM_COLUMNS, 8 * EVENT_COLUMNS
@@ -121,8 +120,8 @@ O_ROW, B_ROW = 8 * OPERATION_COLUMNS, 8 * (1 + 2 * BATCH)
 BUDGET = 64
 """What decoding may cost for each byte of a packet, and finding packets for each byte of a file.
 
-An operation costs 1, a byte of a column as well. Fields of no bits would else cost nothing: a
-few bytes of a packet could fill the memory. A bit that becomes a number of its own costs 3.
+An operation costs 1, a byte of a column as well: with fields of no bits, a few bytes of a packet
+could else fill the memory.
 """
 
 ENDLESS = 1 << 40
@@ -186,10 +185,9 @@ class Slot(NamedTuple):
 
 @dataclass(frozen=True)
 class Table:
-    """Where the events of one name and one shape go.
+    """Where the events of one name and one shape go: ``time``, ``cpu`` where known, ``columns``.
 
-    ``counter`` is the row counter of level 0 and ``levels`` how many belong to the table; the
-    columns are ``time``, ``cpu`` where known, and those of ``columns``.
+    ``counter`` is the row counter of level 0 and ``levels`` how many belong to the table.
     """
 
     name: str
@@ -201,10 +199,9 @@ class Table:
 
 
 class Wanted(NamedTuple):
-    """What is to be read: events that get a table, and which of their context.
+    """Events that get a table, those of them without their procname, and whether with all context.
 
-    pid, tid and procname always, procname not for the ``nameless`` ones; the other context fields
-    with ``context``.
+    pid and tid always are wanted.
     """
 
     names: frozenset[str] = frozenset()
@@ -231,9 +228,8 @@ class Event(NamedTuple):
 class Layout:
     """Tables for the kernels, and what their rows mean.
 
-    ``ranges`` are those of variants' tags: low, high, target, 1 + option. ``folders`` has the rows
-    of each folder's stream classes (first, end), ``steps`` counts the types that were laid out,
-    ``labels`` has the ranges of enumerations by label.
+    ``folders`` has the rows of each folder's stream classes (first, end), ``steps`` counts the
+    types that were laid out, ``labels`` has the ranges of enumerations by label.
     """
 
     operations: list[list[int]] = field(default_factory=list)
@@ -252,17 +248,13 @@ class Layout:
     def arrays(self) -> dict[int, NDArray[np.int64]]:
         """The kernels' tables by their word in the machine, none of them empty."""
         if not self._arrays:
-            events = [event.row for event in self.events]
             rows = {M_OPS: self.operations, M_RANGES: self.ranges, M_STREAMS: self.streams}
-            rows |= {M_EVENTS: events, M_IDS: [[number] for number in self.ids]}
+            rows |= {M_EVENTS: [one.row for one in self.events], M_IDS: [[n] for n in self.ids]}
             self._arrays = {word: np.array(t or [[0]], np.int64) for word, t in rows.items()}
         return self._arrays
 
     def attach(self, table: Table, time: int, cpu: int, slots: Sequence[tuple[int, int]]) -> None:
-        """Give a table's event classes the operations that write to its columns.
-
-        ``time`` and ``cpu`` (0: none) are addresses, ``slots`` addresses and bytes per row.
-        """
+        """Give a table's event classes what writes to its columns, whose addresses these are."""
         self._arrays, self.steps = {}, 0
         for event in self.tables[table]:
             row, writer = event.row, event.header.following(slots)
@@ -290,10 +282,7 @@ class Layout:
 
 
 def lay_out(folders: Sequence[tsdl.CtfFolder], wanted: Wanted) -> Layout:
-    """Lay out every stream and event class of all ``folders``.
-
-    Raises `CtfError` for types that cannot be read.
-    """
+    """Lay out every stream and event class. Raises `CtfError` for types that cannot be read."""
     layout = Layout()
     for folder in folders:
         first = len(layout.streams)
@@ -338,8 +327,7 @@ class _Writer:
     ``addresses`` are those of the slots, and their bytes per row; without them rows are only
     counted. ``roots`` maps a dynamic scope (``stream.event.context``, …) to the numbers read there
     so far; a number whose name is ``referenced`` gets a register, ``registers`` the next one. In
-    headers (``fixed``) the numbers of REGISTERS have those. ``slots`` and ``levels`` grow with
-    every column that is wanted.
+    headers (``fixed``) the numbers of REGISTERS have those.
     """
 
     layout: Layout
@@ -367,15 +355,13 @@ class _Writer:
             if kind is not None:
                 self._skip(kind.align, 0)
             for member in kind.fields if kind is not None else ():
-                match member:
-                    case tsdl.Field("uuid", tsdl.ArrayType(tsdl.IntegerType(8, 8), 16)) if (
-                        self.fixed
-                    ):
+                place = _Place((frame,), 0, member.name in wanted)
+                match member.type if self.fixed and member.name == "uuid" else None:
+                    case tsdl.ArrayType(tsdl.IntegerType(8, 8), 16):
+                        half = tsdl.IntegerType(64, 8, byte_order="le")
                         for name in ("uuid_low", "uuid_high"):
-                            half = tsdl.IntegerType(64, 8, byte_order="le")
-                            self._number(name, half, _Place((frame,), 0, False))
+                            self._number(name, half, place)
                     case _:
-                        place = _Place((frame,), 0, member.name in wanted)
                         self._type(member.name, member.type, place)
         self.layout.registers = max(self.layout.registers, self.registers)
         return self.start, len(self.layout.operations)
@@ -449,10 +435,8 @@ class _Writer:
         if at.keep:
             self.levels += 1
             columns[O_INNER] = inner
-        slots, loop = len(self.slots), self._row(LOOP, columns)
-        first = len(rows)
-        place_inside = at.inside({})._replace(level=inner)
-        least = self._type(f"{name}[]", kind.element, place_inside)
+        slots, loop, first = len(self.slots), self._row(LOOP, columns), len(rows)
+        least = self._type(f"{name}[]", kind.element, at.inside({})._replace(level=inner))
         found = self.slots[slots:]
         loop[O_COST] = sum(slot.dtype.itemsize for slot in found if slot.level == inner)
         only = rows[first] if len(rows) == first + 1 else loop
@@ -503,13 +487,11 @@ class _Writer:
         return min(least, default=0)
 
     def _ranges_by_label(self, tag: _Number) -> dict[str, list[tuple[int, int]]]:
-        """The values that choose each option of a variant; variants may share an enumeration.
-
-        Unsigned tags are compared as signed numbers, both with their top bit turned.
-        """
+        """The values that choose each option of a variant; variants may share an enumeration."""
         found = self.layout.labels.get(id(tag.mappings))
         if found is None:
             found = self.layout.labels[id(tag.mappings)] = {}
+            # Unsigned tags are compared as signed numbers, both with their top bit turned.
             first, turned = (-(1 << 63), 0) if tag.signed else (0, 1 << 63)
             last = first + (1 << 64) - 1
             for label, low, high in tag.mappings:
@@ -610,7 +592,7 @@ def _add_event(
     stream: list[int],
     wanted: Wanted,
 ) -> list[int]:
-    """Lay out an event class; returns its row. A wanted one goes to the table of its shape."""
+    """Lay out an event class; its row. A wanted one goes to the table of its shape."""
     writer, row, table = header.following(), [0] * EVENT_COLUMNS, None
     start, stop = row[E_WALK], row[E_WALK_STOP] = writer.run(scopes)
     row[E_COUNTER], row[E_COST] = -1, layout.cost(start, stop)
@@ -639,28 +621,28 @@ def _columns(
 ) -> tuple[list[_Scope], list[tuple[str, tsdl.Type]]]:
     """The scopes of an event behind its header, and its columns by their final names.
 
-    A kernel trace's own pid and tid are those of the initial namespace; user space traces have
-    ``vpid`` and ``vtid`` of the process's namespace only.
+    A kernel trace's pid and tid are of the initial namespace; user space traces have ``vpid`` and
+    ``vtid`` of the process's only.
     """
     contexts = {"stream.event.context": stream.event_context, "event.context": event.context}
     if event.name not in asked.names:
         return [(s, k, ()) for s, k in {**contexts, "event.fields": event.fields}.items()], []
+    members_of = {s: kind.fields if kind is not None else () for s, kind in contexts.items()}
     present: dict[str, tuple[str, str]] = {}
-    for scope, kind in contexts.items():
-        for member in kind.fields if kind is not None else ():
+    for scope, members in members_of.items():
+        for member in members:
             present.setdefault(tsdl.field_name(member.name), (scope, member.name))
     standard: dict[tuple[str, str], str] = {}
     for column in ("pid", "tid", *(["procname"] if event.name not in asked.nameless else [])):
-        for name in (column, f"v{column}") if kernel else (f"v{column}", column):
-            if name in present:
-                standard[present[name]] = column
-                break
+        names = (column, f"v{column}") if kernel else (f"v{column}", column)
+        found = next((present[name] for name in names if name in present), None)
+        if found is not None:
+            standard[found] = column
     scopes: list[_Scope] = []
     columns: list[tuple[str, tsdl.Type]] = []
-    for scope, kind in contexts.items():
-        members = kind.fields if kind is not None else ()
+    for scope, members in members_of.items():
         chosen = [m for m in members if asked.context or (scope, m.name) in standard]
-        scopes.append((scope, kind, {member.name for member in chosen}))
+        scopes.append((scope, contexts[scope], {member.name for member in chosen}))
         for member in chosen:
             name = standard.get((scope, member.name), f"context.{tsdl.field_name(member.name)}")
             columns.append((name, member.type))
@@ -677,7 +659,7 @@ def _columns(
 
 
 def _id_table(layout: Layout, rows: dict[int, int]) -> list[int]:
-    """Append a stream class's event ids; returns where they lie and the id to assume."""
+    """Append a stream class's event ids; where they lie, and the id to assume."""
     first = len(layout.ids)
     dense = max((i + 1 for i in rows if i < _DENSE_IDS), default=0)
     layout.ids += [rows.get(i, -1) for i in range(dense)]

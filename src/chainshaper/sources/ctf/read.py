@@ -1,9 +1,9 @@
 """Counting events and reading them into data frames.
 
-Pass 1 (`_File.walk`) steps over every event of every stream, counts, and finds where each span of
-time begins in each file. Pass 2 (`_fill`) merges the streams of one span by time and writes the
-wanted events straight to their rows. Spans are independent and run on several threads; with many
-of them only a part of a large trace is in memory at once.
+Pass 1 (`_File.walk`) steps over every event, counts, and finds where each span of time begins in
+each file. Pass 2 (`_fill`) merges the streams of one span by time and writes the wanted events
+straight to their rows. Spans run on several threads; with many of them only a part of a large trace
+is in memory at once.
 """
 
 # ruff: noqa: PLR0917 - the parts of one pass
@@ -44,10 +44,9 @@ _Progress = Callable[[float], None]
 
 
 class Events(dict[str, pl.DataFrame]):
-    """Frames by event name.
+    """Frames by event name; ``warnings`` say what could not be read.
 
-    ``warnings`` say what could not be read, ``counts`` how often each event happened in the
-    streams that were read, also those that were not asked for; ``unread`` are the other streams.
+    ``counts`` are of all events in the streams that were read; ``unread`` are the other streams.
     """
 
     warnings: tuple[str, ...] = ()
@@ -56,10 +55,7 @@ class Events(dict[str, pl.DataFrame]):
 
 
 def count_events(trace: CtfTrace, threads: int | None = None) -> dict[str, int]:
-    """Events per name, zeros included, ordered by name; nothing is built.
-
-    Raises `CtfError` where a file is gone.
-    """
+    """Events per name, zeros included, ordered by name. Raises `CtfError` where a file is gone."""
     layout = lay_out(trace.folders, Wanted())
     return _counts(trace, layout, _walked(trace.streams, layout, np.zeros(0, np.int64), threads))
 
@@ -106,17 +102,16 @@ def read_events(
     texts = _filled(
         files, layout, len(borders) + 1, columns, threads, lambda n: progress((1 + 2 * n) / 3)
     )
-    unsorted = any(file.unsorted for file in files)
-    events = Events(_frames(columns, texts, unsorted))
+    events = Events(_frames(columns, texts, any(file.unsorted for file in files)))
     events.warnings = tuple(warning for file in files for warning in file.warnings())
     events.counts = _counts(trace, layout, files)
-    read_paths = {stream.path for stream in used}
-    events.unread = tuple(s for s in trace.streams if s.path not in read_paths)
+    read = frozenset(used)
+    events.unread = tuple(stream for stream in trace.streams if stream not in read)
     return events
 
 
 def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    return len(os.sched_getaffinity(0))
 
 
 # Pass 1
@@ -127,7 +122,7 @@ class _File:
 
     ``counts`` per event class; ``marks`` (spans - 1, 3) where each span but the first begins:
     packet, bit position, clock; ``reached`` (spans + 1, counters) the rows before each span and
-    before the end; ``unsorted`` whether time went back.
+    before the end; ``unsorted``: time went back.
     """
 
     def __init__(self, stream: CtfStream) -> None:
@@ -139,10 +134,7 @@ class _File:
         self.unsorted = False
 
     def walk(self, layout: Layout, borders: NDArray[np.int64], lean: bool) -> None:
-        """Step over all events, and shorten packets to what can be read.
-
-        ``lean`` gives back the file's memory behind it.
-        """
+        """Step over all events, and shorten packets to what can be read; ``lean`` on memory."""
         scratch, packets = Scratch(layout), self.packets
         self.counts = np.zeros(max(len(layout.events), 1), np.int64)
         marks = np.zeros((len(borders) + 1, 3 + len(scratch.rows)), np.int64)
@@ -186,10 +178,9 @@ def _walked(
     """Pass 1 over all streams."""
     files, done = [_File(stream) for stream in streams], 0
     size = sum(file.map.size for file in files)
-    # Read twice, a trace that fits into memory had better stay there in between.
-    lean = size > _LARGE_BYTES
     with ThreadPoolExecutor(threads or _cores()) as pool:
-        steps = pool.map(lambda file: file.walk(layout, borders, lean), files)
+        # Read twice, a trace that fits into memory had better stay there in between.
+        steps = pool.map(lambda file: file.walk(layout, borders, size > _LARGE_BYTES), files)
         for file, _ in zip(files, steps, strict=True):
             done += file.map.size
             progress(done / max(size, 1))
@@ -231,7 +222,7 @@ def _filled(
     threads: int | None,
     progress: _Progress,
 ) -> list[str]:
-    """Pass 2 over all spans; returns the strings that text slots then hold codes of."""
+    """Pass 2 over all spans; returns the strings that text slots then have codes of."""
     if not files:
         return []
     packets = np.concatenate([file.packets for file in files])
@@ -249,24 +240,23 @@ def _filled(
 
 
 def _fill(span: int, files: list[_File], packets: NDArray[np.int64], layout: Layout) -> list[bytes]:
-    """Pass 2 over one span; returns the strings that its text slots hold codes of.
-
-    ``packets`` are those of all ``files``, one behind the other. Raises `CtfError` where a
-    file changed since pass 1.
-    """
+    """Pass 2 over one span of ``packets``, those of all files; the strings of its text slots."""
     table, count = _span_files(span, files), len(files)
     scratch = Scratch(layout, count)
     scratch.rows[:] = sum(file.reached[span] for file in files)
     scratch.caps[:] = sum(file.reached[span + 1] for file in files)
     cursors = np.zeros((count, tb.CURSOR_COLUMNS), np.int64)
+    cursors[:, tb.C_PACKET] = table[:, tb.F_PACKET] - 1
     ahead = np.zeros((count * tb.AHEAD, tb.AHEAD_COLUMNS), np.int64)
     leaves = 1 << (count - 1).bit_length()
     tree = np.full((2 * leaves, 2), tb.NEVER, np.int64)
-    tree[0] = 0
+    tree[leaves : leaves + count] = [(-(1 << 63), file) for file in range(count)]
+    for node in range(leaves - 1, 0, -1):
+        tree[node] = tree[2 * node]
     status = tb.FULL_DICTIONARY
     while status == tb.FULL_DICTIONARY:
         status = _fill_columns(
-            scratch.address, table.ctypes.data, count, cursors.ctypes.data, ahead.ctypes.data,
+            scratch.address, table.ctypes.data, cursors.ctypes.data, ahead.ctypes.data,
             tree.ctypes.data, leaves, packets.ctypes.data, scratch.registers.ctypes.data,
             layout.registers, len(layout.events),
         )  # fmt: skip
@@ -305,8 +295,8 @@ def _span_files(span: int, files: list[_File]) -> NDArray[np.int64]:
 class _Columns:
     """The arrays of one table: time, cpu (or None) and its slots; ``rows`` of each level.
 
-    They are parts of one piece of memory, large enough for huge pages: at millions of rows a
-    second, the kernel's page faults would else be a third of all work.
+    They are parts of one piece of memory, large enough for huge pages: page faults would else be a
+    third of all work.
     """
 
     def __init__(self, layout: Layout, table: Table, total: NDArray[np.int64]) -> None:
@@ -318,13 +308,11 @@ class _Columns:
         # Columns side by side must not begin alike in their pages, or they would compete for
         # the same few lines of the processor's cache.
         sizes = [-(-rows * kind.itemsize // 4096) * 4096 + 320 for rows, kind in wanted]
-        memory = _memory(sum(sizes))
-        arrays: list[NDArray[Any]] = []
-        start = 0
-        for (rows, kind), size in zip(wanted, sizes, strict=True):
-            arrays.append(memory[start : start + rows * kind.itemsize].view(kind))
-            start += size
-        self.time, self.cpu, *self.slots = arrays
+        parts = np.split(_memory(sum(sizes)), np.cumsum(sizes))
+        self.time, self.cpu, *self.slots = (
+            part[: rows * kind.itemsize].view(kind)
+            for part, (rows, kind) in zip(parts, wanted, strict=False)
+        )
         for slot, array in zip(table.slots, self.slots, strict=True):
             if slot.sparse:
                 array[:] = 0
@@ -361,11 +349,7 @@ class _Columns:
         return pl.DataFrame([found[n] for n in dict.fromkeys([*leading, *found])])
 
     def _column(self, name: str, kind: tsdl.Type, rows: int, texts: pl.Series) -> pl.Series | None:
-        """One column, from the next slots and levels; None for a structure without fields.
-
-        Numbers keep their type; arrays become Polars arrays, sequences lists, structures and
-        variants structs, an absent option null.
-        """
+        """One column, from the next slots and levels; None for a structure without fields."""
         match kind:
             case tsdl.StringType() | tsdl.ArrayType() if tsdl.is_text(kind):
                 return texts.gather(pl.Series(next(self._slots))).alias(name)
@@ -395,11 +379,7 @@ class _Columns:
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
-    """Bytes that hold anything; many of them fill huge pages from the first to the last.
-
-    NumPy asks for huge pages where it can; what lies before the first and behind the last whole
-    one would come in hundreds of small pages, each at the cost of a fault.
-    """
+    """Bytes of any content; many of them fill huge pages, which NumPy asks for, from end to end."""
     if size < 2 * _HUGE_PAGE:
         return np.empty(size, np.uint8)
     memory = np.empty((size // _HUGE_PAGE + 2) * _HUGE_PAGE, np.uint8)

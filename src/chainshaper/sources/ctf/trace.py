@@ -3,7 +3,7 @@
 import ctypes
 import mmap
 import struct
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,10 +68,10 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     layout = lay_out(folders, Wanted())
     first = folders[0].clock
     warnings = [
-        f"{folder.path}: clock {folder.clock.name!r} is not the clock of {folders[0].path};"
+        f"{one.path}: clock {one.clock.name!r} is not the clock of {folders[0].path};"
         " times of the two cannot be compared"
-        for folder in folders[1:]
-        if (folder.clock.name, folder.clock.uuid) != (first.name, first.uuid)
+        for one in folders[1:]
+        if (one.clock.name, one.clock.uuid) != (first.name, first.uuid)
     ]
     streams: list[CtfStream] = []
     groups: dict[object, list[CtfStream]] = {}
@@ -86,8 +86,10 @@ def open_trace(*paths: Path | str) -> CtfTrace:
                 kind, instance = table[0, [tb.P_STREAM, tb.P_INSTANCE]].tolist()
                 name = path if instance < 0 else instance
                 groups.setdefault((kind, name), []).append(streams[-1])
-    losses = [_losses(group) for group in groups.values()]
-    for group, (discarded, lost) in zip(groups.values(), losses, strict=True):
+    all_discarded = all_lost = 0
+    for group in groups.values():
+        discarded, lost = _losses(group)
+        all_discarded, all_lost = all_discarded + discarded, all_lost + lost
         if discarded:
             warnings.append(
                 f"{group[0].path}: the tracer discarded {discarded} events of this stream"
@@ -106,13 +108,13 @@ def open_trace(*paths: Path | str) -> CtfTrace:
         env=folders[0].declared.env,
         clock_offset_ns=first.offset_ns,
         packets=sum(len(stream.table) for stream in streams),
-        discarded_events=sum(discarded for discarded, _ in losses),
-        lost_packets=sum(lost for _, lost in losses),
+        discarded_events=all_discarded,
+        lost_packets=all_lost,
         warnings=tuple(warnings),
     )
 
 
-def _find(paths: Iterable[Path | str]) -> Iterator[Path]:
+def _find(paths: Iterable[Path | str]) -> Iterable[Path]:
     found: dict[Path, Path] = {}
     for path in map(Path, paths):
         if not path.exists():
@@ -125,16 +127,15 @@ def _find(paths: Iterable[Path | str]) -> Iterator[Path]:
             found.setdefault(folder.resolve(), folder)
     if not found:
         raise CtfError(".", None, "no trace given")
-    return iter(found.values())
+    return found.values()
 
 
 def _losses(files: list[CtfStream]) -> tuple[int, int]:
     """Discarded events and lost packets of one stream (LTTng's packet context, section 5.2).
 
     ``events_discarded`` counts from the beginning of the stream (32-bit tracers' counters wrap).
-    What the first packet says counts where it is the stream's first; a snapshot or a rotated
-    trace begins anywhere, and what was lost before it is not its own. A gap in
-    ``packet_seq_num`` is that many packets lost.
+    What the first packet says counts where it is the stream's first; a snapshot or a rotated trace
+    begins anywhere, and what was lost before it is not its own.
     """
     table = np.concatenate([file.table for file in files])
     # Files of one stream follow each other (tracefile rotation), not always by name.
@@ -166,15 +167,12 @@ class MappedFile:
         """Give back the memory of packets in a row; the file's pages stay cached."""
         first = -(-int(packets[0, tb.P_BYTE]) // mmap.PAGESIZE) * mmap.PAGESIZE
         last = int(packets[-1, tb.P_BYTE] + packets[-1, tb.P_BYTES])
-        if last - first >= mmap.PAGESIZE and hasattr(mmap, "MADV_DONTNEED"):
+        if last - first >= mmap.PAGESIZE:
             self._map.madvise(mmap.MADV_DONTNEED, first, last - first)
 
 
 class Scratch:
-    """The tables that kernels work with in one thread.
-
-    ``address`` is that of the table of addresses (see `layout`), valid as long as this lives.
-    """
+    """The tables that kernels work with in one thread, and the ``address`` of that of addresses."""
 
     def __init__(self, layout: Layout, files: int = 1) -> None:
         counters = max(layout.counters, 1)
@@ -192,8 +190,7 @@ class Scratch:
             tb.M_BATCHES: np.zeros((len(layout.events), 1 + 2 * tb.BATCH), np.int64),
         }
         self._words = np.zeros(tb.MACHINE_WORDS, np.int64)
-        for word, table in self._tables.items():
-            self._words[word] = table.ctypes.data
+        self._words[list(self._tables)] = [table.ctypes.data for table in self._tables.values()]
         self._words[tb.M_COUNTERS] = counters
         self.address = int(self._words.ctypes.data)
         self.entries = np.zeros((0, 4), np.int64)
@@ -217,11 +214,7 @@ class Scratch:
 
 
 def _packet_table(path: Path, layout: Layout, folder: int) -> tuple[NDArray[np.int64], list[str]]:
-    """The packets of a stream file (see `layout`) and warnings about it.
-
-    Reading stops where a packet's header makes no sense, since nothing says where the next one
-    begins; of a packet that the end of the file cuts short, what is there counts.
-    """
+    """The packets of a stream file (see `layout`), up to one that makes no sense, and warnings."""
     packets = np.zeros((256, tb.PACKET_COLUMNS), np.int64)
     if path.stat().st_size == 0:
         return packets[:0], []
@@ -247,7 +240,6 @@ def _packet_table(path: Path, layout: Layout, folder: int) -> tuple[NDArray[np.i
 # The metadata file
 
 METADATA_MAGIC = 0x75D11D57
-_HEADER = "I16sIIIBBBBB"
 _LARGEST = 64 << 20
 _RECORD_SEPARATOR = b"\x1e"  # begins every fragment of CTF 2's JSON text sequence
 
@@ -270,8 +262,7 @@ def read_metadata(path: Path) -> TraceClass:
 def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
     """The TSDL text of a metadata file, plain or in packets (section 7.1), and its pieces.
 
-    Each piece is a pair (byte offset in the text, byte offset in the file). Raises
-    `CtfError` for a file that cannot be read, lying packet sizes, compression or encryption.
+    Each piece is a pair (byte offset in the text, byte offset in the file). Raises `CtfError`.
     """
     try:
         if path.stat().st_size > _LARGEST:
@@ -300,7 +291,7 @@ def _in_file(position: int, pieces: list[tuple[int, int]]) -> int:
 
 
 def _unpacked(path: Path, data: bytes, order: str) -> tuple[bytes, list[tuple[int, int]]]:
-    header = struct.Struct(order + _HEADER)
+    header = struct.Struct(order + "I16sIIIBBBBB")
     text, pieces, offset = bytearray(), [], 0
     while offset < len(data):
         if offset + header.size > len(data):

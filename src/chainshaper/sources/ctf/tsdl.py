@@ -285,11 +285,11 @@ def _number(values: Attributes, name: str, default: int) -> int:
     return default if found is None else found
 
 
-def _identifier(values: Attributes, name: str) -> int | None:
+def _identifier(values: Attributes, name: str, default: int = 0) -> int:
     found = _typed(values, name, int, "an unsigned integer")
     if found is not None and not 0 <= found < 1 << 63:
         raise TsdlError(values[name][1], f"{name} must be an unsigned integer, not {found}")
-    return found
+    return default if found is None else found
 
 
 def _one_of(choices: Mapping[int | str, _T], values: Attributes, name: str, default: _T) -> _T:
@@ -312,22 +312,19 @@ def _alignment(align: int, offset: int) -> int:
 
 def _integer_type(values: Attributes, offset: int) -> IntegerType:
     size = _number(values, "size", 0)
-    clock: str | None = None
     if not 0 < size <= 64:
         raise TsdlError(offset, f"integer of {size} bits; 1 to 64 are supported")
-    if "map" in values:
-        target, place = values["map"]
-        first, *names, last = str(target).split(".")
-        if (first, last, len(names)) != ("clock", "value", 1):
-            raise TsdlError(place, f"map must be clock.NAME.value, not {target!r}")
-        clock = names[0]
+    target, place = values.get("map", (None, 0))
+    clock = re.fullmatch(r"clock\.([^.]*)\.value", str(target))
+    if target is not None and clock is None:
+        raise TsdlError(place, f"map must be clock.NAME.value, not {target!r}")
     return IntegerType(
         size=size,
         align=_alignment(_number(values, "align", 1 if size % 8 else 8), offset),
         signed=_one_of(_SIGNED, values, "signed", False),
         byte_order=_one_of(_ORDERS, values, "byte_order", "native"),
         encoded=_one_of(_ENCODED, values, "encoding", False),
-        clock=clock,
+        clock=clock and clock[1],
     )
 
 
@@ -368,7 +365,6 @@ class _Parser:
         return self.token.text == text and self.token.kind in ("word", "mark")
 
     def accept(self, text: str) -> bool:
-        """Step over ``text`` where it stands here."""
         found = self.at(text)
         self.position += found
         return found
@@ -658,7 +654,7 @@ def _streams(
 ) -> dict[int, StreamClass]:
     streams: dict[int, StreamClass] = {}
     for values, offset in blocks:
-        identifier = _identifier(values, "id") or 0
+        identifier = _identifier(values, "id")
         if identifier in streams:
             raise TsdlError(offset, f"stream {identifier} declared twice")
         names = ("packet.context", "event.header", "event.context")
@@ -668,11 +664,10 @@ def _streams(
     only = next(iter(streams)) if len(streams) == 1 else 0
     events: dict[int, dict[int, EventClass]] = {identifier: {} for identifier in streams}
     for values, offset in event_blocks:
-        name, identifier = values.get("name", (None, 0))[0], _identifier(values, "id") or 0
+        name, identifier = values.get("name", (None, 0))[0], _identifier(values, "id")
         if not isinstance(name, str):
             raise TsdlError(offset, "event without a name")
-        stream = _identifier(values, "stream_id")
-        target = only if stream is None else stream
+        target = _identifier(values, "stream_id", only)
         if target not in streams:
             raise TsdlError(offset, f"event {name!r} of undeclared stream {target}")
         if identifier in events[target]:

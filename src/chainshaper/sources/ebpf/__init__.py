@@ -7,7 +7,6 @@ other: what comes before the last one was set or after the first one was removed
 Upstream: bpftrace(8); `src/bpftrace.cpp` of bpftrace 0.17 to 0.26.
 """
 
-import mmap
 import os
 import re
 import signal
@@ -18,6 +17,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 
@@ -29,18 +29,11 @@ from chainshaper.linux.threads import parents, read_proc, read_stat, status_fiel
 from chainshaper.sources.ebpf import trace_points as tp
 from chainshaper.sources.ebpf.functions import callback_functions, open_regular
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
-from chainshaper.sources.system import (
-    distribution_of,
-    own_pid_namespace,
-    processes_of,
-    rmw_of_gids,
-)
+from chainshaper.sources.system import info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
-
-__all__ = ["EbpfTracer", "lost_events"]
 
 _ATTACHED = "__BPFTRACE_NOTIFY_PROBES_ATTACHED"
 _PAGES = "BPFTRACE_PERF_RB_PAGES"
@@ -53,7 +46,7 @@ _SETTINGS = {
     "BPFTRACE_MAX_BPF_PROGS": "4096",
     "BPFTRACE_CACHE_USER_SYMBOLS": "0",
 }
-_LOST = re.compile(rb"^Lost (\d+) events", re.MULTILINE)
+_LOST = re.compile(rb"Lost (\d+) events")
 _NICE = 10
 _SHORTEST_SUSPENSION_NS = 1_000_000
 _START_S, _READ_S, _STOP_S = 120.0, 10.0, 60.0
@@ -138,10 +131,7 @@ class EbpfTracer:
             return
         self._ended_ns = time.monotonic_ns()
         if _boot_time_ahead() - self._ahead_ns > _SHORTEST_SUSPENSION_NS:
-            self._notes.append(
-                "the machine was suspended during the recording: times after that are too late by "
-                "as long as it slept."
-            )
+            self._notes.append("the machine was suspended meanwhile: times after it are too late.")
         bpftrace, until = f"/proc/{self._bpftrace.pid}", time.monotonic() + _READ_S
         with suppress(OSError):  # it has ended
             time.sleep(_LOOK_S)
@@ -152,10 +142,8 @@ class EbpfTracer:
         try:
             self._bpftrace.wait(_STOP_S)
         except subprocess.TimeoutExpired:
-            raise OperationError(
-                f"bpftrace (process {self._bpftrace.pid}) did not end within {_STOP_S:.0f} s and "
-                "is killed: the last events are missing"
-            ) from None
+            late = f"bpftrace (process {self._bpftrace.pid}) did not end within {_STOP_S:.0f} s"
+            raise OperationError(f"{late} and is killed: the last events are missing") from None
         with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
             self._printed = tp.read_printed(self._events, self._points, self._ahead_ns)
             # As long as the application runs: its memory tells.
@@ -178,9 +166,8 @@ class EbpfTracer:
             printed = self._printed or tp.read_printed(self._events, self._points, self._ahead_ns)
             lost = lost_events(self._events, self._said)
         except (OSError, pl.exceptions.PolarsError) as error:
-            raise OperationError(
-                f"{self._events}: what bpftrace wrote cannot be read: {error}"
-            ) from error
+            unread = "what bpftrace wrote cannot be read"
+            raise OperationError(f"{self._events}: {unread}: {error}") from error
         ended = self._ended_ns or time.monotonic_ns()
         in_place = pl.col("time").is_between(self._began_ns, ended)  # all probes, that is
         whole = {name: table.filter(in_place) for name, table in printed.tables.items()}
@@ -195,33 +182,23 @@ class EbpfTracer:
         names = dict(switches.unique("next_tid", keep="last").iter_rows())
         emitting = (table["pid"] for name, table in tables.items() if name != "sched_switch")
         commands = {pid: names.get(pid) or "" for pids in emitting for pid in pids.unique()}
-        # What `rcl_init` would say of the library's version, whether or not it was traced.
         versions = [point.tracing_library.version for point in self._points[:1]]
-        info = RecordingInfo(
-            source="ebpf",
-            distribution=distribution_of({"rcl_init": pl.DataFrame({"version": versions})}, {}),
-            rmw=printed.rmw or rmw_of_gids(tables),
-            clock_offset_ns=self._clock_offset_ns,
-            processes=processes_of(tables, commands),
-            pid_namespace=_FIRST_PID_NAMESPACE,
-            lost={"lost_events": lost},
-            notes=tuple(notes),
-        )
-        return tables, info
+        facts: dict[str, Any] = {"rmw": printed.rmw, "notes": tuple(notes)}
+        facts |= {"clock_offset_ns": self._clock_offset_ns, "pid_namespace": _FIRST_PID_NAMESPACE}
+        return tables, info_of("ebpf", tables, versions, commands, lost, **facts)
 
     def _libraries(self) -> tuple[tp.TracingLibrary, ...]:
         """The libraries to set probes on; at least one that exports trace points."""
         libraries = self._mapped() if self._attached else tp.installed_libraries(os.environ)
         if not libraries:
             raise PlatformError(
-                f"no {tp.LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: set ROS 2 up "
-                "first (`source /opt/ros/DISTRIBUTION/setup.bash`); an application in a "
-                "container is started first, then attached to (no COMMAND)"
+                f"no {tp.LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: source the "
+                "setup.bash of ROS 2; attach to an application in a container (no COMMAND)"
             )
         if not tp.trace_points(libraries):
             paths = ", ".join(str(library.path) for library in libraries)
             raise PlatformError(
-                f"{paths}: exports no trace point, because this ROS 2 was built without tracing "
+                f"{paths}: exports no trace point: this ROS 2 was built without tracing "
                 "(TRACETOOLS_DISABLED): build tracetools with it, or install ROS 2's packages"
             )
         return libraries
@@ -236,17 +213,16 @@ class EbpfTracer:
         unsuited = [pid for pid in self._pids if not descendants(parent_of, pid) & mapped.keys()]
         if unsuited:
             raise InputError(
-                f"process {', '.join(map(str, unsuited))} neither uses {tp.LIBRARY}, as every "
-                "ROS 2 node does, nor has started one that does: give processes of nodes "
-                "(`chainshaper threads` lists them)"
+                f"process {', '.join(map(str, unsuited))} neither uses {tp.LIBRARY} nor has "
+                "started what does: give processes of nodes (`chainshaper threads` lists them)"
             )
         wanted = family if self._pids else mapped.keys()
         libraries = dict.fromkeys(one for pid in mapped if pid in wanted for one in mapped[pid])
         if not libraries:
+            users = ", ".join(map(user_name, sorted(self._users)))
             raise OperationError(
-                f"no process of {', '.join(map(user_name, sorted(self._users)))} uses "
-                f"{tp.LIBRARY}, so there is no ROS 2 node to attach to: start the application "
-                "first, give the COMMAND that does behind `--`, or name who runs it (--user)"
+                f"no process of {users} uses {tp.LIBRARY}, so there is no ROS 2 node to attach to: "
+                "start the application, give its COMMAND behind `--`, or name its --user"
             )
         return tuple(libraries)
 
@@ -256,9 +232,8 @@ class EbpfTracer:
             return ()
         if own_pid_namespace() != _FIRST_PID_NAMESPACE:
             self._notes.append(
-                "inside a container bpftrace cannot tell which process is which: everything of "
-                "the same users on this machine that uses the same libraries was recorded, under "
-                "the machine's process numbers."
+                "in a container bpftrace cannot tell processes apart: all of the same users on the "
+                "machine that use the same libraries were recorded, by the machine's numbers."
             )
             return ()
         # What we start is ours: the application, which does not run yet.
@@ -275,9 +250,8 @@ class EbpfTracer:
                     "container: `docker run --privileged --pid host`)"
                 )
             if time.monotonic() > until:
-                raise OperationError(
-                    f"bpftrace did not set its probes within {_START_S:.0f} s: {self._complaint()}"
-                )
+                late = f"bpftrace did not set its probes within {_START_S:.0f} s"
+                raise OperationError(f"{late}: {self._complaint()}")
             time.sleep(_LOOK_S)
 
     def _complaint(self) -> str:
@@ -294,16 +268,13 @@ class EbpfTracer:
             yield f"no event was traced: nothing that ran has called {', '.join(libraries)}."
         unknown = set(_callbacks(tables)) - self._functions.keys()
         if unknown and "rclcpp_callback_register" not in tables:
-            yield (
-                f"{len(unknown)} callbacks' functions have no name: the application had ended, or"
-                " its files were stripped."
-            )
+            why = "the application had ended, or its files were stripped"
+            yield f"{len(unknown)} callbacks' functions have no name: {why}."
         if lost:
             pages = os.environ.get(_PAGES, _SETTINGS[_PAGES])
             yield (
                 f"{lost} events were lost: bpftrace could not keep up. Record again with larger "
-                f"buffers (environment variable {_PAGES}, a power of two above {pages}), or leave "
-                "it a core that is less busy."
+                f"buffers ({_PAGES}, a power of two above {pages}), or leave it a less busy core."
             )
         if printed.cut_names:
             yield f"{printed.cut_names} names are longer than {tp.TEXT_BYTES} bytes and cut."
@@ -313,20 +284,15 @@ def lost_events(*paths: Path) -> int:
     """How many events bpftrace says it has lost, in what it wrote into these files."""
     count = 0
     for path in paths:
-        if path.is_file() and path.stat().st_size:
-            with (
-                path.open("rb") as stream,
-                mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as said,
-            ):
-                count += sum(int(found[1]) for found in _LOST.finditer(said))
+        if path.is_file():
+            with path.open("rb") as said:
+                lines = (line for line in said if line.startswith(b"Lost "))
+                count += sum(int(found[1]) for found in map(_LOST.match, lines) if found)
     return count
 
 
 def _in_the_background(parent_pid: int) -> None:
-    """Have a new process end with its parent, and disturb the threads little that it watches.
-
-    Every event wakes it: if it pre-empted the thread then, these were two more events, and so on.
-    """
+    """Have a new process end with its parent, and not pre-empt the threads whose events wake it."""
     signalled_with_parent(parent_pid, signal.SIGINT)
     os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
     os.nice(_NICE)
@@ -352,10 +318,7 @@ def _check_privileges() -> None:
 
 
 def _boot_time_ahead() -> int:
-    """CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns: how long the machine has been suspended.
-
-    The narrowest of several brackets counts; without a suspension the clocks are the same.
-    """
+    """CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns (the narrowest of several brackets counts)."""
     brackets = []
     for _ in range(10):
         before = time.monotonic_ns()

@@ -1,7 +1,7 @@
 """Functions: those that a library exports, and those that a process's callbacks are.
 
-With LTTng `rclcpp_callback_register` says which function a callback is, with uprobes no event does.
-But a callback's handle is an address, and what stands around it tells (64 bits, GCC's library):
+With uprobes no event says which function a callback is. But a callback's handle is an address, and
+what stands around it tells (64 bits, GCC's library):
 
 * that of a timer is a member of `rclcpp::WallTimer<F, …>` or `GenericTimer<F, …>`, which begins
   with the address of its class's table, which leads to the class's name, stripped or not;
@@ -119,10 +119,7 @@ def mapped_regions(pid: int) -> Iterator[Region]:
 
 
 class _Process:
-    """A process that runs: its memory, and the functions that callbacks in it are.
-
-    ``invokers`` are those that were found in files so far: path → offset → mangled name.
-    """
+    """A process that runs: its memory; ``invokers`` by path, offset: their mangled names so far."""
 
     def __init__(self, pid: int, memory: int, invokers: dict[str, dict[int, str]]) -> None:
         self.pid, self.memory, self.invokers = pid, memory, invokers
@@ -208,12 +205,9 @@ def demangled(name: bytes) -> str | None:
         return None
     library.__cxa_demangle.restype = ctypes.c_void_p
     text = library.__cxa_demangle(name, None, None, None)
-    if not text:
-        return None
-    try:
-        return ctypes.string_at(text).decode(errors="replace")
-    finally:
-        libc.free(ctypes.c_void_p(text))
+    found = ctypes.string_at(text).decode(errors="replace") if text else None
+    libc.free(ctypes.c_void_p(text))
+    return found
 
 
 def type_argument(name: str | None, number: int) -> str | None:

@@ -1,10 +1,9 @@
 """Who exists in an application that ran before tracing began, as far as it can be found out.
 
 Objects say who they are when they are created. For those created before, the same tables are filled
-with what is known otherwise; `docs/record_ebpf.md` says how. What is not certain is left open.
-
-Handles are the real ones where events carry them, and addresses of other things of the same object
-where not; nodes are numbered from 1, where no object's address can be.
+with what is known otherwise (`docs/record_ebpf.md`). What is not certain is left open. Handles are
+the real ones where events carry them, else other addresses of the same object; nodes are numbered
+from 1.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -71,11 +70,11 @@ def with_found_objects(
     if not any(rows.height for rows in found.values()):
         return tables, ()
     note = (
-        "tracing began while the application ran; found were publishers "
-        f"({publishers.height}) and subscriptions ({subscriptions.height}) by the topics in their "
-        f"memory, callbacks of subscriptions ({readers.height}) by the messages taken just before "
-        f"they start, and timers ({timers.height}) by their regularity (their periods are "
-        "measured). Services, and what neither published nor took meanwhile, cannot be known."
+        f"tracing began while the application ran; found were publishers ({publishers.height}) and "
+        f"subscriptions ({subscriptions.height}) by the topics in their memory, callbacks of "
+        f"subscriptions ({readers.height}) by the messages taken before, and timers "
+        f"({timers.height}) by their regularity (with measured periods). Services, and what was "
+        "idle, cannot be known."
     )
     return {**tables, **added_rows(tables, found, began_ns)}, (note,)
 
@@ -83,10 +82,7 @@ def with_found_objects(
 def with_functions(
     tables: events.EventTables, functions: Mapping[tuple[int, int], str], began_ns: int
 ) -> events.EventTables:
-    """Add what `rclcpp_callback_register` would have shown: (process, callback) → its function.
-
-    What the event itself shows, as on Humble, stays.
-    """
+    """Add what `rclcpp_callback_register` has not shown: (process, callback) → its function."""
     named = pl.DataFrame(
         [(*callback, symbol) for callback, symbol in functions.items()],
         schema={"pid": pl.Int32, "callback": pl.UInt64, "symbol": pl.String},
@@ -129,7 +125,7 @@ def _threads_rows(*marks: pl.DataFrame) -> pl.DataFrame:
 def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFrame:
     """``pid, publisher_handle, rmw_publisher_handle, topic_name`` of those created before.
 
-    From `rcl_publish` to the `rmw_publish` of the same message lead both handles of a publisher.
+    `rcl_publish` and the `rmw_publish` of the same message have one handle of a publisher each.
     """
     key = ["pid", "rmw_publisher_handle"]
     known = events.table(tables, "rcl_publisher_init")
@@ -151,7 +147,7 @@ def _publishers(tables: events.EventTables, handles: pl.DataFrame) -> pl.DataFra
 
 
 def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
-    """Starts of callbacks that were never registered: ``time, pid, callback, taken``.
+    """``time, pid, callback, taken`` of starts of unregistered callbacks.
 
     ``taken``: the subscription from which the thread had just taken a message, null if none.
     """
@@ -198,8 +194,8 @@ def with_found_nodes(
 ) -> tuple[events.EventTables, RecordingInfo]:
     """Give publishers, subscriptions and timers without a node theirs, where it is certain.
 
-    ``endpoints`` are those of DDS discovery: a topic that one node only publishes says whose
-    publisher it is, and which node lives in that process. What stays unknown becomes a note.
+    In the ``endpoints`` of DDS discovery, a topic that one node only publishes says whose publisher
+    it is, and which node lives in that process. What stays unknown becomes a note.
     """
     created = {kind: events.table(tables, f"rcl_{kind}_init") for kind in _KINDS}
     nameless = pl.concat(
@@ -234,10 +230,8 @@ def with_found_nodes(
     names = processes_of(changed, info.processes)
     notes = info.notes
     if unknown := sorted({key[2] for key in wanted if key not in owners} - INTERNAL_TOPICS):
-        notes += (
-            f"which nodes publish or subscribe {', '.join(unknown)} is not certain: neither the "
-            "ROS graph nor a command line tells.",
-        )
+        which = f"which nodes publish or subscribe {', '.join(unknown)} is not certain"
+        notes += (f"{which}: neither the ROS graph nor a command line tells.",)
     return changed, info.model_copy(update={"processes": names, "notes": notes})
 
 
@@ -256,9 +250,8 @@ def _owners(
         candidates.setdefault((one.kind, one.topic), set()).add(one.node)
     nodes_of = {pid: set(named.get(pid, ())) for _, pid, _ in wanted}
     for kind, pid, topic in wanted:
-        found = candidates.get((kind, topic), set())
-        if len(found) == 1:
-            nodes_of[pid] |= found
+        if len(candidates.get((kind, topic), ())) == 1:
+            nodes_of[pid] |= candidates[kind, topic]
     owners = {}
     for kind, pid, topic in wanted:
         found = candidates.get((kind, topic), nodes_of[pid])

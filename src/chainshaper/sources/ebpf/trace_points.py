@@ -8,12 +8,11 @@ numbers, separated by tabs and in no order:
 
 * The code says which of the trace points it is, :data:`FIRST_POINT` being the first one.
 * A number or a flag is one value, a gid two: its first 16 bytes, those that mean anything.
-* A text is printed as the eight-byte words it lies in, in lines of its own (:data:`TEXT_CODE`):
-  16 × the argument's place + the line's number, how many bytes before the text the first word
-  begins, and eight words. So a name may be of any length and contain anything, unlike with `str()`.
-  Aligned words never reach into a page without the text.
+* A text is printed as the aligned eight-byte words it lies in, in lines of its own
+  (:data:`TEXT_CODE`): 16 × the argument's place + the line's number, how many bytes before the text
+  the first word begins, and eight words. So a name may contain anything, unlike with `str()`.
 * `sched_switch` (:data:`SWITCH_CODE`) is printed where a thread that has emitted events goes or
-  comes; it came unseen before the first one, so a line stands there that says nothing of who went.
+  comes; before its first one stands a line that says nothing of who went.
 
 The handles of `rmw_publish` and `rmw_take` are the addresses of structures that begin with the
 addresses of the RMW's name, of its data and of the topic's name. Before tracetools 8 the former is
@@ -84,14 +83,14 @@ class TracingLibrary:
     version: str | None
 
     @property
-    def major(self) -> int | None:
-        """The first number of the version."""
-        return None if self.version is None else int(self.version.partition(".")[0])
+    def major(self) -> int:
+        """The first number of the version: where it is not known, one of today's."""
+        return 8 if self.version is None else int(self.version.partition(".")[0])
 
     @property
     def handles_at_rmw(self) -> bool:
         """Whether `rmw_publish` of this version names its publisher."""
-        return self.major is None or self.major >= 8
+        return self.major >= 8
 
 
 @dataclass(frozen=True)
@@ -180,9 +179,8 @@ def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...
 def _mapped(pid: int) -> Iterator[Path]:
     """Files of that name which a process has mapped, by paths that lead there from here."""
     with suppress(OSError):  # it is gone, or another user's
-        for mapped in sorted(
-            {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
-        ):
+        paths = {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
+        for mapped in sorted(paths):
             inside = Path(f"/proc/{pid}/root{mapped}")  # as a container has it
             if inside.is_file():  # else replaced since: its new contents are not what runs
                 outside = Path(mapped)
@@ -295,10 +293,10 @@ def _text(address: str, place: int) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class Printed:
-    """The output of one run; times are ns of CLOCK_MONOTONIC.
+    """The output of one run. ``cut_names``: how many were longer than what is printed.
 
     ``handles`` are the names of handles that were in use when tracing began, ``pid, event, handle,
-    topic``; ``rmw`` is from such a one. ``cut_names``: how many were longer than what is printed.
+    topic``; ``rmw`` is from such a one.
     """
 
     tables: dict[str, pl.DataFrame]
@@ -343,17 +341,16 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
     }
     event_of = {code: point.event for code, point in enumerate(points, FIRST_POINT)}
     named = texts.filter(place=NAME_PLACE).select("time", "tid", topic="text")
-    handles = lines.filter(pl.col("code").is_in(list(event_of))).join(named, on=["time", "tid"])
-    event = pl.col("code").replace_strict(event_of, return_dtype=pl.String)
-    handle = pl.col(VALUES[0]).cast(pl.UInt64)
-    handles = handles.with_columns(pl.col("pid").cast(pl.Int32), event=event, handle=handle)
-    rmw = texts.filter(place=RMW_PLACE)["text"]
-    return Printed(
-        tables,
-        handles.select("pid", "event", "handle", "topic").unique(maintain_order=True),
-        rmw[0] if len(rmw) else None,
-        int(texts["cut"].sum()),
+    of_points = lines.filter(pl.col("code").is_in(list(event_of)))
+    handles = of_points.join(named, on=["time", "tid"]).select(
+        pl.col("pid").cast(pl.Int32),
+        event=pl.col("code").replace_strict(event_of, return_dtype=pl.String),
+        handle=pl.col(VALUES[0]).cast(pl.UInt64),
+        topic="topic",
     )
+    handles = handles.unique(maintain_order=True)
+    rmw = texts.filter(place=RMW_PLACE)["text"]
+    return Printed(tables, handles, rmw[0] if len(rmw) else None, int(texts["cut"].sum()))
 
 
 def _texts(lines: pl.DataFrame) -> pl.DataFrame:
@@ -384,9 +381,8 @@ def _table(rows: pl.DataFrame, point: TracePoint, texts: pl.DataFrame) -> pl.Dat
     for argument in point.arguments:
         column = argument.column
         if argument.kind == "text":
-            own = texts.filter(place=argument.place).select(
-                "time", "tid", pl.col("text").alias(column)
-            )
+            text = pl.col("text").alias(column)
+            own = texts.filter(place=argument.place).select("time", "tid", text)
             rows = rows.join(own, on=["time", "tid"], how="left")
         elif argument.kind == "gid":
             words = rows.select(next(values), next(values)).to_numpy().astype("<i8")

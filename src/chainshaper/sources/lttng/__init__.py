@@ -3,12 +3,11 @@
 A root daemon that runs already, which we may use as root or in the group `tracing`, traces
 everybody's processes, and the kernel: we add a session to it, and leave out of the tables what
 other applications did. Otherwise we start a daemon and end it afterwards. It listens in a home
-directory of our own, which the command gets as its `LTTNG_HOME`, so it traces the command alone.
-Root's run directory is /var/run/lttng whatever its environment says, so root's daemon and clients
-have one of ours mounted there, in mount namespaces that they alone see. Where root may not mount
-(most containers), there can be one recording at a time.
+directory of our own, the command's `LTTNG_HOME`, so it traces the command alone. Root's run
+directory is always /var/run/lttng, so root's daemon and clients have one of ours mounted there, in
+mount namespaces of their own. Where root may not mount, there can be one recording at a time.
 
-We may be killed. The kernel then ends a daemon of ours; a shell that waits for our end destroys our
+If we are killed, the kernel ends a daemon of ours; a shell that waits for our end destroys our
 sessions in another's daemon and removes the home directory.
 
 Upstream: lttng(1), lttng-sessiond(8), lttng-enable-channel(1); lttng-tools, `utils_get_rundir`;
@@ -39,13 +38,8 @@ from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = ["LttngSession", "buffer_size"]
-
 EVENTS = ("ros2:*", "ros2_caret:*", "dds:*")
 """Everything that `tracetools` of any distribution, CARET, and a traced Cyclone DDS emit."""
-CONTEXTS = ("procname", "vpid", "vtid")
-REGISTER_TIMEOUT_MS = 30_000
-"""A starting process waits that long for the session daemon, which many may occupy at once."""
 MARK = "CHAINSHAPER_RECORDING"
 """In the environment of the command, and of everything that it starts."""
 
@@ -78,10 +72,7 @@ class Lttng:
     """A connection to the session daemon that traces our applications, or to one of our own.
 
     ``home`` is a directory of our own, whose unique name sessions are called after. ``daemon`` is
-    the daemon's process where we have started it.
-
-    Raises PlatformError: LTTng is not installed, or cannot make two recordings at a time here.
-    OperationError: the daemon does not start.
+    the daemon's process where we have started it. Raises PlatformError, OperationError.
     """
 
     def __init__(self) -> None:
@@ -108,13 +99,8 @@ class Lttng:
             self.close()
             raise
 
-    @property
-    def environment(self) -> dict[str, str]:
-        """What an application needs to find the daemon."""
-        return {} if self.daemon is None else {"LTTNG_HOME": str(self.home)}
-
     def ask(self, *arguments: str) -> ElementTree.Element:
-        """Run `lttng ARGUMENTS`; its answer. Raises OperationError: it fails; in its own words."""
+        """The answer of `lttng ARGUMENTS`. Raises OperationError: it fails; in its own words."""
         what = f"`{shlex.join(('lttng', *arguments))}`"
         try:
             run = subprocess.run(
@@ -155,14 +141,12 @@ class Lttng:
                 self._inside = inside if run.returncode == 0 else ()
         if another and not self._inside:
             raise PlatformError(
-                "another recording runs, and LTTng can make one at a time here, because root may "
-                "not mount: wait for its end, or record where mounting is permitted (Docker: "
-                "`--privileged`)"
+                "another recording runs, and LTTng makes one at a time where root may not mount: "
+                "wait for its end, or permit mounting (Docker: `--privileged`)"
             )
         if not is_installed("lttng-sessiond"):
-            raise PlatformError(
-                f"no LTTng session daemon runs, and `lttng-sessiond` is not there: {_PACKAGES}"
-            )
+            missing = "no LTTng session daemon runs, and `lttng-sessiond` is not there"
+            raise PlatformError(f"{missing}: {_PACKAGES}")
         said, folder = self.home / "daemon.log", self.home / ".lttng"
         folder.mkdir()
         for version in range(5, 20):  # applications look for one with their ABI's version
@@ -252,9 +236,11 @@ class LttngSession:
                 "group `tracing`; `--source ebpf` needs root only."
             )
         lttng.ask("start", self._new_session(lttng))
-        timeout = str(REGISTER_TIMEOUT_MS)
-        environment = {"LTTNG_UST_REGISTER_TIMEOUT": timeout, MARK: self._sessions[0]}
-        return {**environment, **lttng.environment}
+        # A process that starts waits that long (ms) for the session daemon, which may be busy.
+        environment = {"LTTNG_UST_REGISTER_TIMEOUT": "30000", MARK: self._sessions[0]}
+        if lttng.daemon is not None:
+            environment["LTTNG_HOME"] = str(lttng.home)
+        return environment
 
     def failure(self) -> str | None:
         """Look whether the daemon is there and the session loses nothing; enlarge the buffers."""
@@ -298,7 +284,7 @@ class LttngSession:
 
             trace = open_lttng_trace([self._folder])
             tables, info = _without_processes(self._strangers, trace.events, trace.info)
-        if not any(tables[name].height for name in tables):
+        if not any(table.height for table in tables.values()):
             shutil.rmtree(self._folder)  # other applications' events are in it at most
             self._folder.mkdir()
             raise OperationError(
@@ -309,17 +295,14 @@ class LttngSession:
         notes = [*info.notes, *self._notes]
         if lost := sum(info.lost.values()):
             larger = self._buffer * (1 if len(self._sessions) > 1 else _ENLARGED_BY)
-            notes.append(
-                f"{lost} events were lost: buffers were too small. Record again with `--buffer "
-                f"{max(1, larger // MIB)}` (MiB a core)."
-            )
+            remedy = f"Record again with `--buffer {max(1, larger // MIB)}` (MiB a core)."
+            notes.append(f"{lost} events were lost: buffers were too small. {remedy}")
         return tables, info.model_copy(update={"notes": tuple(notes)})
 
     def _look_for_strangers(self, lttng: Lttng) -> None:
         """Note who else runs, if the daemon is not ours and so hears every application.
 
-        What descends from us is the command's, and what has our mark in its environment: a process
-        whose parent is gone still has that; what `sudo` starts has lost it.
+        The command's is what descends from us, or has our mark, as with a parent that is gone.
         """
         if lttng.daemon is None:
             parent_of, mark = parents(), f"{MARK}={self._sessions[0]}"
@@ -345,7 +328,7 @@ class LttngSession:
         of_channel = (f"--session={name}", "--channel=events")
         lttng.ask("enable-channel", "--userspace", "--buffers-uid", *channel)
         lttng.ask("enable-event", "--userspace", *of_channel, ",".join(EVENTS))
-        contexts = [f"--type={context}" for context in CONTEXTS]
+        contexts = ("--type=procname", "--type=vpid", "--type=vtid")
         lttng.ask("add-context", "--userspace", *of_channel, *contexts)
         if self._kernel:
             lttng.ask("enable-channel", "--kernel", *channel)
@@ -366,8 +349,7 @@ class LttngSession:
         lttng.ask("destroy", former)  # once all of it is on disk
         self._notes.append(
             f"events were lost, so the buffers were enlarged from {before >> 10} KiB to "
-            f"{larger >> 10} KiB a core while the application ran; nothing was recorded for "
-            f"{duration_text(round(gap, -6))} meanwhile."
+            f"{larger >> 10} KiB a core; nothing was recorded for {duration_text(round(gap, -6))}."
         )
 
 
@@ -387,18 +369,16 @@ def buffer_size(
 
 def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
     """Whether a process of these users has the mark: others can read and write it as well."""
-    try:
-        with process_folder(pid) as folder:
-            marked = mark.encode() in read_proc("environ", folder).split(b"\0")
-            return marked and user_in(folder) in users
-    except OSError:  # it has ended, or is another user's
-        return False
+    with suppress(OSError), process_folder(pid) as folder:  # else it has ended, or is another's
+        marked = mark.encode() in read_proc("environ", folder).split(b"\0")
+        return marked and user_in(folder) in users
+    return False
 
 
 def _without_processes(
     strangers: Collection[int], tables: EventTables, info: RecordingInfo
 ) -> tuple[EventTables, RecordingInfo]:
-    """The events without those of processes that are none of the command's, if there are any."""
+    """The events without those of processes that are none of the command's."""
     traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
     foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
     if not foreign:
@@ -407,12 +387,10 @@ def _without_processes(
     own = {name: frame.filter(is_own) for name, frame in tables.items()}
     names = ", ".join(f"{pid} {info.processes.get(pid, '')}".strip() for pid in foreign)
     note = f"processes that the command has not started are left out: {names}."
+    counts = {n if n == "sched_switch" else f"ros2:{n}": f.height for n, f in own.items()}
     facts = {
         "processes": {pid: name for pid, name in info.processes.items() if pid not in foreign},
         "notes": (*info.notes, note),
-        "trace_events": {
-            name if name == "sched_switch" else f"ros2:{name}": frame.height
-            for name, frame in own.items()
-        },
+        "trace_events": counts,
     }
     return own, info.model_copy(update=facts)

@@ -1,16 +1,14 @@
 """LTTng traces as recordings: the folders that `ros2 trace` writes.
 
 Events lose their provider (``ros2:callback_start`` → ``callback_start``) and get the columns and
-types of :mod:`chainshaper.values.events`; events that no table is for are left out. Integers are
-widened; a field that a trace does not declare, or of a kind that no cast brings right, becomes a
-column of nulls, and a note says so unless that is how a distribution is.
+types of :mod:`chainshaper.values.events`. A field that a trace does not declare, or of a kind that
+no cast brings right, becomes a column of nulls; a note says so unless a distribution is like that.
 
-Tables are decoded in groups that are used together, because one pass over a trace costs nearly the
-same for one table as for twenty. Containers number their processes independently of each other:
-folders of several hosts are read host by host, and of one host (`--network host` has its name) path
-by path as they are given; where two use the same number, the later one's are moved
-(:data:`NEXT_HOST`). CARET emits the events of an application's start again when
-tracing begins; those carry ``init_timestamp``, when they really happened, and are put there.
+Tables are decoded in groups that are used together: one pass over a trace costs nearly the same for
+one table as for twenty. Containers number their processes independently: folders of several hosts
+are read host by host, and of one host (`--network host` has its name) path by path; where two use
+the same number, the later one's are moved (:data:`NEXT_HOST`). CARET emits the events of an
+application's start again when tracing begins; ``init_timestamp`` says when they really happened.
 """
 
 from collections import Counter
@@ -37,8 +35,6 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import CREATION
 from chainshaper.values.recording import Recording, RecordingInfo
 
-__all__ = ["NEXT_HOST", "Progress", "TraceTables", "open_lttng_trace", "table_name"]
-
 Progress: TypeAlias = Callable[[float, str], None]
 """Gets the share of the work that is done, from 0 to 1, and what is being done."""
 
@@ -57,10 +53,8 @@ def open_lttng_trace(
 ) -> Recording:
     """Open the LTTng trace in ``paths``: folders of one recording, searched recursively.
 
-    ``overview`` leaves callbacks and messages undecoded until their first use.
-
-    Raises InputError: no trace there, metadata that cannot be understood, or traces taken by
-    different clocks (other machines, other boots), whose times cannot be compared.
+    ``overview`` leaves callbacks and messages undecoded until their first use. Raises InputError:
+    no trace there, metadata that cannot be understood, or times that cannot be compared.
     """
     progress = progress or (lambda _, __: None)
     progress(0.0, "opening the trace (the first time on a machine, its decoder is compiled)")
@@ -70,9 +64,8 @@ def open_lttng_trace(
     for folder in trace.folders[1:]:
         if None not in (clocks := {first.clock.uuid, folder.clock.uuid}) and len(clocks) == 2:
             raise InputError(
-                f"{folder.path} was taken by another clock than {first.path} (another machine, or "
-                "another boot of this one): their times cannot be compared; give the folders of "
-                "one recording"
+                f"{folder.path} was taken by another clock than {first.path} (another machine or "
+                "boot): their times cannot be compared; give the folders of one recording"
             )
     tables = TraceTables(_by_host(trace, paths), progress, overview)
     creation = tables.creation()
@@ -98,9 +91,8 @@ def _as_our_errors() -> Iterator[None]:
     try:
         yield
     except PermissionError as error:
-        raise InputError(
-            f"{error.filename}: no permission to read it: copy the trace, or run as its owner"
-        ) from error
+        remedy = "copy the trace, or run as its owner"
+        raise InputError(f"{error.filename}: no permission to read it: {remedy}") from error
     except OSError as error:
         raise OperationError(f"the trace cannot be read: {error}") from error
 
@@ -123,8 +115,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._decoding = Lock()  # the analysis asks for tables from two threads
         self._sources: dict[str, list[str]] = {}
         for full_name in trace.event_names:
-            name = table_name(full_name)
-            if name is not None:
+            if (name := table_name(full_name)) is not None:
                 self._sources.setdefault(name, []).append(full_name)
         self.counts: dict[str, int] = {}
         self.warnings: tuple[str, ...] = ()
@@ -141,10 +132,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         return {n: t for n, t in self._read.items() if n in CREATION or n == _CARET_INIT}
 
     def commands(self) -> dict[int, str]:
-        """Process → what its main thread is called, for all that created objects.
-
-        Where no object was created during the recording, everything that ran is looked at.
-        """
+        """Process → what its main thread is called, for all that created objects, or else ran."""
         tables = [self._read[name] for name in CREATION if name in self._read]
         if not any(self._counted(name) for name in ("rcl_node_init", "rcl_init")):
             tables += [self[name] for name in _WHO_RUNS if name in self]
@@ -153,10 +141,8 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
     def thread_names(self) -> set[str]:
         """Names of threads that the tracer recorded, the kernel's view included."""
-        names = set(self._names.values())
-        if "sched_switch" in self and "next_comm" in self["sched_switch"].columns:
-            names |= set(self["sched_switch"]["next_comm"].unique().drop_nulls())
-        return names
+        switches = events.table(self, "sched_switch", ["next_comm"])
+        return {*self._names.values(), *switches["next_comm"].unique().drop_nulls()}
 
     def field_lengths(self) -> dict[str, dict[str, int]]:
         """Event → its declared fields, with the length of those that are arrays (0: no array)."""
@@ -199,10 +185,8 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 and not events.castable(_decoded_type(self._fields[name].get(field)), kind)
             ]
             if missing:
-                yield (
-                    f"the trace's {name} has no usable field {', '.join(missing)}: what depends on "
-                    "it cannot be known."
-                )
+                fields = f"no usable field {', '.join(missing)}"
+                yield f"the trace's {name} has {fields}: what depends on it cannot be known."
         for host, by in self._moved.items():
             if by:
                 yield (
@@ -251,10 +235,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._progress((place + share) / len(self._hosts), "decoding events")
 
     def _take_stock(self, host: str, trace: CtfTrace, found: Events) -> None:
-        """Count all events, those of streams included of which no event is wanted.
-
-        The host's process numbers are moved out of the way if another host has one of them.
-        """
+        """Count all events, also of unwanted streams; move numbers that another host has, too."""
         with _as_our_errors():
             others = count_events(replace(trace, streams=found.unread))
         for name, count in found.counts.items():
@@ -279,10 +260,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
 
 def _by_host(trace: CtfTrace, paths: Sequence[str | Path]) -> dict[str, CtfTrace]:
-    """The trace in parts, one per host whose processes were traced, or per path of that host.
-
-    The kernel's folder goes with its own host, or with the first one.
-    """
+    """The trace in parts, one per traced host, or path of one; the first has foreign kernels'."""
     hosts = [_fact(folder.declared.env, "hostname") for folder in trace.folders]
     kernel = [folder.declared.env.get("domain") == "kernel" for folder in trace.folders]
     given = [next(p for p in paths if f.path.is_relative_to(p)) for f in trace.folders]
@@ -316,14 +294,11 @@ def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
 
 
 def table_name(event: str) -> str | None:
-    """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``.
-
-    None for others, and another provider's event of the same name; the kernel's have no provider.
-    """
+    """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``."""
     provider, _, name = event.rpartition(":")
-    of_kernel = name == "sched_switch"
     known = name in events.FIELDS or name == _CARET_INIT
-    return name if known and provider in (("",) if of_kernel else ("ros2", "ros2_caret")) else None
+    providers = ("",) if name == "sched_switch" else ("ros2", "ros2_caret")
+    return name if known and provider in providers else None
 
 
 def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:
@@ -332,11 +307,10 @@ def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:
     for folder in trace.folders:
         for stream in folder.declared.streams.values():
             for event in stream.events.values():
-                name = table_name(event.name)
-                if name is not None:
-                    kind = event.fields or ctf.StructType()
-                    fields = {ctf.field_name(f.name): f.type for f in kind.fields}
-                    declared.setdefault(name, {}).update(fields)
+                if (name := table_name(event.name)) is not None:
+                    fields = event.fields.fields if event.fields is not None else ()
+                    types = {ctf.field_name(one.name): one.type for one in fields}
+                    declared.setdefault(name, {}).update(types)
     return declared
 
 

@@ -2,12 +2,10 @@
 
 `preload.c` is that library. It sends us the memory of its process with the process's first event,
 over a socket whose name is in no file system; that of a process that runs already is in `/proc`. A
-thread reads all memories ten times a second: a process that was killed in between has lost nothing,
-since its memory is ours as well.
+thread reads all memories ten times a second, also those of processes that were killed in between.
 
-Nothing is locked: who writes never waits for who reads. So a reader copies what is new in a ring,
-then looks again how much has been written: what may have been overwritten meanwhile is thrown away
-and counted as lost.
+Nothing is locked: a reader copies what is new in a ring, then looks again how much has been
+written: what may have been overwritten meanwhile is thrown away and counted as lost.
 """
 
 import fcntl
@@ -39,46 +37,17 @@ from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import descendants, run_users
 from chainshaper.linux.threads import innermost_id, list_threads, parents, read_proc
 from chainshaper.sources.ebpf.trace_points import Argument, TracePoint, TracingLibrary, version_of
-from chainshaper.sources.system import (
-    NEXT_HOST,
-    distribution_of,
-    own_pid_namespace,
-    processes_of,
-    rmw_of_gids,
-)
+from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.files import why_distrusted
 from chainshaper.values.recording import RecordingInfo
 
-__all__ = [
-    "PreloadTracer",
-    "TracedProcess",
-    "build_library",
-    "compile_library",
-    "creation_tables",
-    "event_names",
-    "event_tables",
-    "in_cache",
-    "info_of",
-    "installed_library",
-    "joined_tables",
-    "memories",
-    "preloading",
-]
-
-
 SOURCE = Path(__file__).with_name("preload.c")
 
 RECORD = np.dtype(
-    [
-        ("time", "<i8"),
-        ("tid", "<u4"),
-        ("cpu", "<u2"),
-        ("event", "<u2"),
-        ("values", "<u8", 6),
-    ]
+    [("time", "<i8"), ("tid", "<u4"), ("cpu", "<u2"), ("event", "<u2"), ("values", "<u8", 6)]
 )
 """`struct record`: one event, or a part of a text."""
 
@@ -100,7 +69,7 @@ _THREAD_TIME = 2  # the value of callback_start and callback_end that is no argu
 _CALL = {"rmw_client_handle": 0, "rmw_service_handle": 0, "request": 1, "response": 1}
 _CALL |= {"client_gid": 2, "sequence_number": 4, "source_timestamp": 5}  # places of CALL's values
 
-_NAME = re.compile(r"^  (?:EVENT|TIMED|CREATION|CALL)\((\w+)", re.MULTILINE)
+_NAME = re.compile(r"^  (?:EVENT|CREATION|CALL)\((\w+)", re.MULTILINE)
 
 
 @functools.cache
@@ -112,8 +81,7 @@ def event_names() -> tuple[str, ...]:
 class TracedProcess:
     """The memory of one process; ``lost`` counts what was overwritten.
 
-    ``pid`` is the process's number here, ``inner_pid`` what it calls itself: another one in a
-    container, whose threads get their numbers here, too.
+    ``pid`` is the process's number here, ``inner_pid`` what it calls itself in its container.
 
     Raises InputError: the descriptor is of no such memory, or of one that may shrink.
     """
@@ -186,29 +154,20 @@ class TracedProcess:
         asked = min(int(self.header["objects"][0]), self._objects.size)
         records = self._objects[:asked].copy()
         own = np.flatnonzero(records["event"] > _TEXT)
-        texts: dict[int, dict[int, bytearray]] = {}
-        lengths: dict[tuple[int, int], int] = {}
+        texts: dict[tuple[int, int], tuple[int, bytearray]] = {}
         for at in np.flatnonzero(records["event"] == _TEXT):
             number = int(np.searchsorted(own, at)) - 1
             length, place = divmod(int(records["values"][at, 0]), _PLACES)
-            part = records["values"][at, 1:].tobytes()
-            texts.setdefault(number, {}).setdefault(place, bytearray()).extend(part)
-            lengths[number, place] = length
-        read = {
-            number: {
-                place: bytes(text[: lengths[number, place]]).decode(errors="replace")
-                for place, text in of_event.items()
-            }
-            for number, of_event in texts.items()
-        }
+            _, text = texts.setdefault((number, place), (length, bytearray()))
+            text += records["values"][at, 1:].tobytes()
+        read: dict[int, dict[int, str]] = {}
+        for (number, place), (length, text) in texts.items():
+            read.setdefault(number, {})[place] = text[:length].decode(errors="replace")
         return self._numbered(records[own]), read
 
 
 def creation_tables(process: TracedProcess) -> tuple[dict[str, pl.DataFrame], TracingLibrary]:
-    """The tables of what a process has created, and the tracing library behind ours.
-
-    The library's version says which arguments functions have.
-    """
+    """The tables of what a process has created, and the tracing library behind ours."""
     objects, texts = process.objects()
     path = next((texts[int(n)][0] for n in np.flatnonzero(objects["event"] == _LIBRARY)), "")
     library = TracingLibrary(Path(path), frozenset(), version_of(Path(path)))
@@ -236,26 +195,6 @@ def joined_tables(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.D
     }
 
 
-def info_of(
-    tables: EventTables,
-    versions: Iterable[str | None],
-    clock_offset_ns: int,
-    lost: int,
-    names: Mapping[int, str],
-) -> RecordingInfo:
-    """What is known of a system: ``versions`` of tracetools, ``names`` of nodeless processes."""
-    known = pl.DataFrame({"version": [one for one in versions if one][:1]})
-    return RecordingInfo(
-        source="preload",
-        distribution=distribution_of({"rcl_init": known}, {}),
-        rmw=rmw_of_gids(tables),
-        clock_offset_ns=clock_offset_ns,
-        processes=processes_of(tables, names),
-        pid_namespace=own_pid_namespace(),
-        lost={"lost_events": lost},
-    )
-
-
 def _tables(
     records: NDArray[Any],
     pids: NDArray[np.int32],
@@ -269,8 +208,15 @@ def _tables(
         if places.size:
             own = records[places]
             said = [texts.get(int(place), {}) for place in places] if texts else []
-            columns = dict(_columns(TracePoint(name, library.path, library), own, said))
-            tables[name] = _table(name, own, {"pid": pids[places], **columns})
+            common = {one: np.ascontiguousarray(own[one]) for one in ("time", "tid", "cpu")}
+            columns = _columns(TracePoint(name, library.path, library), own, said)
+            frame = pl.DataFrame({**common, "pid": pids[places], **dict(columns)})
+            types = {n: t for n, t in events.column_types(name).items() if n in frame.columns}
+            signed = (
+                pl.col(n).reinterpret(signed=True) if t == pl.Int64() else pl.col(n).cast(t)
+                for n, t in types.items()
+            )
+            tables[name] = frame.select(signed).sort("time", maintain_order=True)
     return tables
 
 
@@ -301,24 +247,13 @@ def _columns(
         yield "thread_time", np.ascontiguousarray(values[:, _THREAD_TIME])
 
 
-def _table(name: str, records: NDArray[Any], columns: Mapping[str, Any]) -> pl.DataFrame:
-    types = events.column_types(name)
-    common = {one: np.ascontiguousarray(records[one]) for one in ("time", "tid", "cpu")}
-    frame = pl.DataFrame({**common, **columns})
-    signed = (
-        pl.col(one).reinterpret(signed=True) if kind == pl.Int64() else pl.col(one).cast(kind)
-        for one, kind in types.items()
-        if one in frame.columns
-    )
-    return frame.select(signed).sort("time", maintain_order=True)
-
-
 VARIABLE = "CHAINSHAPER_TRACE"
 _FILE = "libchainshaper_trace.so"
 _BETWEEN_LOOKS_S = 0.1
 _BETWEEN_SEARCHES_NS = 1_000_000_000
 _OPTIONS = ("-O2", "-std=gnu11", "-shared", "-fPIC", "-ftls-model=initial-exec")
 _LIBRARIES = ("-ldl", "-lpthread")
+_REMEDY = "name another cache in $XDG_CACHE_HOME"
 _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
@@ -331,9 +266,8 @@ def build_library(folder: Path) -> Path:
 def compile_library(
     compiler: Literal["cc", "c++"], words: Sequence[str], library: Path, options: tuple[str, str]
 ) -> Path:
-    """Compile a library with the system's compiler; its path.
+    """Compile a library; ``options`` are the one that needs it and the one that does without.
 
-    ``options`` are of the command line: the one that needs it, and the one that does without.
     Raises PlatformError: there is no compiler, or it fails.
     """
     (needs, without), package = options, {"cc": "gcc", "c++": "g++"}[compiler]
@@ -358,10 +292,7 @@ def compile_library(
 
 
 def installed_library() -> Path:
-    """The library that came with the package, or is in the user's cache, built at the first use.
-
-    Raises PlatformError: as :func:`build_library`, or others may write to the cache.
-    """
+    """The package's library, or the cache's, built at first use. Raises: as :func:`in_cache`."""
     if (shipped := SOURCE.with_name(_FILE)).exists():
         return shipped
     return in_cache(_FILE, [SOURCE.read_text()], build_library)
@@ -385,28 +316,18 @@ def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -
                 library.parent.mkdir(exist_ok=True)
                 built.replace(library)  # whole, also where two of us build at once
         except OSError as error:
-            raise PlatformError(
-                f"{library} cannot be written ({error.strerror}): name another cache in "
-                "$XDG_CACHE_HOME"
-            ) from error
+            why = f"{library} cannot be written ({error.strerror})"
+            raise PlatformError(f"{why}: {_REMEDY}") from error
     if (reason := why_distrusted(library)) is not None:
-        raise PlatformError(
-            f"{library} is not loaded into nodes: {reason}; remove it, or name another cache in "
-            "$XDG_CACHE_HOME"
-        )
+        raise PlatformError(f"{library} is not loaded into nodes: {reason}; {_REMEDY}")
     return library
 
 
 def preloading(library: Path) -> str:
-    """`LD_PRELOAD` with the library in front of those that it names already.
-
-    Raises PlatformError: its path has a character that separates libraries there.
-    """
+    """`LD_PRELOAD` with the library in front of what it names. Raises PlatformError: it cannot."""
     if re.search(r"[\s:]", str(library)):
-        raise PlatformError(
-            f"{str(library)!r} has a space or a colon in it, so LD_PRELOAD cannot name it: name "
-            "another cache in $XDG_CACHE_HOME"
-        )
+        why = f"{str(library)!r} has a space or a colon in it, so LD_PRELOAD cannot name it"
+        raise PlatformError(f"{why}: {_REMEDY}")
     before = os.environ.get("LD_PRELOAD", "").split(":")
     return ":".join([str(library), *(one for one in before if one and one != str(library))])
 
@@ -437,10 +358,7 @@ def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[i
 
 
 class PreloadTracer:
-    """Records with the library in front: a :class:`~chainshaper.sources.Tracer`.
-
-    Without a command it follows ``pids`` and their descendants, or all of the users' that have it.
-    """
+    """Records with the library in front: a :class:`~chainshaper.sources.Tracer`."""
 
     def __init__(
         self,
@@ -502,8 +420,7 @@ class PreloadTracer:
             raise OperationError(
                 "no process has loaded the tracing library: is tracing compiled into this ROS 2 "
                 "(`ros2 run tracetools status`), and do the nodes run here, not in a container, "
-                "and without more rights than you (LD_PRELOAD is ignored then)? LTTng can record "
-                "what loads it: `--source lttng`"
+                "without more rights than you (LD_PRELOAD is ignored then)? Else `--source lttng`"
             )
         parts: list[dict[str, pl.DataFrame]] = []
         versions: list[str | None] = []
@@ -519,11 +436,10 @@ class PreloadTracer:
         lost = sum(process.lost + process.dropped for process in self._processes)
         notes = [] if self._failure is None else [f"{self._failure}."]
         if lost:
-            notes.append(
-                f"{lost} events were lost: recording did not run often enough to read them."
-            )
-        info = info_of(tables, versions, self._clock_offset_ns, lost, self._names)
-        return tables, info.model_copy(update={"notes": tuple(notes)})
+            notes.append(f"{lost} events were lost: recording did not run often enough for them.")
+        facts: dict[str, Any] = {"pid_namespace": own_pid_namespace(), "notes": tuple(notes)}
+        facts["clock_offset_ns"] = self._clock_offset_ns
+        return tables, info_of("preload", tables, versions, self._names, lost, **facts)
 
     def _file(self, place: int) -> Path:
         return self._folder / f"process_{place}.records"

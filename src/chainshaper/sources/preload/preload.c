@@ -12,12 +12,9 @@
 //   first event, and gives it back as it ends. `written` counts: who reads sees what it has missed.
 // * Nothing waits, nothing is allocated behind a thread's first event. What finds no room is counted.
 //
-// A record is 64 bytes; times are ns of CLOCK_MONOTONIC, values are a function's arguments as they
-// are in registers (of a bool the lowest byte counts). The third one of callback_start and
-// callback_end is the CPU time of the thread. Texts follow their event in records of their own.
-//
-// The calls of services have trace points from Kilted on only: we see them as librcl calls rmw, on
-// all distributions alike.
+// Times are ns of CLOCK_MONOTONIC, values are a function's arguments as they are in registers (of a
+// bool the lowest byte counts). Texts follow their event in records of their own. Calls of services
+// have trace points from Kilted on only: we see them as librcl calls rmw.
 //
 // Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1: all arguments are
 // integers or pointers, at most five, so that any of its versions can be called, and answered, alike.
@@ -99,13 +96,12 @@ static inline uint64_t now(clockid_t clock) {
 }
 
 // CPU time of the thread, without a system call while it has been on its core since the last one:
-// then it has used what has passed. The kernel says so: it resets the thread's pointer to a
-// restartable sequence (rseq(2)) when it takes the core away outside of that sequence, and ours is
-// empty. The clock itself is read again after SURELY_USED, so that interrupts and stolen time, which
-// it leaves out, add up to no more. A kernel need not reset the pointer of a thread that waits in a
-// system call: one try in each process finds that out, and the clock is read each time. A reading
-// that an interrupt separates from its instant (READ_AT_ONCE) serves for one event only: what came
-// between them would be missing from all that follow.
+// then it has used what has passed. The kernel resets the thread's pointer to a restartable sequence
+// (rseq(2)) when it takes the core away outside of it, and ours is empty. The clock itself is read
+// again after SURELY_USED, so that interrupts and stolen time, which it leaves out, add up to no more.
+// A kernel need not reset the pointer of a thread that waits in a system call: one try in each
+// process finds that out. A reading that an interrupt separates from its instant (READ_AT_ONCE)
+// serves for one event only: what came between them would be missing from all that follow.
 #define SURELY_USED 200000u   // ns
 #define READ_AT_ONCE 4000u    // ns
 #if defined(__x86_64__)
@@ -166,7 +162,7 @@ static void stamp(struct record *record, uint64_t time) {
   record->cpu = (uint16_t)sched_getcpu();
 }
 
-// Send the memory to who waits for it; whoever is not there gets nothing.
+// Send the memory to who waits for it, if anyone does.
 static void send_memory(const char *name) {
   struct sockaddr_un address = {.sun_family = AF_UNIX};
   size_t length = strlen(name);
@@ -279,10 +275,8 @@ static bool has_ring(void) {
 }
 
 // `time` 0: now.
-static inline __attribute__((always_inline)) void write_record(uint16_t event, uint64_t time,
-                                                               unsigned count,
-                                                               const uint64_t *values,
-                                                               bool timed) {
+static inline __attribute__((always_inline)) void write_record(
+  uint16_t event, uint64_t time, unsigned count, const uint64_t *values, bool timed) {
   if (__builtin_expect(!own.ring, 0) && !has_ring()) return;
   uint64_t number = atomic_load_explicit(&own.ring->written, memory_order_relaxed);
   struct record *record = &own.records[number & (RING_RECORDS - 1)];
@@ -349,11 +343,10 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
 }
 
 #define BIT(place) (1u << (place))
-// EVENT: name, arguments that are values. TIMED: the same, CPU time behind them. CREATION: name, the
-// places of texts as bits, that of a gid (0: none). CALL: handle, message, gid, sequence number and
-// source timestamp of a service's call. A record's number is the place in this list.
-// Not in it: rclcpp_executor_get_next_ready and _wait_for_work. Executors of several threads emit
-// some 100,000 a second while a callback group with waiting messages is busy.
+// EVENT: name, arguments that are values, whether the third is the thread's CPU time. CREATION: name,
+// the places of texts as bits, that of a gid (0: none). CALL: handle, message, gid, sequence number
+// and source timestamp of a service's call. A record's number is the place in this list.
+// Not in it: rclcpp_executor_get_next_ready and _wait_for_work, which are some 100,000 a second.
 #define ALL_EVENTS \
   CREATION(rcl_init, 0, 0) \
   CREATION(rcl_node_init, BIT(2) | BIT(3), 0) \
@@ -375,32 +368,30 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
   CREATION(rclcpp_ipb_to_subscription, 0, 0) \
   CREATION(rcl_lifecycle_state_machine_init, 0, 0) \
   CREATION(rcl_lifecycle_transition, BIT(1) | BIT(2), 0) \
-  TIMED(callback_start, 2) \
-  TIMED(callback_end, 1) \
-  EVENT(rclcpp_publish, 2) \
-  EVENT(rclcpp_intra_publish, 2) \
-  EVENT(rcl_publish, 2) \
-  EVENT(rmw_publish, 3) \
-  EVENT(rmw_take, 4) \
-  EVENT(rcl_take, 1) \
-  EVENT(rclcpp_take, 1) \
-  EVENT(rclcpp_ring_buffer_enqueue, 4) \
-  EVENT(rclcpp_ring_buffer_dequeue, 3) \
-  EVENT(rclcpp_ring_buffer_clear, 1) \
-  EVENT(rclcpp_executor_execute, 1) \
-  EVENT(rcl_timer_call, 1) \
+  EVENT(callback_start, 2, true) \
+  EVENT(callback_end, 1, true) \
+  EVENT(rclcpp_publish, 2, false) \
+  EVENT(rclcpp_intra_publish, 2, false) \
+  EVENT(rcl_publish, 2, false) \
+  EVENT(rmw_publish, 3, false) \
+  EVENT(rmw_take, 4, false) \
+  EVENT(rcl_take, 1, false) \
+  EVENT(rclcpp_take, 1, false) \
+  EVENT(rclcpp_ring_buffer_enqueue, 4, false) \
+  EVENT(rclcpp_ring_buffer_dequeue, 3, false) \
+  EVENT(rclcpp_ring_buffer_clear, 1, false) \
+  EVENT(rclcpp_executor_execute, 1, false) \
+  EVENT(rcl_timer_call, 1, false) \
   CALL(rmw_send_request) \
   CALL(rmw_take_request) \
   CALL(rmw_send_response) \
   CALL(rmw_take_response)
 
 #define EVENT(name, ...) number_##name,
-#define TIMED EVENT
 #define CREATION EVENT
 #define CALL EVENT
 enum { before_first = FIRST_EVENT - 1, ALL_EVENTS };
 #undef EVENT
-#undef TIMED
 #undef CREATION
 #undef CALL
 
@@ -430,10 +421,8 @@ typedef bool (*question)(void);
   } \
   bool ros_trace_enabled_##name(void) { return true; }
 
-#define EVENT(name, count) \
-  HOOK(name, write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), false))
-#define TIMED(name, count) \
-  HOOK(name, write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), true))
+#define EVENT(name, count, timed) \
+  HOOK(name, write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), timed))
 #define CREATION(name, texts, gid) \
   HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
 #define CALL(name)

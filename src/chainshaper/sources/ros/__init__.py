@@ -1,11 +1,11 @@
 """Asking an application's own ROS 2 while it runs, by a script of ours (:mod:`.script`).
 
 The Python that has `rclpy` is seldom ours, and domain and RMW are those of the application's nodes.
-An environment says which programs and libraries are loaded: who wrote it chooses what runs. So this
-is the one place where something is run that was found through another process, even the
-interpreter, and it runs with that process's user's rights, without capabilities or a way to get
-any, in that environment and a session of its own, with no files of ours but the script and what it
-may print into, for a limited time, or not at all. What it prints is a stranger's word.
+An environment says which programs and libraries are loaded: who wrote it chooses what runs. So only
+here something is run that was found through another process, with that process's user's rights,
+without capabilities or a way to get any, in that environment and a session of its own, with no
+files of ours but the script and what it may print into, for a limited time, or not at all. What it
+prints is a stranger's word.
 """
 
 import ctypes
@@ -75,10 +75,7 @@ class Script:
         return self.process.poll() is not None
 
     def end(self, within_s: float = 0.0) -> tuple[str, str | None]:
-        """Wait for its end, once, and end all of its session's group when that takes longer.
-
-        Returns what it printed, and why it failed, if it did.
-        """
+        """Wait for its end, once, or end its group; what it printed, and why it failed, if so."""
         problem = None
         try:
             code = self.process.wait(within_s)
@@ -112,19 +109,14 @@ def environment_of(pid: int) -> Environment:
             )
             same = user_in(folder) == user  # nor has it become another program meanwhile
     except OSError as error:
-        raise OperationError(
-            f"the environment of process {pid} cannot be read: {error.strerror}"
-        ) from error
+        what = f"the environment of process {pid}"
+        raise OperationError(f"{what} cannot be read: {error.strerror}") from error
+    unused = "so nothing that its environment names is run"
     if user is None or not same:
-        raise OperationError(
-            f"process {pid} was started by another user than runs it, so nothing that its "
-            "environment names is run"
-        )
+        raise OperationError(f"process {pid} was started by another user than runs it, {unused}")
     if elsewhere:
-        raise OperationError(
-            f"process {pid} is in a container or a namespace of its own, so nothing that its "
-            "environment names is run here: run chainshaper in there"
-        )
+        where = f"process {pid} is in a container or a namespace of its own"
+        raise OperationError(f"{where}, {unused} here: run chainshaper in there")
     _becoming(user)
     pairs = (entry.partition("=") for entry in content.split("\0") if "=" in entry)
     return Environment({name: value for name, _, value in pairs if name}, user)
@@ -172,9 +164,8 @@ def start_with_rclpy(
     except OSError as error:
         os.close(printed)
         os.close(said)
-        raise OperationError(
-            f"no script of user {user_name(environment.user)} can be started: {error.strerror}"
-        ) from error
+        what = f"no script of user {user_name(environment.user)}"
+        raise OperationError(f"{what} can be started: {error.strerror}") from error
     return Script(process, printed, said)
 
 
@@ -185,10 +176,8 @@ def _becoming(user: int) -> dict[str, Any]:
     try:
         known = pwd.getpwuid(user)
     except KeyError:
-        raise OperationError(
-            f"user {user} of the application is not in this machine's user database, so its groups "
-            "are not known and nothing is run as it"
-        ) from None
+        who = f"the application's user {user} is not in this machine's user database"
+        raise OperationError(f"{who}: nothing is run as it") from None
     if os.geteuid() != 0:
         raise OperationError(
             f"the application is user {known.pw_name}'s, and what its environment names is run by "
@@ -227,8 +216,7 @@ def _content(descriptor: int) -> str:
 def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str | None]:
     """All endpoints of the ROS graph of a node with this environment, and why there are none.
 
-    Types and QoS travel in DDS discovery only, which one participant learns in a few seconds. DDS
-    without its security plug-ins does not prove who is in the graph: the answer is bounded and
+    DDS without its security plug-ins does not prove who is in the graph: the answer is bounded and
     checked in its form, and believed in names, types and QoS only.
     """
     asked = (ros_script.__file__, "graph", str(_PATIENCE_S))
@@ -248,12 +236,10 @@ def ask_graph(environment: Environment) -> tuple[tuple[EndpointInfo, ...], str |
 def publishing_diagnostics(
     environment: Environment,
 ) -> Iterator[Callable[[Sequence[Mapping[str, Any]]], str | None]]:
-    """A node in this environment that publishes on `/diagnostics` what it is given.
+    """A function that has a node in this environment publish statuses on `/diagnostics`.
 
-    It gives a function that takes statuses (``name``, ``level``, ``message``, ``values``), and
-    returns why they are not published, once.
-
-    Raises OperationError: as :func:`start_with_rclpy`.
+    They have ``name``, ``level``, ``message``, ``values``; it returns why they are not published,
+    once. Raises OperationError: as :func:`start_with_rclpy`.
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)  # a node that does not read must not stop who watches

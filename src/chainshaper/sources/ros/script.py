@@ -8,15 +8,13 @@ This file is run, not imported: by the interpreter that has `rclpy` (Humble or l
 of ours may be installed.
 
 `graph` prints one JSON object: ``endpoints``, one per publisher and subscription of each topic with
-type and QoS, two of a kind included. Discovery is over when nothing new has appeared for two
-seconds, or after SECONDS (10). Durations are ns; null where the application set none, or the RMW
-does not tell.
+type and QoS. Discovery is over when nothing new has appeared for two seconds, or after SECONDS
+(10). Durations are ns; null where the application set none, or the RMW does not tell.
 
 `parameter` sets an integer parameter. It ends with an error that names each node which has no such
-parameter, refuses the value, or does not answer; all together have five seconds. Who answers is
-whoever offers the service under the node's name: DDS does not prove who that is without its
-security plug-ins (SROS 2). Where several offer it (rclpy counts them since Jazzy), an answer says
-nothing, and that is an error.
+parameter, refuses the value, or does not answer within five seconds. Who answers is whoever offers
+the service under the node's name. Where several offer it (rclpy counts them since Jazzy), an answer
+says nothing, and that is an error.
 
 `diagnostics` publishes each line that it reads from DESCRIPTOR on `/diagnostics`, until that ends:
 a JSON list of objects with ``name``, ``level`` (0: OK, 1: WARN, 2: ERROR), ``message``, ``values``.

@@ -1,9 +1,9 @@
 """Compiled loops over bytes and columns, ready to run without their compiler.
 
-Importing Numba takes half a second, which is as long as reading ten million events. Loops that
-every trace needs are therefore written for addresses and counts only
-(:mod:`~chainshaper.values.compiled.memory`): what Numba makes of those needs nothing of Python, so
-it is compiled once on a machine, then loaded from an object file in some tens of milliseconds.
+Importing Numba takes half a second, as long as reading ten million events. So loops that every
+trace needs are written for addresses and counts only (:mod:`~chainshaper.values.compiled.memory`):
+what Numba makes of those needs nothing of Python. It is compiled once on a machine, then loaded
+from an object file in some tens of milliseconds.
 
 The file stands beside the kernel's module, or in the user's cache where that folder cannot be
 written; where neither can, every process compiles anew. Its name is a digest of the sources of the
@@ -36,13 +36,10 @@ try:
 except ModuleNotFoundError:  # Python interprets the functions (`memory`)
     llvm = None
 
-__all__ = ["kernel"]
-
 _OF_NUMBAS_RUNTIME = re.compile(r"^declare (.*@(?:NRT_|numba_)\w+\([^)]*\)).*$", re.MULTILINE)
-"""What code from Numba calls to raise and to free, which kernels never do.
+"""What code from Numba calls to raise and to free, which kernels never do: traps, in their file.
 
-It is defined in the object file itself, as a trap: under its own name it would take the place of
-the real one for all code that Numba compiles in this process.
+Under their own names they would take the place of the real ones for all code that Numba compiles.
 """
 
 _DIGEST_SIZE = hashlib.sha256().digest_size

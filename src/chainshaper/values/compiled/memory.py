@@ -1,8 +1,8 @@
 """Loads and stores at machine addresses for the compiled kernels.
 
-Packets are bytes at any alignment in several memory maps, and columns are arrays of several
-types; an address is the one thing that they share.  Whoever calls these has checked the bounds:
-nothing here does.  The machine is taken to be little-endian, as all are that run ROS 2.
+Packets are bytes at any alignment, and columns are arrays of several types; an address is the one
+thing that they share. Whoever calls these has checked the bounds. The machine is taken to be
+little-endian, as all are that run ROS 2.
 
 Where Numba is not installed, Python interprets the same functions: some hundred times slower, which
 is quick enough for what a robot decides on, and not for a long trace.
@@ -32,10 +32,9 @@ _WORDS: dict[int, Any] = {
 
 
 def compiled(*, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
-    """``njit`` for functions of numbers, as they are called by each other.
+    """``njit`` for functions of numbers that call each other, ``inline`` where a call costs more.
 
-    ``inline`` has the compiler put the function into its callers, where a call would cost more
-    than what it does. Python calls them by way of :func:`~chainshaper.values.compiled.kernel`.
+    Python calls them by way of :func:`~chainshaper.values.compiled.kernel`.
     """
 
     def decorate(function: Callable[..., Any]) -> Any:
@@ -53,12 +52,7 @@ def _instruction(signature: Any, build: Callable[..., Any]) -> Any:
         found = build(builder, *values)
         return context.get_dummy_value() if signature.return_type == types.void else found
 
-    def of_one(_typing: Any, _number: Any) -> Any:
-        return signature, generate
-
-    def of_two(_typing: Any, _number: Any, _value: Any) -> Any:
-        return signature, generate
-
+    of_one, of_two = lambda _, __: (signature, generate), lambda _, __, ___: (signature, generate)
     return intrinsic(of_one if len(signature.args) == 1 else of_two)
 
 
@@ -105,19 +99,17 @@ class _Table:
         self._numbers[index] = int(value)
 
 
+# A uint64 with its bytes in reverse order; how many low bits of one are 0 (64 for 0), as int64; and
+# the int64 table at an address, for ``table[index]``.
 swap_bytes: Any = lambda value: np.uint64(int(value)).byteswap()  # noqa: E731 - as the compiled ones
 trailing_zeros: Any = lambda value: (int(value) & -int(value)).bit_length() - 1 if value else 64  # noqa: E731
 table_at: Any = _Table
 if not INTERPRETED:
-    swap_bytes = _instruction(types.uint64(types.uint64), lambda b, value: b.bswap(value))
-    trailing_zeros = _instruction(
-        types.int64(types.uint64), lambda b, value: b.cttz(value, ir.Constant(ir.IntType(1), 0))
-    )
-    table_at = _instruction(
-        types.CPointer(types.int64)(types.int64), lambda b, address: _pointer(b, address, 64)
-    )
-# A uint64 with its bytes in reverse order; how many low bits of one are 0 (64 for 0), as int64; and
-# the int64 table at an address, for ``table[index]``.
+    word, number = types.uint64, types.int64
+    swap_bytes = _instruction(word(word), lambda b, value: b.bswap(value))
+    zeros = lambda b, value: b.cttz(value, ir.Constant(ir.IntType(1), 0))  # noqa: E731
+    trailing_zeros = _instruction(number(word), zeros)
+    table_at = _instruction(types.CPointer(number)(number), lambda b, at: _pointer(b, at, 64))
 
 
 @compiled(inline=True)
