@@ -60,13 +60,10 @@ BANDS, MARGIN = "Latency bands", "Margin"
 class Wishes:
     """The wishes for a plan, all but the modes of the system. Times in nanoseconds.
 
-    The margin is ``epsilon_ns`` behind the longest undisturbed latency where that is given.
-    Otherwise it covers all cycles, also disturbed ones, but a share of ``overrun_probability``
-    (None: 1 %, or as few as the sample shows). ``publish_slot_ns`` is Δ of eq. 2 and 4, None: the
-    longest publication measured, 1 ms at least. ``overrun`` None: an output that missed its slot
-    leaves at once, where the policy and the publisher allow it. ``bands`` to ``seed`` go with the
-    policy ``shaped``, see :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` goes
-    with ``one-long-slot``. ``cores`` None: executors are planned for the cores that they ran on.
+    Without ``epsilon_ns`` the margin covers all cycles, also disturbed ones, but a share of
+    ``overrun_probability`` (None: 1 %, or as few as the sample shows). ``publish_slot_ns`` is Δ of
+    eq. 2 and 4. ``bands`` to ``seed`` go with the policy ``shaped``, see
+    :func:`~chainshaper.planning.bands.with_bands`; ``slot_start_ns`` with ``one-long-slot``.
     """
 
     policy: Annotated[Policy, Option("Scheduling policy.")] = "shaped"

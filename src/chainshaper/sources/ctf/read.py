@@ -105,8 +105,7 @@ def read_events(
     events = Events(_frames(columns, texts, any(file.unsorted for file in files)))
     events.warnings = tuple(warning for file in files for warning in file.warnings())
     events.counts = _counts(trace, layout, files)
-    read = frozenset(used)
-    events.unread = tuple(stream for stream in trace.streams if stream not in read)
+    events.unread = tuple(stream for stream in trace.streams if stream not in used)
     return events
 
 

@@ -2,7 +2,7 @@
 
 `preload.c` is that library. It sends us the memory of its process with the process's first event,
 over a socket whose name is in no file system; that of a process that runs already is in `/proc`. A
-thread reads all memories ten times a second, also those of processes that were killed in between.
+thread reads all memories ten times a second, also what a process wrote that was killed in between.
 
 Nothing is locked: a reader copies what is new in a ring, then looks again how much has been
 written: what may have been overwritten meanwhile is thrown away and counted as lost.
