@@ -176,7 +176,7 @@ def _becoming(user: int) -> dict[str, Any]:
     try:
         known = pwd.getpwuid(user)
     except KeyError:
-        who = f"the application's user {user} is not in this machine's user database"
+        who = f"user {user} of the application is not in this machine's user database"
         raise OperationError(f"{who}: nothing is run as it") from None
     if os.geteuid() != 0:
         raise OperationError(
