@@ -1,9 +1,11 @@
 """Slots that follow a timer that is some ppm off, for as long as you like: live, two chains.
 
-    python benchmarks/enforcement/drifting_timer.py [--minutes 60] [--ppm -50] [--keep DIR]
+    python benchmarks/enforcement/drifting_timer.py [--minutes 60] [--ppm -50] [--epsilon 18ms]
+        [--keep DIR]
 
 As root. The chains take turns, and both timers are off alike, as those of one sensor; each slot of
-the one is followed by one of the other, so a slot that stays behind its timer shows at once.
+the one is followed by one of the other, so a slot that stays behind its timer shows soon. The margin
+takes what room the cycle has: a shared machine stands still for 10 ms now and then.
 Prints for every five minutes how many outputs were late, and how far apart the others left; at the
 end how far the timer and the slots have moved. Nothing is asserted: a machine that stalls makes
 outputs late by itself.
@@ -33,14 +35,14 @@ nodes:
   a1: {callbacks: [{timer: 100ms, execution: {uniform: [500us, 1ms]}, publishes: [/a1]}]}
   a2: {callbacks: [{subscription: /a1, execution: {uniform: [1ms, 2ms]}, publishes: [/a2]}]}
   a3: {callbacks: [{subscription: /a2, execution: {uniform: [500us, 1ms]}, publishes: [/a3]}]}
-  b1: {callbacks: [{timer: 40ms, execution: {uniform: [500us, 1ms]}, publishes: [/b1]}]}
+  b1: {callbacks: [{timer: 50ms, execution: {uniform: [500us, 1ms]}, publishes: [/b1]}]}
   b2: {callbacks: [{subscription: /b1, execution: {uniform: [1ms, 1500us]}, publishes: [/b2]}]}
   sink:
     core: 0
     priority: 70
     callbacks: [{subscription: /a3}, {subscription: /b2}]
 """
-TIMERS_NS = {"a1": 100_000_000, "b1": 40_000_000}
+TIMERS_NS = {"a1": 100_000_000, "b1": 50_000_000}
 CHAINSHAPER = (sys.executable, "-m", "chainshaper")
 
 
@@ -63,6 +65,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Slots that follow a drifting timer.")
     parser.add_argument("--minutes", type=float, default=60)
     parser.add_argument("--ppm", type=float, default=-50)
+    parser.add_argument("--epsilon", default="18ms", help="what is added to the longest latency")
     parser.add_argument("--keep", type=Path, help="a new folder for recordings and the plan")
     given = parser.parse_args()
     folder = given.keep or Path(tempfile.mkdtemp())
@@ -70,7 +73,7 @@ def main() -> None:
     application, plan, shaped = folder / "app.yaml", folder / "plan.yaml", folder / "shaped"
     application.write_text(APPLICATION)
     run("run", application, "-o", folder / "before", "--cycles", "310")
-    chains = ("--chain", "/a1../a3", "--chain", "/b1../b2", "--epsilon", "3ms")
+    chains = ("--chain", "/a1../a3", "--chain", "/b1../b2", "--epsilon", given.epsilon)
     run("plan", folder / "before", *chains, "-o", plan)
     off = folder / "off.yaml"
     off.write_text(yaml.safe_dump(drifting(plan, application, given.ppm), sort_keys=False))
