@@ -10,16 +10,18 @@ test: .venv/.ready-dev
 	scripts/test-tools
 	$(MAKE) --jobs=2 --output-sync=line test-untimed test-timed
 
-test-untimed: lint
-	.venv/bin/python -m pytest -m "not timed"
-
 # What fails beside the others is named, and tried once more when those are through; what fails again
 # has failed.
-timed = .venv/bin/python -m pytest -m timed -o cache_dir=.pytest_cache/timed
+tried = run='.venv/bin/python -m pytest -m "$(1)" -o cache_dir=.pytest_cache/$(2)'; \
+	eval "$$run"; code=$$?; [ $$code = 1 ] || exit $$code; \
+	while pgrep -f "[p]ytest -m $(3)" >/dev/null; do sleep 1; done; \
+	echo "tried once more, alone:"; eval "$$run --last-failed --last-failed-no-failures none"
+
+test-untimed: lint
+	@$(call tried,not timed,untimed,timed)
+
 test-timed: .venv/.ready-dev
-	$(timed); code=$$?; [ $$code = 1 ] || exit $$code; \
-		while pgrep -f "pytest -m not time[d]" >/dev/null; do sleep 1; done; \
-		echo "tried once more, alone:"; $(timed) --last-failed --last-failed-no-failures none
+	@$(call tried,timed,timed,not timed)
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.
