@@ -4,7 +4,7 @@
         [--keep DIR]
 
 As root. The chains take turns, and both timers are off alike, as those of one sensor; each slot of
-the one is followed by one of the other, so a slot that stays behind its timer shows soon. The margin
+the one is followed by one of the other, so one that stays behind its timer shows soon. The margin
 takes what room the cycle has: a shared machine stands still for 10 ms now and then.
 Prints for every five minutes how many outputs were late, and how far apart the others left; at the
 end how far the timer and the slots have moved. Nothing is asserted: a machine that stalls makes

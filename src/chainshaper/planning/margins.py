@@ -39,9 +39,11 @@ from numpy.typing import NDArray
 from chainshaper.planning.plan import Adaptation, Margin
 from chainshaper.values.durations import duration_text, parse_duration
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.plan_choices import Publication
 
 LONGEST_NS = 24 * 3_600 * 1_000_000_000  # beyond a day it is a wrong unit, not a latency
 EPSILON_NS = 1_000_000  # a margin's beyond latencies: the way to the shaping node is not in them
+HOP_NS = 200_000  # so long that way takes: measured 0.07 to 0.2 ms; a gate in the process has none
 OVERRUN_PROBABILITY = 0.01  # the share of all cycles that may be late by default, at most
 
 # A tail is the n^(2/3) longest of n latencies, or these parts of it: the more there are, the
@@ -111,6 +113,11 @@ def _read_lines(path: Path) -> _Latencies:
             reason = f"{content} is no latency: write 0 ms or more, up to a day"
             raise InputError(f"{path}:{number}: {reason}")
     return np.array(found, dtype=np.int64)
+
+
+def least_epsilon_ns(publication: Publication) -> int:
+    """ε where the machine does not stall and no other is wished."""
+    return EPSILON_NS - (HOP_NS if publication == "in-process" else 0)
 
 
 def check_latencies(latencies: object) -> _Latencies:

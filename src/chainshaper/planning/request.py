@@ -24,7 +24,6 @@ from chainshaper.planning.bands import (
 )
 from chainshaper.planning.cores import assign_cores
 from chainshaper.planning.margins import (
-    EPSILON_NS,
     MOST_PROBABLE,
     OVERRUN_PROBABILITY,
     check_latencies,
@@ -32,6 +31,7 @@ from chainshaper.planning.margins import (
     cycles_needed,
     derive_margin,
     late_share,
+    least_epsilon_ns,
 )
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import pipelined, stage_places
@@ -211,7 +211,8 @@ def cores_for(
             raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
         return {node: cores[k] for node, k in _places(profiles, cores).items()}
-    margin = EPSILON_NS if request.epsilon_ns is None else request.epsilon_ns
+    least = least_epsilon_ns(request.publication)
+    margin = least if request.epsilon_ns is None else request.epsilon_ns
     return assign_cores(profiles, cores, margin_ns=margin, worth=worth)
 
 
@@ -265,7 +266,7 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
 
 def _latest(profile: Profile, request: PlanRequest) -> int:
     """The longest latency behind which a publish slot fits into the cycle."""
-    return profile.period_ns - _slot_ns(profile, request) - EPSILON_NS
+    return profile.period_ns - _slot_ns(profile, request) - least_epsilon_ns(request.publication)
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -431,7 +432,7 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
         share = probability or OVERRUN_PROBABILITY  # a stall belongs to no single callback
         latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
         stalls = max(0, covered_latency(covered, share, latest) - longest)
-    epsilon = EPSILON_NS + stalls
+    epsilon = least_epsilon_ns(request.publication) + stalls
     return Margin(
         epsilon_ns=epsilon,
         source="measured",

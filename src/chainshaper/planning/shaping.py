@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.bands import predict_bands
-from chainshaper.planning.margins import EPSILON_NS, check_latencies
+from chainshaper.planning.margins import check_latencies, least_epsilon_ns
 from chainshaper.planning.overruns import united
 from chainshaper.planning.plan import (
     SHORTEST_SLOT_NS,
@@ -69,8 +69,9 @@ def plan_shaping(
     ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
     same cycle (eq. 3), at the better priority, on ``output_core`` (default: the same core).
 
-    ε is the margin's or, without one, 1 ms unless the wishes say otherwise; so is Δ. ``nodes`` are
-    those whose executors run the chain, ``fifo_priority`` and ``receivers`` for the shaping node.
+    ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process) unless
+    the wishes say otherwise; Δ is 1 ms. ``nodes`` are those whose executors run the chain,
+    ``fifo_priority`` and ``receivers`` for the shaping node.
     ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` and
     :class:`~chainshaper.planning.plan.Evidence`, and single
     :class:`~chainshaper.values.plan_choices.Wishes`. OperationError: L̄ + ε + Δ does not fit.
@@ -80,7 +81,8 @@ def plan_shaping(
     wishes = replace(wishes or Wishes(), **{n: values.pop(n) for n in _WISHES & values.keys()})
     length = SHORTEST_SLOT_NS if wishes.publish_slot_ns is None else wishes.publish_slot_ns
     longest = int(latencies.max())
-    given = EPSILON_NS if wishes.epsilon_ns is None else wishes.epsilon_ns
+    least = least_epsilon_ns(wishes.publication)
+    given = least if wishes.epsilon_ns is None else wishes.epsilon_ns
     epsilon = given if margin is None else margin.epsilon_ns
     if epsilon < 0 or length <= 0 or period_ns <= 0:
         found = ", ".join(map(duration_text, (epsilon, length, period_ns)))
