@@ -117,6 +117,8 @@ _rest = [b""]
 
 def _receive(timeout_s: float | None) -> None:
     """Wait for lines, unless there are some; None is their end."""
+    while timeout_s is None and not _lines and not select.select([0], [], [], 0.1)[0]:
+        pass  # a signal that comes right before the call ends none; upstream's ends its wait
     if not _lines and select.select([0], [], [], timeout_s)[0]:
         received = os.read(0, 1 << 16)
         *lines, _rest[0] = (_rest[0] + received).split(b"\n")
