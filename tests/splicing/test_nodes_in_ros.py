@@ -17,7 +17,7 @@ from known import known
 from node_run import SLOTS, banded
 from ros2 import ros2_environment
 
-from chainshaper.gate.throttling import RULES, Rule
+from chainshaper.gate.decision import RULES, Rule
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from chainshaper.gate.throttling import Rule
+from chainshaper.gate.decision import Rule
 from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
 from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
 from chainshaper.sources.ros import own_environment, run_with_rclpy
@@ -76,7 +76,7 @@ class Splicing:
 class ThrottledInput(Part):
     """A topic that is to reach its ``subscriber`` (None: all) once every ``period_ns`` at most.
 
-    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.gate.throttling`).
+    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.gate.decision`).
     """
 
     topic: FullName

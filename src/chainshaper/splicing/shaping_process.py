@@ -21,7 +21,7 @@ from typing import Any, Literal
 import yaml
 
 from chainshaper.analysis.chains import close_names
-from chainshaper.gate import decision, handover, throttling
+from chainshaper.gate import decision, handover
 from chainshaper.gate.decision import DEPTH, Gate, Modes, NodeParameters, gate_parameters
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.planning.application_plan import ApplicationPlan
@@ -166,7 +166,7 @@ def write_throttler(
     kind: Literal["python", "cpp"],
     folder: Path,
     *,
-    rule: throttling.Rule = "newest",
+    rule: decision.Rule = "newest",
     name: str = "chainshaper_throttler",
     phase_ns: int = 0,
     core: int | None = None,
@@ -178,7 +178,7 @@ def write_throttler(
 
     Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``: by the
     ``rule`` ``newest`` at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC, by ``first`` as it
-    comes (:mod:`chainshaper.gate.throttling`). ``depth`` is the history of the publishers where
+    comes (:mod:`chainshaper.gate.decision`). ``depth`` is the history of the publishers where
     that of the originals is not known; ``into`` as for a shaping process. Raises InputError: no
     topics or period, ``first`` with a phase, or another file is there. OperationError: a file
     cannot be written.
@@ -497,7 +497,7 @@ def _schema() -> dict[str, str]:
     }
     numbers = {
         name.lower(): value
-        for room in (decision, handover, throttling)
+        for room in (decision, handover)
         for name, value in vars(room).items()
         if name.isupper() and isinstance(value, int) and not name.startswith("_")
     }

@@ -1,7 +1,7 @@
 """The throttler, for chains whose input is not quite periodic (paper, section 5.1).
 
 Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place, by a ``rule``
-of :mod:`chainshaper.gate.throttling`. Times of ``newest`` are ``phase_ns`` after multiples of
+of :mod:`chainshaper.gate.decision`. Times of ``newest`` are ``phase_ns`` after multiples of
 ``period_ns`` on CLOCK_MONOTONIC. Where none came nothing is published, and where several came the
 older ones are dropped; both are counted, and said at the end. ``first`` is periodic only behind the
 paper's server, a slot of 2 ms in every cycle; a timer is so on every kernel.
@@ -15,8 +15,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from chainshaper.gate.decision import sleep_until
-from chainshaper.gate.throttling import RULES, FirstOfPeriod
+from chainshaper.gate.decision import RULES, FirstOfPeriod, sleep_until
 from chainshaper.splicing.nodes.python.node import (
     asked_of,
     create_subscription,

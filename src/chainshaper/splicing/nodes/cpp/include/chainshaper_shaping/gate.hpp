@@ -359,7 +359,7 @@ private:
   std::uint64_t number_{0};
 };
 
-// The throttler's rule `first`: the same as chainshaper/gate/throttling.py, which explains it.
+// The throttler's rule `first`: the same as chainshaper/gate/decision.py, which explains it.
 struct FirstOfPeriod {
   std::int64_t period_ns;
   std::int64_t early_ns{period_ns / schema::early_divisor};
