@@ -126,7 +126,7 @@ class TracedProcess:
             written = int(self._rings["written"][number])
             oldest = max(read, written - ring.size)
             places = np.arange(oldest, written) % ring.size
-            copied = ring[places]
+            copied = ring.take(places)
             # The record behind `written` may be half there, in the place of the oldest of all.
             whole = max(oldest, int(self._rings["written"][number]) + 1 - ring.size)
             self.lost += min(whole, written) - read
@@ -206,7 +206,7 @@ def _tables(
     for number, name in enumerate(event_names(), _FIRST_EVENT):
         places = np.flatnonzero(records["event"] == number) if name in names else np.array([])
         if places.size:
-            own = records[places]
+            own = records.take(places)  # ten times as fast as by index
             said = [texts.get(int(place), {}) for place in places] if texts else []
             common = {one: np.ascontiguousarray(own[one]) for one in ("time", "tid", "cpu")}
             columns = _columns(TracePoint(name, library.path, library), own, said)
