@@ -137,14 +137,30 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
     for _ in range(2):
         with running(tmp_path, 1000):
             watch._searched_ns = 0
-            watched(watch, 1.0)
+            seen = watched(watch, 1.0)[-1]
             assert len(watch.processes) >= 1
+            assert seen.chains[0].problem is None, "the one that has ended is no second path"
     counted = watch.look().chains[0].spans["hour"].count
     assert counted > 15
     watch._searched_ns = 0
     watch._latest = dict.fromkeys(watch._latest, 0)  # as twelve seconds later
     watch.read()
     assert not watch.processes
+
+
+def test_a_look_that_comes_late_counts_all_cycles(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watch_module, "RECORDER_NS", SECOND // 10)
+    with running(tmp_path, 1000):
+        watch = own_watch()
+        before = watched(watch, 0.5)[-1].chains[0].counted["complete"]
+        until = time.monotonic() + 2
+        while time.monotonic() < until:
+            watch.read()
+            time.sleep(0.05)
+        counted = watch.look().chains[0].counted["complete"] - before
+    assert counted >= 1.5 * SECOND // PERIOD_NS
 
 
 def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> None:

@@ -52,6 +52,10 @@ def service_calls(
 
     A call is a client's, which numbers its own. Servers know clients by their gids.
     """
+    columns = ["time", "pid", "tid", "rmw_handle"]
+    if not any(events.table(tables, name).height for name in _CALLS):
+        none = events.table(tables, "rmw_send_request").rename({"rmw_client_handle": "rmw_handle"})
+        return (none := none.select(*columns, call="sequence_number")), none
     found = {}
     for name, role in _CALLS.items():
         optional = [column for column in ("taken", "source_timestamp") if "take" in name]
@@ -71,7 +75,6 @@ def service_calls(
         rows = found[name].with_columns(gid=_gid_text("client_gid"))
         found[name] = rows.join(owners, on="gid", how="left", maintain_order="left")
     number = pl.col("client").cast(pl.Int64) * (1 << _CALL_BITS) + pl.col("sequence_number")
-    columns = ["time", "pid", "tid", "rmw_handle"]
     calls = {name: rows.select(*columns, call=-1 - number) for name, rows in found.items()}
     send_request, take_request, send_response, take_response = (calls[name] for name in _CALLS)
     return pl.concat([send_request, send_response]), pl.concat([take_request, take_response])

@@ -272,11 +272,15 @@ class Watch:
     def _leave_ended(self) -> None:
         """Leave processes that have ended, once their last events are too old to be asked for."""
         for pid in [one for one in self.processes if not Path(f"/proc/{one}").exists()]:
-            if self._latest[pid] < self._searched_ns - RECORDER_NS - self.longest_ns:
+            if self._latest[pid] < self._needed_ns(self._searched_ns):
                 process = self.processes.pop(pid)
                 self._lost_with_ended += process.lost + process.dropped
                 self._created.pop(pid, None)
                 del self._latest[pid]
+
+    def _needed_ns(self, now_ns: int) -> int:
+        """From when on events may be asked for: by the flight recorder, or by a late look."""
+        return min(now_ns - RECORDER_NS, self._over_ns) - self.longest_ns
 
     def look(self) -> Seen:
         """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
@@ -363,9 +367,13 @@ class Watch:
         return there + self._lost_with_ended
 
     def _tables(self, since_ns: int) -> EventTables:
-        """All that was created, and what happened since an instant."""
+        """All that was created, but for what ended before an instant, and what happened since."""
         self._take_fresh(time.monotonic_ns())
-        created = (tables for _, tables, _ in self._created.values())
+        created = (
+            tables
+            for pid, (_, tables, _) in self._created.items()
+            if self._latest[pid] >= since_ns or Path(f"/proc/{pid}").exists()
+        )
         recent = (tables for last, tables in self._recent if last >= since_ns)
         return joined_tables([*created, *recent])
 
@@ -385,7 +393,7 @@ class Watch:
             tables = event_tables(records, pids.astype(np.int32), library)
             self._recent.append((int(records["time"].max()), tables))
         self._fresh, self._tabled_ns = [], now_ns
-        while self._recent and self._recent[0][0] < now_ns - RECORDER_NS - self.longest_ns:
+        while self._recent and self._recent[0][0] < self._needed_ns(now_ns):
             self._recent.popleft()
 
     def save(self, output: str | Path) -> Recording:
