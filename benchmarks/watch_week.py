@@ -16,9 +16,7 @@ cycles that are under way.
 
 The command reads ten times and looks once a second; here a read comes every ten seconds, a look
 every thirty: a look costs much the same for few events as for many. Each analyses more events at
-once than the command's, and takes more memory. Watch has events for ``RECORDER_NS`` (10 s) and
-``longest_ns`` (2 s, its default), and would miss cycles between such looks, so the benchmark sets
-the former to the time between two looks.
+once than the command's, and takes more memory.
 
 Prints a row a day, with the resident set from the third hour on (an hour of cycles stays on
 purpose): the median and maximum over all looks. `--keep` writes a row an hour, from which the
@@ -353,7 +351,6 @@ def main() -> None:
         clock_offset=lambda: application.offset,
         memories=application.memories,
         Path=application.path,
-        RECORDER_NS=max(look_ns, watch_module.RECORDER_NS),
     ):
         run(application, int(given.days * DAY) // BLOCK_NS * BLOCK_NS, look_ns, given.keep)
 
