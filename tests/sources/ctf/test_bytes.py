@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from reference import assert_equal_to_babeltrace
 
-from chainshaper.sources.ctf import open_trace, read_events
+from chainshaper.sources.ctf import CtfError, open_trace, read_events
 
 PLAIN = """/* CTF 1.8 */
 typealias integer {{ size = 8; align = 8; }} := u8;
@@ -44,6 +44,9 @@ UNSIGNED = NUMBER & (1 << 64) - 1
 GAP = b"\xff" * 3
 VARIANT = """struct { enum : u8 { number = 0, text = 5 ... 9, many = 128 ... 255 } tag;
     variant <tag> { u8 number; string text; struct { u8 n; u8 v[n]; } many; } v; u8 after; }"""
+
+ARRAYS = """struct { enum : u8 { a = 0, b = 1 } tag; variant <tag> { u8 a; u8 b[2]; } v;
+    u8 after; }"""
 
 
 def chosen(tag: int, **option: Any) -> dict[str, Any]:
@@ -96,6 +99,10 @@ KNOWN: dict[str, tuple[Any, ...]] = {
     "a_range_of_tags": (VARIANT, b"\x07hello\0\x09", chosen(7, text="hello")),
     "an_option_with_a_sequence": (
         VARIANT, bytes([200, 2, 8, 9, 9]), chosen(200, many={"n": 2, "v": [8, 9]})),
+    "an_option_with_an_array": (
+        ARRAYS, bytes([1, 5, 6, 9]), {"tag": 1, "v": {"a": None, "b": [5, 6]}, "after": 9}),
+    "not_the_option_with_an_array": (
+        ARRAYS, bytes([0, 5, 9]), {"tag": 0, "v": {"a": 5, "b": None}, "after": 9}),
     "negative_tags": (
         """struct { enum : integer { size = 8; signed = true; } { low = -5 ... -1, "high" = 3 } tag;
         variant <tag> { u8 low; u32 high; } v; }""",
@@ -108,6 +115,13 @@ def test_known_bytes_mean_what_the_specification_says(tmp_path: Path) -> None:
         row = one_event(tmp_path / name, fields, payload, "".join(order) or "le", name)
         assert row == [{"time": 1000, **expected}], name
     assert_equal_to_babeltrace(tmp_path)
+
+
+def test_fields_of_one_name_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
+    one_event(tmp_path / "a", "struct { u8 x; }", b"\1")
+    one_event(tmp_path / "b", "struct { u8 x[2]; }", b"\1\2")
+    with pytest.raises(CtfError, match="types that do not fit together.*one by one"):
+        read_events(open_trace(tmp_path))
 
 
 def test_what_babeltrace_shows_otherwise(tmp_path: Path) -> None:

@@ -102,7 +102,12 @@ def read_events(
     texts = _filled(
         files, layout, len(borders) + 1, columns, threads, lambda n: progress((1 + 2 * n) / 3)
     )
-    events = Events(_frames(columns, texts, any(file.unsorted for file in files)))
+    try:
+        events = Events(_frames(columns, texts, any(file.unsorted for file in files)))
+    except pl.exceptions.PolarsError as error:
+        reason = f"events of one name have fields of types that do not fit together: {error}"
+        folder = trace.folders[0].path
+        raise tsdl.CtfError(folder, None, reason, "read its folders one by one") from None
     events.warnings = tuple(warning for file in files for warning in file.warnings())
     events.counts = _counts(trace, layout, files)
     events.unread = tuple(stream for stream in trace.streams if stream not in used)
@@ -347,8 +352,18 @@ class _Columns:
         leading = [n for n in ("time", "cpu", "pid", "tid", "procname") if n in found]
         return pl.DataFrame([found[n] for n in dict.fromkeys([*leading, *found])])
 
-    def _column(self, name: str, kind: tsdl.Type, rows: int, texts: pl.Series) -> pl.Series | None:
-        """One column, from the next slots and levels; None for a structure without fields."""
+    def _column(
+        self,
+        name: str,
+        kind: tsdl.Type,
+        rows: int,
+        texts: pl.Series,
+        chosen: NDArray[np.bool_] | None = None,
+    ) -> pl.Series | None:
+        """One column, from the next slots and levels; None for a structure without fields.
+
+        Of a variant's option levels have the rows only that have ``chosen`` it.
+        """
         match kind:
             case tsdl.StringType() | tsdl.ArrayType() if tsdl.is_text(kind):
                 return texts.gather(pl.Series(next(self._slots))).alias(name)
@@ -359,19 +374,24 @@ class _Columns:
                 if values is None or not count or isinstance(count, str):
                     return None if values is None else _ragged(values, lengths)
                 deeper = values.dtype.shape if isinstance(values.dtype, pl.Array) else ()
-                return values.reshape((rows, count, *deeper))
+                there = rows if chosen is None else int(chosen.sum())
+                arrays = values.reshape((there, count, *deeper))
+                at = None if chosen is None else _where(chosen, np.cumsum(chosen) - 1)
+                return arrays if at is None else arrays.gather(at)
             case tsdl.StructType(fields):
-                found = [self._column(tsdl.field_name(f.name), f.type, rows, texts) for f in fields]
+                found = [
+                    self._column(tsdl.field_name(one.name), one.type, rows, texts, chosen)
+                    for one in fields
+                ]
                 columns = [column for column in found if column is not None]
                 return _struct(name, columns) if columns else None
             case tsdl.VariantType(_, options):
-                chosen, parts = pl.Series(next(self._slots)), []
+                tags, parts = next(self._slots), []
                 for number, option in enumerate(options, start=1):
-                    values = self._column(tsdl.field_name(option.name), option.type, rows, texts)
+                    own, called = tags == number, tsdl.field_name(option.name)
+                    values = self._column(called, option.type, rows, texts, own)
                     if values is not None:
-                        present = pl.when(pl.Series(chosen == number)).then(pl.lit(values))
-                        alone = present.otherwise(None).alias(values.name)
-                        parts.append(pl.select(alone).to_series())
+                        parts.append(values.gather(_where(own, np.arange(rows))))
                 nothing = pl.Series(name, [None], pl.Null).new_from_index(0, rows)
                 return _struct(name, parts) if parts else nothing
         return pl.Series(name, next(self._slots))
@@ -401,6 +421,11 @@ def _frames(columns: list[_Columns], texts: list[str], unsorted: bool) -> dict[s
             frame = frame.sort("time", maintain_order=True)
         frames[name] = frame.with_columns(pl.col("time").set_sorted())
     return frames
+
+
+def _where(chosen: NDArray[np.bool_], places: NDArray[np.int64]) -> pl.Series:
+    """Row numbers, null where a row has not ``chosen`` what is looked for."""
+    return pl.Series(places.astype(np.uint32)).set(pl.Series(~chosen), None)
 
 
 def _ragged(values: pl.Series, lengths: NDArray[Any]) -> pl.Series:
