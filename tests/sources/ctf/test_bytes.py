@@ -120,7 +120,7 @@ def test_known_bytes_mean_what_the_specification_says(tmp_path: Path) -> None:
 def test_fields_of_one_name_that_do_not_fit_together_are_refused(tmp_path: Path) -> None:
     one_event(tmp_path / "a", "struct { u8 x; }", b"\1")
     one_event(tmp_path / "b", "struct { u8 x[2]; }", b"\1\2")
-    with pytest.raises(CtfError, match="types that do not fit together.*one by one"):
+    with pytest.raises(CtfError, match=r"types that do not fit together.*one by one"):
         read_events(open_trace(tmp_path))
 
 
