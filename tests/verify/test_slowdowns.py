@@ -192,13 +192,20 @@ def test_the_command(tmp_path: Path) -> None:
     assert (suite.get("tests"), suite.get("failures")) == ("4", "1")
     assert line in markdown.read_text()
     rows = json.loads(called("check", after, "--baseline", before, "--json").out)["limits"]
-    assert [row["node"] for row in rows if not row["met"]] == ["/second"]
+    assert [row["where"] for row in rows if not row["met"]] == ["/second (/t1)"]
     equal = called("check", str(tmp_path / "bef*" / "rec*"), "--baseline", before)
     assert equal.code == 0, equal.err
     assert "none of 4 callbacks is slower" in equal.out
     both = tmp_path / "b.yaml"
     called("budget", before, "-o", both)
     assert called("check", before, "--budget", both, "--baseline", before).code == 0
+    broken = tmp_path / "broken"
+    broken.mkdir()
+    every = ("check", before, broken, "--budget", both, "--baseline", before)
+    partly = called(*every, "--junit", tmp_path / "partly.xml")
+    assert partly.code == 1, "what cannot be read stands among the limits, the others are compared"
+    assert "none of 4 callbacks is slower" in partly.out
+    assert (tmp_path / "partly.xml").exists()
 
 
 def test_wrong_uses_are_refused(tmp_path: Path) -> None:
@@ -206,6 +213,8 @@ def test_wrong_uses_are_refused(tmp_path: Path) -> None:
     assert "--budget FILE, or --baseline REC" in refused(2, "check", recording)
     assert "no folder has such a name" in refused(2, "check", "x*", "--baseline", recording)
     assert "no such folder" in refused(2, "check", tmp_path / "gone", "--baseline", recording)
+    (tmp_path / "empty.yaml").write_text("format: 1\n")
+    assert "has no limits" in refused(2, "check", recording, "--budget", tmp_path / "empty.yaml")
     nowhere = ("--baseline", recording, "--scheduler", "nowhere")
     assert "no scheduler's address" in refused(2, "check", recording, *nowhere)
     elsewhere = called("check", recording, "--baseline", recording, "--chain", "/x../y")

@@ -243,7 +243,9 @@ def check(
     with out.late_progress("check") as report:
         if budget is not None:
             found = budgets.check_budgets(paths, limits, report, scheduler)
-        if before:
+            unread = {own[0].recording for own in found if own[0].what == budgets.EVENTS}
+            paths = [path for path in paths if str(path) not in unread]
+        if before and paths:
             from chainshaper.verify.slowdowns import slowdowns_in
 
             chains = chain or [one.chain for one in limits.chains]
@@ -259,7 +261,8 @@ def check(
         write_whole(markdown, ["\n".join(parts).encode()])
     out.notes(notes)
     if json:
-        rows = [{**asdict(one), "met": one.met, "text": one.text} for one in every]
+        said = ("where", "what", "met", "text")
+        rows = [asdict(one) | {name: getattr(one, name) for name in said} for one in every]
         out.print_json({"format": JSON_FORMAT, "limits": rows})
     verdicts = [
         _limits_shown(found, str(budget), json) if budget is not None else None,

@@ -48,6 +48,7 @@ ROOM = 0.1
 GRAIN_NS = 10_000
 """Proposed limits are whole multiples of it."""
 LEAST_MISSING = 0.01
+EVENTS = "its events"  # what a recording lacks that cannot be read
 
 _Longest: TypeAlias = tuple[float | None, float | None]
 
@@ -145,8 +146,11 @@ class Judged:
 
 
 def load_budget(path: str | Path) -> Budget:
-    """Read a budget file. Raises InputError: as :func:`.read_model`."""
-    return read_model(path, Budget, made_by="written by `chainshaper budget`")
+    """Read a budget file. Raises InputError: as :func:`.read_model`, or it has no limits."""
+    budget = read_model(path, Budget, made_by="written by `chainshaper budget`")
+    if not (budget.chains or budget.callbacks):
+        raise InputError(f"{path} has no limits: `chainshaper budget REC -o FILE` proposes some")
+    return budget
 
 
 def save_budget(budget: Budget, path: str | Path) -> Path:
@@ -262,7 +266,7 @@ def _checked(
     try:
         return check_budget(open_source(path, progress=progress), budget, str(path))
     except ChainshaperError as error:
-        return [Judged(str(path), str(path), "its events", 0, None, because=str(error))]
+        return [Judged(str(path), str(path), EVENTS, 0, None, because=str(error))]
 
 
 def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
