@@ -26,7 +26,7 @@ from chainshaper.simulation import layout as at
 from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
 from chainshaper.simulation.layout import Int64s, X
 from chainshaper.sources import open_source
-from chainshaper.splicing.application import check_periods, splice_application
+from chainshaper.splicing.application import at_offsets, splice_application
 from chainshaper.values.compiled import kernel
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
@@ -144,7 +144,7 @@ def _checked(
         if all(shaping):
             application = splice_application(application, plan)
         else:  # a baseline
-            check_periods(application, plan)
+            application = at_offsets(application, plan)
     timing = live.timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:

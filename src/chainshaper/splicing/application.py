@@ -34,10 +34,9 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
     application.
     """
     joint = whole(plan)
-    check_periods(application, joint)
-    application = _placed(application, joint)
+    application = _placed(at_offsets(application, joint), joint)
     for chain in joint.chains:
-        application = _with_chain(_at_offset(application, joint, chain), joint, chain)
+        application = _with_chain(application, joint, chain)
     _refuse_strange_nodes(application, joint)
     return application
 
@@ -53,8 +52,11 @@ def _refuse_strange_nodes(application: Application, joint: ApplicationPlan) -> N
         )
 
 
-def check_periods(application: Application, joint: ApplicationPlan) -> None:
-    """InputError: the application lacks a chain of the plan, or it has another period there."""
+def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
+    """The application with timers that start chains expiring at the chains' offsets.
+
+    InputError: the application lacks a chain of the plan, or it has another period there.
+    """
     for chain in joint.chains:
         _, timer = _origin(application, joint, chain)
         if timer.timer_ns != chain.chain.period_ns:
@@ -65,6 +67,8 @@ def check_periods(application: Application, joint: ApplicationPlan) -> None:
                 f" {duration_text(timer.timer_ns or 0)}: plan again from a recording of this"
                 " application"
             )
+        application = _at_offset(application, joint, chain)
+    return application
 
 
 def _origin(
