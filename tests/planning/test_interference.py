@@ -1,5 +1,6 @@
 """How long other chains can have a chain's core: by hand, and played out."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -107,7 +108,10 @@ def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = 
         topics=topics,
         begins=(ord(name), name),
         core_of=dict.fromkeys(nodes, 1),
-        callbacks=tuple(CallbackTimes(n, 1, MS, MS, int(half[0])) for n in nodes),
+        callbacks=tuple(
+            CallbackTimes(n, 1, MS, int(half[0]), int(half[0]), (0,) * k)
+            for k, n in enumerate(nodes)
+        ),
         steps_ns=np.stack([half, half], axis=1),
         every_step_ns=np.stack([half, second], axis=1),
     )
@@ -118,11 +122,37 @@ def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:
     with pytest.raises(OperationError, match=r"24 ms too long") as refused:
         plan_application([_profile("a", 60), _profile("b", 60)])
     assert "core 1, 62 ms behind /a1../a2" in str(refused.value)
-    assert "It fits with /a1../a2 on a core of its own (its nodes' `core`)" in str(refused.value)
+    assert "What helps: a longer period, or a shorter chain. It fits with --cores 1,2" in str(
+        refused.value
+    )
     # What passes one node has to take turns, for which stalls of 20 ms leave no room.
     both = [_profile(name, 40, 20, last="/filter") for name in "ab"]
-    with pytest.raises(OperationError, match=r"does not stall \(--ideal-machine\)"):
+    with pytest.raises(OperationError, match=r"does not stall \(--ideal-machine\)") as refused:
         plan_application(both)
+    assert "They share the executor of /filter, and so have to take turns" in str(refused.value)
+    assert "core for" not in str(refused.value)
+
+
+def test_a_smaller_margin_that_is_proposed_was_planned() -> None:
+    both = [_profile("a", 41), _profile("b", 41)]
+    with pytest.raises(OperationError, match="too long") as refused:
+        plan_application(both, PlanRequest(epsilon_ns=55 * MS))
+    margin = re.search(r"--epsilon ([\d.]+)ms$", str(refused.value))
+    assert margin and "a margin of" not in str(refused.value)
+    most = round(float(margin[1]) * MS)
+    plan_application(both, PlanRequest(epsilon_ns=most))
+    with pytest.raises(OperationError):
+        plan_application(both, PlanRequest(epsilon_ns=most + MS // 10))
+
+
+def test_chains_that_collide_get_a_named_core_that_is_idle() -> None:
+    """The longest executions fit beside each other, but not with the machine's stalls."""
+    both = [_profile(name, 30, 20) for name in "ab"]
+    _, remarks = plan_application(both, PlanRequest(cores=(1,)))
+    assert ["run at the same time" in one for one in remarks] == [True]
+    plan, remarks = plan_application(both, PlanRequest(cores=(1, 2)))
+    assert [one.servers[0].core for one in plan.chains] == [2, 1]
+    assert not remarks
 
 
 OVERRUNNING = """

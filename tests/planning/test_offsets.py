@@ -10,7 +10,7 @@ from bare_plans import MS, bare_plan
 
 from chainshaper.planning import offsets
 from chainshaper.planning.offsets import place_chains, with_offsets
-from chainshaper.planning.plan import Plan, Server, revised
+from chainshaper.planning.plan import Plan, Server, Thread, revised
 from chainshaper.values.errors import InputError, OperationError
 
 
@@ -163,10 +163,11 @@ def test_what_is_not_known_is_said_not_to_be_known() -> None:
 
 
 def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
-    chains = [_shaped("a", 100, 60), _shaped("b", 50, 30)]
+    chains = [_shaped("a", 100, 50), _shaped("b", 50, 20)]
     with pytest.raises(OperationError, match="collide at every offset"):
         with_offsets(chains)
-    placed, remarks = place_chains(chains)
+    again = [_shaped("a", 100, 60), _shaped("b", 50, 30)]
+    placed, remarks = place_chains(chains, at_once=lambda: again)
     assert [[server.priority for server in plan.servers] for plan in placed] == [[3, 1], [2, 1]]
     assert ["only their publish slots do not overlap" in remark for remark in remarks] == [True]
     slots = [plan.offset_ns + plan.servers[1].slots[0][0] for plan in placed]
@@ -176,6 +177,46 @@ def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
     turns, none = place_chains([_shaped("a", 100, 40), _shaped("b", 100, 40)])
     assert none == []
     assert [plan.servers[0].priority for plan in turns] == [2, 2]
+    # Priorities that the plans have already say that latencies were measured with them.
+    assert place_chains(placed)[1] == []
+
+
+def test_chains_at_once_whose_delays_no_plan_has_are_refused() -> None:
+    reason = (
+        r"a and b on core 1 at priority 2 .* modulo 50 ms, and their longest take 70 ms, 20 ms too"
+        r" long. At the same time .* \(`chainshaper plan REC --chain a --chain b`\)"
+    )
+    chains = [_shaped("a", 100, 50), _shaped("b", 50, 20)]
+    with pytest.raises(OperationError, match=reason):
+        place_chains(chains)
+    apart = [revised(one, policy="server-per-callback") for one in chains]
+    with pytest.raises(OperationError, match=r"Planned as server-per-callback, .* take turns"):
+        place_chains(apart)
+    thread = Thread(node="/filter")
+    shared = [
+        revised(one, servers=(one.servers[0].model_copy(update={"threads": (thread,)}), gate))
+        for one in chains
+        for gate in one.servers[1:]
+    ]
+    for at_once in (None, lambda: shared):
+        with pytest.raises(OperationError, match=r"share the executor of /filter, and so have to"):
+            place_chains(shared, at_once=at_once)
+    # Priorities of their own help as little where they fill more than the core's time.
+    both = [_shaped("a", 100, 60), _shaped("b", 100, 50)]
+    worse = both[1].servers[0].model_copy(update={"priority": 3})
+    both[1] = revised(both[1], servers=(worse, *both[1].servers[1:]))
+    longest = [one.evidence.model_copy(update={"max_latency_ns": 55 * MS}) for one in both]
+    with pytest.raises(OperationError, match=r"a, b fill 110.0% of the time of core 1"):
+        place_chains([revised(p, evidence=e) for p, e in zip(both, longest, strict=True)])
+
+
+def test_who_collides_is_named_where_both_are() -> None:
+    wide, narrow = (
+        _plan("a", 100, (1, 2, [(0, 90)]), (0, 2, [(0, 60)])),
+        _plan("b", 100, (0, 2, [(0, 50)])),
+    )
+    with pytest.raises(OperationError, match=r"on core 0 at priority 2 .* 110 ns, 10 ns too long"):
+        with_offsets([wide, narrow])
 
 
 def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:

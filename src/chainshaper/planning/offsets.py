@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.overruns import slots_without
-from chainshaper.planning.plan import Plan, Slot, publishing_servers, revised
+from chainshaper.planning.plan import PER_CALLBACK, Plan, Slot, publishing_servers, revised
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
@@ -77,23 +77,27 @@ def place_chains(
 ) -> tuple[tuple[Plan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
-    The chains take turns where they can (:func:`with_offsets`). Where they cannot, they run at the
-    same time, the chain with the shorter period at the better priority, and only their publish
-    slots stay apart. None begins while a better one runs, where there are such offsets, for slots
-    count from when a chain really begins; and each has its core for as long as there can be.
-    ``at_once`` plans the chains again, with latencies that they have then.
+    The chains take turns where they can (:func:`with_offsets`). Where they cannot, ``at_once``
+    plans them again, with the latencies that they have when they run at the same time: the chain
+    with the shorter period at the better priority, and only their publish slots stay apart. None
+    begins while a better one runs, where there are such offsets, for slots count from when a chain
+    really begins; and each has its core for as long as there can be.
+
+    Raises: as :func:`with_offsets`; OperationError also where chains that cannot take turns may not
+    run at the same time, or nothing says how long they delay each other then.
     """
     together = together or [[k] for k in range(len(plans))]
+    if at_once is None:
+        _refuse_too_full(plans)
     try:
         return with_offsets(plans, together=together, time_limit_s=time_limit_s), []
     except OperationError as error:
-        if _ranked(plans, together) == list(plans):
-            raise
-        ranked = _ranked(plans if at_once is None else at_once(), together)
-        condition = ": their latencies must have been measured while all of them ran like this"
+        if at_once is None or _shared_threads(plans, together):
+            raise OperationError(f"{error}. {_turns_only(plans, together)}") from error
+        ranked = _ranked(at_once(), together)
         remark = (
             f"{error}. Instead, the chains run at the same time at priorities of their own, and"
-            f" only their publish slots do not overlap{'' if at_once else condition}."
+            " only their publish slots do not overlap."
         )
         apart = partial(with_offsets, ranked, together=together, time_limit_s=time_limit_s)
         for share in SHARES:
@@ -102,16 +106,54 @@ def place_chains(
         return apart(), [remark]
 
 
-def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
-    """The plans with a priority for each group of chains; as they are where groups share threads,
-    which have one priority.
-    """
+def _shared_threads(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> set[str]:
+    """The threads that several groups of chains have in their servers: each has one priority."""
     threads = [
-        {thread for k in group for server in plans[k].servers for thread in server.threads}
+        {thread.text for k in group for server in plans[k].servers for thread in server.threads}
         for group in together
     ]
-    if any(one & two for one, two in combinations(threads, 2)):
-        return list(plans)
+    return {thread for one, two in combinations(threads, 2) for thread in one & two}
+
+
+def _refuse_too_full(plans: Sequence[Plan]) -> None:
+    """Refuse chains that take more than all of a core, whatever their priorities are."""
+    shares: dict[int, dict[str, float]] = {}
+    for plan in plans:
+        beside = publishing_servers(plan)
+        cores = {one.core for one in plan.servers if one not in beside and not one.best_effort}
+        longest_ns = plan.evidence.max_latency_ns - (plan.evidence.interference_ns or 0)
+        if len(cores) == 1:
+            share = (longest_ns + plan.margin.epsilon_ns) / plan.cycle_ns
+            shares.setdefault(cores.pop(), {})[chain_name(plan)] = share
+    for core, of in sorted(shares.items()):
+        if len(of) > 1 and (load := sum(of.values())) > 1 + 1e-9:
+            raise OperationError(
+                f"with their margins, {', '.join(of)} fill {load:.1%} of the time of core {core}."
+                " What helps: another core for one of them, longer periods, or smaller margins"
+            )
+
+
+def _turns_only(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> str:
+    """Why chains that cannot take turns are not planned at the same time, and what helps."""
+    helps = "periods with a larger common divisor, a smaller margin, or shorter chains"
+    if shared := _shared_threads(plans, together):
+        reason = f"They share {', '.join(sorted(shared))}, and so have to take turns"
+        return f"{reason}. What helps: {helps}"
+    if policies := ", ".join(sorted({one.policy for one in plans} & {*PER_CALLBACK})):
+        reason = f"Planned as {policies}, chains on one core have to take turns"
+        return f"{reason}. What helps: a core for each chain, {helps}"
+    recordings = {one.evidence.recording or "REC" for one in plans}
+    recording = recordings.pop() if len(recordings) == 1 else "REC"
+    chains = " ".join(f"--chain {chain_name(one)}" for one in plans)
+    return (
+        "At the same time they would delay each other, and these plans do not say by how much: plan"
+        f" them together (`chainshaper plan {recording} {chains}`), which adds it. Where all were"
+        " measured at priorities of their own, write these into the plans"
+    )
+
+
+def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
+    """The plans with a priority for each group of chains."""
     ranked = list(plans)
     shortest_first = sorted(together, key=lambda group: (plans[group[0]].cycle_ns, group[0]))
     last = {"priority": OUTPUT_PRIORITY + 1 + len(together)}
@@ -187,7 +229,7 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
             names = ", ".join(one.name for one in tables if (core, priority) in one.slots)
             raise OperationError(
                 f"the slots of {names} on core {core} at priority {priority} fill {load:.1%} of its"
-                " time: move a chain to another core, or give servers different priorities"
+                " time"
             )
     offsets = dict.fromkeys(range(len(tables)), 0)
     for group in linked(len(tables), allowed):
@@ -203,8 +245,7 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
         if solution is None:
             raise OperationError(
                 f"there are no offsets at which {', '.join(tables[k].name for k in group)} keep"
-                " their slots apart, although any two of them could: move one to another core,"
-                " give servers different priorities, or shorten slots"
+                f" their slots apart, although any two of them could: {_fullest(tables, group)}"
             )
         offsets.update(solution)
     return offsets
@@ -346,12 +387,9 @@ def _solve(
         return None
     if status in (cp_model.OPTIMAL, cp_model.FEASIBLE):
         return {k: int(solver.value(offset)) for k, offset in offsets.items()}
-    loads = _loads([tables[k] for k in group])
-    core, priority = max(loads, key=lambda place: (loads[place], place))
     raise OperationError(
         f"undecided: no offsets for {len(group)} chains were found in time, nor a proof that there"
-        f" are none. Their slots fill {loads[core, priority]:.1%} of core {core} at priority"
-        f" {priority}: put fewer chains on it, shorten slots, or allow more time"
+        f" are none: {_fullest(tables, group)}. Put fewer chains on it, or allow more time"
     )
 
 
@@ -385,19 +423,23 @@ def _loads(tables: Sequence[Timetable]) -> dict[tuple[int, int], float]:
     return dict(sorted(loads.items()))
 
 
+def _fullest(tables: Sequence[Timetable], group: Sequence[int]) -> str:
+    loads = _loads([tables[k] for k in group])
+    core, priority = max(loads, key=lambda place: (loads[place], place))
+    return f"their slots fill {loads[core, priority]:.1%} of core {core} at priority {priority}"
+
+
 def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
     longest = {
-        place: max(end - start for start, end in slots)
-        + max((end - start for start, end in two.slots.get(place, [])), default=0)
-        for place, slots in one.slots.items()
+        place: sum(max(end - start for start, end in own.slots[place]) for own in (one, two))
+        for place in one.slots.keys() & two.slots.keys()
     }
     (core, priority), needed = max(longest.items(), key=lambda item: (item[1], item[0]))
     excess = f", {duration_text(needed - common)} too long" if needed > common else ""
     return (
         f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide at"
         f" every offset: they meet in every distance modulo {duration_text(common)}, and their"
-        f" longest take {duration_text(needed)}{excess}. Give them other cores or priorities, or"
-        " periods with a larger common divisor"
+        f" longest take {duration_text(needed)}{excess}"
     )
 
 

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.margins import check_latencies
-from chainshaper.planning.plan import SHORTEST_SLOT_NS
+from chainshaper.planning.plan import PER_CALLBACK, SHORTEST_SLOT_NS
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
@@ -38,7 +38,6 @@ _Stage: TypeAlias = tuple[str, str | None]
 START_UP_NS = 3_000_000_000  # in so long an application starts, or ends
 APART = 1.3  # so many times as long as others is no part of their tail
 FEWEST = 20  # cycles, to tell one from the others
-_ADDED_UP = ("shaped", "one-long-slot", "server-per-chain")
 
 
 @dataclass(frozen=True)
@@ -219,9 +218,10 @@ def with_interference(
     """The profiles with the latencies that the chains can have while all of them run.
 
     ``groups`` are the places of chains that begin together. With ``at_once`` groups do not take
-    turns: those of a shorter period run at a better priority.
+    turns: those of a shorter period run at a better priority. Where every callback has slots of
+    its own nothing is added: chains in turns do not delay each other, and others are not planned.
     """
-    if len(profiles) == 1 or wishes.policy not in _ADDED_UP:
+    if len(profiles) == 1 or wishes.policy in PER_CALLBACK:
         return list(profiles)
     undelayed = [alone(profile) for profile in profiles]
     delayed = list(undelayed)
@@ -260,7 +260,7 @@ def _later(profile: Profile, delay_ns: int) -> Profile:
         profile,
         latencies_ns=profile.latencies_ns + delay_ns,
         every_latency_ns=profile.every + delay_ns,
-        interference_ns=delay_ns or None,
+        interference_ns=delay_ns,
         of_modes={mode: _later(one, delay_ns) for mode, one in profile.of_modes.items()},
     )
 

@@ -222,7 +222,14 @@ def on_cores(
     """The profiles with their executors on the wished cores, and whose latency is another there."""
     if request.cores is None or request.policy == "pipelined":  # there, stages get them
         return tuple(profiles), []
-    core_of, moved, doubts = cores_for(profiles, request.cores, request), [], []
+    return moved_to(profiles, request.cores, cores_for(profiles, request.cores, request))
+
+
+def moved_to(
+    profiles: Sequence[Profile], cores: Sequence[int], core_of: Mapping[str, int]
+) -> tuple[tuple[Profile, ...], list[str]]:
+    """The profiles with nodes on these of the wished cores, and whose latency is another there."""
+    moved, doubts = [], []
     for one in profiles:
         own = {node: core_of[node] for node in one.core_of}
         homes = {(own[node], core) for node, core in one.core_of.items()}
@@ -230,7 +237,7 @@ def on_cores(
             doubts.append(
                 f"{one.name} was measured with its executors on cores in another way than planned,"
                 " which is another latency: measure it so (`chainshaper profile --cores"
-                f" {','.join(map(str, request.cores))}`)"
+                f" {','.join(map(str, cores))}`)"
             )
         callbacks = tuple(replace(each, core=core_of[each.node]) for each in one.callbacks)
         moved.append(replace(one, core_of=own, callbacks=callbacks))

@@ -18,6 +18,7 @@ from typing import Any
 from chainshaper.planning.application_plan import ApplicationPlan, combined
 from chainshaper.planning.offsets import TIME_LIMIT_SECONDS, chain_name, place_chains
 from chainshaper.planning.plan import (
+    PER_CALLBACK,
     Plan,
     Prediction,
     Server,
@@ -29,17 +30,19 @@ from chainshaper.planning.profile import Profile, with_interference
 from chainshaper.planning.request import (
     PlanRequest,
     best_effort_cores,
+    moved_to,
     on_cores,
     plan_chain,
     refuse_entangled,
     refuse_simulated,
 )
 from chainshaper.planning.shaping import behind_others, with_best_effort
-from chainshaper.values.durations import duration_text
+from chainshaper.values.durations import duration_text, format_duration
 from chainshaper.values.errors import InputError, OperationError
 
 _STANDARD = PlanRequest()
 _SHARING = ("shaped", "one-long-slot")
+_MARGIN_STEP_NS = 100_000  # of a smaller margin that is tried
 
 
 def plan_application(
@@ -56,14 +59,10 @@ def plan_application(
     """
     if not profiles:
         raise InputError("no chain is named: give one at least")
-    profiles, doubts = on_cores(profiles, request)
-    if request.policy != "pipelined":
-        request = replace(request, cores=None)
     refuse_entangled(profiles, request.policy)
     refuse_simulated(profiles, request)
     try:
-        plan, remarks = _planned(profiles, request, time_limit_s)
-        return plan, [*doubts, *remarks]
+        return _on_wished_cores(profiles, request, time_limit_s)
     except OperationError as error:
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
@@ -88,6 +87,45 @@ def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
     return renamed
 
 
+def _on_wished_cores(
+    profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
+) -> tuple[ApplicationPlan, list[str]]:
+    """The plan on the wished cores. Where chains collide although one of these is idle, the first
+    plan in which they do not, with one of them there.
+    """
+    moved, doubts = on_cores(profiles, request)
+    ways = [(moved, doubts)]
+    if request.policy != "pipelined":
+        used = {core for one in moved for core in one.core_of.values()}
+        for idle in [core for core in request.cores or () if core not in used][:1]:
+            ways += (moved_to(profiles, request.cores or (), of) for of in _one_on(moved, idle))
+        request = replace(request, cores=None)
+    found, refused = [], []
+    for moved, doubts in ways:
+        try:
+            plan, remarks = _planned(moved, request, time_limit_s)
+        except OperationError as error:
+            refused.append(error)
+            continue
+        found.append((plan, [*doubts, *remarks]))
+        if not remarks:
+            return found[-1]
+    if not found:
+        raise refused[0]
+    return found[0]
+
+
+def _one_on(profiles: Sequence[Profile], core: int) -> Iterator[dict[str, int]]:
+    """The core of each node, with one chain on this core that shares no node: those of few cores,
+    whose latencies change least, first.
+    """
+    core_of = {node: at for one in profiles for node, at in one.core_of.items()}
+    for one in sorted(profiles, key=lambda profile: len(set(profile.core_of.values()))):
+        others = {node for other in profiles if other is not one for node in other.core_of}
+        if others.isdisjoint(one.core_of):
+            yield {**core_of, **dict.fromkeys(one.core_of, core)}
+
+
 def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> tuple[ApplicationPlan, list[str]]:
@@ -105,7 +143,7 @@ def _planned(
         plans(at_once=False),
         together=groups,
         time_limit_s=time_limit_s,
-        at_once=partial(plans, at_once=True),
+        at_once=None if request.policy in PER_CALLBACK else partial(plans, at_once=True),
     )
     return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 
@@ -183,24 +221,39 @@ def _later(predicted: Prediction, later_ns: int) -> Prediction:
 def _fitting(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
 ) -> Iterator[str]:
-    """What would make the chains fit, in words: tried one after the other."""
-    free = 1 + max(core for one in profiles for core in (*one.core_of.values(), 0))
-    variants: list[tuple[str, Sequence[Profile], PlanRequest]] = []
-    for place, profile in enumerate(profiles):
-        shared = {
-            node for other in profiles if other is not profile for node in other.core_of
-        } & profile.core_of.keys()
-        if profile.core_of and not shared:
-            moved = replace(profile, core_of=dict.fromkeys(profile.core_of, free))
-            others = [*profiles[:place], moved, *profiles[place + 1 :]]
-            variants.append((f"{profile.name} on a core of its own", others, request))
-    if request.epsilon_ns is None and not request.ideal_machine:
-        smaller = replace(request, ideal_machine=True, overrun_probability=None)
-        variants.append(("a margin for a machine that does not stall", profiles, smaller))
-    for text, changed, wished in variants:
+    """What would make the chains fit, in words: each was tried."""
+
+    def fits(wished: PlanRequest, those: Sequence[Profile] = profiles) -> bool:
         try:
-            _planned(changed, wished, min(time_limit_s, 5.0))
+            _on_wished_cores(those, wished, min(time_limit_s, 2.0))
         except (OperationError, InputError):
-            continue
-        option = " (--ideal-machine)" if wished is not request else " (its nodes' `core`)"
-        yield text + option
+            return False
+        return True
+
+    recorded = sorted({core for one in profiles for core in one.core_of.values()})
+    named = request.cores or tuple(recorded)
+    free = 1 + max(named, default=0)
+    if request.policy != "pipelined":
+        more = ((*named, *range(free, free + count)) for count in range(1, len(profiles)))
+        enough = next((one for one in more if fits(replace(request, cores=one))), None)
+        if enough:
+            yield f"--cores {','.join(map(str, enough))}"
+    elif request.cores and fits(replace(request, cores=None)):
+        yield f"the cores of the recording, {','.join(map(str, recorded))}: without --cores"
+    elif not request.cores:
+        for core_of in _one_on(profiles, free):
+            if fits(request, moved_to(profiles, (), core_of)[0]):
+                names = (one.name for one in profiles if free in map(core_of.get, one.core_of))
+                yield f"{''.join(names)} on a core of its own while it is recorded"
+    if request.epsilon_ns and fits(replace(request, epsilon_ns=0)):
+        low, high = 0, request.epsilon_ns // _MARGIN_STEP_NS + 1
+        while high - low > 1:
+            middle = (low + high) // 2
+            if fits(replace(request, epsilon_ns=middle * _MARGIN_STEP_NS)):
+                low = middle
+            else:
+                high = middle
+        yield f"--epsilon {format_duration(low * _MARGIN_STEP_NS)}"
+    smaller = replace(request, ideal_machine=True, overrun_probability=None)
+    if request.epsilon_ns is None and not request.ideal_machine and fits(smaller):
+        yield "a margin for a machine that does not stall (--ideal-machine)"

@@ -89,7 +89,8 @@ def plan_shaping(
         raise InputError(f"epsilon must be 0 ms or more, slot and period longer than 0 ms: {found}")
     start = longest + epsilon
     if (end := start + length) > period_ns:
-        _refuse_too_long(longest, epsilon, length, period_ns)
+        alone = values.get("interference_ns") is None
+        _refuse_too_long(longest, epsilon, length, period_ns, alone=alone)
     output_core = core if output_core is None else output_core
     with wrong_values_refused(Plan):
         chain = ChainOfPlan(period_ns=period_ns, **of_chain)
@@ -171,14 +172,17 @@ def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
     )
 
 
-def _refuse_too_long(longest: int, epsilon: int, publish_slot: int, period: int) -> NoReturn:
+def _refuse_too_long(
+    longest: int, epsilon: int, publish_slot: int, period: int, *, alone: bool
+) -> NoReturn:
+    """Name what would make the chain fit: unless it is ``alone``, others may not fit then."""
     missing = longest + epsilon + publish_slot - period
     remedies = ["a longer period", "a shorter chain"]
-    if longest + epsilon < period:
+    if alone and longest + epsilon < period:
         remedies.insert(0, f"a publish slot of {duration_text(period - longest - epsilon)}")
-    if longest + publish_slot <= period:
+    if alone and longest + publish_slot <= period:
         remedies.insert(0, f"a margin of {duration_text(period - longest - publish_slot)}")
-    if longest >= period:
+    if alone and longest >= period:
         remedies.append("a pipeline of stages, each shorter than the cycle (--policy pipelined)")
     raise OperationError(
         f"the longest latency {duration_text(longest)}, the margin {duration_text(epsilon)} and"
