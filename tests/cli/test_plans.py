@@ -223,6 +223,11 @@ def test_chains_take_turns_where_they_can(saved: Callable[..., Path], tmp_path: 
     assert load_plan(tmp_path / "placed" / "2_b.yaml").offset_ns == 41 * MS
     again = refused(2, "offsets", *files, "-o", tmp_path / "placed")
     assert "exists already and is not overwritten" in again
+    assert "a, c fill 102.0% of the time of core 1" in refused(
+        1, "offsets", files[0], saved("c", 60)
+    )
+    colliding = refused(1, "offsets", files[0], saved("d", 20, 40))
+    assert "`chainshaper plan REC --chain a --chain d`" in colliding
 
 
 def test_an_offset_is_refused_where_nothing_stops_the_chain(

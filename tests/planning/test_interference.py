@@ -14,6 +14,7 @@ from chainshaper.planning import CallbackTimes, PlanRequest, plan_application
 from chainshaper.planning.application_plan import combined
 from chainshaper.planning.profile import Profile, Rival, interference
 from chainshaper.values.errors import OperationError
+from chainshaper.values.plan_choices import Policy
 
 MS = 1_000_000
 
@@ -195,3 +196,32 @@ def test_an_overrun_goes_on_behind_the_next_chain_and_does_not_hit_it(tmp_path: 
     # It had 6 ms to go at most, behind a slot of the second chain that lasts for 10 to 13.
     assert 60 < (late.late or 0) < 180
     assert 30 * MS < (late.max_ns or 0) < 41 * MS
+
+
+@pytest.mark.parametrize("policy", ["pipelined", "server-per-callback", "let-per-callback"])
+def test_chains_with_slots_per_callback_only_take_turns(policy: Policy, tmp_path: Path) -> None:
+    """30 ms every 40 and 26 every 100 do not."""
+    pytest.importorskip("numba")
+    text = OVERRUNNING.replace("50ms", "40ms").replace("constant: 6ms", "constant: 22ms")
+    (tmp_path / "app.yaml").write_text(text)
+    recording = simulate(load_application(tmp_path / "app.yaml"), tmp_path / "rec", cycles=40)
+    profiles = profile_chains(recording, ("/a1../a2", "/b1../b2"))
+    with pytest.raises(OperationError, match=f"core 1 .*Planned as {policy}, .* take turns"):
+        plan_application(profiles, PlanRequest(policy=policy))
+
+
+def test_simulated_servers_of_callbacks_begin_at_their_chains_offsets(tmp_path: Path) -> None:
+    """A timer whose phase is late in its slot would be stopped, and cost a cycle."""
+    pytest.importorskip("numba")
+    text = OVERRUNNING.replace("50ms", "100ms, phase: 33ms")
+    (tmp_path / "app.yaml").write_text(text)
+    application, chains = load_application(tmp_path / "app.yaml"), ("/a1../a2", "/b1../b2")
+    recording = simulate(application, tmp_path / "rec", cycles=100)
+    request = PlanRequest(policy="server-per-callback")
+    plan, _ = plan_application(profile_chains(recording, chains), request)
+    shaped = simulate(application, tmp_path / "shaped", plan, cycles=100)
+    for chain, one in zip(chains, plan.chains, strict=True):
+        found = measure_latency(shaped, chain)
+        assert (found.analysis.statistics.max_ns or 0) < one.servers[-1].slots[-1][1]
+        starts = found.analysis.traversals["start"] % (100 * MS)
+        assert abs(starts - one.offset_ns).max() < MS

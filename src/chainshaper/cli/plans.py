@@ -132,8 +132,8 @@ def offsets(
 ) -> None:
     """Find when each chain's cycles start, so that no slots of one core collide.
 
-    Where chains cannot take turns on a core, they run at the same time at different priorities, and
-    only their publish slots are separate.
+    Plans do not say by how much chains that cannot take turns on a core would delay each other:
+    `plan` with a `--chain` for each measures that.
     """
     placed, remarks = cs.place_chains(
         [chain for path in plans for chain in cs.load_application_plan(path).chains],

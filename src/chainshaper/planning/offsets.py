@@ -122,7 +122,7 @@ def _refuse_too_full(plans: Sequence[Plan]) -> None:
         beside = publishing_servers(plan)
         cores = {one.core for one in plan.servers if one not in beside and not one.best_effort}
         longest_ns = plan.evidence.max_latency_ns - (plan.evidence.interference_ns or 0)
-        if len(cores) == 1:
+        if len(cores) == 1 and plan.policy not in PER_CALLBACK:  # these take turns
             share = (longest_ns + plan.margin.epsilon_ns) / plan.cycle_ns
             shares.setdefault(cores.pop(), {})[chain_name(plan)] = share
     for core, of in sorted(shares.items()):
