@@ -21,8 +21,9 @@ once than the command's, and takes more memory.
 Prints a row a day, with the resident set from the third hour on (an hour of cycles stays on
 purpose): the median and maximum over all looks. `--keep` writes a row an hour, from which the
 figures can be computed again. At the end: all events; cycles that were counted, those that no look
-counted because the chain was not clear (two processes had its nodes), and those that were
-generated; the largest resident set, and its slope from the second day on. Nothing is asserted.
+counted because the chain was not clear (two processes had its nodes; one that is started again goes
+on in the same chain, so it is 0), and those that were generated; the largest resident set, and its
+slope from the second day on. Nothing is asserted.
 """
 
 import argparse

@@ -11,9 +11,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from datetime import datetime
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
+from types import SimpleNamespace
 from typing import ClassVar
 from urllib.request import urlopen
 
@@ -29,6 +31,7 @@ from traced_program import built
 
 from chainshaper import plan_recording
 from chainshaper.analysis import analyse_latency, data_flow, latency_statistics
+from chainshaper.cli import runs
 from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
@@ -180,7 +183,11 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
         beside.due = [latest]
         too_late = watched(beside, 1.0)[-1].chains[0]
     assert in_time.promised_ns == slot[1]
-    assert in_time.shares == (1.0,)
+    places = beside.chains[0].cycles["place_ns"]
+    inside = places.is_between(slot[0] - 100_000, slot[1], "left")
+    assert in_time.shares == (inside[: in_time.spans["hour"].count].mean(),)
+    assert in_time.early > 0.2, "an unshaped program holds no output back"
+    assert in_time.early + in_time.shares[0] <= 1.0
     assert in_time.spans["hour"].late is not None
     assert in_time.spans["hour"].late <= 2, "of a machine that stands still"
     assert measure_latency(recording).analysis.statistics.count >= 20
@@ -190,6 +197,16 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
     counted = too_late.spans["hour"].count - in_time.spans["hour"].count
     assert counted > 10
     assert too_late.spans["hour"].late == in_time.spans["hour"].late + counted
+
+
+def test_shares_are_of_outputs_within_slots() -> None:
+    ms = 1_000_000
+    (chain,) = own_watch().chains
+    chain.slots = ((10 * ms, 12 * ms), (20 * ms, 22 * ms))
+    places = [5 * ms, 10 * ms - 50_000, 11 * ms, 12 * ms, 15 * ms, 20 * ms, 22 * ms, 60 * ms]
+    rows = {"start": range(8), "latency_ns": places, "late": [False] * 8, "place_ns": places}
+    chain.cycles = pl.DataFrame(rows, schema=chain.cycles.schema)
+    assert chain.shares() == ((2 / 8, 1 / 8), 1 / 8)
 
 
 def test_a_node_that_dies_in_a_callback_leaves_a_cycle_that_is_incomplete(tmp_path: Path) -> None:
@@ -347,6 +364,61 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
     assert "/second" in text
 
 
+def test_the_python_example_of_the_documentation_records_again_and_again(tmp_path: Path) -> None:
+    page = (Path(__file__).parents[2] / "docs/watch.md").read_text()
+    (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for wanted, shorter in (("/t1../t5", CHAIN), ("80_000_000", "1"), ("600", "60")):
+        assert wanted in example
+        example = example.replace(wanted, shorter)
+    with running(tmp_path, 1000):
+        words = [sys.executable, "-c", example]
+        run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    assert len([*tmp_path.glob("slow_*/recording.json")]) > 1
+
+
+def test_the_flight_recorder_takes_the_next_free_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Several watch in a folder, or Ctrl-\\ comes in the second in which a limit breaks."""
+    now = datetime(2026, 1, 2, 3, 4, 5)
+    monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: now))
+    with running(tmp_path, 200):
+        watch = own_watch()
+        watched(watch, 0.5)
+        for _ in range(3):
+            runs._save(watch, tmp_path)
+    names = sorted(one.parent.name for one in tmp_path.glob("watch-*/recording.json"))
+    assert names == [f"watch-20260102-030405{end}" for end in ("", "-2", "-3")]
+    runs._save(own_watch(), tmp_path)
+    assert "no event has been seen" in capsys.readouterr().err
+    assert len([*tmp_path.glob("watch-*")]) == 3, "no empty folder is left"
+
+
+def test_the_command_that_fails_and_names_that_never_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failed = called("watch", "--chain", CHAIN, "--", "sh", "-c", "exit 3")
+    assert (failed.code, "the command ended with code 3" in failed.err) == (1, True)
+    assert called("watch", "--chain", CHAIN, "--", "true").code == 0
+    gone = called("watch", "--chain", CHAIN, "--recorder", tmp_path / "gone", "--", "true")
+    assert (gone.code, "no such folder" in gone.err) == (2, True)
+    monkeypatch.setattr(runs, "PATIENCE_NS", SECOND)
+    budget = tmp_path / "budget.yaml"
+    budget.write_text(
+        f"format: 1\nchains: [{{chain: {CHAIN}}}, {{chain: /ebpf1../other}}]\ncallbacks:\n"
+        "- {node: /second, starts: /ebpf1, response: 10s}\n"
+        "- {node: /ended, starts: /other, response: 1us}\n"
+    )
+    words = ("--longest", "200ms", "--every", "200ms", "--recorder", tmp_path)
+    program = built().command("chain", "100")
+    said = called("watch", "--budget", budget, *words, "--", *program).err
+    notes = [line for line in said.splitlines() if line.startswith("note: ")]
+    assert len(notes) == 2, said
+    assert "/ebpf1../other has not run yet: " in notes[0]
+    assert "/ended (/other) has not run yet" in notes[1]
+
+
 class Collector(BaseHTTPRequestHandler):
     """Takes OTLP over HTTP, as an OpenTelemetry collector does."""
 
@@ -369,7 +441,7 @@ def test_metrics_are_the_figures_that_are_shown() -> None:
     )
     counted = {"complete": hour.count, "late": 1, "incomplete": 0, "unclear": 0}
     spans = dict.fromkeys(SPANS, hour)
-    chain = ChainNow(CHAIN, spans, 20.0, hops, (), None, 0, counted, problem=None)
+    chain = ChainNow(CHAIN, spans, 20.0, hops, (), 0.0, None, 0, counted, problem=None)
     seen = Seen(at_ns=0, processes={1: "/first"}, lost=0, chains=(chain,))
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

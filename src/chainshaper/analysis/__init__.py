@@ -10,12 +10,13 @@ one chain; every step is a function of its own.
 
 from chainshaper.analysis.chains import (
     ChainEnumeration,
+    SeveralPathsError,
     enumerate_chains,
     find_chain,
     load_named_paths,
 )
 from chainshaper.analysis.disturbance import disturbed
-from chainshaper.analysis.flow import DataFlow, callback_instances, data_flow
+from chainshaper.analysis.flow import DataFlow, callback_instances, data_flow, with_restarts
 from chainshaper.analysis.graph import application_graph, graph_of
 from chainshaper.analysis.latency import (
     LatencyAnalysis,
@@ -29,6 +30,13 @@ from chainshaper.analysis.objects import resolve_objects
 from chainshaper.analysis.traversals import REASONS, traverse
 
 __all__ = ["REASONS", "ChainEnumeration", "DataFlow", "LatencyAnalysis", "LatencyStatistics"]
-__all__ += ["analyse_latency", "application_graph", "callback_instances", "callback_statistics"]
+__all__ += [
+    "SeveralPathsError",
+    "analyse_latency",
+    "application_graph",
+    "callback_instances",
+    "callback_statistics",
+]
 __all__ += ["data_flow", "disturbed", "enumerate_chains", "executors", "find_chain", "graph_of"]
 __all__ += ["latency_statistics", "load_named_paths", "resolve_objects", "traverse"]
+__all__ += ["with_restarts"]

@@ -85,6 +85,10 @@ def parse_chain(text: str) -> tuple[str, ...]:
     return waypoints
 
 
+class SeveralPathsError(InputError):
+    """Several paths match the text of a chain."""
+
+
 @dataclass(frozen=True)
 class ChainEnumeration:
     """The chains between two places of a graph.
@@ -105,7 +109,8 @@ class ChainEnumeration:
 def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     """The one chain of ``graph`` that ``spec`` means.
 
-    Raises InputError: a topic or node that does not exist, no path, only a cyclic one, or several.
+    Raises InputError: a topic or node that does not exist, no path, or only a cyclic one.
+    SeveralPathsError: several.
     """
     search = _Search(graph, spec, parse_chain(spec))
     paths, complete, _ = search.listed(HANDFUL + 1)
@@ -113,7 +118,7 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     if not chains:
         raise InputError(search.why_no_path())
     if len(chains) > 1 or not complete:
-        raise InputError(_ambiguous(graph, spec, chains, complete))
+        raise SeveralPathsError(_ambiguous(graph, spec, chains, complete))
     return chains[0]
 
 

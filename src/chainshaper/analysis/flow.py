@@ -346,6 +346,42 @@ def _published_in(
     )
 
 
+def with_restarts(flow: DataFlow, ended: Collection[int]) -> DataFlow:
+    """The flow in which callbacks of processes that have ended are those that replace them.
+
+    A callback replaces another one where its node, kind and trigger are the same, in a process that
+    runs or, where none does, began later: its node was started again.
+    """
+    gone, alike = pl.col("pid").is_in(list(ended)), ["node", "kind", "period_ns", "of"]
+    writes = flow.publications.group_by("callback_id").agg(wrote=pl.col("topic").first())
+    known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
+    known = known.join(writes, on="callback_id", how="left", maintain_order="left").sort(
+        ~gone, "valid_from", maintain_order=True
+    )
+    outside = (pl.col("kind") == "unknown") & (pl.col("handle") == 0)
+    of = pl.when(outside).then(pl.col("wrote").cast(pl.String)).otherwise("topic")
+    known = known.with_columns(of=of)
+    known = known.with_columns(place=pl.int_range(pl.len()).over("pid", *alike))
+    known = known.with_columns(
+        pl.col("callback_id", "pid").last().over(*alike, "place").name.prefix("new_")
+    )
+    replaced = known.filter(gone & (pl.col("callback_id") != pl.col("new_callback_id")))
+    if replaced.is_empty():
+        return flow
+    ids = dict(replaced.select("callback_id", "new_callback_id").iter_rows())
+    pids = dict(replaced.select("new_callback_id", "new_pid").iter_rows())
+    number = pl.col("callback_id").replace(ids)
+    callbacks = flow.objects.callbacks.sort(gone, maintain_order=True).with_columns(number)
+    pid = number.replace_strict(pids, default=pl.col("pid"), return_dtype=pl.Int32())
+    return replace(
+        flow,
+        objects=replace(flow.objects, callbacks=callbacks),
+        instances=flow.instances.with_columns(number),
+        publications=flow.publications.with_columns(number, pid=pid),
+        takes=flow.takes.with_columns(number),
+    )
+
+
 def _begun_outside(published: pl.DataFrame, instances: pl.DataFrame) -> pl.DataFrame:
     """The publications, of which those of rclpy's timers are in no instance of a subscription.
 

@@ -499,6 +499,9 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             moved = f", moved by {one.moved_ns / 1e6:+.3f} ms" if one.moved_ns else ""
             title += f"; the plan's last slot ends at {ms(one.promised_ns)} ms{moved}"
             title += f", in slots: {shares}"
+            if one.shares:
+                others = max(1.0 - one.early - sum(one.shares), 0.0)
+                title += f", before the first: {percent(one.early)}, outside: {percent(others)}"
         names = ("cycles", "min", "p50", "p99", "max", "jitter", "late", "incomplete")
         table = ResultTable(title, [*words("last [ms]"), *figures(*names)], one.problem)
         for span, own in one.spans.items():

@@ -270,12 +270,22 @@ def _checked(
 
 
 def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
-    """What is broken of a budget's limits in the last minute; what does not run breaks none."""
+    """What is broken of a budget's limits in the last minute; what has never run breaks none.
+
+    All outputs of a chain that has run are missing where the chain is not found any more.
+    """
     of_chain = {one.chain: one for one in seen.chains}
     found: list[Judged] = []
     for chain in budget.chains:
         now = of_chain.get(chain.chain)
-        if now is not None and (every := (minute := now.spans["minute"]).count + minute.incomplete):
+        if now is None:
+            continue
+        minute = now.spans["minute"]
+        stopped = now.problem or (None if minute.count else "no output in the last minute")
+        if stopped and chain.missing is not None and now.counted["complete"]:
+            found.append(Judged("now", chain.chain, "missing", chain.missing, 1.0, because=stopped))
+            chain = chain.model_copy(update={"missing": None})  # noqa: PLW2901
+        if every := minute.count + minute.incomplete:
             missing = ((minute.late or 0) + minute.incomplete) / every
             why = None if minute.count else "no cycle was complete"
             limits = _chain_limits(chain, minute, missing)
@@ -285,6 +295,20 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
     running = [one for one in budget.callbacks if (one.node, one.starts) in times]
     found += _judged_callbacks("now", running, times)
     return [one for one in found if not one.met]
+
+
+def not_running(budget: Budget, seen: "Seen") -> Iterator[str]:
+    """What a budget names and has never run, each in words."""
+    ran, named = {(c.node, c.starts) for c in seen.callbacks}, {c.chain for c in budget.chains}
+    for chain in seen.chains:
+        if chain.problem and chain.chain in named and not any(chain.counted.values()):
+            yield f"the budget's chain {chain.chain} has not run yet: {chain.problem}"
+    for one in budget.callbacks:
+        if (one.node, one.starts) not in ran:
+            yield (
+                f"the budget's callback {one.node} ({one.starts}) has not run yet: `chainshaper "
+                "callbacks` shows node and start of those in a recording"
+            )
 
 
 def _chain_limits(

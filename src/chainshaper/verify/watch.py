@@ -23,7 +23,15 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.analysis import DataFlow, data_flow, find_chain, graph_of, traverse
+from chainshaper.analysis import (
+    DataFlow,
+    SeveralPathsError,
+    data_flow,
+    find_chain,
+    graph_of,
+    traverse,
+    with_restarts,
+)
 from chainshaper.analysis.disturbance import with_punctuality
 from chainshaper.analysis.latency import LatencyStatistics, latency_statistics, named_callbacks
 from chainshaper.analysis.objects import Objects, resolve_objects
@@ -42,6 +50,7 @@ from chainshaper.sources.preload import (
 from chainshaper.sources.system import info_of, own_pid_namespace, processes_of
 from chainshaper.splicing.shaped_outputs import find_outputs
 from chainshaper.values import events
+from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import (
@@ -91,12 +100,12 @@ class CallbackNow:
 class ChainNow:
     """One chain: statistics by span (:data:`SPANS`), over all cycles that began in it.
 
-    ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of outputs that left in
-    each of the plan's slots, over the hour (empty: without a plan); ``promised_ns`` is the end of
-    its last slot, which is ``moved_ns`` behind the plan's; ``counted`` are cycles since the watch
-    began: ``complete``, of these ``late``, ``incomplete``, and ``unclear``, whose messages no event
-    before Iron tells apart while CLOCK_REALTIME is set. ``problem`` says why there is nothing to be
-    seen.
+    ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of all outputs those that
+    left within each of the plan's slots, over the hour (empty: without a plan), ``early`` those
+    before the first slot; ``promised_ns`` is the end of the last slot, which is ``moved_ns`` behind
+    the plan's; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
+    ``incomplete``, and ``unclear``, whose messages no event before Iron tells apart while
+    CLOCK_REALTIME is set. ``problem`` says why nothing goes through the chain.
     """
 
     chain: str
@@ -104,6 +113,7 @@ class ChainNow:
     rate_hz: float
     hops: tuple[Hop, ...]
     shares: tuple[float, ...]
+    early: float
     promised_ns: int | None
     moved_ns: int
     counted: Mapping[str, int]
@@ -153,6 +163,7 @@ class Seen:
         return statuses
 
 
+_SAME = ("node", "kind", "topic", "period_ns")  # a callback, also of a node that was started again
 _CYCLE = pl.Schema(
     {"start": pl.Int64, "latency_ns": pl.Int64, "late": pl.Boolean, "place_ns": pl.Int64}
 )
@@ -167,6 +178,7 @@ class _Chain:
     cycles: pl.DataFrame = field(default_factory=lambda: pl.DataFrame(schema=_CYCLE))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
+    first: Callback | None = None  # where cycles began when the chain was seen last
     counted: Counter[str] = field(
         default_factory=lambda: Counter(complete=0, late=0, incomplete=0, unclear=0)
     )
@@ -186,7 +198,6 @@ class _Chain:
             most = shares.max().name.prefix("longest_")
             figures = own.group_by("hop").agg(shares.sum(), most, count=pl.len())
             self.hops.append((now_ns, figures))
-        _forget(self.hops, now_ns)
 
     def statistics(self, since_ns: int) -> LatencyStatistics:
         begun = self.cycles.filter(pl.col("start") >= since_ns)
@@ -195,15 +206,24 @@ class _Chain:
         gone = begun.height - whole.height
         return latency_statistics(whole["latency_ns"].to_numpy(), incomplete=gone, late=late)
 
-    def shares(self) -> tuple[float, ...]:
-        """Of the outputs by slot: each counts for the last slot that had opened as it left."""
-        places = self.cycles.drop_nulls("latency_ns")["place_ns"].fill_null(-1).to_numpy()
+    def shares(self) -> tuple[tuple[float, ...], float]:
+        """Of all outputs those within each slot, and those before the first one."""
+        places = self.cycles.drop_nulls("latency_ns")["place_ns"].drop_nulls().to_numpy()
         if not self.slots or not places.size:
-            return ()
-        opens = [start for start, _ in self.slots]
-        found = np.searchsorted(opens, places + _AHEAD_NS, side="right") - 1
-        counted = np.bincount(found.clip(0), minlength=len(opens))
-        return tuple((counted / places.size).tolist())
+            return (), 0.0
+        opens, closes = np.array(self.slots).T
+        slots = np.searchsorted(opens, places + _AHEAD_NS, side="right") - 1
+        inside = (slots >= 0) & (places < closes[slots])
+        counted = np.bincount(slots[inside], minlength=opens.size)
+        return tuple((counted / places.size).tolist()), float((slots < 0).mean())
+
+    def beginning(self, graph: ApplicationGraph) -> Chain | None:
+        """The part of the chain that begins cycles, where it is not found any more but was."""
+        for one in graph.callbacks if self.first else ():
+            alike = (getattr(one, n) == getattr(self.first, n) for n in _SAME)
+            if all(alike) and self.names[0][1] in one.publishes:
+                return Chain(self.text, (one.id,), (self.names[0][1],))
+        return None
 
 
 def _forget(seen: deque[tuple[int, Any]], now_ns: int) -> None:
@@ -247,10 +267,16 @@ class Watch:
         self._searched_ns = 0
         self._lost_with_ended = 0
         self._over_ns = time.monotonic_ns()  # cycles that began until then have been taken over
+        self._began_ns = self._looked_from_ns = self._over_ns  # the last look's cycles from then on
 
     def _slots(self, chain: str) -> tuple[tuple[int, int], ...]:
         output = chain.rpartition("..")[2]
-        return next((due.slots for due in self.due if due.output in (None, output)), ())
+        own = [due for due in self.due if due.output in (None, output)][:1]
+        return tuple(
+            (start + due.cycles * due.cycle_ns, end + due.cycles * due.cycle_ns)
+            for due in own
+            for start, end in due.slots
+        )
 
     def read(self) -> None:
         """Take what is new in all memories, and look for new processes now and then."""
@@ -260,27 +286,42 @@ class Watch:
             self._searched_ns = now
             for pid, memory in memories(self.users, self.processes):
                 self.processes[pid], self._latest[pid] = memory, 0
+                created, _ = memory.objects()
+                if created.size and created["time"][0] < self._began_ns:
+                    self._take(pid, memory, self._began_ns)
+                    memory.lost = 0  # before the watch began
         for pid, process in self.processes.items():
-            for part in process.new_records():
-                self._fresh.append((pid, part))
-                self._latest[pid] = max(self._latest[pid], int(part["time"][-1]))
+            self._take(pid, process)
         if now - self._tabled_ns > SECOND:
             self._take_fresh(now)
         if searches:
             self._leave_ended()
 
+    def _take(self, pid: int, process: TracedProcess, since_ns: int = 0) -> None:
+        for part in process.new_records():
+            if part["time"][-1] >= since_ns:
+                self._fresh.append((pid, part[part["time"] >= since_ns]))
+                self._latest[pid] = max(self._latest[pid], int(part["time"][-1]))
+
     def _leave_ended(self) -> None:
         """Leave processes that have ended, once their last events are too old to be asked for."""
-        for pid in [one for one in self.processes if not Path(f"/proc/{one}").exists()]:
+        for pid in self._ended():
             if self._latest[pid] < self._needed_ns(self._searched_ns):
                 process = self.processes.pop(pid)
                 self._lost_with_ended += process.lost + process.dropped
                 self._created.pop(pid, None)
                 del self._latest[pid]
 
+    def _ended(self) -> list[int]:
+        return [one for one in self.processes if not Path(f"/proc/{one}").exists()]
+
     def _needed_ns(self, now_ns: int) -> int:
         """From when on events may be asked for: by the flight recorder, or by a late look."""
-        return min(now_ns - RECORDER_NS, self._over_ns) - self.longest_ns
+        return self._recorded_ns(now_ns) - self.longest_ns
+
+    def _recorded_ns(self, now_ns: int) -> int:
+        """From when on the flight recorder writes: all cycles of the last look are there."""
+        return min(now_ns - RECORDER_NS, self._looked_from_ns)
 
     def look(self) -> Seen:
         """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
@@ -293,33 +334,44 @@ class Watch:
         since = now - 2 * self.longest_ns - (over - self._over_ns)
         tables = self._tables(since)
         flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
+        if ended := self._ended():
+            flow = with_restarts(flow, ended)
+        moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
         # Where publications carry no stamp, the clock's offset says which one was taken.
         stampless = flow.publications["source_timestamp"].null_count() > 0
         clear_ns = self._stepped_ns if stampless else 0
         within = pl.col("start").is_between(self._over_ns, over, "right")
         graph = graph_of(flow)
-        nodes = {one.id: one.node or "" for one in graph.callbacks}
+        callbacks = {one.id: one for one in graph.callbacks}
         for one in self.chains:
+            _forget(one.hops, now)
+            one.problem, chain = None, None
             try:
                 chain = find_chain(graph, one.text)
             except InputError as error:
                 one.problem = str(error) if self.processes else NO_PROCESS
+                # Every cycle that is over had its events here: none of them has arrived.
+                if not isinstance(error, SeveralPathsError):
+                    chain = one.beginning(graph)
+            if chain is None:
                 continue
-            one.problem = None
             found = traverse(flow, chain, graph)
             due = next((d for d in self.due if d.output in {None, chain.topics[-1]}), None)
             judged, _ = with_punctuality(flow, found, due)
+            if one.problem is None:
+                path = [callbacks[number] for number in chain.callbacks]
+                one.first = path[0]
+                one.names = [(c.node or "", t) for c, t in zip(path, chain.topics, strict=True)]
+            else:
+                judged = judged.with_columns(latency_ns=None, late=None, complete=False)
+            judged = judged.with_columns(pl.col("place_ns") - moved.get(chain.topics[-1], 0))
             new = judged.filter(within)
             one.take_over(clear := new.filter(pl.col("start") > clear_ns), found.hops, now)
             one.counted["unclear"] += new.height - clear.height
-            one.names = list(
-                zip(map(nodes.__getitem__, chain.callbacks), chain.topics, strict=True)
-            )
         if self.callbacks is not None:
             self.callbacks.append((now, _longest(flow, within)))
             _forget(self.callbacks, now)
-        self._over_ns = over
-        moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
+        self._looked_from_ns, self._over_ns = self._over_ns, over
         return Seen(
             at_ns=now,
             processes=processes_of(tables, dict.fromkeys(self.processes, "")),
@@ -347,13 +399,15 @@ class Watch:
     def _now(self, one: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
         moved_ns = moved.get(one.text.rpartition("..")[2], 0)
         begun = one.cycles["start"].filter(one.cycles["start"] > over_ns - SPANS["minute"])
+        shares, early = one.shares()
         lasted = begun[-1] - begun[0] if len(begun) > 1 else 0
         return ChainNow(
             chain=one.text,
             spans={name: one.statistics(over_ns - span) for name, span in SPANS.items()},
             rate_hz=(len(begun) - 1) * SECOND / lasted if lasted else 0.0,
             hops=tuple(_hops(one)),
-            shares=one.shares(),
+            shares=shares,
+            early=early,
             promised_ns=one.slots[-1][1] + moved_ns if one.slots else None,
             moved_ns=moved_ns,
             counted=dict(one.counted),
@@ -397,15 +451,15 @@ class Watch:
             self._recent.popleft()
 
     def save(self, output: str | Path) -> Recording:
-        """Write the last ten seconds as a recording: the flight recorder.
+        """Write the last ten seconds as a recording, or more if the last look had cycles before.
 
         Raises InputError: the folder exists. OperationError: it cannot be written, or there is
         nothing to be written.
         """
         output = refuse_existing(output)
         self.read()
-        now = time.monotonic_ns()
-        tables = self._tables(now - RECORDER_NS)
+        since = self._recorded_ns(time.monotonic_ns())
+        tables = events.happened(self._tables(since), since)
         if not tables:
             raise OperationError(f"{output} is not written: no event has been seen yet")
         versions = (library.version for _, _, library in self._created.values())
@@ -419,7 +473,7 @@ class Watch:
         }
         if self.plan is not None:
             facts["plan"] = plan_values(self.plan)
-            facts["in_force"] = InForceInfo(since_ns=now - RECORDER_NS)
+            facts["in_force"] = InForceInfo(since_ns=since)
         info = info_of("preload", tables, versions, {}, self.lost, **facts)
         return write_recording(output, tables, info)
 
