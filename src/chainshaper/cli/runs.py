@@ -4,7 +4,7 @@ import shlex
 import signal
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,10 +24,13 @@ if TYPE_CHECKING:
 
     from chainshaper.analysis import ChainEnumeration
     from chainshaper.values.application import ApplicationGraph
+    from chainshaper.verify.budgets import Budget, Judged
     from chainshaper.verify.watch import Seen, Watch
 
 MIB = 1 << 20
 STDERR = 2
+PATIENCE_NS = 10_000_000_000
+"""So long after nodes are there `watch` names what has not run of a budget."""
 
 SHAPING_DURATION_NS = 60_000_000_000
 
@@ -305,12 +308,18 @@ def watch(
     The application needs the library in front of ROS 2: `eval "$(chainshaper watch --environment)"`
     before it is started, or start it here, as COMMAND. Watching needs no root and changes nothing.
     """
-    from chainshaper.linux.own_processes import check_command, end_command, start_command
+    from chainshaper.linux.own_processes import (
+        check_command,
+        end_command,
+        end_in_words,
+        start_command,
+    )
     from chainshaper.linux.processes import run_users
     from chainshaper.planning import load_application_plan
     from chainshaper.reporting.overviews import watch_tables
     from chainshaper.sources.preload import installed_library, preloading
-    from chainshaper.verify.budgets import Budget, broken_limits, load_budget
+    from chainshaper.values.recording import refuse_existing
+    from chainshaper.verify.budgets import Budget, load_budget
     from chainshaper.verify.watch import Watch, exporting
 
     if environment:
@@ -325,6 +334,8 @@ def watch(
         raise InputError(
             "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget"
         )
+    if budget is not None or recorder != Path():
+        refuse_existing(recorder / "watch-DATE-TIME")
     if command:
         check_command(command)
     with out.stop_on_signals() as stop, ExitStack() as until:
@@ -344,7 +355,7 @@ def watch(
             callbacks=bool(limits.callbacks),
         )
         publish = _publisher(watched, until) if diagnostics else lambda _: None
-        next_look, breaks = time.monotonic_ns() + every, set[tuple[str, str]]()
+        next_look, judged = time.monotonic_ns() + every, _judging(limits, watched, recorder)
         while not stop.wait(0.1) and (started is None or started.poll() is None):
             watched.read()
             if asked.is_set():
@@ -354,25 +365,63 @@ def watch(
                 next_look += every
                 export(seen := watched.look())
                 publish(seen)
-                broken = broken_limits(limits, seen)
-                new = [one.text for one in broken if (one.where, one.what) not in breaks]
-                breaks = {(one.where, one.what) for one in broken}
-                if new:
-                    out.say("; ".join(new))
-                    _save(watched, recorder)
+                broken = judged(seen)
                 if json:
                     out.print_json_line(seen.as_json() | {"broken": [one.text for one in broken]})
                 else:
                     show(watch_tables(seen))
+    if started is not None and started.returncode and not stop.is_set():
+        raise OperationError(f"the command {end_in_words(started.returncode)}")
+
+
+def _judging(
+    limits: "Budget", watched: "Watch", recorder: Path
+) -> "Callable[[Seen], list[Judged]]":
+    """What finds the limits that are broken; new ones are written to stderr and recorded."""
+    from chainshaper.verify.budgets import broken_limits, not_running
+
+    breaks, named_at = set[tuple[str, str]](), 0
+
+    def judged(seen: "Seen") -> "list[Judged]":
+        nonlocal breaks, named_at
+        broken = broken_limits(limits, seen)
+        new = [one.text for one in broken if (one.where, one.what) not in breaks]
+        breaks = {(one.where, one.what) for one in broken}
+        if new:
+            out.say("; ".join(new))
+            _save(watched, recorder)
+        if not named_at and any(seen.processes.values()):
+            named_at = seen.at_ns + PATIENCE_NS
+        if 0 < named_at <= seen.at_ns:
+            out.notes(not_running(limits, seen))
+            named_at = -1
+        return broken
+
+    return judged
 
 
 def _save(watched: "Watch", recorder: Path) -> None:
     """Have the flight recorder write; that it cannot is no reason to stop watching."""
-    folder = recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}"
     try:
-        out.say(f"the last ten seconds are in {watched.save(folder).path}")
-    except ChainshaperError as error:
+        folder = _own_folder(recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}")
+        try:
+            out.say(f"the last ten seconds are in {watched.save(folder).path}")
+        finally:
+            with suppress(OSError):
+                folder.rmdir()  # it is empty: nothing was written
+    except (ChainshaperError, OSError) as error:
         out.say(f"the flight recorder has not written: {error}")
+
+
+def _own_folder(wanted: Path) -> Path:
+    """A new folder of this name, or with a number behind it if another watch has taken it."""
+    folder, number = wanted, 1
+    while True:
+        with suppress(FileExistsError):
+            folder.mkdir()
+            return folder
+        number += 1
+        folder = wanted.with_name(f"{wanted.name}-{number}")
 
 
 def _publisher(watched: "Watch", until: ExitStack) -> "Callable[[Seen], None]":
