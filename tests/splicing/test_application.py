@@ -15,7 +15,7 @@ from chainshaper.planning.plan import revised
 from chainshaper.planning.shaping import let_per_callback, let_per_chain
 from chainshaper.splicing.application import splice_application, writers_of
 from chainshaper.values.errors import InputError
-from chainshaper.workload.description import Application, TopicDescription
+from chainshaper.workload.description import Application, NodeDescription, TopicDescription
 
 
 @pytest.fixture
@@ -154,6 +154,19 @@ def test_an_output_that_two_nodes_publish_is_refused(application: Application, p
     both = application.model_copy(update={"nodes": nodes})
     with pytest.raises(InputError, match="which third, fourth of the application publishes"):
         splice_application(both, plan)
+
+
+def test_a_plan_is_for_its_own_chain_also_where_the_application_names_another(
+    application: Application, plan: Plan
+) -> None:
+    timer = {"timer": "20ms", "execution": {"constant": "1ms"}, "publishes": ["/image"]}
+    camera = NodeDescription.model_validate({"callbacks": [timer]}, strict=False)
+    beside = application.model_copy(update={"nodes": {"camera": camera, **application.nodes}})
+    other = beside.model_copy(update={"chain": "/image../image"})
+    assert splice_application(other, plan).nodes == splice_application(beside, plan).nodes
+    named = revised(plan, chain=plan.chain.model_copy(update={"spec": "/image../t3"}))
+    with pytest.raises(InputError, match=r"period 50 ms, but /image../t3 of 'small chain' has 20"):
+        splice_application(beside, named)
 
 
 def test_a_plan_for_another_period_is_refused_before_anything_starts(

@@ -36,7 +36,7 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
     joint = whole(plan)
     application = _placed(at_offsets(application, joint), joint)
     for chain in joint.chains:
-        application = _with_chain(application, joint, chain)
+        application = _with_chain(application, chain)
     _refuse_strange_nodes(application, joint)
     return application
 
@@ -58,7 +58,7 @@ def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
     InputError: the application lacks a chain of the plan, or it has another period there.
     """
     for chain in joint.chains:
-        _, timer = _origin(application, joint, chain)
+        _, timer = origin_timer(application, chain.chain.spec)
         if timer.timer_ns != chain.chain.period_ns:
             raise InputError(
                 "the plan is for a chain with the period"
@@ -71,18 +71,11 @@ def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
     return application
 
 
-def _origin(
-    application: Application, joint: ApplicationPlan, chain: Plan
-) -> tuple[str, CallbackDescription]:
-    """The timer that starts a chain: a plan of one chain is for the application's own."""
-    return origin_timer(application, chain.chain.spec if len(joint.chains) > 1 else None)
-
-
 def _at_offset(application: Application, joint: ApplicationPlan, chain: Plan) -> Application:
     """The application with the timer that starts a chain expiring at the chain's offset."""
     if not joint.moves_timers:
         return application
-    name, timer = _origin(application, joint, chain)
+    name, timer = origin_timer(application, chain.chain.spec)
     node = application.nodes[name]
     moved = timer.model_copy(update={"phase_ns": chain.offset_ns})
     callbacks = tuple(moved if one is timer else one for one in node.callbacks)
@@ -90,7 +83,7 @@ def _at_offset(application: Application, joint: ApplicationPlan, chain: Plan) ->
     return application.model_copy(update={"nodes": nodes})
 
 
-def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) -> Application:
+def _with_chain(application: Application, plan: Plan) -> Application:
     shaping = plan.shaping_node
     if shaping is None and any(publisher_servers(plan)):
         check_publication(plan, writers_of(application))
@@ -115,7 +108,7 @@ def _with_chain(application: Application, joint: ApplicationPlan, plan: Plan) ->
                 " library in ROS 2 nodes does, and a described application has none: plan without"
                 " --delivery, or generate ROS 2 nodes (`chainshaper generate`)"
             )
-        application = _spliced(application, joint, plan, node)
+        application = _spliced(application, plan, node)
     return application
 
 
@@ -144,9 +137,7 @@ def _placed(application: Application, joint: ApplicationPlan) -> Application:
     return application.model_copy(update={"nodes": nodes})
 
 
-def _spliced(
-    application: Application, joint: ApplicationPlan, plan: Plan, shaping: ShapingNode
-) -> Application:
+def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Application:
     """The application with one shaping node behind the publisher of its output."""
     if shaping.name in {name.strip("/") for name in application.nodes}:
         raise InputError(
@@ -173,7 +164,7 @@ def _spliced(
         callbacks.append(callback.model_copy(update={"publishes": tuple(published)}))
     nodes[publishers[0]] = publisher.model_copy(update={"callbacks": tuple(callbacks)})
     depth = shaping.depth or max(10, application.topic(shaping.output).depth)
-    _, timer = _origin(application, joint, plan)
+    _, timer = origin_timer(application, plan.chain.spec)
     nodes[shaping.name] = _described(plan, shaping, depth, timer.phase_ns)
     if shaping.output in topics:
         topics[shaping.input] = topics[shaping.output]  # the same quality of service
