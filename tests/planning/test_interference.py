@@ -7,12 +7,16 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from known import known
 
 from chainshaper import load_application, measure_latency, simulate
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import CallbackTimes, PlanRequest, plan_application
 from chainshaper.planning.application_plan import combined
+from chainshaper.planning.overruns import expected
 from chainshaper.planning.profile import Profile, Rival, interference
+from chainshaper.reporting.latency import expected_text
+from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.plan_choices import Policy
 
@@ -91,6 +95,28 @@ def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path:
     assert len(remarks) == (before > 0)
     behind = [7 + 2 + sent[1] + sent[2] + before, 5 + 2 + sent[0] + sent[2] + before]
     assert added == pytest.approx([*behind, 2 + sent[0] + sent[1]], abs=0.5)  # dispatching
+
+
+def test_bands_are_where_outputs_come_and_the_last_is_behind_all_that_may_delay(
+    tmp_path: Path,
+) -> None:
+    pytest.importorskip("numba")
+    varied = GRAPH.replace("{constant: 5ms}", "{uniform: [2ms, 10ms]}").replace("PERIOD", "100ms")
+    (tmp_path / "graph.yaml").write_text(varied)
+    application = load_application(tmp_path / "graph.yaml")
+    recording = simulate(application, tmp_path / "rec", cycles=500)
+    profiles = profile_chains(recording, ("/in../left", "/in../right"))
+    plan, _ = plan_application(profiles, PlanRequest(bands=3, publish_slot_ns=200_000))
+    shaped = simulate(application, tmp_path / "shaped", plan, cycles=500)
+    for profile, chain in zip(profiles, plan.chains, strict=True):
+        seen, evidence = known(expected(chain)), chain.evidence
+        assert evidence.min_latency_ns <= int(profile.latencies_ns.min())
+        assert seen.leave_ns[-1] >= evidence.max_latency_ns + chain.margin.epsilon_ns
+        assert f" to {milliseconds(chain.predicted.mean_ns)};" in expected_text(chain)
+        said = known(measure_latency(shaped, chain.chain.spec).prediction)
+        assert not said.broken
+        for band in said.bands:  # the gate of the other output may be in the way
+            assert band.share == pytest.approx(band.predicted_share, abs=0.15)
 
 
 def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = None) -> Profile:

@@ -201,7 +201,8 @@ def test_a_verdict_is_what_its_printed_figures_say(
         _, predicted, measured, verdict, *_ = next(row for row in rows if row[0].startswith(title))
         low, _, high = predicted.partition(" … ")
         inside = float(low) <= float(measured) <= float(high or low)
-        assert verdict == ("as predicted" if inside else "differs")
+        otherwise = "better" if float(measured) < float(low) else "worse"
+        assert verdict == ("as predicted" if inside else otherwise)
         assert figure.holds is inside
 
 
@@ -253,12 +254,26 @@ def test_a_band_that_may_well_be_empty_is_not_expected(like: LatencyAnalysis) ->
     assert (many.max.from_ns, many.max.holds, many.jitter.holds) == (last, False, False)
 
 
-@pytest.mark.parametrize(("longest", "holds"), [(71 * MS, True), (85 * MS, False)])
+@pytest.mark.parametrize(
+    ("longest", "holds"), [(71 * MS, True), (84 * MS + GATE_NS, True), (85 * MS, False)]
+)
 def test_a_baseline_predicts_at_most(like: LatencyAnalysis, longest: int, holds: bool) -> None:
-    """Outputs leave when they are ready: a maximum below the predicted one is as predicted."""
+    """Outputs leave when they are ready: a maximum below the predicted one is as predicted, and
+    one above it by no more than gates differ."""
     plan = plan_chain(PROFILE, PlanRequest(policy="server-per-chain"))
     said = judge_prediction(plan, _measured([50 * MS, 60 * MS, longest], like))
     assert said.max.holds is holds
+
+
+def test_what_is_better_than_promised_breaks_no_promise(like: LatencyAnalysis) -> None:
+    plan = _bands(2)
+    (first, _), (last, _) = publish_slots(plan)
+    better = judge_prediction(plan, _measured([first + 10] * 60, like))
+    assert (better.max.holds, better.jitter.holds) == (False, False)
+    assert (better.broken, prediction_json(better)["kept"]) == ((), True)
+    assert [row[3] for row in _shown(better)[:3]] == ["as predicted", "better", "better"]
+    worse = judge_prediction(plan, _measured([first + 10, last + 3 * MS], like))
+    assert [text.split()[0] for text in worse.broken] == ["maximum", "jitter"]
 
 
 def test_late_outputs_are_counted_in_all_cycles(like: LatencyAnalysis) -> None:

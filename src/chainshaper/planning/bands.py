@@ -180,6 +180,7 @@ def with_bands(
     latencies_ns: NDArray[np.int64],
     bands: int | Literal["auto"],
     *,
+    most_ns: NDArray[np.int64] | None = None,
     solver: Solver = "exact",
     minimise: Goal = "mean",
     mean_at_most_ns: int | None = None,
@@ -189,7 +190,8 @@ def with_bands(
 ) -> Plan:
     """A shaped plan with ``bands`` publish slots of the plan's length (Δ); the last one stays.
 
-    ``auto`` takes as many as each lower the average by ``least_gain`` of it at least. For
+    ``most_ns`` are the latencies where others delay all executions, behind which the average is
+    not. ``auto`` takes as many as each lower the average by ``least_gain`` of it at least. For
     ``minimise`` and ``mean_at_most_ns`` see :func:`place_bands`; ``limits`` are ``grid_ns``,
     ``max_gap_ns`` and ``max_share`` of :class:`BandProblem`.
 
@@ -209,7 +211,11 @@ def with_bands(
         placement = (place_by_swarm if solver == "pso" else place_randomly)(problem, bands, seed)
     length, ends = problem.publish_slot_ns, placement.slot_ends_ns
     slots = tuple((end - length, end) for end in ends)
-    predicted = predict_bands(problem.latencies_ns, ends, length, plan.into_open_slot)
+    likely, latest = (
+        predict_bands(latencies, ends, length, plan.into_open_slot)
+        for latencies in (latencies_ns, latencies_ns if most_ns is None else most_ns)
+    )
+    predicted = likely.model_copy(update={"mean_ns": latest.mean_ns})
     return with_publish_slots(plan, slots, predicted=predicted)
 
 

@@ -72,7 +72,7 @@ class Evidence(Part):
     They are of undisturbed cycles; where the machine disturbed all but one at most
     (``all_disturbed``), of all. ``max_of_all_ns`` is of all, ``incomplete`` counts traversals
     without an end; ``utilisation`` is the share of its core that the chain takes,
-    ``interference_ns`` the part of each latency that is for others
+    ``interference_ns`` the part of the average and the longest latency that is for others
     (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's asynchronous
     publisher, ``longest_publication_ns`` of its synchronous one; ``publish_slot`` says where Δ is
     from. ``intra_process``: subscribers get the output without DDS. ``None`` is: not known.

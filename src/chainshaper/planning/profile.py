@@ -15,6 +15,9 @@ in one cycle than in another:
   priority;
 * chains of a better priority, where they run at the same time (where they take turns, none);
 * the shaping nodes of all other chains, which spin before a slot and publish.
+
+What delays a cycle is between none of it and all. The longest latency, and the last slot with it,
+is behind all of it; bands before that are placed by what was measured, as far as it is in between.
 """
 
 import math
@@ -46,7 +49,8 @@ class Profile:
 
     ``latencies_ns`` are those of undisturbed cycles (where ``all_disturbed``, of all),
     ``every_latency_ns`` those of all (None: all were undisturbed), both in the order of time;
-    ``starts_ns`` is when each of the former began in the recording (None: a period apart).
+    ``starts_ns`` is when each of the former began in the recording (None: a period apart), and
+    ``measured_ns`` what it took there, where others may delay it to the latency (None: that).
     ``nodes`` and ``topics`` have the node and the topic of each callback of the chain. ``core_of``
     names the core of every node whose executor takes part, also on branches that the chain waits
     for, ``cores`` that of any node that has one core; of a node with several executors,
@@ -65,6 +69,7 @@ class Profile:
     period_ns: int
     every_latency_ns: NDArray[np.int64] | None = None
     starts_ns: NDArray[np.int64] | None = None
+    measured_ns: NDArray[np.int64] | None = None
     spec: str | None = None
     nodes: tuple[str, ...] = ()
     topics: tuple[str, ...] = ()
@@ -118,6 +123,12 @@ class Profile:
         return int(check_latencies(self.latencies_ns).max())
 
     @property
+    def measured(self) -> NDArray[np.int64]:
+        """What the cycles took in the recording, in which others may have delayed them less."""
+        measured = self.latencies_ns if self.measured_ns is None else self.measured_ns
+        return np.minimum(measured, self.longest_ns)
+
+    @property
     def starts(self) -> NDArray[np.int64]:
         """When each cycle began, from the beginning of the recording."""
         given = self.starts_ns
@@ -126,10 +137,13 @@ class Profile:
     def chosen(self, these: NDArray[np.bool_]) -> "Profile":
         """The profile with the longest latency of these cycles; the others stay in ``every``."""
         steps = self.steps_ns[these] if len(self.steps_ns) == len(these) else self.steps_ns
-        latencies, starts = self.latencies_ns[these], self.starts[these]
-        every = self.every
         return replace(
-            self, latencies_ns=latencies, starts_ns=starts, steps_ns=steps, every_latency_ns=every
+            self,
+            latencies_ns=self.latencies_ns[these],
+            starts_ns=self.starts[these],
+            measured_ns=None if self.measured_ns is None else self.measured_ns[these],
+            steps_ns=steps,
+            every_latency_ns=self.every,
         )
 
 
@@ -238,7 +252,7 @@ def with_interference(
                 if gates and place != k and other.core_of.get(other.nodes[-1]) in cores:
                     rivals.append(_gate(other, wishes.spin_ns))
             delay = interference(int(one.every.max()), rivals, one.period_ns)
-            delayed[k] = _later(one, delay)
+            delayed[k] = _later(one, delay, profiles[k].latencies_ns)
         better.append([delayed[k] for k in group])
     return delayed
 
@@ -255,13 +269,15 @@ def alone(profile: Profile) -> Profile:
     )
 
 
-def _later(profile: Profile, delay_ns: int) -> Profile:
+def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> Profile:
+    of_modes = profile.of_modes.items()
     return replace(
         profile,
         latencies_ns=profile.latencies_ns + delay_ns,
         every_latency_ns=profile.every + delay_ns,
+        measured_ns=np.clip(measured_ns, profile.latencies_ns, profile.latencies_ns + delay_ns),
         interference_ns=delay_ns,
-        of_modes={mode: _later(one, delay_ns) for mode, one in profile.of_modes.items()},
+        of_modes={mode: _later(one, delay_ns, one.latencies_ns) for mode, one in of_modes},
     )
 
 

@@ -246,7 +246,7 @@ def moved_to(
 
 def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
     """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it."""
-    latencies = _covered(profile, request).latencies_ns
+    latencies = _covered(profile, request).measured
     return choose_bands(plan, latencies, **_of(request, *_LIMITS, "least_gain"))
 
 
@@ -452,7 +452,8 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
     if request.policy == "shaped":
         names = ("solver", "minimise", "mean_at_most_ns", "least_gain", "seed")
         values = _of(request, *_LIMITS, *names)
-        return with_bands(plan, profile.latencies_ns, request.bands, **values)
+        most = profile.latencies_ns
+        return with_bands(plan, profile.measured, request.bands, most_ns=most, **values)
     if request.policy == "one-long-slot":
         if request.slot_start_ns is None:
             raise InputError("one long slot needs its start: add --slot-start, such as 62ms")

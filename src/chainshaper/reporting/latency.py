@@ -228,6 +228,8 @@ def expected_text(plan: Plan) -> str:
         return "expected average {}, maximum {}, jitter {} at most".format(*figures)
     places = ", ".join(map(milliseconds, seen.leave_ns))
     average = f", average {milliseconds(seen.mean_ns)}" if len(seen.leave_ns) > 1 else ""
+    if average and plan.evidence.interference_ns:  # as far as other chains delay it
+        average += f" to {milliseconds(predicted.mean_ns)}"
     return f"outputs leave at {places}{average}; expected jitter {milliseconds(seen.jitter_ns, 1)}"
 
 
@@ -289,7 +291,7 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
     if prediction is None:
         return f"{said}."
     named = ("average", prediction.mean), ("maximum", prediction.max), ("jitter", prediction.jitter)
-    broken = ", ".join(name for name, figure in named if figure.holds is False)
+    broken = ", ".join(name for name, figure in named if figure.worse)
     verdict = f"differs from the prediction: {broken}" if broken else "as predicted"
     return f"{said}; {verdict}, {count(calm[-1].late)} of {calm[-1].count:,} late."
 
@@ -319,7 +321,8 @@ def prediction_table(judged: JudgedPrediction, name: str = "") -> ResultTable:
         ("maximum", judged.max),
         ("jitter (max − min)", judged.jitter),
     ):
-        verdict = {True: "as predicted", False: "differs", None: ABSENT}[figure.holds]
+        differs = "worse" if figure.worse else "better"
+        verdict = {True: "as predicted", False: differs, None: ABSENT}[figure.holds]
         table.add(title, figure.range_text, ms(figure.measured_ns), verdict, "", "", "")
     table.line()
     for number, band in enumerate(judged.bands, start=1):
