@@ -28,6 +28,7 @@ from chainshaper.enforcement.threads import (
     plan_scheduling,
     server_members,
     server_priorities,
+    waiting_receivers,
     with_gates,
 )
 from chainshaper.flow.threads import check_publishers, first_threads
@@ -405,6 +406,15 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     (gate_thread,) = (one.wanted for one in wanted if one.thread.thread.tid == 100)
     free = _by_tid(left_by_back_end("scx", wanted, plan.free_threads))
     assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
+    assert more_cores[300] == Scheduling(81, (1,)), "it rests while one chain's output is received"
+    other = _server("other", PlannedThread(node="/b"), core=2, priority=2)
+    several = ApplicationPlan(chains=(plan.chains[0], _plan(other).chains[0]))
+    both = _allocation(gate, _node("/a", 200, "executor"), _node("/b", 400, "executor"), sink)
+    for cores, core, notes in (((0, 1, 2), 0, 0), ((1, 2), 1, 1)):
+        found = plan_scheduling(several, both, cores)
+        assert _by_tid(found)[300] == Scheduling(81, (core,))
+        assert len(waiting_receivers(several, found)) == notes
+        assert not waiting_receivers(several, left_by_back_end("scx", found))
     alone = whole(revised(bare, shaping_node=node.model_copy(update={"receivers": ()})))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
 

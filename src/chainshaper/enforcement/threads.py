@@ -13,7 +13,8 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   server share a priority under SCHED_RR, so that they take turns;
 * the thread that begins a chain stands one above the others of its server, if there are any: the
   chain begins as its timer expires, also where another of them runs a callback then;
-* who receives what a shaping node publishes stands below all servers, on the shaping node's core;
+* who receives what a shaping node publishes stands below all servers, on the shaping node's core,
+  or, of several chains, whose servers keep that core busy, on the first core without servers;
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
   the writer's lock, and above them would never let them release it;
 * what a plan has in a best-effort server comes behind all these, on the server's core, under the
@@ -430,6 +431,9 @@ def plan_scheduling(
     planned = {one.thread.identity for group in members.values() for one in group}
     below = min(server_priorities(_ranked(plan.servers)).values()) - _STEP
     cores = {receiver: node.core for node in plan.shaping_nodes for receiver in node.receivers}
+    free = set(available_cores) - {server.core for server in plan.servers}
+    if free and len(plan.chains) > 1:
+        cores = dict.fromkeys(cores, min(free))
     receiving = [
         WantedScheduling(one, Scheduling(max(1, below), (core,)), None, _RECEIVES)
         for one in allocation.threads
@@ -443,6 +447,17 @@ def plan_scheduling(
         clear={node.core for node in plan.shaping_nodes},
         first={begins.node for chain in plan.chains if (begins := first_planned(chain))},
     )
+
+
+def waiting_receivers(plan: ApplicationPlan, wanted: Iterable[WantedScheduling]) -> list[str]:
+    """A note on who receives an output on a core that the servers of other chains keep busy."""
+    busy = {(server.core,) for server in plan.servers if len(plan.chains) > 1}
+    ours = [one for one in wanted if one.reason == _RECEIVES and one.wanted.cores in busy]
+    if not ours:
+        return []
+    nodes = ", ".join(sorted({node for one in ours for node in one.thread.nodes}))
+    reason = "have cores with servers, since all cores have some, and wait for other chains' slots"
+    return [f"callbacks of {nodes} {reason}: leave a core without, or plan with --no-receivers"]
 
 
 def first_planned(chain: Plan) -> PlannedThread | None:

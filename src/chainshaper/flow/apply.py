@@ -137,7 +137,7 @@ def apply_plan(
         run.guardians.await_ready(run.go_on)
         threads.refuse_simulated(given, run.found)
         said = threads.check_publishers(given, run.found, recording)
-        run.schedule()
+        said += allocation.waiting_receivers(given, run.schedule())
         run.begin_state(command, plan_path)
         run.note(*said, *(one for one in run.found.notes if one.endswith(allocation.IN_ORDER)))
         run.find_anchor(phase_ns, progress)
@@ -254,11 +254,12 @@ class _Run:
             progress(min(1.0, waited / wait_ns), "finding the nodes")
             self.stop.wait(min(_LOOK_S, (wait_ns - waited) / 1e9))
 
-    def schedule(self) -> None:
+    def schedule(self) -> tuple[allocation.WantedScheduling, ...]:
         """Give threads their priorities and cores, as far as the back end leaves that to us."""
         wanted = allocation.plan_scheduling(self.plan, self.found, available_cores())
         left = allocation.left_by_back_end(self.choice.name, wanted, self.plan.free_threads)
         change_all(self.journal, ((one.thread.thread, one.wanted) for one in left))
+        return left
 
     def begin_state(self, command: Sequence[str], plan_path: str) -> None:
         self.state = RunState(

@@ -280,7 +280,8 @@ def planned_changes(
         refuse_simulated(plan, found)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
-        return Changes(choice.name, choice.reason, threads, (), found.notes)
+        notes = (*found.notes, *allocation.waiting_receivers(plan, threads))
+        return Changes(choice.name, choice.reason, threads, (), notes)
     notes, anchor_ns = found.notes, 0 if phase_ns is None else phase_ns + LEAD_NS
     try:
         members: dict[str, list[int | str]] = {
