@@ -22,6 +22,8 @@ from pathlib import Path
 import pytest
 from command_line import Finished, called
 
+from chainshaper import load_application_plan
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
@@ -152,6 +154,17 @@ def test_the_python_example_about_traces_runs(tmp_path: Path, recorded: Path) ->
     run = executed(shlex.join(["python", "-c", example]), tmp_path, recorded)
     assert run.code == 0, run.err
     assert "jazzy rmw_cyclonedds_cpp" in run.out
+
+
+def test_the_python_example_about_several_chains_runs(tmp_path: Path, recorded: Path) -> None:
+    page = ROOT / "docs" / "several_chains.md"
+    (example,) = PYTHON.findall(page.read_text())
+    as_in_a_clone(tmp_path)
+    simulated, *_ = commands(page)
+    for command in (simulated, shlex.join([sys.executable, "-c", example])):
+        run = executed(command, tmp_path, recorded)
+        assert run.code == 0, run.err
+    assert len(load_application_plan(tmp_path / "planned.yaml").chains) == 2
 
 
 def test_links_between_pages_lead_somewhere() -> None:

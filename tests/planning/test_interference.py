@@ -1,7 +1,9 @@
 """How long other chains can have a chain's core: by hand, and played out."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,14 +12,20 @@ from hypothesis import strategies as st
 from known import known
 
 from chainshaper import load_application, measure_latency, simulate
-from chainshaper.flow.plan import profile_chains
-from chainshaper.planning import CallbackTimes, PlanRequest, plan_application
+from chainshaper.flow.plan import plan_recording, profile_chains
+from chainshaper.planning import (
+    CallbackTimes,
+    PlanRequest,
+    plan_application,
+    plan_chain,
+    plan_warnings,
+)
 from chainshaper.planning.application_plan import combined
 from chainshaper.planning.overruns import expected
 from chainshaper.planning.profile import Profile, Rival, interference
 from chainshaper.reporting.latency import expected_text
 from chainshaper.values.durations import milliseconds
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy
 
 MS = 1_000_000
@@ -251,3 +259,28 @@ def test_simulated_servers_of_callbacks_begin_at_their_chains_offsets(tmp_path: 
         assert (found.analysis.statistics.max_ns or 0) < one.servers[-1].slots[-1][1]
         starts = found.analysis.traversals["start"] % (100 * MS)
         assert abs(starts - one.offset_ns).max() < MS
+
+
+@pytest.mark.parametrize(
+    ("wishes", "said"),
+    [
+        ({"policy": "pipelined", "first_slot_ns": MS}, "the policy pipelined cuts the whole chain"),
+        ({"policy": "server-per-callback", "first_slot_ns": MS}, "--first-slot gives the first"),
+        ({"policy": "pipelined", "publish_slot_ns": 99 * MS}, "slot 99 ms leave nothing of the"),
+        ({"best_effort": ("/b3",)}, "--best-effort /b3: no node of the recording, name /b1"),
+        ({"best_effort": ("/nothere",)}, "no node of the recording, name /a1 or /a2 or /b1"),
+    ],
+)
+def test_wishes_that_cannot_be_are_refused(wishes: dict[str, Any], said: str) -> None:
+    profile = replace(_profile("a", 40), every_node=("/a1", "/a2", "/b1"))
+    with pytest.raises((InputError, OperationError), match=said):
+        plan_chain(profile, PlanRequest(**wishes))
+
+
+def test_a_list_of_chains_is_for_another_function_and_best_effort_is_no_stage() -> None:
+    with pytest.raises(InputError, match="plan with `plan_application`"):
+        plan_recording("absent", ["/a1../a2", "/b1../b2"])  # type: ignore[arg-type]
+    profile = replace(_profile("a", 40), every_node=("/a1", "/a2", "/b1"))
+    plan = plan_chain(profile, PlanRequest(policy="pipelined", best_effort=("/b1",)))
+    (stages,) = (one for one in plan_warnings(plan) if "stages:" in one)
+    assert "/b1" not in stages

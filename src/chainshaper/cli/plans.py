@@ -49,6 +49,7 @@ def plan(
 
     From a recording, or from bare latencies with their period.
     """
+    from chainshaper.linux.scheduling import available_cores
     from chainshaper.planning import (
         band_choice,
         plan_application,
@@ -71,18 +72,24 @@ def plan(
     profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], how)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     outliers = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
+    strange = [
+        f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
+        for core in sorted({*(request.cores or ())} - {*available_cores()})
+    ]
     if len(planned) > 1:
-        if sinks or curve is not None:
-            raise InputError("--sink and --curve go with one chain: plan chains one by one")
+        if sinks:
+            raise InputError("--sink goes with one chain: name the other output with --chain, too")
+        if curve is not None:
+            raise InputError("--curve goes with one chain: plan it alone")
         joint, remarks = plan_application(planned, request)
-        remarks += outliers
+        remarks += [*outliers, *strange]
         _print_several(joint.chains, remarks, output, json)
         return
     made = cs.plan_chain(planned[0], request, sinks)
     choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
     if output is not None:
         cs.save_plan(made, output)
-    warnings = [*on_cores(profiles, request)[1], *outliers, *plan_warnings(made)]
+    warnings = [*on_cores(profiles, request)[1], *outliers, *strange, *plan_warnings(made)]
     values: dict[str, Any] = {**plan_json(made), "warnings": warnings}
     tables = [plan_table(made)]
     if len(publish_slots(made)) > 1 or made.modes is not None:

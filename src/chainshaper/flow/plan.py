@@ -152,6 +152,7 @@ def _profile_of(
         core_of=core_of,
         executors=named,
         cores=cores,
+        every_node=tuple(node.name for node in graph.nodes),
         together=_together(graph, nodes),
         receivers=tuple(  # tools such as `ros2 topic echo`, which come and go, have hidden names
             node
@@ -536,6 +537,8 @@ def plan_recording(
     ``sinks`` are chains to further outputs of the same graph. Raises: as :func:`profile_chains` and
     :func:`chainshaper.planning.plan_chain`.
     """
+    if not isinstance(chain, str | None):
+        raise InputError("one chain goes here: profile several, and plan with `plan_application`")
     wanted = (chain, *sinks)
     profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
     return plan_chain(profile, request, further)

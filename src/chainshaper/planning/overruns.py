@@ -325,7 +325,8 @@ def _about_stages(plan: Plan) -> Iterator[str]:
     if plan.policy != "pipelined":
         return
     longest, cycle = plan.evidence.max_latency_ns, plan.cycle_ns
-    stages = [server for server in plan.servers if server not in publishing_servers(plan)]
+    beside = publishing_servers(plan)
+    stages = [one for one in plan.servers if one not in beside and not one.best_effort]
     where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
     cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
     waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""

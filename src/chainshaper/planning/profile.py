@@ -53,11 +53,12 @@ class Profile:
     ``measured_ns`` what it took there, where others may delay it to the latency (None: that).
     ``nodes`` and ``topics`` have the node and the topic of each callback of the chain. ``core_of``
     names the core of every node whose executor takes part, also on branches that the chain waits
-    for, ``cores`` that of any node that has one core; of a node with several executors,
-    ``executors`` are those that take part, each by its callbacks. ``begins`` is the first
-    callback's number in the graph, and its name, ``upstream`` the topics that the output waits for:
-    on the chain, on those branches, and before the chain begins. ``receivers`` are other nodes that
-    subscribe to the output. ``callbacks`` are those of the chain and its branches, see
+    for, ``cores`` that of any node that has one core, of ``every_node`` in the recording; of a node
+    with several executors, ``executors`` are those that take part, each by its callbacks.
+    ``begins`` is the first callback's number in the graph, and its name, ``upstream`` the topics
+    that the output waits for: on the chain, on those branches, and before the chain begins.
+    ``receivers`` are other nodes that subscribe to the output. ``callbacks`` are those of the chain
+    and its branches, see
     :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
     are what each callback of the chain took, a row per latency. ``asynchronous``: the process of
     the output's writer has a thread that publishes; ``together`` are nodes that share a process,
@@ -78,6 +79,7 @@ class Profile:
     core_of: Mapping[str, int] = field(default_factory=dict)
     executors: Mapping[str, tuple[tuple[str, ...], ...]] = field(default_factory=dict)
     cores: Mapping[str, int] = field(default_factory=dict)
+    every_node: tuple[str, ...] = ()
     together: tuple[tuple[str, ...], ...] = ()
     receivers: tuple[str, ...] = ()
     callbacks: tuple[CallbackTimes, ...] = ()

@@ -9,6 +9,7 @@ makes that one later than was measured, and its slot too early. Such chains are 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import partial
 from itertools import combinations, permutations
 from typing import Any, Literal
@@ -76,6 +77,7 @@ from chainshaper.values.plan_choices import Policy, Wishes
 DEFAULT_CORE = 1
 OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
+_CUT = ("pipelined", "server-per-callback")
 _LIMITS = ("grid_ns", "max_gap_ns", "max_share")
 
 
@@ -137,12 +139,21 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         )
     measured = profile
     if request.policy in OWN_SLOTS:  # shaping, only the start of the plan, must fit into a cycle
-        most = max(1, period - margin.epsilon_ns - _slot_ns(profile, request))
+        length = _slot_ns(profile, request)
+        if (most := period - margin.epsilon_ns - length) < 1:
+            raise OperationError(
+                f"the margin {duration_text(margin.epsilon_ns)} and the publish slot"
+                f" {duration_text(length)} leave nothing of the cycle of {duration_text(period)}:"
+                " plan with a shorter publish slot, or a smaller margin"
+            )
         latencies = np.minimum(check_latencies(profile.latencies_ns), most)
         measured = replace(profile, latencies_ns=latencies)
     plan = finish(_shaped(measured, request, margin, sinks))
     if request.policy in OWN_SLOTS:
-        figures = evidence_of(profile.latencies_ns).model_dump(exclude_unset=True)
+        delay_ns = profile.interference_ns
+        figures = evidence_of(profile.latencies_ns, interference_ns=delay_ns).model_dump(
+            exclude_unset=True
+        )
         plan = revised(plan, evidence=plan.evidence.model_copy(update=figures))
     for sink in sinks:
         if not sink.topics:
@@ -179,6 +190,11 @@ def best_effort_cores(profiles: Sequence[Profile], request: PlanRequest) -> dict
     cores = {node: core for one in profiles for node, core in one.cores.items()}
     chain = profiles[0].core_of.get(profiles[0].last or "", DEFAULT_CORE)
     names = ["/" + name.strip("/") for name in request.best_effort]
+    known = sorted({node for one in profiles for node in one.every_node})
+    for name in names if known else ():
+        if name not in known:
+            near = " or ".join(get_close_matches(name, known) or known[:5])
+            raise InputError(f"--best-effort {name}: no node of the recording, name {near}")
     return {name: cores.get(name, chain) for name in names}
 
 
@@ -487,6 +503,9 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
     cores = request.cores or ()
     if request.policy != "pipelined" and len(set(cores)) < len(cores):
         raise InputError("--cores names a core twice, which only stages may have: name each once")
+    if request.first_slot_ns is not None and request.policy in _CUT:
+        reason = f"and the policy {request.policy} cuts the whole chain into servers"
+        raise InputError(f"--first-slot gives the first node a server, {reason}: leave it out")
     if request.policy == "shaped":
         return
     why = f"which the policy {request.policy} has not: leave it out, or plan with the policy shaped"
