@@ -272,7 +272,7 @@ def _checked(
 def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
     """What is broken of a budget's limits in the last minute; what has never run breaks none.
 
-    All outputs of a chain that has run are missing where the chain is not found any more.
+    All outputs are missing of a chain that has run, and had none in the last minute.
     """
     of_chain = {one.chain: one for one in seen.chains}
     found: list[Judged] = []
@@ -281,7 +281,7 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
         if now is None:
             continue
         minute = now.spans["minute"]
-        stopped = now.problem or (None if minute.count else "no output in the last minute")
+        stopped = None if minute.count else now.problem or "no output in the last minute"
         if stopped and chain.missing is not None and now.counted["complete"]:
             found.append(Judged("now", chain.chain, "missing", chain.missing, 1.0, because=stopped))
             chain = chain.model_copy(update={"missing": None})  # noqa: PLW2901
