@@ -252,7 +252,7 @@ def test_several_chains_of_a_recording_and_a_further_sink(tmp_path: Path) -> Non
     assert "the plan is of several chains" in refused(
         *(2, "sweep", TWO_CHAINS, file, "--vary", "plan.margin.epsilon=1ms", "-o", "x.parquet")
     )
-    assert "one by one" in refused(2, "plan", recording, *chains, "--sink", "/scan../map")
+    assert "with --chain, too" in refused(2, "plan", recording, *chains, "--sink", "/scan../map")
     values = json_of("plan", recording, *chains[:2], "--sink", "/scan../map")
     assert [node["output"] for node in values["further_shaping_nodes"]] == ["/map"]
     twice = refused(2, "plan", recording, "--sink", "/scan../command")

@@ -250,7 +250,7 @@ def test_a_promise_is_judged_in_one_line_and_an_exit_code(tmp_path: Path) -> Non
     assert kept.out.splitlines()[-1].startswith("after: promise met: jitter 0.000 ms, 0 of 320")
     broken = called("compare", after, before, "--plan", plan, "--strict")
     assert broken.code == 1
-    assert "before: promise broken: average" in broken.out.splitlines()[-1]
+    assert "before: promise broken: jitter" in broken.out.splitlines()[-1]
     assert broken.err == "error: the plan's promise is not met (--strict)\n"
     assert "name the plan in force" in called("compare", before, before, "--strict").err
     assert json_of("compare", before, after)["recordings"][1]["prediction"]["kept"] is True

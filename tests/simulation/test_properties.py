@@ -90,7 +90,7 @@ def descriptions(draw: st.DrawFn) -> dict[str, Any]:
 
 def recorded(description: dict[str, Any], servers: tuple[Server, ...] = ()) -> Recording:
     described = application(yaml.safe_dump(description))
-    governed = plan(*servers, cycle_ms=PERIOD_MS) if servers else None
+    governed = plan(*servers, chain=description["chain"], cycle_ms=PERIOD_MS) if servers else None
     with tempfile.TemporaryDirectory() as folder:
         recording = simulate(described, Path(folder) / "r", governed, cycles=12, switches=True)
         loaded = {name: recording.events[name] for name in recording.events}

@@ -19,9 +19,11 @@ from chainshaper.values.recording import Recording
 CASES = yaml.safe_load(Path(__file__).with_name("schedules.yaml").read_text())
 
 
-def plan(*servers: Server, cycle_ms: int = 20, offset_ms: int = 0, **more: Any) -> Plan:
+def plan(
+    *servers: Server, chain: str = "a", cycle_ms: int = 20, offset_ms: int = 0, **more: Any
+) -> Plan:
     """A plan that consists of servers only."""
-    return bare_plan("a", cycle_ms * MS, *servers, offset_ns=offset_ms * MS, **more)
+    return bare_plan(chain, cycle_ms * MS, *servers, offset_ns=offset_ms * MS, **more)
 
 
 def server(priority: int, nodes: list[str], slots: list[list[int]]) -> Server:
@@ -62,7 +64,8 @@ def test_a_schedule_is_the_one_worked_out_by_hand(tmp_path: Path, case: dict[str
         servers = [server(*each) for each in case["servers"]]
         turns = case.get("equal_priorities", "apart")
         offset_ms = case.get("offset_ms", 0)
-        governed = plan(*servers, offset_ms=offset_ms, equal_priorities=turns)
+        chain = case.get("chain", next(iter(case["nodes"])))
+        governed = plan(*servers, chain=chain, offset_ms=offset_ms, equal_priorities=turns)
     recording = simulated(tmp_path, described(case), governed, case.get("cycles", 1))
     if "callbacks" in case:
         assert callbacks(recording) == [tuple(each) for each in case["callbacks"]]
