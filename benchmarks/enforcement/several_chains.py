@@ -9,6 +9,7 @@ left, over all of them, and how many were late; recordings stay in DIR. Nothing 
 """
 
 import argparse
+import json
 import subprocess
 import sys
 import tempfile
@@ -17,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import yaml
 from rich.console import Console
 from rich.table import Table
 
@@ -84,14 +84,12 @@ def shaped(
         "nodes": {**nodes, "sink": sink},
     }
     application, plan = folder / "app.yaml", folder / "plan.yaml"
-    application.write_text(yaml.safe_dump(described, sort_keys=False))
+    application.write_text(json.dumps(described))  # which is YAML, without aliases
     run("run", application, "-o", folder / "before", "--cycles", str(cycles))
     wanted = [word for chain in chains for word in ("--chain", chain)]
     run("plan", folder / "before", *wanted, "--epsilon", epsilon, "-o", plan)
     spliced = splice_application(cs.load_application(application), cs.load_application_plan(plan))
-    (folder / "spliced.yaml").write_text(
-        yaml.safe_dump(application_as_written(spliced), sort_keys=False)
-    )
+    (folder / "spliced.yaml").write_text(json.dumps(application_as_written(spliced)))
     command = (*CHAINSHAPER, "run", folder / "spliced.yaml", "-o", folder / "after")
     run("apply", plan, "--", *command, "--cycles", str(cycles))
     recording = cs.open_recording(folder / "after")
