@@ -243,7 +243,8 @@ def check(
     with out.late_progress("check") as report:
         if budget is not None:
             found = budgets.check_budgets(paths, limits, report, scheduler)
-            unread = {own[0].recording for own in found if own[0].what == budgets.EVENTS}
+            every_one = (one for own in found for one in own)  # none where a budget limits nothing
+            unread = {one.recording for one in every_one if one.what == budgets.EVENTS}
             paths = [path for path in paths if str(path) not in unread]
         if before and paths:
             from chainshaper.verify.slowdowns import slowdowns_in

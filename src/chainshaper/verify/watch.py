@@ -423,11 +423,8 @@ class Watch:
     def _tables(self, since_ns: int) -> EventTables:
         """All that was created, but for what ended before an instant, and what happened since."""
         self._take_fresh(time.monotonic_ns())
-        created = (
-            tables
-            for pid, (_, tables, _) in self._created.items()
-            if self._latest[pid] >= since_ns or Path(f"/proc/{pid}").exists()
-        )
+        gone = {pid for pid in self._ended() if self._latest[pid] < since_ns}
+        created = (tables for pid, (_, tables, _) in self._created.items() if pid not in gone)
         recent = (tables for last, tables in self._recent if last >= since_ns)
         return joined_tables([*created, *recent])
 
