@@ -11,6 +11,7 @@ is its own server, unless the plan says otherwise (`shaping_thread`): it has no 
 
 import contextlib
 import json
+import math
 import os
 import subprocess
 import threading
@@ -293,7 +294,8 @@ class _Run:
                     if phase.spread_ns > LEAD_NS
                 )
             )
-            self.anchor_ns = threads.common_anchor(self.given, phases)
+            gated = gates(self.choice.name)
+            self.given, self.anchor_ns = threads.placed(self.given, phases, gated=gated)
             self.waits_ns = [
                 (self.anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
                 for chain, phase in zip(self.given.chains, phases, strict=True)
@@ -342,9 +344,8 @@ class _Run:
             return LEAD_NS
         if not self.waits_ns:
             return 0
-        first, _ = next(allocation.in_order_of_slots(chain))
-        waits = first.slots[0][0] > 0 or first.slots[-1][1] < chain.cycle_ns
-        return 0 if waits else self.waits_ns[place]
+        is_always_open = allocation.closed_before(chain) == math.inf
+        return self.waits_ns[place] if is_always_open else 0
 
     def tell(self, moved_ns: Mapping[int, int]) -> None:
         """Begin to give shaping nodes of these chains where cycles, moved by so much, begin."""

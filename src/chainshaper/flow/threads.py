@@ -6,6 +6,7 @@ in their own pid namespace. Which nodes a process has, its creation events say; 
 execute, the callbacks they ran.
 """
 
+import math
 import platform
 import re
 import time
@@ -14,7 +15,7 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import combinations, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree
@@ -48,7 +49,7 @@ from chainshaper.planning.application_plan import (
     whole,
     with_slots_moved,
 )
-from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.offsets import chain_name, linked
 from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
 from chainshaper.planning.plan import (
     Adaptation,
@@ -271,7 +272,7 @@ def planned_changes(
     """What :func:`.apply_plan` would do, with the same errors. LITMUS^RT's commands are given on
     any kernel, with ``TID:NODE`` for threads that do not run.
     """
-    plan = open_until_done(whole(plan))
+    given, plan = whole(plan), open_until_done(whole(plan))
     table = server_table(plan)
     found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
@@ -284,12 +285,13 @@ def planned_changes(
         return Changes(choice.name, choice.reason, threads, (), notes)
     notes, anchor_ns = found.notes, 0 if phase_ns is None else phase_ns + LEAD_NS
     try:
+        if phase_ns is None:
+            given, anchor_ns = placed(given, chain_phases(given, found))
+            table = server_table(open_until_done(given))
         members: dict[str, list[int | str]] = {
             name: [member.thread.tid for member in group]
             for name, group in allocation.server_members(plan, found).items()
         }
-        if phase_ns is None:
-            anchor_ns = common_anchor(plan, chain_phases(plan, found))
     except OperationError:
         members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
         notes += ("slots are counted from a beginning that is measured when the chain runs",)
@@ -391,18 +393,50 @@ def chain_phases(
     return [phases[one] for one in wanted]
 
 
-def common_anchor(plan: ApplicationPlan, phases: Sequence[Phase]) -> int:
-    """The instant of CLOCK_MONOTONIC, modulo the hyper-period, from which all cycles count: every
-    slot opens :data:`LEAD_NS` after its chain's timer at least, and the longest of these waits is
-    as short as can be.
+def placed(
+    plan: ApplicationPlan, phases: Sequence[Phase], *, gated: bool = True
+) -> tuple[ApplicationPlan, int]:
+    """The plan, and the instant of CLOCK_MONOTONIC, modulo the hyper-period, from which its cycles
+    count, so that every slot opens :data:`LEAD_NS` after its chain's timer at least.
+
+    Chains that share no core have timers that expire independently: their offsets are moved, all of
+    a core's alike, so that these do not wait for others'. The longest wait of chains that share one
+    is as short as can be, but no timer is to expire while its slot is open (``gated``): the thread
+    would begin in that of the instance before. Raises OperationError: one does, wherever cycles
+    count from.
     """
-    hyper = plan.cycle_ns
-    wanted = [
-        (phase.at_ns + LEAD_NS - chain.offset_ns, chain.cycle_ns)
-        for chain, phase in zip(plan.chains, phases, strict=True)
-    ]
+    cores = [{server.core for server in chain.servers} for chain in plan.chains]
+    pairs = combinations(range(len(cores)), 2)
+    groups = linked(len(cores), [(j, k) for j, k in pairs if cores[j] & cores[k]])
+    chains, first_ns = list(plan.chains), None
+    for group in groups:
+        anchor_ns = _anchor([(chains[k], phases[k]) for k in group], gated=gated)
+        first_ns = anchor_ns if first_ns is None else first_ns
+        for k in group:
+            offset_ns = (chains[k].offset_ns + anchor_ns - first_ns) % chains[k].cycle_ns
+            chains[k] = revised(chains[k], offset_ns=offset_ns)
+    return combined(chains), first_ns or 0
+
+
+def _anchor(chains: Sequence[tuple[Plan, Phase]], *, gated: bool) -> int:
+    """From when on the cycles of chains that share cores count."""
     # Waits only grow with the anchor, but where one starts again: the best is at such a place.
-    candidates = {
-        (first + n * cycle) % hyper for first, cycle in wanted for n in range(hyper // cycle)
-    }
-    return min(sorted(candidates), key=lambda at: max((at - one) % cycle for one, cycle in wanted))
+    hyper = math.lcm(*(chain.cycle_ns for chain, _ in chains))
+    begin = [(phase.at_ns + LEAD_NS - chain.offset_ns, chain.cycle_ns) for chain, phase in chains]
+    candidates = {(at + n * cycle) % hyper for at, cycle in begin for n in range(hyper // cycle)}
+    closed = [allocation.closed_before(chain) if gated else math.inf for chain, _ in chains]
+
+    def cost(at: int) -> tuple[int, int]:
+        waits = [LEAD_NS + (at - one) % cycle for one, cycle in begin]
+        least = zip(waits, closed, strict=True)
+        return sum(wait > max(LEAD_NS, most) for wait, most in least), max(waits)
+
+    best = min(sorted(candidates), key=cost)
+    if cost(best)[0]:
+        names = ", ".join(chain_name(chain) for chain, _ in chains)
+        raise OperationError(
+            f"the timers of {names} expire so that, wherever cycles begin, one does while the slot"
+            " of its instance before is open: start the nodes again, one after the other, and their"
+            " timers expire at other instants"
+        )
+    return best

@@ -1,0 +1,113 @@
+"""From when on the cycles of several running chains count, by hand and against brute force."""
+
+import math
+from collections.abc import Sequence
+
+import pytest
+from bare_plans import MS, bare_plan
+from hypothesis import given
+from hypothesis import strategies as st
+
+from chainshaper.flow.phase import Phase
+from chainshaper.flow.threads import LEAD_NS, placed
+from chainshaper.planning.application_plan import ApplicationPlan, combined
+from chainshaper.planning.plan import Plan, Server, Thread
+from chainshaper.values.errors import OperationError
+
+LEAD = LEAD_NS // MS
+
+
+def _chain(name: str, cycle: int, offset: int, end: int, *, core: int = 1, rank: int = 2) -> Plan:
+    """A chain whose one server is open for its first ``end`` ms."""
+    own = (Thread(node=f"/{name}"),)
+    slots = ((0, end * MS),)
+    server = Server(name=name, core=core, priority=rank, slots=slots, threads=own)
+    return bare_plan(f"{name}..", cycle * MS, server, output=f"/{name}", offset_ns=offset * MS)
+
+
+def _waits(plan: ApplicationPlan, anchor_ns: int, phases: Sequence[int]) -> list[int]:
+    """From each chain's timer to its slot, in ms."""
+    pairs = zip(plan.chains, phases, strict=True)
+    return [(anchor_ns + c.offset_ns - at * MS) % c.cycle_ns // MS for c, at in pairs]
+
+
+def _placed(chains: Sequence[Plan], phases: Sequence[int], *, gated: bool = True) -> list[int]:
+    found = [Phase(at * MS, 0) for at in phases]
+    return _waits(*placed(combined(chains), found, gated=gated), phases)
+
+
+def test_chains_on_cores_of_their_own_do_not_wait_for_each_other() -> None:
+    """With one anchor for both, the second timer (at 40 ms) would expire in its slot of 83 ms."""
+    one, two = _chain("a", 100, 0, 83), _chain("b", 100, 0, 83, core=0)
+    plan, anchor_ns = placed(combined([one, two]), [Phase(10 * MS, 0), Phase(40 * MS, 0)])
+    assert (anchor_ns, plan.chains[1].offset_ns) == ((10 + LEAD) * MS, 30 * MS)
+    assert _waits(plan, anchor_ns, [10, 40]) == [LEAD, LEAD]
+
+
+def test_chains_of_one_core_are_moved_together() -> None:
+    """The two that share core 1 stay 30 ms apart, wherever the third is."""
+    shared = _chain("a", 100, 0, 20), _chain("c", 100, 30, 20)
+    chains = [shared[0], _chain("b", 100, 70, 20, core=0), shared[1]]
+    plan, _ = placed(combined(chains), [Phase(at * MS, 0) for at in (0, 50, 40)])
+    first, second, third = (chain.offset_ns // MS for chain in plan.chains)
+    assert (third - first) % 100 == 30
+    assert (second - first) % 100 == 40  # its wait is LEAD, a's 10 ms longer, for c's is LEAD
+
+
+def test_no_timer_expires_in_its_own_slot_where_that_can_be() -> None:
+    """By hand: b's slot begins 30 ms after a's, and takes 30 of 50 ms.
+
+    Timers at the same instant: where a waits for 2 ms, b waits for 32 and expires 18 ms after its
+    slot has opened. Where b waits for 2, a does for 22 of the 80 ms for which it is closed.
+    """
+    chains = [_chain("a", 100, 0, 20), _chain("b", 50, 30, 20 + 10, rank=3)]
+    assert _placed(chains, [0, 0]) == [20 + LEAD, LEAD]
+    # Nothing stops threads under priorities alone: there the longest wait is the shortest.
+    assert _placed(chains, [0, 10], gated=False) == [LEAD, 20 + LEAD]
+
+
+def test_a_chain_that_is_never_stopped_may_begin_at_any_time() -> None:
+    chains = [_chain("a", 100, 0, 100), _chain("b", 100, 0, 60, rank=3)]
+    assert _placed(chains, [0, 40]) == [40 + LEAD, LEAD]
+
+
+def test_timers_that_allow_no_beginning_are_named() -> None:
+    """Each of three on one core, at priorities of their own, is closed for 25 of 100 ms."""
+    chains = [_chain(name, 100, 0, 75, rank=k + 2) for k, name in enumerate("abc")]
+    with pytest.raises(OperationError, match=r"timers of a\.\., b\.\., c\.\. .* nodes again"):
+        _placed(chains, [0, 33, 66])
+
+
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([20, 40, 80]), st.integers(0, 79), st.integers(1, 80)),
+        min_size=2,
+        max_size=4,
+    ),
+    st.lists(st.integers(0, 79), min_size=4, max_size=4),
+)
+def test_the_anchor_is_the_best_of_all(
+    wanted: list[tuple[int, int, int]], phases: list[int]
+) -> None:
+    """Against every millisecond of the hyper-period: hardly a slot open, then the longest wait."""
+    chains = [
+        _chain(f"c{k}", cycle, offset % cycle, min(end, cycle - 1), rank=k + 2)
+        for k, (cycle, offset, end) in enumerate(wanted)
+    ]
+    phases = phases[: len(chains)]
+    closed = [(chain.cycle_ns - chain.servers[0].slots[0][1]) // MS for chain in chains]
+    plan, hyper = combined(chains), math.lcm(*(cycle for cycle, _, _ in wanted))
+
+    def cost(waits: Sequence[int]) -> tuple[int, int]:
+        # Before its lead is over, a chain waits for its slot in the next cycle.
+        cycles = (cycle for cycle, _, _ in wanted)
+        full = [w if w >= LEAD else w + cycle for w, cycle in zip(waits, cycles, strict=True)]
+        pairs = zip(full, closed, strict=True)
+        return sum(wait > max(LEAD, most) for wait, most in pairs), max(full)
+
+    best = min(cost(_waits(plan, at * MS, phases)) for at in range(hyper))
+    if best[0]:
+        with pytest.raises(OperationError, match="nodes again"):
+            _placed(chains, phases)
+    else:
+        assert cost(_placed(chains, phases)) == best
