@@ -132,6 +132,28 @@ def test_a_drift_is_followed_in_steps_of_one_direction(direction: int) -> None:
     assert 5 <= len(moves) <= 25
 
 
+def test_outputs_that_wait_for_the_one_before_are_no_step() -> None:
+    """A standstill of 60 ms, of a chain of 11 ms every 20: each is 9 ms less late than the last."""
+    latencies = np.random.default_rng(2).normal(11 * MS, 0.3 * MS, 9_000)
+    start = float(np.quantile(latencies, 0.99))
+    latencies[5_000:5_007] = np.arange(71, 8, -9) * MS
+    ((at, to),) = follow(latencies, start)[:1]
+    assert 5_000 < at < 5_007, "taken for a step"
+    assert to > 1.5 * start
+    assert follow(latencies, start, cycle_ns=20 * MS) == []
+
+
+@pytest.mark.parametrize("grown", [1.3, 2.5])
+def test_a_step_is_one_also_where_outputs_wait(grown: float) -> None:
+    """Even beyond the cycle, where every output is behind one that took longer."""
+    latencies = np.random.default_rng(3).normal(11 * MS, 0.3 * MS, 9_000)
+    start = float(np.quantile(latencies, 0.99))
+    latencies[6_000:] *= grown
+    (at, to), *_ = follow(latencies, start, cycle_ns=20 * MS)
+    assert 6_000 < at < 6_000 + 2 * RULES.window // 8
+    assert to > grown * 0.98 * 11 * MS
+
+
 # Plans ------------------------------------------------------------------------------------------
 
 

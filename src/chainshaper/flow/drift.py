@@ -19,6 +19,7 @@ The latencies of an output are in its gate's page of memory, and tell where its 
 same cycle.
 """
 
+import math
 import os
 import threading
 from collections import deque
@@ -166,7 +167,8 @@ class SlotFollower:
         earliest, latest = (self._planned_ns + by for by in reach_ns)
         promised = chain.margin.overrun_probability or OVERRUN_PROBABILITY
         usual, rules = chain.evidence.mean_latency_ns, chain.adaptation or Adaptation()
-        self._tail = Tail(rules, promised, self._planned_ns, usual, latest, earliest)
+        cycle_ns = math.inf if chain.policy == "pipelined" else chain.cycle_ns
+        self._tail = Tail(rules, promised, self._planned_ns, usual, latest, earliest, cycle_ns)
         self._cores, self._stop = cores, threading.Event()
         self._thread = threading.Thread(target=self._follow, name="slot-follower", daemon=True)
         self._thread.start()

@@ -366,7 +366,8 @@ class Tail:
     """Where the slot of an output has to begin, from latencies as they come (ns).
 
     Those later than ``start_ns``, where it begins now, are to be the share ``promised`` at most.
-    ``usual_ns`` is the median as planned.
+    ``usual_ns`` is the median as planned. An output behind one that took longer than ``cycle_ns``
+    waited for that: one standstill makes several late, which are no sign that the tail has grown.
 
     The window is what came since the last change, :attr:`.Adaptation.window` cycles at most:
 
@@ -387,6 +388,7 @@ class Tail:
     usual_ns: float
     latest_ns: int
     earliest_ns: int = 0
+    cycle_ns: float = math.inf
     seen: int = 0
     _latencies: _Floats = field(init=False)
     _begin: int = 0
@@ -407,10 +409,11 @@ class Tail:
             window = self.rules.window
             self._latencies[:window] = self._latencies[window:]
             self._begin, self._end = self._begin - window, window
+        waited = self._end > 0 and self._latencies[self._end - 1] > self.cycle_ns
         self._latencies[self._end] = latency_ns
         self._end, self.seen = self._end + 1, self.seen + 1
         self._begin = max(self._begin, self._end - self.rules.window)
-        if latency_ns > self.start_ns:
+        if latency_ns > self.start_ns and not waited:
             self._lates.append(self.seen)
             for cycles in AT_ONCE:
                 most = _by_chance(cycles, min(0.5, self.rules.late * self.promised), DOUBT_AT_ONCE)
