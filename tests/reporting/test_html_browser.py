@@ -6,6 +6,7 @@ No assertion depends on how fast the browser is. Where there is none, these test
 import io
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -126,6 +127,16 @@ def test_another_recording_and_an_incomplete_cycle_can_be_chosen(page: Page) -> 
     assert not [label for label in page.run(labels) if "server" in label], "no plan was in force"
     assert _open(page, 1, 6).startswith("Cycle 6: incomplete: lost (/t1)")
     assert [label for label in page.run(labels) if "server output" in label]
+
+
+def test_the_cycle_for_which_a_recording_was_written_is_open(tmp_path: Path) -> None:
+    run = known_run(tmp_path / "flight", 8)
+    starts = measure_latency(run).analysis.traversals["start"]
+    written = replace(run, info=run.info.model_copy(update={"worst_ns": (starts[3],)}))
+    report = write_report([measure_latency(written)], tmp_path / "report.html")
+    with opened(report, tmp_path / "profile") as page:
+        page.wait_for("document.documentElement.dataset.drawn === 'yes'")
+        assert page.run("document.querySelector('#timeline input').value") == "3"
 
 
 def _ticks(page: Page, chart: str) -> list[float]:

@@ -1,6 +1,7 @@
 """The rows that timelines draw, in a run whose every instant is known by hand."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -133,6 +134,18 @@ def _bars(data: dict[str, Any], kind: str) -> list[tuple[Any, ...]]:
         )
         if KINDS[what] == kind
     ]
+
+
+def test_what_a_flight_recorder_was_asked_for_is_shown_first(tmp_path: Path) -> None:
+    """Of so many cycles that not all are in the page, here the 778th."""
+    known = known_run(tmp_path / "known", 1_000)
+    assert "first" not in _page_data(known)["chosen"]
+    starts = measure_latency(known).analysis.traversals["start"]
+    info = known.info.model_copy(update={"worst_ns": (starts[777],)})
+    data = _page_data(replace(known, info=info))
+    assert data["chosen"]["first"] == 777
+    assert 777 in [cycle["n"] for cycle in data["cycles"]]
+    assert len(data["cycles"]) < 1_000
 
 
 def test_a_page_has_all_of_few_cycles(tmp_path: Path) -> None:

@@ -172,7 +172,7 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
     with running(tmp_path, 400):
         watch = own_watch()
         watched(watch, 1.5)
-        recording = watch.save(tmp_path / "flight")
+        recording = watch.save(tmp_path / "flight", reasons=["too slow"])
         with pytest.raises(InputError, match="exists"):
             watch.save(tmp_path / "flight")
         plan = plan_recording(recording, CHAIN)
@@ -190,7 +190,16 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
     assert in_time.early + in_time.shares[0] <= 1.0
     assert in_time.spans["hour"].late is not None
     assert in_time.spans["hour"].late <= 2, "of a machine that stands still"
-    assert measure_latency(recording).analysis.statistics.count >= 20
+    measured = measure_latency(recording).analysis
+    assert measured.statistics.count >= 20
+    assert recording.info.notes[-1] == "too slow"
+    (worst_ns,) = recording.info.worst_ns
+    ((longest_ns, complete),) = (
+        measured.traversals.filter(start=worst_ns).select("latency_ns", "complete").rows()
+    )
+    until_then = measured.traversals.filter(pl.col("start") <= watch._over_ns)
+    assert complete == until_then["complete"].all()
+    assert not complete or longest_ns == until_then["latency_ns"].max()
     assert list(recording.info.processes.values()) == ["/first, /second"]
     shown = called("latency", recording.path)
     assert shown.code == 0, shown.err

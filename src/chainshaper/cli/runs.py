@@ -389,7 +389,7 @@ def _judging(
         breaks = {(one.where, one.what) for one in broken}
         if new:
             out.say("; ".join(new))
-            _save(watched, recorder)
+            _save(watched, recorder, new)
         if not named_at and any(seen.processes.values()):
             named_at = seen.at_ns + PATIENCE_NS
         if 0 < named_at <= seen.at_ns:
@@ -400,12 +400,12 @@ def _judging(
     return judged
 
 
-def _save(watched: "Watch", recorder: Path) -> None:
+def _save(watched: "Watch", recorder: Path, reasons: Sequence[str] = ()) -> None:
     """Have the flight recorder write; that it cannot is no reason to stop watching."""
     try:
         folder = _own_folder(recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}")
         try:
-            out.say(f"the last ten seconds are in {watched.save(folder).path}")
+            out.say(f"the last ten seconds are in {watched.save(folder, reasons=reasons).path}")
         finally:
             with suppress(OSError):
                 folder.rmdir()  # it is empty: nothing was written

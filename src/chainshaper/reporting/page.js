@@ -383,7 +383,7 @@ function plotTimeline({ recordings, n: suffix }) {
   select.addEventListener("change", () => { choose(select.selectedIndex); open(timeline.chosen.median ?? 0); });
   number.addEventListener("change", () => open(Number(number.value)));
   choose(recordings.length - 1);
-  open(timeline.chosen.longest ?? 0);
+  open(timeline.chosen.first ?? timeline.chosen.longest ?? 0);
   return (which, wanted) => {
     if (which !== select.selectedIndex) choose(which);
     open(wanted);

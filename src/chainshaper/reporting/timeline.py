@@ -8,7 +8,7 @@ a long one the longest and the shortest, the median, those without an end, those
 by number, and a sample of the others.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -167,7 +167,7 @@ def _origins(
 def timeline_data(
     measurement: Measurement, timeline: Timeline, cycles: Sequence[int], zero: int
 ) -> dict[str, Any]:
-    """What the page draws around its cycles, and which of them are worst, median and best.
+    """What the page draws around its cycles, and which of them it opens.
 
     ``rows`` are the chain, threads, servers and cores, each with a remark; ``gaps`` are stretches
     of which the page has nothing. Bars are in the columns of :data:`BARS`: ``kind`` is the number
@@ -175,8 +175,10 @@ def timeline_data(
     ``used`` the execution time.
     """
     analysis = measurement.analysis
-    chosen = _cycles_in_page(analysis.traversals, timeline.slices.height, cycles)
-    traversals = analysis.traversals.filter(pl.col("traversal").is_in(chosen))
+    chosen = _chosen(analysis.traversals, measurement.recording.info.worst_ns)
+    per_cycle = timeline.slices.height / max(1, analysis.traversals.height)
+    in_page = _cycles_in_page(analysis.traversals, per_cycle, cycles, chosen.values())
+    traversals = analysis.traversals.filter(pl.col("traversal").is_in(in_page))
     windows = _windows(traversals, timeline)
     stalls = _inside(timeline.stalls.sort("start"), windows)
     servers = () if measurement.plan is None else measurement.plan.servers
@@ -217,7 +219,7 @@ def timeline_data(
         "cycles": list(_cycles(traversals, hops, timeline.slots, zero)),
         "hops": [f"{labels[callback]} → {topic}" for callback, topic in passed],
         "of": analysis.traversals.height,
-        "chosen": _chosen(analysis.traversals),
+        "chosen": chosen,
     }
 
 
@@ -284,22 +286,27 @@ def _cycles(
         yield {**cycle, "length": max(1000, *ends)}
 
 
-def _chosen(traversals: pl.DataFrame) -> dict[str, int]:
-    """The longest, median and shortest undisturbed cycle; of all complete if all are disturbed."""
+def _chosen(traversals: pl.DataFrame, worst_ns: Sequence[int]) -> dict[str, int]:
+    """The longest, median and shortest undisturbed cycle, of all complete if all are disturbed; and
+    that for which the recording was written, which the page shows first.
+    """
+    worst = traversals.filter(pl.col("start").is_in(worst_ns))["traversal"].head(1)
+    first = {} if worst.is_empty() else {"first": int(worst[0])}
     complete = traversals.filter("complete")
     calm = complete.filter(~pl.col("disturbed"))
     ordered = (calm if calm.height else complete).sort("latency_ns", maintain_order=True)
     numbers = ordered["traversal"].to_list()
     if not numbers:
-        return {}
+        return first
     middle = numbers[(len(numbers) - 1) // 2]
-    return {"longest": numbers[-1], "median": middle, "shortest": numbers[0]}
+    return {"longest": numbers[-1], "median": middle, "shortest": numbers[0], **first}
 
 
-def _cycles_in_page(traversals: pl.DataFrame, slices: int, asked: Sequence[int]) -> list[int]:
+def _cycles_in_page(
+    traversals: pl.DataFrame, slices: float, asked: Sequence[int], chosen: Iterable[int]
+) -> list[int]:
     """All cycles where they are few; else those asked for, extremes, incomplete, and a sample."""
-    per_cycle = max(1.0, slices / max(1, traversals.height))
-    room = max(2 * EXTREMES + 1, min(CYCLES, int(SLICES / per_cycle)))
+    room = max(2 * EXTREMES + 1, min(CYCLES, int(SLICES / max(1.0, slices))))
     every = traversals["traversal"].to_list()
     if len(every) <= room:
         return every
@@ -307,7 +314,7 @@ def _cycles_in_page(traversals: pl.DataFrame, slices: int, asked: Sequence[int])
     ordered = traversals.filter("complete").sort("latency_ns", maintain_order=True)["traversal"]
     candidates = [
         *(cycle for cycle in asked if cycle in known),
-        *_chosen(traversals).values(),
+        *chosen,
         *ordered.tail(EXTREMES),
         *ordered.head(EXTREMES),
         *traversals.filter(~pl.col("complete"))["traversal"].head(EXTREMES),

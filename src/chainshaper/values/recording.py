@@ -95,6 +95,7 @@ class RecordingInfo(BaseModel, frozen=True):
     that are known to be missing, by reason. ``realtime``: SCHED_FIFO was in force for every thread
     that was to have it. ``trace_events`` counts all events of a trace that was converted. Processes
     and threads have the numbers of ``pid_namespace`` (its inode); None: each its own.
+    ``worst_ns`` are the starts of cycles for which a flight recorder has written it.
     """
 
     format: Integer = FORMAT
@@ -111,6 +112,7 @@ class RecordingInfo(BaseModel, frozen=True):
     endpoints: tuple[EndpointInfo, ...] = ()
     realtime: bool | None = None  # None: unknown
     notes: tuple[str, ...] = ()
+    worst_ns: tuple[Integer, ...] = ()
     lost: dict[str, Integer] = {}
     trace_events: dict[str, Integer] = {}
     stall_meter: StallMeterInfo | None = None

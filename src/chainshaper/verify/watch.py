@@ -206,6 +206,12 @@ class _Chain:
         gone = begun.height - whole.height
         return latency_statistics(whole["latency_ns"].to_numpy(), incomplete=gone, late=late)
 
+    def worst_ns(self, since_ns: int) -> tuple[int, ...]:
+        """The start of the cycle, since an instant, that has no output, or took longest."""
+        rows = self.cycles.filter(pl.col("start") >= since_ns)
+        worst = rows.sort("latency_ns", descending=True, nulls_last=False, maintain_order=True)
+        return tuple(worst["start"].head(1))
+
     def shares(self) -> tuple[tuple[float, ...], float]:
         """Of all outputs those within each slot, and those before the first one."""
         places = self.cycles.drop_nulls("latency_ns")["place_ns"].drop_nulls().to_numpy()
@@ -447,8 +453,10 @@ class Watch:
         while self._recent and self._recent[0][0] < self._needed_ns(now_ns):
             self._recent.popleft()
 
-    def save(self, output: str | Path) -> Recording:
+    def save(self, output: str | Path, *, reasons: Sequence[str] = ()) -> Recording:
         """Write the last ten seconds as a recording, or more if the last look had cycles before.
+
+        ``reasons`` why stand in its notes. `report` shows the worst cycle of each chain first.
 
         Raises InputError: the folder exists. OperationError: it cannot be written, or there is
         nothing to be written.
@@ -466,7 +474,9 @@ class Watch:
             "chain": self.chains[0].text if self.chains else None,
             "notes": (
                 "the last seconds before it was asked for; objects from before them are there",
+                *reasons,
             ),
+            "worst_ns": tuple(at for one in self.chains for at in one.worst_ns(since)),
         }
         if self.plan is not None:
             facts["plan"] = plan_values(self.plan)
