@@ -327,6 +327,7 @@ def test_memory_does_not_grow(tmp_path: Path) -> None:
         chain.take_over(minute, hops, number * 60 * SECOND)
         minute = minute.with_columns(pl.col("start") + 60 * SECOND)
     assert chain.cycles.height == pytest.approx(3600 * 10, rel=0.001)
+    assert chain.cycles.n_chunks() == 1, "looks get no slower with the hour"
 
 
 def test_the_command_shows_and_streams(tmp_path: Path) -> None:

@@ -187,7 +187,9 @@ class _Chain:
     def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
         """Cycles that are over."""
         recent = self.cycles.filter(pl.col("start") > now_ns - SPANS["hour"])
-        self.cycles = pl.concat([recent, traversals.select(_CYCLE.names()).cast(_CYCLE)])
+        new = traversals.select(_CYCLE.names()).cast(_CYCLE)
+        # Else each look of the hour is a chunk, and the next looks take 100 times as long.
+        self.cycles = pl.concat([recent, new], rechunk=True)
         whole = int(traversals["complete"].sum())
         self.counted["complete"] += whole
         self.counted["incomplete"] += traversals.height - whole
