@@ -400,7 +400,7 @@ def _judging(
     return judged
 
 
-def _save(watched: "Watch", recorder: Path, reasons: Sequence[str] = ()) -> None:
+def _save(watched: "Watch", recorder: Path, reasons: "Sequence[str]" = ()) -> None:
     """Have the flight recorder write; that it cannot is no reason to stop watching."""
     try:
         folder = _own_folder(recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}")
