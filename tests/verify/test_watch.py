@@ -39,6 +39,7 @@ from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library, 
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
+from chainshaper.verify.budgets import load_budget
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 
@@ -427,6 +428,28 @@ def test_the_command_that_fails_and_names_that_never_run(
     assert len(notes) == 2, said
     assert "/ebpf1../other has not run yet: " in notes[0]
     assert "/ended (/other) has not run yet" in notes[1]
+
+
+def test_a_limit_that_breaks_for_ever_does_not_fill_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(runs, "MOST_RECORDED", 2)
+    written: list[list[str]] = []
+    monkeypatch.setattr(runs, "_save", lambda _, __, reasons: written.append(reasons))
+    (tmp_path / "budget.yaml").write_text(
+        f"format: 1\nchains: [{{chain: {CHAIN}, maximum: 10ms}}]\n"
+    )
+    judged = runs._judging(load_budget(tmp_path / "budget.yaml"), own_watch(), tmp_path)
+    for look in range(8):
+        minute = latency_statistics(np.array([5, 25 if look % 2 else 6]) * 1_000_000)
+        spans = dict.fromkeys(SPANS, minute)
+        counted = {"complete": 2, "late": 0, "incomplete": 0, "unclear": 0}
+        chain = ChainNow(CHAIN, spans, 20.0, (), (), 0.0, None, 0, counted, problem=None)
+        assert bool(judged(Seen(look * SECOND, {1: "/first"}, 0, (chain,)))) == bool(look % 2)
+    assert [len(reasons) for reasons in written] == [1, 1]
+    said = capsys.readouterr().err
+    assert said.count("2 recordings are there") == 1
+    assert said.count("25 ms") == 4, "every break is a line"
 
 
 class Collector(BaseHTTPRequestHandler):

@@ -32,6 +32,10 @@ STDERR = 2
 PATIENCE_NS = 10_000_000_000
 """So long after nodes are there `watch` names what has not run of a budget."""
 
+MOST_RECORDED = 100
+"""Recordings that `watch --budget` writes by itself: a limit that breaks again and again for weeks
+would fill the robot's disk."""
+
 SHAPING_DURATION_NS = 60_000_000_000
 
 COMMAND: list[str] | None = opt.argument(
@@ -380,16 +384,20 @@ def _judging(
     """What finds the limits that are broken; new ones are written to stderr and recorded."""
     from chainshaper.verify.budgets import broken_limits, not_running
 
-    breaks, named_at = set[tuple[str, str]](), 0
+    breaks, named_at, left = set[tuple[str, str]](), 0, MOST_RECORDED
 
     def judged(seen: "Seen") -> "list[Judged]":
-        nonlocal breaks, named_at
+        nonlocal breaks, named_at, left
         broken = broken_limits(limits, seen)
         new = [one.text for one in broken if (one.where, one.what) not in breaks]
         breaks = {(one.where, one.what) for one in broken}
         if new:
             out.say("; ".join(new))
-            _save(watched, recorder, new)
+            if left > 0:
+                left -= 1
+                _save(watched, recorder, new)
+                if not left:
+                    out.notes([f"{MOST_RECORDED} recordings are there: no more but with Ctrl-\\"])
         if not named_at and any(seen.processes.values()):
             named_at = seen.at_ns + PATIENCE_NS
         if 0 < named_at <= seen.at_ns:
