@@ -2,10 +2,11 @@
 
 import math
 from collections.abc import Sequence
+from itertools import product
 
 import pytest
 from bare_plans import MS, bare_plan
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.flow.phase import Phase
@@ -71,11 +72,20 @@ def test_a_chain_that_is_never_stopped_may_begin_at_any_time() -> None:
     assert _placed(chains, [0, 40]) == [40 + LEAD, LEAD]
 
 
-def test_timers_that_allow_no_beginning_are_named() -> None:
+def test_where_planned_offsets_do_not_help_others_do() -> None:
     """Each of three on one core, at priorities of their own, is closed for 25 of 100 ms."""
     chains = [_chain(name, 100, 0, 75, rank=k + 2) for k, name in enumerate("abc")]
+    assert all(LEAD <= wait <= 25 for wait in _placed(chains, [0, 33, 66]))
+
+
+def test_timers_that_allow_no_beginning_are_named() -> None:
+    """Three that take turns, each for 33 of 100 ms, and so begin at 2, 35 and 68 at the earliest:
+    then the third has waited for 68 ms, and its slot before was over 67 ms before that.
+    """
+    chains = [_chain(name, 100, 33 * k, 33) for k, name in enumerate("abc")]
     with pytest.raises(OperationError, match=r"timers of a\.\., b\.\., c\.\. .* nodes again"):
-        _placed(chains, [0, 33, 66])
+        _placed(chains, [0, 0, 0])
+    assert sorted(_placed(chains, [0, 1, 1])) == [LEAD, LEAD + 32, LEAD + 65]
 
 
 @given(
@@ -106,8 +116,48 @@ def test_the_anchor_is_the_best_of_all(
         return sum(wait > max(LEAD, most) for wait, most in pairs), max(full)
 
     best = min(cost(_waits(plan, at * MS, phases)) for at in range(hyper))
-    if best[0]:
+    placed_at = _placed(chains, phases)  # at priorities of their own any offsets are allowed
+    assert cost(placed_at) == best if not best[0] else cost(placed_at)[0] == 0
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(
+        st.tuples(st.sampled_from([20, 40]), st.integers(1, 20)), min_size=2, max_size=3
+    ).filter(lambda them: sum(length for _, length in them) <= 20),
+    st.lists(st.integers(0, 39), min_size=3, max_size=3),
+)
+def test_chains_that_take_turns_are_refused_only_where_nothing_helps(
+    wanted: list[tuple[int, int]], phases: list[int]
+) -> None:
+    """Against all beginnings, in milliseconds, of chains whose slots fit one behind the other."""
+    behind = [sum(length for _, length in wanted[:k]) for k in range(len(wanted))]
+    chains = [_chain(f"c{k}", cycle, behind[k], length) for k, (cycle, length) in enumerate(wanted)]
+    phases = phases[: len(chains)]
+
+    def apart(begins: Sequence[int]) -> bool:
+        taken = [
+            (at + n * cycle + ms) % 40
+            for at, (cycle, length) in zip(begins, wanted, strict=True)
+            for n in range(40 // cycle)
+            for ms in range(length)
+        ]
+        return len(taken) == len(set(taken))
+
+    windows = [
+        range(at + LEAD, at + max(LEAD, cycle - length) + 1)
+        for at, (cycle, length) in zip(phases, wanted, strict=True)
+    ]
+    if any(map(apart, product(*windows))):
+        plan, anchor_ns = placed(combined(chains), [Phase(at * MS, 0) for at in phases])
+        waits = _waits(plan, anchor_ns, phases)
+        # By how much a chain waits is known up to a cycle.
+        at = [(begin % cycle) for begin, (cycle, _) in zip(waits, wanted, strict=True)]
+        inside = (
+            (place - LEAD) % cycle <= max(0, cycle - length - LEAD)
+            for place, (cycle, length) in zip(at, wanted, strict=True)
+        )
+        assert all(inside)
+    else:
         with pytest.raises(OperationError, match="nodes again"):
             _placed(chains, phases)
-    else:
-        assert cost(_placed(chains, phases)) == best

@@ -21,7 +21,6 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   fair class (SCHED_OTHER). All others are left alone.
 """
 
-import math
 import time
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -474,13 +473,13 @@ def in_order_of_slots(chain: Plan) -> Iterator[tuple[Server, PlannedThread]]:
         yield from ((server, planned) for planned in server.threads if planned not in gates)
 
 
-def closed_before(chain: Plan) -> float:
+def closed_before(chain: Plan) -> int | None:
     """For how long (ns) before a cycle the server of a chain's first thread is closed: its timer
-    may expire so early. Without an end, where that thread is never stopped.
+    may expire so early. None: that thread is never stopped.
     """
     slots = next(in_order_of_slots(chain))[0].slots
     is_always_open = slots[0][0] == 0 and slots[-1][1] >= chain.cycle_ns
-    return math.inf if is_always_open else chain.cycle_ns - slots[-1][1]
+    return None if is_always_open else chain.cycle_ns - slots[-1][1]
 
 
 def _ranked(servers: Iterable[Server | ReservationServer]) -> list[int]:

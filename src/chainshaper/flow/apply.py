@@ -11,7 +11,6 @@ is its own server, unless the plan says otherwise (`shaping_thread`): it has no 
 
 import contextlib
 import json
-import math
 import os
 import subprocess
 import threading
@@ -344,8 +343,7 @@ class _Run:
             return LEAD_NS
         if not self.waits_ns:
             return 0
-        is_always_open = allocation.closed_before(chain) == math.inf
-        return self.waits_ns[place] if is_always_open else 0
+        return self.waits_ns[place] if allocation.closed_before(chain) is None else 0
 
     def tell(self, moved_ns: Mapping[int, int]) -> None:
         """Begin to give shaping nodes of these chains where cycles, moved by so much, begin."""

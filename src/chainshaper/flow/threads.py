@@ -49,7 +49,7 @@ from chainshaper.planning.application_plan import (
     whole,
     with_slots_moved,
 )
-from chainshaper.planning.offsets import chain_name, linked
+from chainshaper.planning.offsets import chain_name, linked, with_windows
 from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
 from chainshaper.planning.plan import (
     Adaptation,
@@ -399,44 +399,55 @@ def placed(
     """The plan, and the instant of CLOCK_MONOTONIC, modulo the hyper-period, from which its cycles
     count, so that every slot opens :data:`LEAD_NS` after its chain's timer at least.
 
-    Chains that share no core have timers that expire independently: their offsets are moved, all of
-    a core's alike, so that these do not wait for others'. The longest wait of chains that share one
-    is as short as can be, but no timer is to expire while its slot is open (``gated``): the thread
-    would begin in that of the instance before. Raises OperationError: one does, wherever cycles
-    count from.
+    The longest wait of chains that share a core is as short as can be, but no timer is to expire
+    while its slot is open (``gated``): the thread would begin in that of the instance before. Where
+    it does with the plan's offsets, the chains get others. Timers of chains that share no core
+    expire independently: their offsets are moved, so that these do not wait for each other's.
+
+    Raises OperationError: no offsets help.
     """
     cores = [{server.core for server in chain.servers} for chain in plan.chains]
     pairs = combinations(range(len(cores)), 2)
     groups = linked(len(cores), [(j, k) for j, k in pairs if cores[j] & cores[k]])
     chains, first_ns = list(plan.chains), None
     for group in groups:
-        anchor_ns = _anchor([(chains[k], phases[k]) for k in group], gated=gated)
+        own, anchor_ns = _around([chains[k] for k in group], [phases[k] for k in group], gated)
         first_ns = anchor_ns if first_ns is None else first_ns
-        for k in group:
-            offset_ns = (chains[k].offset_ns + anchor_ns - first_ns) % chains[k].cycle_ns
-            chains[k] = revised(chains[k], offset_ns=offset_ns)
+        for k, chain in zip(group, own, strict=True):
+            offset_ns = (chain.offset_ns + anchor_ns - first_ns) % chain.cycle_ns
+            chains[k] = revised(chain, offset_ns=offset_ns)
     return combined(chains), first_ns or 0
 
 
-def _anchor(chains: Sequence[tuple[Plan, Phase]], *, gated: bool) -> int:
-    """From when on the cycles of chains that share cores count."""
+def _around(
+    chains: Sequence[Plan], phases: Sequence[Phase], gated: bool
+) -> tuple[Sequence[Plan], int]:
+    """Chains that share cores, and from when on their cycles count."""
     # Waits only grow with the anchor, but where one starts again: the best is at such a place.
-    hyper = math.lcm(*(chain.cycle_ns for chain, _ in chains))
-    begin = [(phase.at_ns + LEAD_NS - chain.offset_ns, chain.cycle_ns) for chain, phase in chains]
+    hyper = math.lcm(*(chain.cycle_ns for chain in chains))
+    ready = [phase.at_ns + LEAD_NS for phase in phases]
+    begin = [(at - one.offset_ns, one.cycle_ns) for at, one in zip(ready, chains, strict=True)]
     candidates = {(at + n * cycle) % hyper for at, cycle in begin for n in range(hyper // cycle)}
-    closed = [allocation.closed_before(chain) if gated else math.inf for chain, _ in chains]
+    most = [allocation.closed_before(chain) if gated else None for chain in chains]
 
     def cost(at: int) -> tuple[int, int]:
         waits = [LEAD_NS + (at - one) % cycle for one, cycle in begin]
-        least = zip(waits, closed, strict=True)
-        return sum(wait > max(LEAD_NS, most) for wait, most in least), max(waits)
+        inside = (m is not None and w > max(LEAD_NS, m) for w, m in zip(waits, most, strict=True))
+        return sum(inside), max(waits)
 
     best = min(sorted(candidates), key=cost)
-    if cost(best)[0]:
-        names = ", ".join(chain_name(chain) for chain, _ in chains)
+    if not cost(best)[0]:
+        return chains, best
+    windows = [
+        None if m is None else (at, at + max(0, m - LEAD_NS))
+        for at, m in zip(ready, most, strict=True)
+    ]
+    try:
+        return with_windows(chains, windows), 0
+    except OperationError as error:
+        names = ", ".join(map(chain_name, chains))
         raise OperationError(
-            f"the timers of {names} expire so that, wherever cycles begin, one does while the slot"
-            " of its instance before is open: start the nodes again, one after the other, and their"
-            " timers expire at other instants"
-        )
-    return best
+            f"the timers of {names} expire so that, whatever their offsets, one does while the slot"
+            " of its instance before is open: start the nodes again, one after the other, so that"
+            f" their timers expire at other instants ({error})"
+        ) from error

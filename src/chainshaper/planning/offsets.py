@@ -19,10 +19,11 @@ CP-SAT solver of OR-tools decides, which is exact as well but may run out of tim
 import math
 import random
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import combinations
+from types import MappingProxyType
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -177,13 +178,15 @@ def with_offsets(
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
     alone: float | None = None,
+    windows: Mapping[int, tuple[int, int]] = MappingProxyType({}),
 ) -> tuple[Plan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
     ``together`` are groups of chains (places in ``plans``) that begin at the same callback: they
     share servers and have one offset (default: none do). The first group, and any that shares no
-    core with another, has the offset 0. For the share ``alone`` of its slot no chain that begins
-    has its core taken by one of a better priority.
+    core with another, has the offset 0, unless groups have ``windows``: from when and until when
+    cycles may begin. For the share ``alone`` of its slot no chain that begins has its core taken by
+    one of a better priority.
 
     Raises InputError: plans that govern the same output. OperationError: there are no such offsets,
     or the time was up before an answer. PlatformError: many chains collide and OR-tools is missing.
@@ -197,9 +200,28 @@ def with_offsets(
         _refuse_same_beginning(plans[group[0]], plans[other[0]])
     own = [[plans[k] for k in one] for one in together]
     tables = [_timetable(one, _alone(one, plans, alone)) for one in own]
-    found = _find_offsets(tables, time_limit_s)
+    found = _find_offsets(tables, time_limit_s, windows)
     offset_of = {k: found[number] for number, one in enumerate(together) for k in one}
     return tuple(revised(plan, offset_ns=offset_of[k]) for k, plan in enumerate(plans))
+
+
+def with_windows(
+    plans: Sequence[Plan], windows_ns: Sequence[tuple[int, int] | None], time_limit_s: float = 5.0
+) -> tuple[Plan, ...]:
+    """The plans with offsets at which each cycle begins inside its chain's window: from and to, on
+    a common clock (None: anywhere). So chains are placed around timers that cannot be moved.
+
+    Raises: as :func:`with_offsets`.
+    """
+    names = [{server.name for server in plan.servers} for plan in plans]
+    pairs = combinations(range(len(plans)), 2)
+    together = linked(len(plans), [(j, k) for j, k in pairs if names[j] & names[k]])
+    own = {n: at for n, (k, *_) in enumerate(together) if (at := windows_ns[k]) is not None}
+    apart = partial(with_offsets, plans, together=together, time_limit_s=time_limit_s, windows=own)
+    for share in SHARES:
+        with suppress(OperationError):
+            return apart(alone=share)
+    return apart()
 
 
 def _alone(
@@ -212,18 +234,16 @@ def _alone(
             yield (core, best), max(START_NS, int(share * first[core].slots[0][1]))
 
 
-def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int, int]:
-    allowed: _Allowed = {}
-    for j, k in combinations(range(len(tables)), 2):
-        common, forbidden = _collisions(tables[j], tables[k])
-        if forbidden:
-            taken = [(first, last + 1) for first, last in forbidden]
-            free = slots_without([(0, common)], taken)
-            intervals = [(first, end - 1) for first, end in free]
-            if not intervals:
-                raise OperationError(_pair_too_long(tables[j], tables[k], common))
-            allowed[j, k] = common, intervals
-            allowed[k, j] = common, [(-end % common, -start % common) for start, end in intervals]
+def _find_offsets(
+    tables: Sequence[Timetable], time_limit_s: float, windows: Mapping[int, tuple[int, int]]
+) -> dict[int, int]:
+    clock = len(tables)
+    if windows:  # they are to a timetable without slots what the slots of others are to each
+        tables = [*tables, Timetable("timers", math.lcm(*(one.cycle_ns for one in tables)), {})]
+    allowed = _allowed(tables)
+    for k, (first, last) in windows.items():
+        if last - first < (cycle := tables[k].cycle_ns):
+            _allow(allowed, (clock, k), cycle, [(first % cycle, last % cycle)])
     for (core, priority), load in _loads(tables).items():
         if load > 1 + 1e-9:
             names = ", ".join(one.name for one in tables if (core, priority) in one.slots)
@@ -247,8 +267,28 @@ def _find_offsets(tables: Sequence[Timetable], time_limit_s: float) -> dict[int,
                 f"there are no offsets at which {', '.join(tables[k].name for k in group)} keep"
                 f" their slots apart, although any two of them could: {_fullest(tables, group)}"
             )
-        offsets.update(solution)
+        zero = solution.get(clock, 0)
+        offsets.update((k, (at - zero) % tables[k].cycle_ns) for k, at in solution.items())
     return offsets
+
+
+def _allowed(tables: Sequence[Timetable]) -> _Allowed:
+    allowed: _Allowed = {}
+    for j, k in combinations(range(len(tables)), 2):
+        common, forbidden = _collisions(tables[j], tables[k])
+        if forbidden:
+            taken = [(first, last + 1) for first, last in forbidden]
+            free = slots_without([(0, common)], taken)
+            if not free:
+                raise OperationError(_pair_too_long(tables[j], tables[k], common))
+            _allow(allowed, (j, k), common, [(first, end - 1) for first, end in free])
+    return allowed
+
+
+def _allow(allowed: _Allowed, pair: tuple[int, int], common: int, intervals: _Intervals) -> None:
+    """Allow these differences, and those the other way round."""
+    allowed[pair] = common, intervals
+    allowed[pair[::-1]] = common, [(-end % common, -start % common) for start, end in intervals]
 
 
 def _collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:

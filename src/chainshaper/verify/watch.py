@@ -307,9 +307,10 @@ class Watch:
 
     def _take(self, pid: int, process: TracedProcess, since_ns: int = 0) -> None:
         for part in process.new_records():
-            if part["time"][-1] >= since_ns:
-                self._fresh.append((pid, part[part["time"] >= since_ns]))
-                self._latest[pid] = max(self._latest[pid], int(part["time"][-1]))
+            new = part[part["time"] >= since_ns] if since_ns else part
+            if new.size:
+                self._fresh.append((pid, new))
+                self._latest[pid] = max(self._latest[pid], int(new["time"][-1]))
 
     def _leave_ended(self) -> None:
         """Leave processes that have ended, once their last events are too old to be asked for."""
