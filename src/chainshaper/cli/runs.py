@@ -365,8 +365,8 @@ def watch(
             if asked.is_set():
                 asked.clear()
                 _save(watched, recorder)
-            if time.monotonic_ns() >= next_look:
-                next_look += every
+            if (late := time.monotonic_ns() - next_look) >= 0:
+                next_look += (1 + late // every) * every  # none is made up for
                 export(seen := watched.look())
                 publish(seen)
                 broken = judged(seen)
