@@ -30,7 +30,8 @@ TIMED = {"enforcement", "flow", "gate", "linux", "verify", "workload"}
 TIMELESS = {"linux/test_own_processes", "workload/test_computing", "workload/test_launcher"}
 TIMELESS |= {"gate/test_decision", "workload/test_description", "workload/test_execution_times"}
 TIMELESS |= {"enforcement/test_dispatcher", "workload/test_event_log"}
-TIMELESS |= {"flow/test_drift", "gate/test_throttling", "verify/test_several_chains"}
+TIMELESS |= {"flow/test_anchors", "flow/test_drift", "gate/test_throttling"}
+TIMELESS |= {"verify/test_several_chains"}
 TIMELESS |= {"enforcement/test_node_threads", "flow/test_profiles", "linux/test_processes"}
 TIMELESS |= {
     "verify/test_slowdowns",
