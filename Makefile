@@ -5,10 +5,11 @@
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
-# Tests that need the machine's cores for themselves, and all others beside them (tests/conftest.py).
+# Tests that need the machine's cores for themselves, and beside them all others (tests/conftest.py),
+# and what looks at the code.
 test: .venv/.ready-dev
 	scripts/test-tools
-	$(MAKE) --jobs=2 --output-sync=line test-untimed test-timed
+	$(MAKE) --jobs=3 --output-sync=line lint test-untimed test-timed
 
 # What fails beside the others is named, and tried once more when those are through; what fails again
 # has failed.
@@ -17,7 +18,7 @@ tried = run='.venv/bin/python -m pytest -m "$(1)" -o cache_dir=.pytest_cache/$(2
 	while pgrep -f "[p]ytest -m $(3)" >/dev/null; do sleep 1; done; \
 	echo "tried once more, alone:"; eval "$$run --last-failed --last-failed-no-failures none"
 
-test-untimed: lint
+test-untimed: .venv/.ready-dev
 	@$(call tried,not timed,untimed,timed)
 
 test-timed: .venv/.ready-dev
@@ -31,8 +32,8 @@ test-kernel: .venv/.ready-dev
 lint: .venv/.ready-dev
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
-	.venv/bin/mypy
-	.venv/bin/lint-imports --no-cache
+	nice .venv/bin/mypy
+	nice .venv/bin/lint-imports --no-cache
 
 # Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.
 benchmark: .venv/.ready-dev
