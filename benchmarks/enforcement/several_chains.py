@@ -117,7 +117,7 @@ def main() -> None:
     parser.add_argument("--keep", type=Path, help="a new folder for recordings and plans")
     given = parser.parse_args()
     folder = given.keep or Path(tempfile.mkdtemp())
-    table = Table(title="p0.5–p99.5 at publication [ms], over all outputs")
+    table = Table(title="p0.5–p99.5 at publication in ms, over all outputs")
     for name in ("chains", "alone", "late", "together", "late"):
         table.add_column(name)
     for number, (name, chains) in enumerate(APPLICATIONS.items()):

@@ -6,8 +6,9 @@ It sleeps until a boundary, writes ``1`` to the ``cgroup.freeze`` of what closes
 that of what opens, and sleeps again. It runs on the core that it gates, above everything there:
 the timer interrupt alone takes the core from a thread whose slot has ended, so a slot is left
 exactly. But the next thread runs only when the dispatcher sleeps again, so between waking and
-sleeping it does nothing that can wait. All else is done at **ticks** between boundaries:
-counting, the owner's commands on the standard input, the sign of life, and looking for overruns.
+sleeping it does nothing that can wait. All else is done at **ticks** between boundaries, not before
+an output has left that waits for one: counting, the owner's commands on the standard input, and
+looking for overruns.
 
 It thaws its threads however it ends, and ends when the owner is gone. Only SIGKILL and SIGSTOP
 prevent that, which is what guardians are for. Should those be gone together with the owner, it
@@ -40,7 +41,9 @@ from chainshaper.values.errors import ChainshaperError, OperationError, Platform
 PRIORITY = 97
 _LATE_NS = 100_000
 _TICK_NS = 20_000_000
-_REST_NS = 1_000_000  # after a boundary; frozen threads, too, need the core to reach the freezer
+# After a boundary: frozen threads, too, need the core to reach the freezer; and a publish slot may
+# open there, in which a gate releases as much later as its chain has begun late (0.1 to 0.7 ms).
+_REST_NS = 1_000_000
 _ROOM_NS = 200_000  # at least, between a tick and the boundaries around it
 _WATCH_NS = 100_000  # before a boundary, instead of sleeping
 _THAWED_AFTER_NS = 60_000_000  # guardians wait for a sign of life a little longer
@@ -130,6 +133,8 @@ class Dispatcher:
         self.open: frozenset[int] | None = None  # None: not armed, all are
         self.upcoming = (_FAR, self.boundaries[0])
         self.ahead: Iterator[tuple[int, Boundary]] = iter(())
+        self.rest_until = 0  # no tick before
+        self.switched: list[tuple[Boundary, int]] = []  # and how late, since the last tick
         self.unexamined: set[int] = set()
         self.last_tick = self.last_sign = time.monotonic_ns()
         self.let_go = self.own.let_go
@@ -142,7 +147,6 @@ class Dispatcher:
             at, boundary = self.upcoming
             following = next(self.ahead)
             before = self.all if self.open is None else self.open
-            rest = min(_REST_NS, (following[0] - at) // 2)
             if boundary.open and not before:
                 # Waking an idle core takes longest, and delays no thread of ours now.
                 sleep_until(at - _WATCH_NS)
@@ -156,18 +160,11 @@ class Dispatcher:
             self._write(closing, b"1")
             self._write(boundary.open - before, b"0")
             switched = time.monotonic_ns()
-            if rest >= _ROOM_NS:
-                sleep_until(at + rest)  # those who were let in wait for us to sleep
-            for server in boundary.starts:
-                counters, lateness = self.counters[server], switched - at
-                counters.slots += 1
-                counters.late += lateness > _LATE_NS
-                counters.longest = max(counters.longest, lateness)
+            self.switched.append((boundary, switched - at))
             if self.open is not None:
                 self.unexamined |= closing
-            self.open = boundary.open
+            self.open, self.upcoming, self.rest_until = boundary.open, following, at + _REST_NS
             self._give_sign(switched)
-            self.upcoming = following
 
     def thaw_all(self) -> None:
         self._write(self.all, b"0")
@@ -189,6 +186,7 @@ class Dispatcher:
         tick_at = time.monotonic_ns()
         if tick_at - self.last_tick > 10 * _TICK_NS:
             self._tick()
+        tick_at = max(tick_at, self.rest_until)
         while tick_at + _ROOM_NS <= self.upcoming[0]:
             sleep_until(tick_at)
             self._tick()
@@ -197,6 +195,12 @@ class Dispatcher:
     def _tick(self) -> None:
         """A sign of life, and all that has waited."""
         self.last_tick = time.monotonic_ns()
+        for boundary, late_ns in self.switched:
+            for counters in (self.counters[server] for server in boundary.starts):
+                counters.slots += 1
+                counters.late += late_ns > _LATE_NS
+                counters.longest = max(counters.longest, late_ns)
+        self.switched.clear()
         self._give_sign(self.last_tick)
         if os.getppid() != self.owner:
             raise OperationError("the owner is gone")
