@@ -21,9 +21,15 @@ from chainshaper.flow.threads import followed_chains
 from chainshaper.gate import handover
 from chainshaper.gate.handover import Turn
 from chainshaper.planning import margins
-from chainshaper.planning.application_plan import combined, reach, whole, with_slots_moved
+from chainshaper.planning.application_plan import (
+    combined,
+    open_until_done,
+    reach,
+    whole,
+    with_slots_moved,
+)
 from chainshaper.planning.margins import Tail
-from chainshaper.planning.plan import Adaptation, Modes, Plan, revised, with_slots
+from chainshaper.planning.plan import Adaptation, Modes, Plan, Thread, revised, with_slots
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.splicing import shaped_outputs
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
@@ -189,6 +195,35 @@ def test_slots_do_not_move_into_another_chains() -> None:
     assert reach(both, 0)[1] == 9 * MS
     with pytest.raises(InputError, match=r"meets \[0 ms, 30\.001 ms\)"):
         with_slots_moved(both, {0: 9_001_000})
+
+
+@pytest.mark.parametrize(
+    ("due_until", "opened"),
+    [(47.5, [(0, 30)]), (47, [(0, 30), (46.5, 47)]), (46.9, [(0, 30), (46.5, 47)])],
+)
+def test_no_server_is_switched_while_an_output_is_due(
+    due_until: float, opened: list[tuple[float, float]]
+) -> None:
+    """By hand: the first chain may finish until 47 ms, 2 + 1 before its timer of the next cycle,
+    but not from 30 to 46.5 ms, which are another's, whose output is due then on the same core.
+    """
+    one, other = small(), small().model_copy(deep=True)
+    chain, output = other.servers
+    thread = Thread(node="/other_gate")
+    chain = chain.model_copy(
+        update={"name": "b", "slots": ((30 * MS, round(46.5 * MS)),), "threads": ()}
+    )
+    slots = ((round(46.5 * MS), round(due_until * MS)),)
+    output = output.model_copy(update={"name": "out", "slots": slots, "threads": (thread,)})
+    assert other.shaping_node is not None
+    gate = other.shaping_node.model_copy(
+        update={"name": "other_gate", "input": "/b_tmp", "output": "/b"}
+    )
+    spec = other.chain.model_copy(update={"spec": "/b..", "output": "/b", "publisher": "/b"})
+    other = revised(other, chain=spec, servers=(chain, output), shaping_node=gate)
+    enforced = open_until_done(combined([one, other]), [2 * MS, 2 * MS])
+    found = [(start / MS, end / MS) for start, end in enforced.chains[0].servers[0].slots]
+    assert found == opened
 
 
 @pytest.mark.parametrize(

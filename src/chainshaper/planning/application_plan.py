@@ -28,6 +28,7 @@ from chainshaper.planning.plan import (
     Slot,
     Thread,
     publish_slots,
+    publishing_servers,
     shaping_nodes,
     slot_text,
     with_slots,
@@ -161,9 +162,11 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
 
     See :func:`chainshaper.planning.overruns.open_until_done`; slots that are planned for other
     chains are left out, so that an overrun delays none of these; where that makes a server's slots
-    too many, it stays as planned. Of several chains, ``waits_ns`` is how long before its cycle each
-    one's timer expires: its thread waits, so that cycles start at their offsets. So does the first
-    stage of a pipeline, for slots of further stages to count from the same instant.
+    too many, it stays as planned. No such slot begins or ends while an output is due on the core:
+    whoever opens and closes servers would delay it. Of several chains, ``waits_ns`` is how long
+    before its cycle each one's timer expires: its thread waits, so that cycles start at their
+    offsets. So does the first stage of a pipeline, for slots of further stages to count from the
+    same instant.
     """
     opened: dict[str, Server] = {}
     known_ns = waits_ns or [-WAITING_NS] * len(plan.chains)
@@ -171,6 +174,7 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
         waits = plan.moves_timers or chain.policy in ("pipelined", "server-per-callback")
         for server in chain_open_until_done(chain, wait + WAITING_NS if waits else 0).servers:
             slots = slots_without(server.slots, [*_of_others(plan, chain, server)])
+            slots = _switched_beside_outputs(plan, chain, server, slots)
             apart = server.model_copy(update={"slots": slots})
             if len(slots) * plan.cycle_ns > MOST_OPENED * chain.cycle_ns:
                 apart = next(one for one in chain.servers if one.name == server.name)
@@ -189,17 +193,37 @@ def _of_others(plan: ApplicationPlan, chain: Plan, server: Server) -> Iterator[S
     for other in plan.chains:
         if other is chain or chain.equal_priorities == other.equal_priorities == "round-robin":
             continue
-        common = math.gcd(chain.cycle_ns, other.cycle_ns)
         for one in other.servers:
             if one in chain.servers or one.best_effort or one.name == server.name:
                 continue
             if (one.core, one.priority) != (server.core, server.priority):
                 continue
-            for start, end in one.slots:
-                first = (start + other.offset_ns - chain.offset_ns) % common - common
-                yield from (
-                    (again, again + end - start) for again in range(first, chain.cycle_ns, common)
-                )
+            yield from _in_cycles_of(chain, other, one)
+
+
+def _in_cycles_of(chain: Plan, other: Plan, server: Server) -> Iterator[Slot]:
+    """The slots of another chain's server in a chain's cycle, of all cycles that they meet in."""
+    common = math.gcd(chain.cycle_ns, other.cycle_ns)
+    for start, end in server.slots:
+        first = (start + other.offset_ns - chain.offset_ns) % common - common
+        yield from ((again, again + end - start) for again in range(first, chain.cycle_ns, common))
+
+
+def _switched_beside_outputs(
+    plan: ApplicationPlan, chain: Plan, server: Server, slots: Sequence[Slot]
+) -> tuple[Slot, ...]:
+    """The slots without outputs' own on the core, in which one of them begins or ends unplanned."""
+    planned = next(one for one in chain.servers if one.name == server.name).slots
+    edges = {edge for slot in slots for edge in slot} - {edge for slot in planned for edge in slot}
+    due = [
+        slot
+        for other in plan.chains
+        for one in publishing_servers(other)
+        if one.core == server.core and one.name != server.name
+        for slot in _in_cycles_of(chain, other, one)
+        if any(slot[0] < edge < slot[1] for edge in edges)
+    ]
+    return slots_without(slots, slots_without(united(due), planned))
 
 
 def combined(plans: Sequence[Plan]) -> ApplicationPlan:
