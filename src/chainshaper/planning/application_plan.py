@@ -212,7 +212,9 @@ def _in_cycles_of(chain: Plan, other: Plan, server: Server) -> Iterator[Slot]:
 def _switched_beside_outputs(
     plan: ApplicationPlan, chain: Plan, server: Server, slots: Sequence[Slot]
 ) -> tuple[Slot, ...]:
-    """The slots without outputs' own on the core, in which one of them begins or ends unplanned."""
+    """The slots without those of outputs on the core in which one of them began or ended, where
+    that is not planned.
+    """
     planned = next(one for one in chain.servers if one.name == server.name).slots
     edges = {edge for slot in slots for edge in slot} - {edge for slot in planned for edge in slot}
     due = [

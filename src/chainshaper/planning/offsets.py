@@ -101,10 +101,15 @@ def place_chains(
             " only their publish slots do not overlap."
         )
         apart = partial(with_offsets, ranked, together=together, time_limit_s=time_limit_s)
-        for share in SHARES:
-            with suppress(OperationError):
-                return apart(alone=share), [remark]
-        return apart(), [remark]
+        return _longest_alone(apart), [remark]
+
+
+def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...]:
+    """The offsets with which no better chain has the core for the largest of the shares."""
+    for share in SHARES:
+        with suppress(OperationError):
+            return apart(alone=share)
+    return apart()
 
 
 def _shared_threads(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> set[str]:
@@ -217,11 +222,8 @@ def with_windows(
     pairs = combinations(range(len(plans)), 2)
     together = linked(len(plans), [(j, k) for j, k in pairs if names[j] & names[k]])
     own = {n: at for n, (k, *_) in enumerate(together) if (at := windows_ns[k]) is not None}
-    apart = partial(with_offsets, plans, together=together, time_limit_s=time_limit_s, windows=own)
-    for share in SHARES:
-        with suppress(OperationError):
-            return apart(alone=share)
-    return apart()
+    found = partial(with_offsets, plans, together=together, time_limit_s=time_limit_s, windows=own)
+    return _longest_alone(found)
 
 
 def _alone(
