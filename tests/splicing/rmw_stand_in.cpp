@@ -3,7 +3,7 @@
 // PROGRAM, it is such a process instead: each line of its standard input is
 //
 //   subscription TOPIC NODE | take NS SUBSCRIPTION STAMP | publisher TOPIC NODE DEPTH | at NS PUBLISHER STAMP | serialized NS PUBLISHER STAMP
-//   | loaned NS PUBLISHER | mode NS TOPIC NAME | end NS PUBLISHER | fork NS PUBLISHER | until NS
+//   | loaned NS PUBLISHER STAMP | mode NS TOPIC NAME | end NS PUBLISHER | fork NS PUBLISHER | until NS
 //
 // in the order of their times, which count from the instant in the first line (CLOCK_MONOTONIC),
 // which is asked for by "ready". A STAMP counts from there too; - is none. What is written to DDS, and what
@@ -69,6 +69,9 @@ int rmw_destroy_publisher(Node *, Publisher *);
 int rmw_publish(const Publisher *, const void *, void *);
 int rmw_publish_serialized_message(const Publisher *, const Bytes *, void *);
 int rmw_publish_loaned_message(const Publisher *, void *, void *);
+int rmw_borrow_loaned_message(const Publisher *, const void *, void **);
+bool rcl_publisher_can_loan_messages(const void *);
+const Publisher * rcl_publisher_get_rmw_handle(const void *);
 int rmw_serialize(const void *, const void *, Bytes *);
 Options rmw_get_default_subscription_options();
 void * rmw_create_subscription(const Node *, const void *, const char *, const Qos *,
@@ -132,6 +135,15 @@ int rmw_publish(const Publisher * publisher, const void * message, void *) {
 
 int rmw_publish_loaned_message(const Publisher * publisher, void * message, void *) {
   return written("loaned", publisher, static_cast<const Message *>(message)->number);
+}
+
+int rmw_borrow_loaned_message(const Publisher *, const void *, void **) { return 0; }
+
+// An rcl_publisher_t is here a pointer to one of rmw's.
+bool rcl_publisher_can_loan_messages(const void *) { return true; }
+
+const Publisher * rcl_publisher_get_rmw_handle(const void * handle) {
+  return *static_cast<const Publisher * const *>(handle);
 }
 
 int rmw_publish_serialized_message(const Publisher * publisher, const Bytes * bytes, void *) {
@@ -303,10 +315,14 @@ int main() {
       continue;
     }
     Message message{0, number++};
-    if (what != "loaned" && (std::cin >> word) && word != "-")
-      message.stamp = start + offset + std::stoll(word);
+    std::cin >> word;
+    if (word != "-") message.stamp = start + offset + std::stoll(word);
+    if (what == "loaned") {  // what rclcpp does not do without having asked
+      void * loan = nullptr;
+      std::printf("borrowed %d\n", rmw_borrow_loaned_message(publisher, nullptr, &loan));
+    }
     const auto began = now(CLOCK_MONOTONIC);
-    if (what == "loaned") {
+    if (what == "loaned" && rcl_publisher_can_loan_messages(&publisher)) {
       rmw_publish_loaned_message(publisher, &message, nullptr);
     } else {
       ros_trace_rcl_publish(&publisher, &message);

@@ -327,7 +327,7 @@ GATES = "CHAINSHAPER_GATES"
 _GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp", "in_front_of_rmw.hpp")
 _GATE_FILE = "libchainshaper_gate.so"
 _GATE_OPTIONS = ("-O2", "-std=c++17", "-shared", "-fPIC", "-static-libstdc++", "-static-libgcc")
-_EXPORTED = "{ global: rmw_*; ros_trace_*; local: *; };\n"
+_EXPORTED = "{ global: rcl_*; rmw_*; ros_trace_*; local: *; };\n"
 
 
 def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
@@ -373,7 +373,8 @@ def gate_library() -> Path:
         options = "--publication in-process", "--publication synchronous"
         return compile_library("c++", words, folder / _GATE_FILE, options)
 
-    return in_cache(_GATE_FILE, [*(one.read_text() for one in sources), *headers.values()], build)
+    made_of = (*(one.read_text() for one in sources), *headers.values(), *_GATE_OPTIONS, _EXPORTED)
+    return in_cache(_GATE_FILE, made_of, build)
 
 
 # Packages in C++ ----------------------------------------------------------------------------------

@@ -439,15 +439,27 @@ EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, cons
   return RMW(Publish, "rmw_publish_serialized_message")(publisher, message, allocation);
 }
 
-EXPORTED int rmw_publish_loaned_message(const RmwPublisher * publisher, void * message,
-                                        void * allocation) {
-  using Publish = int (*)(const RmwPublisher *, void *, void *);
+// A loaned message leaves as it is: it cannot wait without a copy. rclcpp asks before it borrows one,
+// and where the answer is no it publishes from memory of its own, which is shaped like any other.
+EXPORTED bool rcl_publisher_can_loan_messages(const void * handle) {
+  using Publisher = const RmwPublisher * (*)(const void *);
+  using CanLoan = bool (*)(const void *);
   static std::atomic<bool> said;
-  if (output_of(publisher) != nullptr && !said.exchange(true))
-    say("%s: loaned messages leave at once: they cannot be copied without giving up what they are"
-        " loaned for; plan with --publication synchronous",
+  const bool can = RMW(CanLoan, "rcl_publisher_can_loan_messages")(handle);
+  const auto * const publisher = RMW(Publisher, "rcl_publisher_get_rmw_handle")(handle);
+  if (!can || output_of(publisher) == nullptr) return can;
+  if (!said.exchange(true))
+    say("%s: no messages are loaned: they cannot wait for their slot without a copy, so the node's own"
+        " memory is used; plan with --publication synchronous to have loans",
         publisher->topic);
-  return RMW(Publish, "rmw_publish_loaned_message")(publisher, message, allocation);
+  return false;
+}
+
+EXPORTED int rmw_borrow_loaned_message(const RmwPublisher * publisher, const void * type_support,
+                                       void ** message) {
+  using Borrow = int (*)(const RmwPublisher *, const void *, void **);
+  if (output_of(publisher) != nullptr) return 3;  // RMW_RET_UNSUPPORTED
+  return RMW(Borrow, "rmw_borrow_loaned_message")(publisher, type_support, message);
 }
 
 // Called by rcl for each publisher, behind rmw_create_publisher.
