@@ -58,8 +58,8 @@ def compiles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool
                 patched.delitem(sys.modules, name, raising=False)
             importlib.invalidate_caches()
             loading._digest.cache_clear()
-            compiler = mock.Mock(wraps=loading._compiled)
-            patched.setattr(loading, "_compiled", compiler)
+            compiler = mock.Mock(wraps=loading._compiled_apart)
+            patched.setattr(loading, "_compiled_apart", compiler)
             numbers = np.arange(1, 5)
             assert loading.kernel.__wrapped__("made.summing", "total")(numbers.ctypes.data, 4) >= 10
             assert numbers.tolist() == [1, 3, 6, 10]
@@ -68,18 +68,30 @@ def compiles(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[], bool
     return call
 
 
-def test_the_compiler_is_imported_once_and_runs_again_when_the_source_changed(
+def test_the_compiler_runs_once_elsewhere_and_again_when_the_source_changed(
     folder: Path, compiles: Callable[[], bool]
 ) -> None:
     path = os.pathsep.join((str(folder), str(Path(chainshaper.__file__).parents[1])))
     environment = {**os.environ, "PYTHONPATH": path}
-    for compiler in ("True", "False"):
+    for _ in range(2):
         command = [sys.executable, "-c", _CALL]
         found = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        assert found.stdout.strip() == f"10 [ 1  3  6 10] {compiler}"
+        assert found.stdout.strip() == "10 [ 1  3  6 10] False"  # Numba's memory is not ours
+    assert not compiles()
     (folder / "made" / "summing.py").write_text(_KERNEL.format(more="+ 1"))
     assert compiles()
     assert len(list((folder / "made" / "__pycache__").glob("*.o"))) == 1
+
+
+def test_a_process_compiles_itself_where_it_can_start_no_other(
+    folder: Path, compiles: Callable[[], bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for command in ("", "/bin/false"):  # inside another program; one that cannot do it
+        monkeypatch.setattr(sys, "executable", command)
+        with mock.patch.object(loading, "compiled_here", wraps=loading.compiled_here) as here:
+            compiles()
+        assert here.called
+        next((folder / "made" / "__pycache__").glob("*.o")).unlink()
 
 
 def test_code_goes_to_the_users_cache_where_the_package_cannot_be_written(

@@ -2,8 +2,8 @@
 
 Importing Numba takes half a second, as long as reading ten million events. So loops that every
 trace needs are written for addresses and counts only (:mod:`~chainshaper.values.compiled.memory`):
-what Numba makes of those needs nothing of Python. It is compiled once on a machine, then loaded
-from an object file in some tens of milliseconds.
+what Numba makes of those needs nothing of Python. It is compiled once on a machine, in a process of
+its own, whose 90 MB end with it, then loaded from an object file in some tens of milliseconds.
 
 The file stands beside the kernel's module, or in the user's cache where that folder cannot be
 written; where neither can, every process compiles anew. Its name is a digest of the sources of the
@@ -19,6 +19,8 @@ import importlib.util
 import os
 import pwd
 import re
+import subprocess
+import sys
 from collections.abc import Callable
 from contextlib import suppress
 from importlib.metadata import version
@@ -64,7 +66,7 @@ def kernel(module: str, name: str) -> Callable[..., int]:
         file, folders = f"{symbol}-{_digest(beside)}.o", _folders(beside)
         code = next((found for folder in folders if (found := _read(folder / file))), None)
         if code is None:
-            code = _compiled(getattr(importlib.import_module(module), name), symbol)
+            code = _compiled_apart(module, name) or compiled_here(module, name)
             _write(code, folders, symbol, file)
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), _target())
         engine.add_object_file(llvm.object_file.ObjectFileRef.from_data(code))
@@ -138,11 +140,26 @@ def _target() -> Any:
     )
 
 
-def _compiled(dispatcher: Any, symbol: str) -> bytes:
-    """The object file of a function that Numba compiles, callable as ``symbol``."""
+def _compiled_apart(module: str, name: str) -> bytes:
+    """What :func:`compiled_here` gives, from another process; nothing where none can be had.
+
+    An interpreter inside another program, for example, has no command of its own.
+    """
+    script = "import sys; from chainshaper.values.compiled import compiled_here as made; "
+    script += "sys.stdout.buffer.write(made(*sys.argv[1:]))"
+    command = [sys.executable, "-c", script, module, name]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with suppress(OSError, subprocess.SubprocessError):
+        made = subprocess.run(command, env=environment, capture_output=True, check=True)
+        return made.stdout
+    return b""
+
+
+def compiled_here(module: str, name: str) -> bytes:
+    """The object file of a function that Numba compiles, callable as ``MODULE.NAME``."""
     import numba
 
-    function = dispatcher.py_func
+    function, symbol = getattr(importlib.import_module(module), name).py_func, f"{module}.{name}"
     kind = numba.types.int64(*[numba.types.int64] * function.__code__.co_argcount)
     found = numba.cfunc(kind, error_model="numpy")(function)
     text = found.inspect_llvm().replace(found.native_name, symbol)
