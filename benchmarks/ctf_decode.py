@@ -61,7 +61,7 @@ from chainshaper.sources.ctf import count_events, open_trace, read_events
 trace = open_trace(sys.argv[1])
 started = time.monotonic()
 if sys.argv[2] == "count":
-    total = sum(count_events(trace).values())
+    total = sum(count_events(trace)[0].values())
 else:
     names = None if sys.argv[2] == "all" else {sys.argv[2]}
     total = sum(len(frame) for frame in read_events(trace, names).values())

@@ -96,6 +96,22 @@ def test_responses_come_back_to_the_client_that_asked(gids: bool) -> None:
     ]
 
 
+def test_two_servers_of_one_name_send_their_own_responses() -> None:
+    """A node that was started twice: both take the call, and both answer, the second later."""
+    run = Called()
+    second = run.story.service(run.story.node("/again", 4), "/add")
+    run.request(0, 100, 1)
+    run.serve(0, 120, 1, sent=102)
+    run.server, first = second, run.server
+    run.serve(0, 140, 1, sent=102)
+    run.answer(0, 170, 1)
+    flow = run.flow()
+    names = dict(flow.objects.callbacks.select("callback_id", "node").unique().iter_rows())
+    sent = flow.publications.filter(pl.col("topic").cast(pl.String) == "/add:response")
+    assert [names[one] for one in sent.sort("time")["callback_id"]] == ["/server", "/again"]
+    assert first is not second
+
+
 def test_no_chain_leads_from_one_client_to_another() -> None:
     graph = graph_of(both_at_once(gids=True).flow())
     with pytest.raises(InputError, match="responses go back to the node that sent"):

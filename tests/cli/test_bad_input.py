@@ -190,6 +190,10 @@ def test_what_does_not_go_is_refused_and_nothing_written(
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
+def test_a_pattern_that_is_none_is_refused() -> None:
+    assert "no pattern" in refused(2, "check", "runs/**x", "--budget", "budget.yaml")
+
+
 def test_with_json_an_error_is_json_too(words: Words) -> None:
     failed = called(*words("latency REC --chain /t1../t9 --json"))
     assert (failed.code, failed.out) == (2, "")
@@ -220,6 +224,8 @@ def test_without_a_chain_those_of_the_trace_are_proposed() -> None:
         "plan rec --epsilon -1ms",
         "plan rec --anchor clock",
         "shape app.yaml",
+        "watch --every 0ms --chain /a../b",
+        "watch --longest 0ms --chain /a../b",
         "latency",
         "dance",
         "--louder",

@@ -13,6 +13,7 @@ from processes import wait_for
 from small_chain import NODES
 
 from chainshaper import measure_latency
+from chainshaper.cli.output import stop_on_signals
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.values.recording import Recording
 
@@ -144,3 +145,21 @@ def test_a_reader_that_has_seen_enough_is_no_error(
     assert "Broken" not in finished.err
     assert "Traceback" not in finished.err
     assert "Exception" not in finished.err
+
+
+def test_a_signal_that_comes_while_the_event_is_waited_for_is_heard() -> None:
+    """Its handler interrupts who has the event's lock, and must not want it itself."""
+    with stop_on_signals() as stop:
+        with stop._cond:  # type: ignore[attr-defined]
+            os.kill(os.getpid(), signal.SIGTERM)
+        assert stop.wait(5)
+
+
+def test_under_nohup_a_lost_terminal_stops_nothing() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with stop_on_signals() as stop:
+            os.kill(os.getpid(), signal.SIGHUP)
+            assert not stop.wait(0.05)
+    finally:
+        signal.signal(signal.SIGHUP, before)

@@ -147,6 +147,10 @@ def test_a_node_that_does_not_appear_is_named(
     ):
         time.sleep(0.001)
         see_to_it(list_processes(nodes.values()))
+    # One that was there and is gone ends nothing: what was recorded is of use.
+    with profiling_condition(["/front"], folder=tmp_path) as see_to_it:
+        running = list_processes(nodes.values())
+        assert [see_to_it(running), see_to_it(running), see_to_it(())] == [False, True, False]
 
 
 def test_an_executor_that_had_several_threads_has_them_again() -> None:
@@ -174,7 +178,11 @@ def test_a_core_that_is_not_there_is_refused() -> None:
 def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     command = chain_command(node, 100_000)
-    assert called("record", *LTTNG, "-o", first, "--duration", "1s", "--", *command).code == 0
+    run = json_of("record", *LTTNG, "-o", first, "--duration", "1s", "--", *command)
+    assert run["exit_code"] is None  # it was ended
+    # The application was there to be asked; who answers is no ROS 2.
+    notes = open_recording(first).info.notes
+    assert any("types and QoS of topics could not be asked for" in note for note in notes)
     assert chain_nodes(open_recording(first), "/x../y") == ("/source", "/relay")
     _, cores = profiled_cores(open_recording(first), ["/x../y"], PlanRequest())
     assert cores == {"/source": available_cores()[-1], "/relay": available_cores()[-1]}

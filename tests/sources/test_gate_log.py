@@ -31,7 +31,8 @@ def test_each_line_is_a_row_of_gate_release(log: Path) -> None:
         **events.FIELDS["gate_release"],
         **events.OPTIONAL_FIELDS["gate_release"],
     }
-    assert set(table.columns) == {*LOG_COLUMNS, "callback"}
+    assert set(table.columns) == {*LOG_COLUMNS, "callback", "gate"}
+    assert set(table["gate"]) == {"gate"}
     shown = ("time", "release", "slot", "published", "overrun", "mode", "source_timestamp")
     assert table.select(shown).rows() == [
         (1060, 1060, 2, 1071, None, None, None),
@@ -82,3 +83,28 @@ def test_stalls_that_a_gate_saw_are_the_machines(log: Path) -> None:
     tables, _ = with_gate_logs({"machine_stall": seen}, [log], since_ns=0, until_ns=2_000_000)
     stalls = tables["machine_stall"].select("time", "cpu", "duration").rows()
     assert stalls == [(500, 0, 150_000), (1_000_060, 1, 200_000)]
+
+
+def test_gates_of_one_process_count_their_rows_for_themselves(tmp_path: Path) -> None:
+    """Rows 1 to 3 of the one; of the other 2 was not written: one is missing, and no more."""
+    logs = [tmp_path / "one.csv", tmp_path / "two.csv"]
+    for log, numbers in zip(logs, ((1, 2, 3), (1, 3)), strict=True):
+        rows = (EARLY.replace("1060,7", f"{1060 + n},7", 1)[:-1] + f",{n}\n" for n in numbers)
+        log.write_text(HEADER[:-1] + ",row\n" + "".join(rows))
+    tables, notes = with_gate_logs({}, logs, since_ns=0, until_ns=2000)
+    assert tables["gate_release"].group_by("gate").len().sort("gate").rows() == [
+        ("one", 3),
+        ("two", 2),
+    ]
+    (note,) = notes
+    assert note.startswith("1 rows of shaping nodes' logs could not be written")
+
+
+def test_a_log_that_a_full_disk_left_empty_costs_no_other(log: Path) -> None:
+    log.write_text(HEADER + EARLY)
+    empty = log.with_name("empty.csv")
+    empty.touch()
+    log.with_name("gate.csv.1").touch()
+    tables, (note,) = with_gate_logs({}, [empty, log], since_ns=0, until_ns=2000)
+    assert tables["gate_release"].height == 1
+    assert f"{empty} is not there: it has let nothing through" in note

@@ -19,7 +19,7 @@ from lttng_node import required_node
 from processes import children_of, marked_processes, wait_for
 
 from chainshaper.sources.lttng import MIB, LttngSession, buffer_size
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
@@ -202,15 +202,10 @@ def test_a_daemon_that_dies_is_a_failure_in_words(node: Path, tmp_path: Path) ->
         daemon.send_signal(signal.SIGKILL)
         daemon.wait()
         assert session.failure() == "the LTTng session daemon ended with code -9"
+        session.stop()  # what is there already is of use
+        assert "the last events may be missing: " in session._notes[-1]
     finally:
         session.remove()
-
-
-def test_an_application_without_trace_points_is_said_to_have_none(
-    node: Path, tmp_path: Path
-) -> None:
-    with pytest.raises(OperationError, match=r"no process with LTTng trace points .*source ebpf`"):
-        result(LttngSession(tmp_path, ["x"], ()), "true")
 
 
 @pytest.mark.parametrize(("command", "pids"), [((), ()), ((), (1,)), (("x",), (1,))])

@@ -125,6 +125,19 @@ def test_execution_times_from_a_kernel_trace_beside_user_space(tmp_path: Path) -
     assert statistics["execution_ns"].null_count() == 2
 
 
+def test_damage_to_the_kernels_part_is_said_though_it_is_read_late(tmp_path: Path) -> None:
+    story = chain_story(cycles=3)
+    switch(story, {900: (0, 10), 1160: (10, 11)})
+    trace = written(tmp_path / "trace", story)
+    (stream,) = (one for one in (trace / "kernel").iterdir() if one.name != "metadata")
+    content = bytearray(stream.read_bytes())
+    content[-8:] = b"\xff" * 8
+    stream.write_bytes(content)
+    recording = open_source(trace)
+    assert len(recording.events["callback_start"])
+    assert any(str(stream) in note for note in recording.info.notes)
+
+
 def test_what_the_tracer_dropped_is_in_every_result(tmp_path: Path) -> None:
     trace, recording = (
         written(tmp_path / "trace", chain_story(), discarded_events=7),

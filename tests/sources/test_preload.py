@@ -30,6 +30,7 @@ from chainshaper.sources.preload import (
     TracedProcess,
     build_library,
     event_names,
+    in_cache,
     preloading,
 )
 from chainshaper.values import events
@@ -580,3 +581,41 @@ def test_an_environment_with_other_libraries_in_front_has_them_still(
         tracer.remove()
     assert given["LD_PRELOAD"].endswith(":/other.so")
     assert given.keys() == {"LD_PRELOAD", VARIABLE}
+
+
+def test_a_ring_whose_count_is_damaged_costs_no_other(tmp_path: Path) -> None:
+    """A node may write where it should not: what its memory says then is no count of events."""
+    program = "take(1)\nprint(os.getpid(), flush=True)\ninput()"
+    environment = {**os.environ, "LD_PRELOAD": str(build_library(tmp_path))}
+    with subprocess.Popen(
+        [sys.executable, "-c", CALLER + program],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        folder = Path(f"/proc/{process.pid}/fd")
+        (found,) = (one for one in folder.iterdir() if "chainshaper-trace" in str(one.readlink()))
+        with found.open("r+b") as file:
+            memory = TracedProcess(file.fileno())
+            counts = [(1 << 63) + 5, 1]
+            for count in counts:
+                file.seek(64)  # behind the header: how much the first thread has written
+                file.write(count.to_bytes(8, "little"))
+                file.flush()
+                assert memory.new_records() == []
+        assert memory.lost == len(counts)
+        process.communicate("\n")
+
+
+def test_root_builds_nothing_where_others_may_write(tmp_path: Path) -> None:
+    open_to_others = tmp_path / "cache"
+    open_to_others.mkdir()
+    open_to_others.chmod(0o777)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("chainshaper.sources.preload.own_cache", lambda: open_to_others / "own")
+        with pytest.raises(PlatformError, match="writable by others"):
+            in_cache("x.so", ["source"], lambda _: pytest.fail("it is built all the same"))
+    assert list(open_to_others.iterdir()) == []

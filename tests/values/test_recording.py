@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import polars as pl
@@ -13,6 +14,7 @@ from chainshaper.flow.exploration import convert_recording
 from chainshaper.reporting.overviews import contents_json
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.files import write_whole
 from chainshaper.values.recording import (
     RecordingInfo,
     StallMeterInfo,
@@ -313,3 +315,13 @@ def test_facts_of_the_wrong_type_are_named(whole: Path, change: dict[str, object
     text = _refused(whole)
     assert text.startswith(f"{file}: ")
     assert next(iter(change)) in text
+
+
+def test_whatever_ends_writing_leaves_nothing(tmp_path: Path) -> None:
+    def parts() -> Iterator[bytes]:
+        yield b"half"
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        write_whole(tmp_path / "file", parts())
+    assert list(tmp_path.iterdir()) == []

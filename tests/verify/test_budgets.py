@@ -194,3 +194,40 @@ def test_wrong_budgets_are_refused_with_their_line(tmp_path: Path, text: str, me
     with pytest.raises(InputError, match=message) as refused:
         load_budget(file)
     assert f"{file}:2" in str(refused.value)
+
+
+def ending(recording: Recording, folder: Path, after: int) -> Recording:
+    """The last node of the chain takes no message of a cycle behind so many any more."""
+    hops = measure_latency(recording).analysis.hops
+    gone = hops.filter(hop=2).sort("start")["source_timestamp"][after:]
+    takes = recording.events["rmw_take"]
+    left = takes.filter(~pl.col("source_timestamp").is_in(gone.implode()))
+    events = {**recording.events, "rmw_take": left}
+    return write_recording(folder / f"ending{after}", events, recording.info)
+
+
+@pytest.mark.parametrize(("after", "missing"), [(50, 0.75), (0, 1.0)])
+def test_outputs_are_missing_of_a_chain_whose_last_node_died(
+    recording: Recording, tmp_path: Path, after: int, missing: float
+) -> None:
+    budget = Budget(chains=(ChainBudget(chain="/t1../t3", maximum_ns=MS, missing=0.01),))
+    longest, gone = check_budget(ending(recording, tmp_path, after), budget)
+    assert gone.found == pytest.approx(missing, abs=0.006)
+    assert not (longest.met or gone.met)
+    assert ("no cycle was complete" in longest.text) == (after == 0)
+
+
+def test_of_callbacks_with_one_name_the_longest_counts(recording: Recording) -> None:
+    """A node that was started again goes on as another process, whose callbacks are slower."""
+    again = {
+        name: table.with_columns(pl.col("pid", "tid") + 50_000, pl.col("time") + 10_000 * MS)
+        for name, table in recording.events.items()
+        if "pid" in table.columns
+    }
+    again["callback_end"] = again["callback_end"].with_columns(pl.col("time") + 2 * MS)
+    both = {name: pl.concat([recording.events[name], table]) for name, table in again.items()}
+    whole = replace(recording, events={**recording.events, **both})
+    budget = propose_budget(recording, room=0.1)
+    judged = {(one.where, one.what): one for one in check_budget(whole, budget)}
+    limit = judged["/second (/t1)", "response"]
+    assert limit.found == pytest.approx(limit.limit / 1.1 + 2 * MS, abs=20_000)

@@ -365,3 +365,12 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
     measured = measure_latency(recording)
     assert measured.prediction is not None
     assert (measured.prediction.late_of_all, measured.prediction.cycles) == (late, values["count"])
+
+
+def test_of_gates_in_one_process_each_chain_has_its_own_rows(shaped: Recording, plan: Plan) -> None:
+    rows = shaped.events["gate_release"]
+    own, others = (rows.with_columns(gate=pl.lit(name)) for name in ("chainshaper_t3", "another"))
+    both = replace(shaped, events={**shaped.events, "gate_release": pl.concat([own, others])})
+    decided = gate_releases(both, plan)
+    assert decided is not None
+    assert decided.height == rows.height

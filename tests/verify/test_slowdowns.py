@@ -234,3 +234,16 @@ def test_instances_that_met_a_stall_are_left_out(tmp_path: Path) -> None:
     }
     assert sum(gone.values()) >= 1
     assert not any(np.isnan(own.response).any() for own in sample_of(recording).callbacks.values())
+
+
+def test_too_few_instances_undisturbed_in_both_say_nothing() -> None:
+    """45 of 90 are undisturbed on either side, but not the same: nobody else is slower for that."""
+    before, after = run(1, count=90, inputs=None), run(2, count=90, inputs=None)
+    for side, hit in ((before, slice(0, 45)), (after, slice(45, 90))):
+        for times in side.callbacks[NAMES[2]]:
+            times[hit] = np.nan
+    compared, notes = find_slowdowns([after], [before])
+    assert [one.node for one in compared if not one.met] == []
+    assert "/n2" not in {one.node for one in compared}
+    assert any("not compared" in note and "/n2" in note for note in notes)
+    assert all(np.isfinite(one.p) for one in compared)

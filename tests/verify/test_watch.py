@@ -178,12 +178,13 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
             watch.save(tmp_path / "flight")
         plan = plan_recording(recording, CHAIN)
         (slot,) = publish_slots(plan)
-        beside = own_watch(plan=whole(plan))
-        in_time = watched(beside, 1.0)[-1].chains[0]
+        beside = own_watch(CHAIN, "/first../second", plan=whole(plan))
+        in_time, by_nodes = watched(beside, 1.0)[-1].chains
         latest = replace(beside.due[0], cycle_ns=1_000_000, slots=())
         beside.due = [latest]
         too_late = watched(beside, 1.0)[-1].chains[0]
-    assert in_time.promised_ns == slot[1]
+    assert in_time.promised_ns == by_nodes.promised_ns == slot[1]
+    assert in_time.shares == by_nodes.shares
     places = beside.chains[0].cycles["place_ns"]
     inside = places.is_between(slot[0] - 100_000, slot[1], "left")
     assert in_time.shares == (inside[: in_time.spans["hour"].count].mean(),)

@@ -9,17 +9,17 @@ from small_chain import DDS_CORE, EXECUTOR_CORE, PERIOD_NS, small_chain
 from chainshaper import plan_recording, run_application, simulate
 from chainshaper.flow.plan import shape_application
 from chainshaper.planning import PlanRequest
+from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.overruns import dropped_in
 from chainshaper.workload.description import Application
 
 
-def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path) -> None:
+def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path, unshaped: Recording) -> None:
     """The slot of /t1 comes behind the end of fast callbacks, in the same cycle."""
     application = small_chain(tmp_path)
-    profile = run_application(application, tmp_path / "profile", cycles=12)
-    plan = plan_recording(profile, request=PlanRequest(policy="let-per-callback"))
+    plan = plan_recording(unshaped, request=PlanRequest(policy="let-per-callback"))
     shaped = shape_application(application, plan, tmp_path / "shaped", cycles=20)
 
     releases = shaped.events["gate_release"].filter(pl.col("overrun").is_null())

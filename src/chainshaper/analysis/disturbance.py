@@ -212,13 +212,16 @@ def _queued_behind(hit: Mask, start: Times, busy_until: Times, may_queue: Mask) 
 def stalled_within(start: Times, end: Times, began: Times, ended: Times, core: Times) -> Times:
     """Per window [start, end] the time lost in it to stalls of one core, the worst one (ns).
 
-    Stalls of one core do not overlap: what they took up to an instant is linear between their
-    beginnings and ends, and a window's share is a difference of two.
+    A gate and a meter may both have seen a stall: of those that overlap, each ns counts once. What
+    stalls took up to an instant is then linear between their beginnings and ends, and a window's
+    share is a difference of two.
     """
     worst = np.zeros(len(start), dtype=np.int64)
     for one in np.unique(core):
         order = np.argsort(began[core == one], kind="stable")
         first, last = began[core == one][order], ended[core == one][order]
+        last = np.maximum.accumulate(last)
+        first[1:] = np.maximum(first[1:], last[:-1])
         total = np.concatenate(([0], np.cumsum(last - first)))
         lost = []
         for instant in (start, end):

@@ -298,8 +298,8 @@ def _answered(published: pl.DataFrame, taken: pl.DataFrame) -> pl.DataFrame:
     calls = calls.filter(pl.col("topic").cast(pl.String).str.ends_with(REQUEST))
     own = published.filter(pl.col("source_timestamp") < 0)
     own = own.filter(pl.col("topic").cast(pl.String).str.ends_with(RESPONSE))
-    columns = ["instance", "callback_id"]
-    rows = own.drop(columns).join(calls.select("source_timestamp", *columns), on="source_timestamp")
+    columns, call = ["instance", "callback_id"], ["pid", "source_timestamp"]
+    rows = own.drop(columns).join(calls.select(*call, *columns), on=call)
     return published.with_columns(
         pl.coalesce(by_number(rows, "publication", column, published.height), column)
         for column in columns

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -101,22 +101,29 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     )
 
 
-def named_callbacks(flow: DataFlow) -> dict[tuple[str, str], dict[str, Any]]:
-    """Callbacks that ran and are named alike in every run, by node and what starts them.
+def named_callbacks(flow: DataFlow) -> pl.DataFrame:
+    """Callbacks that ran and are named alike in every run: by node, and ``starts``, what starts
+    them. Several may have one name: two timers of one period, or those of a node started again.
 
     They are rows of :func:`.callback_statistics`, without those that every node has.
     """
-    found = (
-        callback_statistics(flow)
-        .filter(
-            pl.col("node").is_not_null()
-            & pl.col("kind").is_in(["timer", "subscription"])
-            & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
-        )
-        .unique(["node", "topic", "period_ns"], keep="first", maintain_order=True)
+    found = callback_statistics(flow).filter(
+        pl.col("node").is_not_null()
+        & pl.col("kind").is_in(["timer", "subscription"])
+        & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
     )
-    rows = found.iter_rows(named=True)
-    return {(row["node"], trigger_text(row["topic"], row["period_ns"])): row for row in rows}
+    starts = [trigger_text(*one) for one in found.select("topic", "period_ns").iter_rows()]
+    return found.with_columns(starts=pl.Series(starts, dtype=pl.String))
+
+
+def longest_times(flow: DataFlow) -> dict[tuple[str, str], tuple[float | None, float | None]]:
+    """The longest response and execution time (ns) of each name of :func:`named_callbacks`."""
+    named = named_callbacks(flow).group_by("node", "starts", maintain_order=True)
+    rows = named.agg(
+        response=pl.col("response_ns").struct.field("max").max(),
+        execution=pl.col("execution_ns").struct.field("max").max(),
+    )
+    return {(node, starts): (most, used) for node, starts, most, used in rows.iter_rows()}
 
 
 class Executor(NamedTuple):

@@ -38,6 +38,12 @@ def _duration(text: str) -> int:
     return value
 
 
+def _positive(text: str) -> int:
+    if not (value := _duration(text)):
+        raise typer.BadParameter(f"{text} is no time: write more than 0")
+    return value
+
+
 def _bands(text: str) -> int | Literal["auto"]:
     if text == "auto":
         return "auto"
@@ -65,6 +71,7 @@ def _share(text: str) -> float:
 
 PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     "DURATION": (_duration, format_duration),
+    "DURATION>0": (_positive, format_duration),
     "N|auto": (_bands, str),
     "CORES": (_cores, lambda cores: ",".join(map(str, cores))),
     "SHARE": (_share, "{:.0%}".format),

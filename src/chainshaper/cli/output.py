@@ -6,9 +6,8 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import chainshaper as cs
@@ -182,32 +181,33 @@ def lost_events(recording: "cs.Recording") -> str:
     return lost_text(recording.info.lost)
 
 
-@contextmanager
-def stop_on_signals() -> Iterator[threading.Event]:
+def stop_on_signals() -> AbstractContextManager[threading.Event]:
     """Ctrl-C, a closed terminal and `kill` are an order to finish inside: each sets the event."""
-    stop = threading.Event()
+    nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+    return set_by(signal.SIGINT, signal.SIGTERM, *(() if nohup else (signal.SIGHUP,)))
 
-    def end(_number: int, _frame: FrameType | None) -> None:
-        stop.set()
 
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    before = {number: signal.signal(number, end) for number in numbers}
+@contextmanager
+def set_by(*numbers: signal.Signals) -> Iterator[threading.Event]:
+    """An event that these signals set, inside.
+
+    A thread of its own does that: a handler may interrupt who holds the event's lock.
+    """
+    event, (reading, writing) = threading.Event(), os.pipe()
+
+    def listen() -> None:
+        while os.read(reading, 1):
+            event.set()
+        os.close(reading)
+
+    threading.Thread(target=listen, daemon=True).start()
+    before = {one: signal.signal(one, lambda *_: os.write(writing, b"!")) for one in numbers}
     try:
-        yield stop
+        yield event
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-@contextmanager
-def asked_for(number: int) -> Iterator[threading.Event]:
-    """An event that a signal sets, inside."""
-    asked = threading.Event()
-    before = signal.signal(number, lambda *_: asked.set())
-    try:
-        yield asked
-    finally:
-        signal.signal(number, before)
+        os.close(writing)
 
 
 @contextmanager

@@ -277,9 +277,9 @@ def watch(
         "--plan plan.yaml", "The plan in force: its chains, slots, and which outputs are late."
     ),
     longest: int = opt.option(
-        "--longest DURATION", "What takes longer counts as incomplete.", 2_000_000_000
+        "--longest DURATION>0", "What takes longer counts as incomplete.", 2_000_000_000
     ),
-    every: int = opt.option("--every DURATION", "How often to look.", 1_000_000_000),
+    every: int = opt.option("--every DURATION>0", "How often to look.", 1_000_000_000),
     budget: Path | None = opt.option(
         "--budget FILE",
         "What chains, hops and callbacks may take in the last minute: a limit that breaks is said,"
@@ -350,7 +350,7 @@ def watch(
             until.callback(end_command, started)
         show = until.enter_context(out.live())
         export = until.enter_context(exporting(metrics, otlp))
-        asked = until.enter_context(out.asked_for(signal.SIGQUIT))
+        asked = until.enter_context(out.set_by(signal.SIGQUIT))
         watched = Watch(
             chains,
             users=run_users(user or []),

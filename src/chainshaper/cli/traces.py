@@ -200,7 +200,10 @@ def _matching(recordings: list[Path]) -> list[Path]:
     for one in recordings:
         own = [one]
         if not one.exists() and any(letter in str(one) for letter in "*?["):
-            own = sorted(Path(one.anchor or ".").glob(str(one.relative_to(one.anchor))))
+            try:
+                own = sorted(Path(one.anchor or ".").glob(str(one.relative_to(one.anchor))))
+            except ValueError as error:  # such as runs/**x
+                raise InputError(f"{one} is no pattern: {error}") from error
         if not own:
             raise InputError(f"{one}: no folder has such a name; see that the pattern is right")
         found += own

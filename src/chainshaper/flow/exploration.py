@@ -120,7 +120,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
         trigger: dict[str, Any] = {"timer": format_duration(round(period, -3))}
         if set(read) <= published:
             trigger = {"synchronises": read} if len(read) > 1 else {"subscription": read[0]}
-        steps = np.quantile(taken, np.linspace(0, 1, QUANTILES))
+        steps = np.quantile(taken, (np.arange(QUANTILES) + 0.5) / QUANTILES)  # of equal shares
         samples = [format_duration(max(1_000, int(step) // 1000 * 1000)) for step in steps]
         callback = {**trigger, "execution": {"samples": samples}, "publishes": topics}
         nodes.setdefault(one.node.strip("/"), {"callbacks": []})["callbacks"].append(callback)

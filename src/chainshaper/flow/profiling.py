@@ -66,20 +66,24 @@ def profiling_condition(
         graph = _graph(like)
         first = {graph.callbacks[find_chain(graph, one).callbacks[0]].node for one in chains}
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
+    appeared = False
 
     def see_to_it(processes: Sequence[Process]) -> bool:
         """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
+        nonlocal appeared
         found = allocate(processes, recorded)
         there = {node for one in found.threads for node in one.nodes}
         members = executors_of(found, wanted, processes)
         if not members or not wanted <= there:
-            if time.monotonic_ns() - begun_ns > START_NS:
+            # Of an application that ends, or a node that is started again, the recording goes on.
+            if not appeared and time.monotonic_ns() - begun_ns > START_NS:
                 missing, running = (", ".join(sorted(n)) for n in (wanted - there, there))
                 raise OperationError(
                     f"{f'node {missing}' if missing else 'a node'} has not appeared within"
                     f" {duration_text(START_NS)}; running: {running or 'no node'}"
                 )
             return False
+        appeared = True
         at_home: dict[str, list[NodeThread]] = {server.name: [] for server in servers.values()}
         for one in members:
             node = next((node for node in one.nodes if node in core_of), "")

@@ -156,16 +156,21 @@ def record_command(
         run = _Run(tracer, folder, *how, gate_logs, notes)
         for note in notes:
             progress(0.0, note)
-        _trace(run, command_stdout, watch_stalls=watch_stalls)
-        progress(1.0, "reading the events")
         try:
+            _trace(run, command_stdout, watch_stalls=watch_stalls)
+            progress(1.0, "reading the events")
             recording = _written(output, run, chain, plan)
-        except ChainshaperError as error:
+        except BaseException as error:  # the trace may be of hours: nothing costs it
+            if not run.ended_ns:
+                raise
             said = "".join(f"; {note.rstrip('.')}" for note in run.notes)
             if any(folder.iterdir()):
                 left = folder.rename(output.with_name(folder.name.lstrip(".")))
                 said += f"; what was traced stays in {left}"
-            raise OperationError(f"{error}{said}") from error
+            if isinstance(error, ChainshaperError):
+                raise OperationError(f"{error}{said}") from error
+            progress(1.0, f"it cannot be read{said}")
+            raise
         if any(folder.iterdir()):
             open_to_all(folder)
             folder.rename(recording.path / TRACE_FOLDER)

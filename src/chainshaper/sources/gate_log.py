@@ -24,9 +24,14 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
     file, or it is no shaping node's log.
     """
     path = Path(path)
+    table = pl.concat([_read_part(part) for part in _parts(path) or [path]])
+    return table.with_columns(gate=pl.lit(path.stem)).sort("time", maintain_order=True)
+
+
+def _parts(path: Path) -> list[Path]:
+    """The files of a log that are there, but for one for which the disk had no room."""
     before = path.with_name(f"{path.name}.1")
-    parts = [one for one in (before, path) if one.exists()] or [path]
-    return pl.concat([_read_part(part) for part in parts]).sort("time", maintain_order=True)
+    return [one for one in (before, path) if one.is_file() and one.stat().st_size]
 
 
 def _read_part(path: Path) -> pl.DataFrame:
@@ -49,10 +54,10 @@ def _read_part(path: Path) -> pl.DataFrame:
 def rows_missing(releases: pl.DataFrame) -> tuple[int, int]:
     """How many rows of logs are in no file: removed to make room, and never written.
 
-    Rows are numbered from 1 since a node started; logs of before are taken to be whole.
+    Rows are numbered from 1 since a gate began; logs of before are taken to be whole.
     """
     first, last = pl.min("row"), pl.max("row")
-    spans = releases.drop_nulls("row").group_by("pid")
+    spans = releases.drop_nulls("row").group_by("gate", "pid")
     counts = spans.agg(removed=first - 1, unwritten=last - first + 1 - pl.len().cast(pl.Int64))
     removed, unwritten = counts.select("removed", "unwritten").sum().row(0)
     return removed, unwritten
@@ -76,7 +81,7 @@ def with_gate_logs(
     Cycles count that began at ``since_ns`` or later, and whose message was let go before
     ``until_ns`` (CLOCK_MONOTONIC). Raises InputError: no such log.
     """
-    there = [log for log in logs if log.is_file()]
+    there = [log for log in logs if _parts(log)]
     notes = [
         f"the shaping node's log {log} is not there: it has let nothing through, or did not start."
         for log in logs

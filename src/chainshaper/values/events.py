@@ -191,6 +191,7 @@ OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
         # By how much the slots of the cycle in which it leaves are moved from where the plan has
         # them; null: the recording is from before slots could follow the latencies.
         "moved": _NANOSECONDS,
+        "gate": _NAME,  # the shaping node's name, in its log; one process may have several gates
     },
 }
 # fmt: on

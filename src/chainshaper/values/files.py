@@ -11,6 +11,7 @@ import pwd
 import stat
 import tempfile
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from chainshaper.values.errors import InputError, OperationError
@@ -32,6 +33,21 @@ def why_distrusted(path: str | Path) -> str | None:
         if of_group or state.st_mode & stat.S_IWOTH:
             return f"{part} is writable by others than {_user(state.st_uid)}"
     return None
+
+
+def own_cache() -> Path:
+    """Our folder in the user's cache, which need not be there; links to it are followed.
+
+    Where the cache that the environment names is another user's (`sudo -E`), it is our own.
+    """
+    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
+    if not cache.is_absolute():  # and is to be ignored, as its specification has it
+        cache = Path(os.path.expanduser("~/.cache"))  # noqa: PTH111 - the other raises without one
+    existing = next(place for place in (cache, *cache.parents) if os.path.exists(place))  # noqa: PTH110
+    if why_distrusted(existing) is not None:
+        with suppress(KeyError):  # a user without a name
+            cache = Path(pwd.getpwuid(os.geteuid()).pw_dir, ".cache")
+    return Path(os.path.realpath(cache / "chainshaper"))
 
 
 def _user(uid: int) -> str:
@@ -90,9 +106,11 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
             os.fsync(stream.fileno())
             os.fchmod(stream.fileno(), 0o644)  # the name may be a link of a folder's owner by now
         partial.rename(path)
-    except OSError as error:
+    except BaseException as error:  # Ctrl-C among them
         if partial is not None:
             partial.unlink(missing_ok=True)
+        if not isinstance(error, OSError):
+            raise
         raise OperationError(f"{path}: the file cannot be written: {error.strerror}") from error
     return path
 

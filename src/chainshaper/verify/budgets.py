@@ -15,20 +15,20 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 from xml.etree import ElementTree
 
 import polars as pl
 import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
-from chainshaper.analysis import data_flow
+from chainshaper.analysis import DataFlow, data_flow
 from chainshaper.analysis.latency import (
     PERCENTILES,
     LatencyAnalysis,
     LatencyStatistics,
     latency_statistics,
-    named_callbacks,
+    longest_times,
 )
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
@@ -185,7 +185,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             )
             for hop in hop_breakdown(analysis).to_dicts()
         )
-        missing = _missing(analysis) or 0.0
+        missing = _missing(analysis.traversals, _under_way_from(flow, analysis)) or 0.0
         of_chains.append(
             ChainBudget(
                 chain=chain,
@@ -200,10 +200,10 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
         CallbackBudget(
             node=node,
             starts=starts,
-            response_ns=limit(_most(row["response_ns"])),
-            execution_ns=limit(_most(row["execution_ns"])),
+            response_ns=limit(response),
+            execution_ns=limit(execution),
         )
-        for (node, starts), row in named_callbacks(flow).items()
+        for (node, starts), (response, execution) in longest_times(flow).items()
     )
     return Budget(chains=tuple(of_chains), callbacks=callbacks)
 
@@ -225,22 +225,22 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
                 for what, limit, _ in _chain_limits(chain, None, None)
             )
             continue
-        calm, parts = _calm(analysis), hop_breakdown(analysis)
+        parts = hop_breakdown(analysis)
         longest = {
             one["topic"]: (_most(one["communication_ns"]), _most(one["computation_ns"]))
             for one in parts.to_dicts()
         }
         hops = list(_judged_hops(name, chain, longest))
-        because = _from_where(hops, parts)
-        every = _chain_limits(chain, analysis.statistics, _missing(analysis))
-        undisturbed = _chain_limits(chain, calm.statistics, _missing(calm))
+        because = _from_where(hops, parts) or "no cycle was complete"
+        cycles, open_ns = analysis.traversals, _under_way_from(flow, analysis)
+        calm = _missing(cycles.filter(~pl.col("disturbed")), open_ns)
+        every = _chain_limits(chain, analysis.statistics, _missing(cycles, open_ns))
+        undisturbed = _chain_limits(chain, analysis.undisturbed, calm)
         for (what, limit, value), (_, _, at_rest) in zip(every, undisturbed, strict=True):
             one = Judged(name, chain.chain, what, limit, value, at_rest)
             found.append(one if one.met else replace(one, because=because))
         found += hops
-    rows = named_callbacks(flow)
-    times = {key: (_most(r["response_ns"]), _most(r["execution_ns"])) for key, r in rows.items()}
-    return [*found, *_judged_callbacks(name, budget.callbacks, times)]
+    return [*found, *_judged_callbacks(name, budget.callbacks, longest_times(flow))]
 
 
 def check_budgets(
@@ -326,17 +326,19 @@ def _chain_limits(
         yield "missing", chain.missing, missing
 
 
-def _calm(analysis: LatencyAnalysis) -> LatencyAnalysis:
-    """The same analysis of undisturbed cycles."""
-    frame = analysis.traversals.filter(~pl.col("disturbed"))
-    return replace(analysis, statistics=analysis.undisturbed, traversals=frame)
+def _under_way_from(flow: DataFlow, analysis: LatencyAnalysis) -> int:
+    """Cycles that began behind this instant may have been under way as the recording ended."""
+    end: Any = flow.instances["start"].max() or 0
+    return int(end) - (analysis.statistics.max_ns or 0)
 
 
-def _missing(analysis: LatencyAnalysis) -> float | None:
-    """The share of outputs that were late or never came; what was under way at the end is not."""
-    frame = analysis.traversals
-    over = frame.filter(
-        pl.col("complete") | (pl.col("start") <= pl.col("start").filter("complete").max())
+def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
+    """The share of outputs that were late or never came; those are not missing that were under way
+    at the end, or of lifecycle nodes that were not active.
+    """
+    over = traversals.filter(
+        pl.col("complete") | (pl.col("start") <= under_way_from_ns),
+        pl.col("reason").ne_missing("inactive"),
     )
     if not over.height:
         return None

@@ -7,8 +7,8 @@ A gate records its decision for every message. The thread of an asynchronous pub
 nothing; there the messages that were never sent count as discarded, and those that were sent in a
 later cycle than due as having waited.
 
-Where several chains are shaped, a chain's figures are those of its own gates. Each gate is a
-process; what processes of other nodes recorded does not count.
+Where several chains are shaped, a chain's figures are those of its own gates: of the rows that name
+one of them, and where rows name none, as in live recordings, each gate is a process.
 
 Whatever the policy, an overrun is to be late by itself: the **next cycle** was hit where its output
 missed its slot too, or did not come, whatever the cause.
@@ -54,13 +54,14 @@ def gate_releases(
     """
     if "gate_release" not in recording.events:
         return None
-    table = events.table(recording.events, "gate_release", ["dropped", "lost"])
+    table = events.table(recording.events, "gate_release", ["dropped", "lost", "gate"])
     table = with_overrun(table, 0 if plan is None else cycles_until_output(plan))
     if plan is None:
         return table
     nodes = [n for n in shaping_nodes(plan) if not analysis or n.output in analysis.chain.topics]
-    gates = [f"{one.thread.node}{ending}" for one in nodes for ending in ("", STANDBY)]
-    return _of_nodes(recording, table, gates) if gates else None
+    names = [f"{one.name}{ending}" for one in nodes for ending in ("", STANDBY)]
+    table = table.filter(pl.col("gate").is_in(names) | pl.col("gate").is_null())
+    return _of_nodes(recording, table, [f"/{name}" for name in names]) if names else None
 
 
 def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -> pl.DataFrame:

@@ -99,7 +99,7 @@ class Compared:
 
     @property
     def met(self) -> bool:
-        return self.p >= LEVEL
+        return not self.p < LEVEL
 
     @property
     def where(self) -> str:
@@ -157,12 +157,13 @@ def _read(
 def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None = None) -> Sample:
     """What counts of a recording, and of the ``chains`` that it has (none: its own)."""
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    names = {row["callback_id"]: name for name, row in named_callbacks(flow).items()}
+    named = named_callbacks(flow).select("callback_id", "node", "starts")
+    names = {number: (node, starts) for number, node, starts in named.iter_rows()}
     ended = flow.instances.filter(pl.col("callback_id").is_in([*names]) & ~pl.col("assumed"))
     ended = ended.drop_nulls("end")
     hit = pl.Series(stalled_after(flow, ended["start"].to_numpy(), ended["end"].to_numpy()))
-    calm = ended.select(
-        "callback_id",
+    calm = ended.join(named, on="callback_id", maintain_order="left").select(
+        *("node", "starts"),
         *(
             pl.when(~hit).then(taken.cast(pl.Float64).clip(1)).fill_null(np.nan).alias(time)
             for time, taken in (
@@ -172,8 +173,8 @@ def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None
         ),
     )
     callbacks = {
-        names[number]: Taken(*(own[time].to_numpy() for time in Taken._fields))
-        for (number,), own in calm.group_by("callback_id", maintain_order=True)
+        (node, starts): Taken(*(own[time].to_numpy() for time in Taken._fields))
+        for (node, starts), own in calm.group_by("node", "starts", maintain_order=True)
     }
     found = {}
     for chain in chains or (None,):
@@ -195,12 +196,16 @@ def find_slowdowns(
     every, notes = [*before, *samples], list[str]()
     named = [frozenset(one.callbacks) for one in every]
     times: dict[Name, tuple[str, list[Times]]] = {}
+    beside: dict[Name, list[Times]] = {}
     for name in sorted(frozenset.intersection(*named)):
         for time in reversed(Taken._fields):
             own = [getattr(one.callbacks[name], time) for one in every]
-            if min(np.count_nonzero(~np.isnan(one)) for one in own) >= FEWEST:
-                times[name] = (time, own)
-                break
+            if min(np.count_nonzero(~np.isnan(one)) for one in own) < FEWEST:
+                continue
+            ratios = [_ratios(own[0], one) for one in own]
+            if min(one.size for one in ratios) >= FEWEST:
+                times[name], beside[name] = (time, own), ratios
+            break
     if not times:
         raise InputError(
             f"{every[-1].recording} and {every[0].recording} have no callback with {FEWEST}"
@@ -212,8 +217,8 @@ def find_slowdowns(
         notes.append(
             f"not compared, since not all recordings have {FEWEST} undisturbed instances: {listed}"
         )
-    beside = [[_beside(own[0], one) for one in own] for _, own in times.values()]
-    shifts, errors, noise = np.moveaxis(np.array(beside), 2, 0)  # [callback, recording]
+    figures = np.array([[_beside(one) for one in own] for own in beside.values()])
+    shifts, errors, noise = np.moveaxis(figures, 2, 0)  # [callback, recording]
     common, tested = _tested(shifts, errors[:, 1:], noise[:, 1:], len(before))
     if abs(common) > LEAST:
         notes.append(
@@ -269,17 +274,21 @@ def _chains(samples: Sequence[Sample], before: Sequence[Sample], name: Name) -> 
     return changes
 
 
-def _beside(first: Times, own: Times) -> tuple[float, float, float]:
+def _beside(ratios: Times) -> tuple[float, float, float]:
     """How much longer instances took than those of the first recording: median of log ratios, its
     standard error, and their robust standard deviation."""
-    if own is first:
-        return 0.0, 0.0, 0.0
-    places, beside = _alike(first, own)
-    ratios = np.log(own[beside] / first[places])
-    ratios = ratios[~np.isnan(ratios)]
     medians = [np.median(block) for block in np.array_split(ratios, BLOCKS)]
     noise = float(stats.median_abs_deviation(ratios, scale="normal"))
     return float(np.median(ratios)), float(stats.sem(medians)), noise
+
+
+def _ratios(first: Times, own: Times) -> Times:
+    """The logarithms of how much longer instances took, of those undisturbed in both."""
+    if own is first:
+        return np.zeros(np.count_nonzero(~np.isnan(own)))
+    places, beside = _alike(first, own)
+    ratios = np.log(own[beside] / first[places])
+    return np.asarray(ratios[~np.isnan(ratios)])
 
 
 def _alike(first: Times, own: Times) -> tuple[Places, Places]:

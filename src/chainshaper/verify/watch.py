@@ -24,7 +24,6 @@ import polars as pl
 from numpy.typing import NDArray
 
 from chainshaper.analysis import (
-    DataFlow,
     SeveralPathsError,
     data_flow,
     find_chain,
@@ -33,7 +32,7 @@ from chainshaper.analysis import (
     with_restarts,
 )
 from chainshaper.analysis.disturbance import with_punctuality
-from chainshaper.analysis.latency import LatencyStatistics, latency_statistics, named_callbacks
+from chainshaper.analysis.latency import LatencyStatistics, latency_statistics, longest_times
 from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.gate.decision import clock_offset
 from chainshaper.planning import ApplicationPlan
@@ -174,6 +173,7 @@ class _Chain:
     """What is known of a chain: a row for each cycle, in the order of beginning, for an hour."""
 
     text: str
+    output: str  # its topic, as far as that is known
     slots: tuple[tuple[int, int], ...]
     cycles: pl.DataFrame = field(default_factory=lambda: pl.DataFrame(schema=_CYCLE))
     hops: deque[tuple[int, pl.DataFrame]] = field(default_factory=deque)
@@ -261,7 +261,8 @@ class Watch:
         self.callbacks: deque[tuple[int, Any]] | None = deque() if callbacks else None
         self.users, self.plan, self.longest_ns = users, plan, longest_ns
         self.due = [] if plan is None else [due for one in plan.chains for due in due_of(one)]
-        self.chains = [_Chain(text, self._slots(text)) for text in chains]
+        ends = [(text, text.rpartition("..")[2]) for text in chains]
+        self.chains = [_Chain(text, end, self._slots(end)) for text, end in ends]
         self.processes: dict[int, TracedProcess] = {}
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
         self._fresh: list[tuple[int, NDArray[Any]]] = []  # of a process, not yet in a table
@@ -277,8 +278,7 @@ class Watch:
         self._over_ns = time.monotonic_ns()  # cycles that began until then have been taken over
         self._began_ns = self._looked_from_ns = self._over_ns  # the last look's cycles from then on
 
-    def _slots(self, chain: str) -> tuple[tuple[int, int], ...]:
-        output = chain.rpartition("..")[2]
+    def _slots(self, output: str) -> tuple[tuple[int, int], ...]:
         own = [due for due in self.due if due.output in (None, output)][:1]
         return tuple(
             (start + due.cycles * due.cycle_ns, end + due.cycles * due.cycle_ns)
@@ -369,16 +369,19 @@ class Watch:
             judged, _ = with_punctuality(flow, found, due)
             if one.problem is None:
                 path = [callbacks[number] for number in chain.callbacks]
-                one.first = path[0]
+                one.first, one.output = path[0], chain.topics[-1]
+                one.slots = self._slots(one.output)  # the text may end with a node
                 one.names = [(c.node or "", t) for c, t in zip(path, chain.topics, strict=True)]
             else:
                 judged = judged.with_columns(latency_ns=None, late=None, complete=False)
             judged = judged.with_columns(pl.col("place_ns") - moved.get(chain.topics[-1], 0))
-            new = judged.filter(within)
+            # A lifecycle node that is not active owes no output.
+            new = judged.filter(within, pl.col("reason").ne_missing("inactive"))
             one.take_over(clear := new.filter(pl.col("start") > clear_ns), found.hops, now)
             one.counted["unclear"] += new.height - clear.height
         if self.callbacks is not None:
-            self.callbacks.append((now, _longest(flow, within)))
+            own = replace(flow, instances=flow.instances.filter(within))
+            self.callbacks.append((now, longest_times(own)))
             _forget(self.callbacks, now)
         self._looked_from_ns, self._over_ns = self._over_ns, over
         return Seen(
@@ -406,7 +409,7 @@ class Watch:
         return self._resolved
 
     def _now(self, one: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
-        moved_ns = moved.get(one.text.rpartition("..")[2], 0)
+        moved_ns = moved.get(one.output, 0)
         begun = one.cycles["start"].filter(one.cycles["start"] > over_ns - SPANS["minute"])
         shares, early = one.shares()
         lasted = begun[-1] - begun[0] if len(begun) > 1 else 0
@@ -501,15 +504,6 @@ def _hops(one: _Chain) -> Iterator[Hop]:
 
 _Longest: TypeAlias = tuple[float | None, float | None]
 """A callback's response and execution time."""
-
-
-def _longest(flow: DataFlow, within: pl.Expr) -> dict[tuple[str, str], _Longest]:
-    rows = named_callbacks(replace(flow, instances=flow.instances.filter(within)))
-    none: dict[str, float] = {}
-    return {
-        name: ((row["response_ns"] or none).get("max"), (row["execution_ns"] or none).get("max"))
-        for name, row in rows.items()
-    }
 
 
 def _callbacks(looks: Iterable[Mapping[tuple[str, str], _Longest]]) -> Iterator[CallbackNow]:

@@ -57,7 +57,7 @@ def test_kernel_beside_user_space_and_per_process_folders(tmp_path: Path) -> Non
     assert len(trace.folders) == 3
     assert len(trace.streams) == 9
     frames = read_events(trace)
-    assert sum(count_events(trace).values()) == 3 * 3 * 4 * 20
+    assert sum(count_events(trace)[0].values()) == 3 * 3 * 4 * 20
     assert all(frame["time"].is_sorted() for frame in frames.values())
     alone = read_events(open_trace(tmp_path / "ust/pid/first-1-20260101"))
     for name, frame in alone.items():

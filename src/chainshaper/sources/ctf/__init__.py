@@ -1,7 +1,7 @@
 """LTTng traces (Common Trace Format 1.8, https://diamon.org/ctf/v1.8.3/) as data frames.
 
     trace = open_trace("~/lttng-traces/session")
-    count_events(trace)                       # {"ros2:callback_start": 4711, …}
+    count_events(trace)                       # {"ros2:callback_start": 4711, …}, what is damaged
     read_events(trace, {"ros2:callback_start"})["ros2:callback_start"]
 
 From a folder to frames: `tsdl` reads the metadata, `layout` makes operations and tables of it,

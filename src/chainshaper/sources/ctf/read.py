@@ -54,10 +54,20 @@ class Events(dict[str, pl.DataFrame]):
     unread: tuple[CtfStream, ...] = ()
 
 
-def count_events(trace: CtfTrace, threads: int | None = None) -> dict[str, int]:
-    """Events per name, zeros included, ordered by name. Raises `CtfError` where a file is gone."""
+def count_events(
+    trace: CtfTrace, threads: int | None = None
+) -> tuple[dict[str, int], tuple[str, ...]]:
+    """Events per name, zeros included, ordered by name, and what cannot be read.
+
+    Raises `CtfError` where a file is gone.
+    """
     layout = lay_out(trace.folders, Wanted())
-    return _counts(trace, layout, _walked(trace.streams, layout, np.zeros(0, np.int64), threads))
+    files = _walked(trace.streams, layout, np.zeros(0, np.int64), threads)
+    return _counts(trace, layout, files), _warnings(files)
+
+
+def _warnings(files: "Sequence[_File]") -> tuple[str, ...]:
+    return tuple(warning for file in files for warning in file.warnings())
 
 
 def read_events(
@@ -108,7 +118,7 @@ def read_events(
         reason = f"events of one name have fields of types that do not fit together: {error}"
         folder = trace.folders[0].path
         raise tsdl.CtfError(folder, None, reason, "read its folders one by one") from None
-    events.warnings = tuple(warning for file in files for warning in file.warnings())
+    events.warnings = _warnings(files)
     events.counts = _counts(trace, layout, files)
     events.unread = tuple(stream for stream in trace.streams if stream not in used)
     return events

@@ -143,7 +143,9 @@ class EbpfTracer:
             self._bpftrace.wait(_STOP_S)
         except subprocess.TimeoutExpired:
             late = f"bpftrace (process {self._bpftrace.pid}) did not end within {_STOP_S:.0f} s"
-            raise OperationError(f"{late} and is killed: the last events are missing") from None
+            self._notes.append(f"{late} and was killed: the last events are missing.")
+            self._bpftrace.kill()
+            self._bpftrace.wait()
         with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
             self._printed = tp.read_printed(self._events, self._points, self._ahead_ns)
             # As long as the application runs: its memory tells.

@@ -261,10 +261,16 @@ class LttngSession:
         return None
 
     def stop(self) -> None:
-        """Stop the session; LTTng waits until its buffers are on disk."""
+        """Stop the session; LTTng waits until its buffers are on disk.
+
+        What is there already stays of use where that fails, so it is noted.
+        """
         if self._lttng is not None and self._sessions:
             self._look_for_strangers(self._lttng)
-            self._lttng.ask("stop", self._sessions[-1])
+            try:
+                self._lttng.ask("stop", self._sessions[-1])
+            except OperationError as error:
+                self._notes.append(f"the last events may be missing: {error}.")
 
     def remove(self) -> None:
         """Destroy the sessions, and end the daemon if it is ours."""
@@ -341,7 +347,11 @@ class LttngSession:
         if larger <= before:
             return
         former, self._buffer = self._sessions[-1], larger
-        successor = self._new_session(lttng)
+        try:
+            successor = self._new_session(lttng)
+        except OperationError:
+            self._sessions.sort(key=former.__eq__)  # the last one is that which runs
+            raise
         stopped = time.monotonic_ns()
         lttng.ask("stop", former, "--no-wait")
         lttng.ask("start", successor)

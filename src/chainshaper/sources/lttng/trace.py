@@ -237,10 +237,10 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def _take_stock(self, host: str, trace: CtfTrace, found: Events) -> None:
         """Count all events, also of unwanted streams; move numbers that another host has, too."""
         with _as_our_errors():
-            others = count_events(replace(trace, streams=found.unread))
+            others, unread = count_events(replace(trace, streams=found.unread))
         for name, count in found.counts.items():
             self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
-        self.warnings += found.warnings
+        self.warnings += found.warnings + unread
         self._moved[host] = 0
         if len(self._hosts) > 1:
             known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]

@@ -41,7 +41,7 @@ from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
-from chainshaper.values.files import why_distrusted
+from chainshaper.values.files import own_cache, why_distrusted
 from chainshaper.values.recording import RecordingInfo
 
 SOURCE = Path(__file__).with_name("preload.c")
@@ -124,6 +124,10 @@ class TracedProcess:
         for number in np.flatnonzero(self._rings["written"] != self._read):
             ring, read = self._records[number], int(self._read[number])
             written = int(self._rings["written"][number])
+            if not read <= written < 1 << 62:  # the node has written where it should not
+                self.lost += 1
+                self._read[number] = written
+                continue
             oldest = max(read, written - ring.size)
             places = np.arange(oldest, written) % ring.size
             copied = ring.take(places)
@@ -305,9 +309,11 @@ def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -
     """
     content = "\0".join([*sources, platform.machine()]).encode()
     digest = hashlib.sha256(content).hexdigest()[:16]
-    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    cache = cache if cache.is_absolute() else Path.home() / ".cache"
-    library = cache / "chainshaper" / f"preload-{digest}" / name
+    cache = own_cache()
+    library = cache / f"preload-{digest}" / name
+    existing = next(place for place in (cache, *cache.parents) if place.exists())
+    if (reason := why_distrusted(existing)) is not None:
+        raise PlatformError(f"no library is built in {cache}: {reason}; {_REMEDY}")
     if not library.exists():
         try:
             library.parent.parent.mkdir(parents=True, exist_ok=True)

@@ -445,9 +445,9 @@ EXPORTED bool rcl_publisher_can_loan_messages(const void * handle) {
   using Publisher = const RmwPublisher * (*)(const void *);
   using CanLoan = bool (*)(const void *);
   static std::atomic<bool> said;
-  const bool can = RMW(CanLoan, "rcl_publisher_can_loan_messages")(handle);
+  if (!RMW(CanLoan, "rcl_publisher_can_loan_messages")(handle)) return false;
   const auto * const publisher = RMW(Publisher, "rcl_publisher_get_rmw_handle")(handle);
-  if (!can || output_of(publisher) == nullptr) return can;
+  if (output_of(publisher) == nullptr) return true;
   if (!said.exchange(true))
     say("%s: no messages are loaned: they cannot wait for their slot without a copy, so the node's own"
         " memory is used; plan with --publication synchronous to have loans",

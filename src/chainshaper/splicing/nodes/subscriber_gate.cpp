@@ -35,7 +35,8 @@ void remember(const void * subscription, const RmwNode * node, const char * topi
   });
   if (!block || !usable()) return;
   for (auto & one : deliveries) {
-    if (one.subscription != nullptr) continue;
+    const void * none = nullptr;  // containers load components in several threads
+    if (!one.subscription.compare_exchange_strong(none, &one)) continue;
     one.after_ns = std::atoll(first_of(*block, "delivery_ns").c_str());
     one.subscription = subscription;
     return;

@@ -17,7 +17,6 @@ import hashlib
 import importlib
 import importlib.util
 import os
-import pwd
 import re
 import subprocess
 import sys
@@ -31,7 +30,7 @@ from typing import Any
 import numpy as np
 
 from chainshaper.values.errors import OperationError
-from chainshaper.values.files import why_distrusted, write_whole
+from chainshaper.values.files import own_cache, why_distrusted, write_whole
 
 try:
     import llvmlite.binding as llvm  # type: ignore[import-untyped]
@@ -100,18 +99,8 @@ def _digest(folder: Path) -> str:
 
 
 def _folders(beside: Path) -> list[Path]:
-    """Where machine code may be, best first. Links are followed here, once, before any check.
-
-    Where the cache that the environment names is another user's (`sudo -E`), it is our own.
-    """
-    cache = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    if not cache.is_absolute():  # and is to be ignored, as its specification has it
-        cache = Path(os.path.expanduser("~/.cache"))  # noqa: PTH111 - the other raises without one
-    existing = next(place for place in (cache, *cache.parents) if os.path.exists(place))  # noqa: PTH110
-    if why_distrusted(existing) is not None:
-        with suppress(KeyError):  # a user without a name
-            cache = Path(pwd.getpwuid(os.geteuid()).pw_dir, ".cache")
-    return [Path(os.path.realpath(f)) for f in (beside / "__pycache__", cache / "chainshaper")]
+    """Where machine code may be, best first. Links are followed here, once, before any check."""
+    return [Path(os.path.realpath(beside / "__pycache__")), own_cache()]
 
 
 def _read(file: Path) -> bytes | None:
@@ -143,15 +132,18 @@ def _target() -> Any:
 def _compiled_apart(module: str, name: str) -> bytes:
     """What :func:`compiled_here` gives, from another process; nothing where none can be had.
 
-    An interpreter inside another program, for example, has no command of its own.
+    An interpreter inside another program, for example, has no command of its own. The process
+    imports from where this one does, but from no current folder: it may be anybody's.
     """
-    script = "import sys; from chainshaper.values.compiled import compiled_here as made; "
-    script += "sys.stdout.buffer.write(made(*sys.argv[1:]))"
-    command = [sys.executable, "-c", script, module, name]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    script = (
+        "import sys; sys.path[:0] = sys.argv[1].split(':'); "
+        "from chainshaper.values.compiled import compiled_here; "
+        "sys.stdout.buffer.write(compiled_here(*sys.argv[2:]))"
+    )
+    folders = ":".join(filter(os.path.isabs, sys.path))
+    command = [sys.executable, "-I", "-c", script, folders, module, name]
     with suppress(OSError, subprocess.SubprocessError):
-        made = subprocess.run(command, env=environment, capture_output=True, check=True)
-        return made.stdout
+        return subprocess.run(command, capture_output=True, check=True).stdout
     return b""
 
 
