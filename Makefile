@@ -1,28 +1,31 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
-.PHONY: demo test test-untimed test-timed test-kernel lint benchmark experiments docs clean
+.PHONY: demo test test-untimed test-timed test-daemons test-kernel lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
-# Tests that need the machine's cores for themselves, and beside them all others (tests/conftest.py),
-# and what looks at the code.
+# Tests that need the machine's cores for themselves, and beside them those that talk to LTTng's
+# daemon, all others (tests/conftest.py), and what looks at the code.
 test: .venv/.ready-dev
 	scripts/test-tools
-	$(MAKE) --jobs=3 --output-sync=line lint test-untimed test-timed
+	$(MAKE) --jobs=4 --output-sync=line lint test-untimed test-timed test-daemons
 
 # What fails beside the others is named, and tried once more when those are through; what fails again
 # has failed.
 tried = run='.venv/bin/python -m pytest -m "$(1)" -o cache_dir=.pytest_cache/$(2)'; \
 	eval "$$run"; code=$$?; [ $$code = 1 ] || exit $$code; \
-	while pgrep -f "[p]ytest -m $(3)" >/dev/null; do sleep 1; done; \
+	while pgrep -f "[p]ytest -m [a-z]" >/dev/null; do sleep 1; done; \
 	echo "tried once more, alone:"; eval "$$run --last-failed --last-failed-no-failures none"
 
 test-untimed: .venv/.ready-dev
-	@$(call tried,not timed,untimed,timed)
+	@$(call tried,not timed and not daemons,untimed)
 
 test-timed: .venv/.ready-dev
-	@$(call tried,timed,timed,not timed)
+	@$(call tried,timed,timed)
+
+test-daemons: .venv/.ready-dev
+	@$(call tried,daemons,daemons)
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.

@@ -12,7 +12,7 @@ from calm_runs import calm_run
 from hypothesis import settings
 from small_chain import EXECUTOR_CORE, small_chain, small_chain_plan, small_chain_text
 
-from chainshaper import run_application, shape_application
+from chainshaper import run_application, shape_application, simulate
 from chainshaper.planning import Plan
 from chainshaper.values.recording import Recording
 
@@ -33,6 +33,8 @@ TIMELESS |= {"enforcement/test_dispatcher", "workload/test_event_log"}
 TIMELESS |= {"flow/test_anchors", "flow/test_drift", "gate/test_throttling"}
 TIMELESS |= {"verify/test_several_chains"}
 TIMELESS |= {"enforcement/test_node_threads", "flow/test_profiles", "linux/test_processes"}
+TIMELESS |= {"verify/test_watch_restarts", "linux/test_threads", "flow/test_launch_shaping"}
+TIMELESS |= {"gate/test_gates_in_containers"}
 TIMELESS |= {
     "verify/test_slowdowns",
     "verify/test_budgets",
@@ -52,7 +54,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         file = item.path.relative_to(Path(__file__).parent).with_suffix("")
         timed = file.parent.as_posix() in TIMED and file.as_posix() not in TIMELESS
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
-        if timed or live or item.get_closest_marker("ros2"):
+        # One session daemon at a time, but no core for itself: they have a process of their own.
+        daemons = item.get_closest_marker("daemons") and not item.get_closest_marker("ros2")
+        if not daemons and (timed or live or item.get_closest_marker("ros2")):
             item.add_marker("timed")
 
 
@@ -120,6 +124,20 @@ def shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
     return calm_run(
         lambda place: shape_application(application, plan, place / "after", cycles=CYCLES), folder
     )
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The same as ``unshaped``, simulated: where nothing depends on what the machine did."""
+    folder = tmp_path_factory.mktemp("simulated")
+    return simulate(small_chain(folder), folder / "before", cycles=CYCLES)
+
+
+@pytest.fixture(scope="session")
+def simulated_shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
+    """The same as ``shaped``, simulated."""
+    folder = tmp_path_factory.mktemp("simulated_shaped")
+    return simulate(small_chain(folder), folder / "after", plan, cycles=CYCLES)
 
 
 @pytest.fixture

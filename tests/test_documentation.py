@@ -10,6 +10,8 @@ there is no planning from what is left. What failed is therefore tried again fro
 a fresh folder and with more cycles.
 """
 
+import hashlib
+import json
 import os
 import re
 import shlex
@@ -20,16 +22,19 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 
 import pytest
-from command_line import Finished, called
+from command_line import Finished, called, json_of
 
-from chainshaper import load_application_plan
+from chainshaper import load_application_plan, open_recording
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 CONSOLE = re.compile(r"```console\n(.*?)```", re.DOTALL)
 YAML_EXAMPLE = re.compile(r"```yaml\n(name: .*?)```", re.DOTALL)
 PYTHON = re.compile(r"```python\n(.*?)```", re.DOTALL)
-EXAMPLE_RUN = re.compile(r"chainshaper (run examples/\S+) -o (\S+) (--cycles \d+)")
+LIVE_RUN = re.compile(
+    r"chainshaper (?P<verb>run|shape) (?P<files>\S+\.yaml( \S+\.yaml)?) -o (?P<output>\S+)"
+    r" --cycles (?P<cycles>\d+)"
+)
 CYCLES = (12, 40, 120)
 
 
@@ -84,15 +89,18 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def executed(command: str, folder: Path, recorded: Path) -> Finished:
-    """A command, in a folder; the recording of an example is copied where there is one."""
-    if run := EXAMPLE_RUN.fullmatch(command):
-        known = recorded / re.sub(r"\W+", "_", run[1] + run[3])
+    """A command, in a folder; the same live run's recording is copied where there is one."""
+    if run := LIVE_RUN.fullmatch(command):
+        texts = ((folder / name).read_text() for name in run["files"].split())
+        plain = (re.sub(r"^ *recording: .*\n", "", one, flags=re.MULTILINE) for one in texts)
+        same = "\0".join([run["verb"], run["cycles"], *plain])
+        known = recorded / hashlib.sha256(same.encode()).hexdigest()
         if known.exists():
-            shutil.copytree(known, folder / run[2])
+            shutil.copytree(known, folder / run["output"])
             return Finished(0, "", "")
-        finished = executed(f"chainshaper {run[1]} {run[3]} -o {run[2]}", folder, recorded)
+        finished = executed(f"{command} ", folder, recorded)
         if finished.code == 0:
-            shutil.copytree(folder / run[2], known)
+            shutil.copytree(folder / run["output"], known)
         return finished
     program, *words = shlex.split(command)
     if program == "chainshaper" and "--" not in words:
@@ -131,7 +139,24 @@ def test_every_command_runs(page: Path, tmp_path: Path, recorded: Path) -> None:
             (folder / name).write_text(example)
         return [shortened(command, cycles) for command in commands(page)]
 
-    tried(read, tmp_path, recorded)
+    clone = tried(read, tmp_path, recorded)
+    if page.name == "command_line.md":
+        demo_puts_everything_into_one_folder(clone / "my_demo")
+
+
+def demo_puts_everything_into_one_folder(folder: Path) -> None:
+    assert sorted(entry.name for entry in folder.iterdir()) == [
+        *("after", "application.yaml", "before", "comparison.json"),
+        *("distribution.png", "latency.png", "plan.yaml"),
+    ]
+    example = (ROOT / "examples/synthetic_chain.yaml").read_text()
+    assert (folder / "application.yaml").read_text() == example
+    assert open_recording(folder / "after").info.plan is not None
+    # Every figure can be recomputed from what is on disk.
+    compared = json_of("compare", folder / "before", folder / "after")
+    kept = json.loads((folder / "comparison.json").read_text())
+    assert compared["recordings"] == kept["recordings"]
+    assert len(compared["recordings"]) == 2
 
 
 @pytest.mark.timed

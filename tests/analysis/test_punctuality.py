@@ -183,19 +183,27 @@ def test_of_equal_stamps_the_decision_is_meant_that_was_made_there() -> None:
     assert arrivals == starts
 
 
-def test_a_shaping_node_that_knows_no_handles_is_told_by_its_process(shaped: Recording) -> None:
+def test_a_shaping_node_that_knows_no_handles_is_told_by_its_process(
+    simulated_shaped: Recording,
+) -> None:
     """What a node in ROS 2 notes of itself: the same rows, but for the handle."""
-    releases = shaped.events["gate_release"]
+    releases = simulated_shaped.events["gate_release"]
     nameless = releases.with_columns(callback=pl.lit(None, dtype=releases.schema["callback"]))
-    without = {**shaped.events, "gate_release": nameless}
+    without = {**simulated_shaped.events, "gate_release": nameless}
 
-    flow = data_flow(shaped.events, shaped.info.clock_offset_ns)
-    one, other = (gate_decisions(tables, flow.objects) for tables in (shaped.events, without))
+    flow = data_flow(simulated_shaped.events, simulated_shaped.info.clock_offset_ns)
+    one, other = (
+        gate_decisions(tables, flow.objects) for tables in (simulated_shaped.events, without)
+    )
     assert one.height == releases.height > 0
     assert one.drop("callback").equals(other.drop("callback"))
 
-    known = analyse_latency(shaped.events, "/t1../t3", clock_offset_ns=shaped.info.clock_offset_ns)
-    found = analyse_latency(without, "/t1../t3", clock_offset_ns=shaped.info.clock_offset_ns)
+    known = analyse_latency(
+        simulated_shaped.events, "/t1../t3", clock_offset_ns=simulated_shaped.info.clock_offset_ns
+    )
+    found = analyse_latency(
+        without, "/t1../t3", clock_offset_ns=simulated_shaped.info.clock_offset_ns
+    )
     assert known.traversals.equals(found.traversals)
 
 

@@ -34,16 +34,16 @@ def folder(application_file: Path, plan: Plan) -> Path:
 
 
 @pytest.fixture
-def words(folder: Path, unshaped: Recording) -> Words:
+def words(folder: Path, simulated: Recording) -> Words:
     """The words of a command, with files in their places; OUT and MISSING are not there."""
     places = {
         "APP": folder / "application.yaml",
         "PLAN": folder / "plan.yaml",
         "LATENCIES": folder / "latencies.txt",
-        "REC": unshaped.path,
+        "REC": simulated.path,
         "OUT": folder / "recording",
         "DIR": folder,
-        "TABLE": unshaped.path / "callback_start.parquet",
+        "TABLE": simulated.path / "callback_start.parquet",
         "MISSING": folder / "missing" / "recording",
     }
     return lambda text: [str(places.get(word, word)) for word in text.split()]
@@ -61,9 +61,9 @@ def words(folder: Path, unshaped: Recording) -> Words:
     ],
 )
 def test_a_chain_that_does_not_exist(
-    verb: str, chain: str, message: str, unshaped: Recording
+    verb: str, chain: str, message: str, simulated: Recording
 ) -> None:
-    assert message in refused(2, verb, unshaped.path, "--chain", chain)
+    assert message in refused(2, verb, simulated.path, "--chain", chain)
 
 
 @pytest.mark.parametrize("command", ["run APP -o OUT", "shape APP PLAN -o OUT"])
@@ -290,10 +290,10 @@ def test_other_mistakes_of_ours_stay_tracebacks() -> None:
 
 @pytest.mark.parametrize("megabytes", [100, 400, 650])
 def test_limited_memory_ends_in_one_message_whoever_wanted_more(
-    megabytes: int, unshaped: Recording
+    megabytes: int, simulated: Recording
 ) -> None:
     limited = ("sh", "-c", f'ulimit -v {megabytes * 1000}; exec "$@"', "sh")
-    finished = chainshaper("latency", unshaped.path, prefix=limited)
+    finished = chainshaper("latency", simulated.path, prefix=limited)
     assert "Traceback" not in finished.err
     # OpenBLAS ends the process by itself, with its own message.
     last = finished.err.strip().splitlines()[-1]

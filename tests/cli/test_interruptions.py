@@ -83,7 +83,7 @@ def test_interrupted_it_ends_in_order(
 def test_whole_cycles_until_an_interruption_are_recorded_and_marked(
     run: Running, application_file: Path
 ) -> None:
-    time.sleep(3)
+    time.sleep(1.2)
     run.process.send_signal(signal.SIGINT)
     finished = run.end()
     assert finished.code == 1
@@ -127,9 +127,9 @@ def test_a_full_disk_is_named_and_nothing_stays_on_it(
     assert [entry.name for entry in full_disk.iterdir()] == ["filling"]
 
 
-def test_standard_output_on_a_full_disk(unshaped: Recording) -> None:
+def test_standard_output_on_a_full_disk(simulated: Recording) -> None:
     redirected = ("sh", "-c", '"$@" > /dev/full', "sh")
-    finished = chainshaper("latency", unshaped.path, prefix=redirected)
+    finished = chainshaper("latency", simulated.path, prefix=redirected)
     assert finished.code == 1
     assert finished.err.startswith("error: standard output cannot be written (No space left")
     assert "Traceback" not in finished.err
@@ -137,10 +137,10 @@ def test_standard_output_on_a_full_disk(unshaped: Recording) -> None:
 
 @pytest.mark.parametrize("form", [(), ("--json",)])
 def test_a_reader_that_has_seen_enough_is_no_error(
-    form: tuple[str, ...], unshaped: Recording
+    form: tuple[str, ...], simulated: Recording
 ) -> None:
     pipe = ("sh", "-c", '"$@" | true', "sh")
-    finished = chainshaper("latency", unshaped.path, *form, prefix=pipe)
+    finished = chainshaper("latency", simulated.path, *form, prefix=pipe)
     assert finished.code == 0, "of `true`"
     assert "Broken" not in finished.err
     assert "Traceback" not in finished.err

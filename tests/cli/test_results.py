@@ -13,7 +13,7 @@ from rich.console import Console
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
 import chainshaper as cs
-from chainshaper import load_plan, measure_latency, open_recording
+from chainshaper import load_plan, measure_latency
 from chainshaper.cli import output
 from chainshaper.cli.app import VERBS
 from chainshaper.flow import doctor
@@ -143,29 +143,6 @@ def test_doctor_says_what_is_limited_on_a_middleware(
     assert [(found or "") in check.found for check in checks] == [True] * bool(found)
     works = found in ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp")
     assert {check.state for check in checks} <= {"good" if works else "limited"}
-
-
-@pytest.mark.timed
-def test_demo_puts_everything_into_one_folder(application_file: Path) -> None:
-    """With the small chain and few cycles: the flow is the same."""
-    for cycles in ("8", "40", "120"):  # a busy machine may disturb eight of eight
-        folder = application_file.parent / f"demo{cycles}"
-        demo = ("demo", "--application", application_file, "--cycles", cycles)
-        made = called(*demo, "-o", folder, "--json")
-        if made.code == 0:
-            break
-    values = json.loads(made.out)
-    assert values["folder"] == str(folder)
-    assert sorted(entry.name for entry in folder.iterdir()) == [
-        *("after", "application.yaml", "before", "comparison.json"),
-        *("distribution.png", "latency.png", "plan.yaml"),
-    ]
-    assert (folder / "application.yaml").read_text() == small_chain_text()
-    assert open_recording(folder / "after").info.plan is not None
-    # Every figure can be recomputed from what is on disk.
-    compared = json_of("compare", folder / "before", folder / "after")
-    assert compared["recordings"] == values["recordings"]
-    assert len(compared["recordings"]) == 2
 
 
 def test_tables_are_for_people(unshaped: Recording, shaped: Recording, plan: Plan) -> None:

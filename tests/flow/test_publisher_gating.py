@@ -36,7 +36,7 @@ def test_the_publisher_waits_for_its_slot_and_its_executor_does_not(tmp_path: Pa
     plan = _plan()
     ((_, server, _),) = publisher_servers(plan)
     recording = calm_run(
-        lambda place: shape_application(application, plan, place / "rec", cycles=40), tmp_path
+        lambda place: shape_application(application, plan, place / "rec", cycles=26), tmp_path
     )
 
     measured = measure_latency(recording)

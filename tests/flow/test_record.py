@@ -22,6 +22,8 @@ from chainshaper.values.errors import OperationError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
+pytestmark = pytest.mark.daemons
+
 CYCLES = 30
 
 

@@ -534,6 +534,7 @@ def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> N
 
 
 @pytest.mark.timed  # other tests' daemons of LTTng come and go beside it
+@pytest.mark.daemons
 def test_without_a_library_lttng_records_and_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -46,8 +46,8 @@ def _verdicts(said: JudgedPrediction) -> tuple[bool | None, bool | None, bool | 
 
 
 @pytest.fixture
-def like(unshaped: Recording) -> LatencyAnalysis:
-    return measure_latency(unshaped).analysis
+def like(simulated: Recording) -> LatencyAnalysis:
+    return measure_latency(simulated).analysis
 
 
 def _bands(bands: int = 3) -> Plan:
@@ -170,9 +170,9 @@ def test_three_bands_of_a_simulated_chain(tmp_path: Path) -> None:
 
 
 def test_the_plan_may_be_named_where_the_recording_does_not(
-    unshaped: Recording, plan: Plan
+    simulated: Recording, plan: Plan
 ) -> None:
-    comparison = compare_recordings([unshaped, unshaped], plan=plan)
+    comparison = compare_recordings([simulated, simulated], plan=plan)
     first, second = comparison.measurements
     assert first.prediction is None
     assert second.prediction is not None

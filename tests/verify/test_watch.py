@@ -159,12 +159,12 @@ def test_a_look_that_comes_late_counts_all_cycles(
     with running(tmp_path, 1000):
         watch = own_watch()
         before = watched(watch, 0.5)[-1].chains[0].counted["complete"]
-        until = time.monotonic() + 2
+        until = time.monotonic() + 1
         while time.monotonic() < until:
             watch.read()
             time.sleep(0.05)
         counted = watch.look().chains[0].counted["complete"] - before
-    assert counted >= 1.5 * SECOND // PERIOD_NS
+    assert counted >= 0.75 * SECOND // PERIOD_NS
 
 
 def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> None:
@@ -287,16 +287,16 @@ def test_a_clock_that_is_set_spoils_no_figure(
     (tmp_path / "clock.c").write_text(REALTIME_STEPS)
     words = ["gcc", "-shared", "-fPIC", "-o", str(tmp_path / "clock.so"), str(tmp_path / "clock.c")]
     subprocess.run(words, check=True)
-    at, real = time.monotonic_ns() + 2 * SECOND, decision.clock_offset
+    at, real = time.monotonic_ns() + 3 * SECOND // 2, decision.clock_offset
     shifted = lambda: real() - (60_000_000 if time.monotonic_ns() > at else 0)  # noqa: E731
     monkeypatch.setattr(watch_module, "clock_offset", shifted)
     program = built("-DHUMBLE", version=version) if version == "4.1.1" else built()
     watch, libraries = own_watch(), f"{build_library(tmp_path)}:{tmp_path / 'clock.so'}"
     variables = {**os.environ, "LD_PRELOAD": libraries, "STEP_AT": str(at)}
     process = subprocess.Popen(
-        program.command("chain", "80"), env=variables, stdout=subprocess.PIPE, text=True
+        program.command("chain", "60"), env=variables, stdout=subprocess.PIPE, text=True
     )
-    counted = watched(watch, 4.5)[-1].chains[0].counted
+    counted = watched(watch, 3.5)[-1].chains[0].counted
     printed = [line.split("\t") for line in process.communicate()[0].splitlines()]
     starts = [int(row[2]) for row in printed if row[0] == "instance"][::2]
     outputs = [int(row[2]) for row in printed if row[:2] == ["publication", "/ebpf2"]]
@@ -379,7 +379,7 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
 def test_the_python_example_of_the_documentation_records_again_and_again(tmp_path: Path) -> None:
     page = (Path(__file__).parents[2] / "docs/watch.md").read_text()
     (example,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
-    for wanted, shorter in (("/t1../t5", CHAIN), ("80_000_000", "1"), ("600", "60")):
+    for wanted, shorter in (("/t1../t5", CHAIN), ("80_000_000", "1"), ("600", "40")):
         assert wanted in example
         example = example.replace(wanted, shorter)
     with running(tmp_path, 1000):
@@ -423,7 +423,7 @@ def test_the_command_that_fails_and_names_that_never_run(
         "- {node: /ended, starts: /other, response: 1us}\n"
     )
     words = ("--longest", "200ms", "--every", "200ms", "--recorder", tmp_path)
-    program = built().command("chain", "100")
+    program = built().command("chain", "50")
     said = called("watch", "--budget", budget, *words, "--", *program).err
     notes = [line for line in said.splitlines() if line.startswith("note: ")]
     assert len(notes) == 2, said

@@ -83,6 +83,7 @@ def test_a_data_message_is_the_message_that_topics_carry() -> None:
     assert bytes(dds.data_of(message)) == data
 
 
+@pytest.mark.timed
 def test_megabytes_are_computed_on_and_what_returns_nothing_publishes_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

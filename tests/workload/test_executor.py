@@ -135,7 +135,7 @@ def test_threads_run_callbacks_beside_each_other_unless_they_are_in_one_group(
         for name, group in zip(names, groups, strict=True)
     ]
     _send(*publishers)
-    bench.spin(1500 * MS)
+    bench.spin(800 * MS)
     assert (len(set(met)), most[0]) == ((2, 2) if beside else (0, 1))
     assert sorted(bench.diary) == ["first", "second"]
     assert len(bench.recorded("rclcpp_executor_wait_for_work")) < 20, "it spun while one was busy"

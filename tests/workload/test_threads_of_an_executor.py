@@ -53,11 +53,11 @@ def _beside_the_timer(recording: Recording) -> pl.DataFrame:
 @pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
 def test_it_runs_live_as_it_is_simulated(tmp_path: Path) -> None:
     application = _described(tmp_path)
-    live = cs.run_application(application, tmp_path / "live", cycles=40)
-    simulated = cs.simulate(application, tmp_path / "simulated", cycles=40)
+    live = cs.run_application(application, tmp_path / "live", cycles=20)
+    simulated = cs.simulate(application, tmp_path / "simulated", cycles=20)
     for recording in (live, simulated):
         both = _beside_the_timer(recording)
-        assert len(both) > 35, "the callbacks do not run beside each other"
+        assert len(both) > 17, "the callbacks do not run beside each other"
         assert (both["tid"] != both["tid_right"]).all()
         workers = [one for one in recording.info.threads if one.node == "/worker"]
         executing = {one.tid: one.cores for one in workers if one.role == "executor"}
@@ -66,6 +66,6 @@ def test_it_runs_live_as_it_is_simulated(tmp_path: Path) -> None:
     alone = THREADS.replace("threads: 2", "").replace("cores: [1, 0]", "")
     alone = alone.replace("executor: multi_threaded", "").replace(", group: slow", "")
     alone = alone.replace("    callback_groups: {slow: mutually_exclusive}\n", "")
-    one_thread = cs.simulate(_described(tmp_path, alone), tmp_path / "alone", cycles=40)
+    one_thread = cs.simulate(_described(tmp_path, alone), tmp_path / "alone", cycles=20)
     apart = _median_ms(live) - _median_ms(simulated)
     assert abs(apart) < 0.1 * (_median_ms(one_thread) - _median_ms(simulated))
