@@ -1,4 +1,5 @@
-"""How fast `check` goes through a fleet's traces: in threads, and on a local Dask cluster.
+"""How fast `check` goes through a fleet's traces: in threads, and on a local Dask cluster of a
+worker for each core, which has it alone (`taskset -c N dask worker … --nthreads 1`).
 
     python benchmarks/fleet.py [--traces 100] [--events 2000000] [--rounds 3]
 
@@ -22,6 +23,8 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from ctf_decode import read_records, scaled
@@ -68,20 +71,32 @@ def used(processes: list[int]) -> float:
     return sum(int(one[11]) + int(one[12]) for one in stats) / os.sysconf("SC_CLK_TCK")
 
 
+@contextmanager
+def dask_cluster(cores: Iterable[int]) -> Iterator[tuple[str, list[int]]]:
+    """A scheduler and its workers: where it listens, and their processes."""
+    from distributed import LocalCluster
+
+    dask, options = Path(sys.executable).with_name("dask"), ("--nthreads", "1", "--no-dashboard")
+    with LocalCluster(n_workers=0, dashboard_address=None) as cluster, ExitStack() as until:  # type: ignore[no-untyped-call]
+        address, workers = cluster.scheduler_address, []
+        for core in cores:
+            command = ["taskset", "-c", str(core), dask, "worker", address, *options, "--no-nanny"]
+            workers.append(subprocess.Popen(command, stderr=subprocess.DEVNULL))
+            until.callback(workers[-1].wait)
+            until.callback(workers[-1].terminate)
+        yield address, [one.pid for one in workers]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--traces", type=int, default=100)
     parser.add_argument("--events", type=int, default=2_000_000)
     parser.add_argument("--rounds", type=int, default=3)
     arguments = parser.parse_args()
-    from distributed import LocalCluster
-
     cores = len(available_cores())
     with (
         tempfile.TemporaryDirectory() as temporary,
-        LocalCluster(  # type: ignore[no-untyped-call]
-            n_workers=cores, threads_per_worker=1, dashboard_address=None
-        ) as cluster,
+        dask_cluster(available_cores()) as (address, workers),
     ):
         folder = Path(temporary)
         trace = folder / "trace"
@@ -90,8 +105,8 @@ def main() -> None:
         proposed = propose_budget(open_source(trace), ["/image../command"])
         file = save_budget(proposed, folder / "budget.yaml")
         budget = load_budget(file)
-        ways = {"threads": None, "Dask, a process per core": cluster.scheduler_address}
-        processes = [os.getpid(), *(one.pid for one in cluster.workers.values())]
+        ways = {"threads": None, "Dask, a process per core": address}
+        processes = [os.getpid(), *workers]
         taken: dict[str, list[float]] = {way: [] for way in ways}
         for way in ways.values():  # what is compiled is loaded
             check_budgets(robots[: 2 * cores], budget, scheduler=way)
