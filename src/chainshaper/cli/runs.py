@@ -591,8 +591,8 @@ def shape(
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, **following}
-        recording = _shape_described(Path(words[0]), Path(words[1]), output, how)
-        judge(cs.compare_chains([recording], least=1), strict=strict, json=False)
+        shaped = _shape_described(Path(words[0]), Path(words[1]), output, how)
+        judge(shaped, strict=strict, json=False)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
@@ -620,8 +620,8 @@ def shape(
 
 def _shape_described(
     application: Path, plan: Path, output: Path, how: dict[str, Any]
-) -> "cs.Recording":
-    from chainshaper.verify.overruns import dropped_in, dropped_text, overruns_in, overruns_text
+) -> "Sequence[cs.Comparison]":
+    from chainshaper.verify.overruns import dropped_text, overruns_text
 
     described, planned = cs.load_application(application), cs.load_application_plan(plan)
     out.warn(planned)
@@ -634,15 +634,17 @@ def _shape_described(
             progress=report,
             **how,
         )
-    for chain in planned.chains:
-        about = f"{chain.chain.output}: " if len(planned.chains) > 1 else ""
-        if overruns := overruns_in(recording, chain):
-            out.notes([about + overruns_text(overruns)])
-    if dropped := dropped_in(recording):
-        out.notes([dropped_text(dropped)])
+    comparisons = cs.compare_chains([recording], least=1)
+    for one in comparisons:
+        about = f"{one.chain}: " if len(comparisons) > 1 else ""
+        (measured,) = one.measurements
+        if measured.overruns:
+            out.notes([about + overruns_text(measured.overruns)])
+        if measured.dropped:
+            out.notes([about + dropped_text(measured.dropped)])
     out.notes(recording.info.notes)
     out.show_line(recording.path)
-    return recording
+    return comparisons
 
 
 def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, **how: Any) -> None:
