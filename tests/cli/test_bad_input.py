@@ -190,8 +190,10 @@ def test_what_does_not_go_is_refused_and_nothing_written(
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
-def test_a_pattern_that_is_none_is_refused() -> None:
-    assert "no pattern" in refused(2, "check", "runs/**x", "--budget", "budget.yaml")
+def test_a_pattern_that_is_none_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "budget.yaml").write_text("format: 1\nchains: [{chain: /a../b, maximum: 1ms}]\n")
+    said = refused(2, "check", tmp_path / "**x", "--budget", tmp_path / "budget.yaml")
+    assert "no pattern" in said
 
 
 def test_with_json_an_error_is_json_too(words: Words) -> None:
