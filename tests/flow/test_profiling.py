@@ -1,5 +1,6 @@
 """The paper's profiling condition on real processes that are named like nodes."""
 
+import json
 import os
 import subprocess
 import sys
@@ -178,8 +179,8 @@ def test_a_core_that_is_not_there_is_refused() -> None:
 def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     command = chain_command(node, 100_000)
-    run = json_of("record", *LTTNG, "-o", first, "--duration", "1s", "--", *command)
-    assert run["exit_code"] is None  # it was ended
+    run = called("record", "--json", *LTTNG, "-o", first, "--duration", "1s", "--", *command)
+    assert json.loads(run.out)["exit_code"] is None  # it was ended
     # The application was there to be asked; who answers is no ROS 2.
     notes = open_recording(first).info.notes
     assert any("types and QoS of topics could not be asked for" in note for note in notes)
