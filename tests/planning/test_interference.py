@@ -22,7 +22,7 @@ from chainshaper.planning import (
 )
 from chainshaper.planning.application_plan import combined
 from chainshaper.planning.overruns import expected
-from chainshaper.planning.profile import Profile, Rival, interference
+from chainshaper.planning.profile import Profile, Rival, interference, with_interference
 from chainshaper.reporting.latency import expected_text
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import InputError, OperationError
@@ -150,6 +150,16 @@ def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = 
         steps_ns=np.stack([half, half], axis=1),
         every_step_ns=np.stack([half, second], axis=1),
     )
+
+
+def test_cycles_that_do_not_fit_into_the_period_do_not_hide_what_delays_the_others() -> None:
+    """40 ms behind 20 of the other, and the other way round, with or without stalls of 80 ms."""
+    wishes = PlanRequest(publication="asynchronous")  # no gates
+    for groups, at_once, added_ms in (([[0, 1]], False, [20, 40]), ([[0], [1]], True, [0, 40])):
+        for stalls_ms in (0, 80):
+            both = [_profile("a", 40, stalls_ms), _profile("b", 20)]
+            delayed = with_interference(both, groups, wishes, at_once=at_once)
+            assert [(one.interference_ns or 0) / MS for one in delayed] == added_ms
 
 
 def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:

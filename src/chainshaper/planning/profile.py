@@ -253,7 +253,7 @@ def with_interference(
                 cores = _cores(one, forked if place in group else _stages([one]))
                 if gates and place != k and other.core_of.get(other.nodes[-1]) in cores:
                     rivals.append(_gate(other, wishes.spin_ns))
-            delay = interference(int(one.every.max()), rivals, one.period_ns)
+            delay = interference(_longest_in_time(one), rivals, one.period_ns)
             delayed[k] = _later(one, delay, profiles[k].latencies_ns)
         better.append([delayed[k] for k in group])
     return delayed
@@ -283,6 +283,14 @@ def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> P
     )
 
 
+def _longest_in_time(profile: Profile) -> int:
+    """The longest of all cycles that fit into the period: one that does not is late anyway, and
+    would leave no room to count in what delays the others.
+    """
+    every = profile.every
+    return int(every[every < profile.period_ns].max(initial=0))
+
+
 def _stages(profiles: Sequence[Profile]) -> dict[_Stage, CallbackTimes]:
     callbacks = joined.from_iterable(profile.callbacks for profile in profiles)
     return {(one.node, one.publishes): one for one in callbacks}
@@ -302,7 +310,7 @@ def _demand(profile: Profile, others: Sequence[Profile], stages: Collection[_Sta
 def _group(profile: Profile, chains: Sequence[Profile]) -> Rival:
     """Chains of one beginning that run before a chain: what waits elsewhere comes late."""
     cost = _demand(profile, chains, _stages([profile]))
-    longest = max(int(one.every.max()) for one in chains)
+    longest = max(map(_longest_in_time, chains))
     return Rival(chains[0].period_ns, cost, max(0, longest - cost))
 
 
