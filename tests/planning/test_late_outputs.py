@@ -35,6 +35,7 @@ from chainshaper.planning.shaping import (
     let_per_callback,
     let_per_chain,
     server_per_chain,
+    with_best_effort,
     with_sink,
 )
 from chainshaper.values.errors import InputError
@@ -298,3 +299,11 @@ def test_a_publishers_thread_may_send_late_outputs_below_its_executor() -> None:
     assert slots(enforced) == {"chain": ((0, 100),), "output": ((39, 40), (59, 100))}
     chain, output = enforced.servers
     assert output.priority > chain.priority, "it must not out-rank what holds its locks"
+    # What is best effort on that core runs behind both, and prevents neither.
+    beside = open_until_done(*with_best_effort([plan], {"/logger": 0}))
+    assert slots(beside) == {
+        "chain": ((0, 100),),
+        "output": ((59, 100),),
+        "best_effort_core0": ((0, 100),),
+    }
+    assert [server.priority for server in beside.servers] == [2, 3, 4]

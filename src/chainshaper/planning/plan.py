@@ -582,16 +582,24 @@ def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Sl
 
 
 def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:
-    """The servers, with those of publishers' threads ranked below what may run at the same time."""
+    """The servers, with those of publishers' threads ranked below what may run at the same time,
+    and those for best effort behind all others of their core.
+    """
     publishing = [s for s in servers if any(t.role == "publisher" for t in s.threads)]
-    executors = [server for server in servers if server not in publishing]
+    executors = [one for one in servers if one not in publishing and not one.best_effort]
 
     def priority(server: Server) -> int:
         others = (one for one in executors if server in publishing and one.core == server.core)
         below = (one.priority + 1 for one in others if one.slots[-1][1] > server.slots[0][0])
         return max([server.priority, *below])
 
-    return tuple(one.model_copy(update={"priority": priority(one)}) for one in servers)
+    ranked = [one.model_copy(update={"priority": priority(one)}) for one in servers]
+
+    def behind(server: Server) -> int:
+        others = (one for one in ranked if one.core == server.core and not one.best_effort)
+        return max([server.priority, *(one.priority + 1 for one in others if server.best_effort)])
+
+    return tuple(one.model_copy(update={"priority": behind(one)}) for one in ranked)
 
 
 def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:
