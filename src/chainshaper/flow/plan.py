@@ -67,11 +67,12 @@ def profile_chains(
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
     """
     recording = opened(recording)
-    starts = events.table(recording.events, "callback_start")["time"]
+    all_events = recording.events
+    starts = events.table(all_events, "callback_start")["time"]
     begun = int(starts.min() or 0)  # type: ignore[arg-type]
     if since_ns or until_ns is not None:
         until = None if until_ns is None else begun + until_ns
-        within = events.happened(recording.events, begun + since_ns, until)
+        within = events.happened(all_events, begun + since_ns, until)
         recording = replace(recording, events=within)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
@@ -85,6 +86,8 @@ def profile_chains(
         return tuple(profiles)
     if others := ", ".join(mode_recordings.keys() - modes.bands.keys()):
         raise InputError(f"{others}: none of the modes {', '.join(modes.bands)}: correct it")
+    # Announcements are counted from the first one on, also where that is left out.
+    announced = data_flow(all_events, recording.info.clock_offset_ns) if since_ns else flow
     for number, analysis in enumerate(analyses):
         apart: dict[str, Profile] = {}
         for mode, place in mode_recordings.items():
@@ -96,7 +99,7 @@ def profile_chains(
                 (apart[mode],) = profile_chains(
                     place, only, period_ns=period_ns, since_ns=since_ns, until_ns=until_ns
                 )
-        in_force = _modes_in_force(recording, flow, analysis.traversals["start"], modes)
+        in_force = _modes_in_force(recording, announced, analysis.traversals["start"], modes)
         for mode in modes.bands.keys() - apart if apart or in_force.count() else ():
             own = replace(analysis, traversals=analysis.traversals.filter(in_force == mode))
             try:
