@@ -76,12 +76,17 @@ def _of_no_use() -> dict[str, NDArray[np.int64]]:
     clustered[1:] = np.maximum(clustered[1:], clustered[:-1])
     heavy = stats.genpareto.rvs(0.4, scale=MS, size=500, random_state=np.random.default_rng(6))
     equal = np.repeat([50 * MS, 60 * MS], 400)[np.random.default_rng(1).permutation(800)]
+    # A hundred are beyond each threshold, all by 10 ms.
+    few_equal = np.repeat([50 * MS, 60 * MS], [3900, 100])[
+        np.random.default_rng(2).permutation(4000)
+    ]
     return {
         "300 latencies are too few": _uniform_sums(1, 300),
         "not stationary": _uniform_sums(2) + np.linspace(0, 5 * MS, 4000).astype(np.int64),
         r"not stationary \(": np.sort(_uniform_sums(1)),
         "do not follow a generalised Pareto": two_modes,
         "Pareto": equal,
+        "above any of 0 thresholds": few_equal,
         "come in clusters": clustered,
         "500 latencies are too few for an overrun probability of 1e-06": (
             (10 * MS + heavy).astype(np.int64)

@@ -241,8 +241,13 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
     ordered = np.sort(latencies)
     longest = min(ordered.size ** (2 / 3), MOST_EXCESSES)
     thresholds = [int(ordered[-round(share * longest) - 1]) for share in TAILS]
-    # Equal latencies may leave too few beyond.
-    thresholds = [u for u in thresholds if np.count_nonzero(latencies > u) >= FEWEST_EXCESSES]
+    # Equal latencies may leave too few beyond, or none but equal ones, which have no shape.
+    beyond = [ordered[np.searchsorted(ordered, u, side="right") :] for u in thresholds]
+    thresholds = [
+        u
+        for u, own in zip(thresholds, beyond, strict=True)
+        if own.size >= FEWEST_EXCESSES and own[0] < own[-1]
+    ]
     random, best = np.random.default_rng(seed), 0.0
     for number, threshold in enumerate(thresholds):
         if number == 0:
@@ -533,7 +538,7 @@ def _beyond(latencies: _Floats, share: float) -> tuple[float, float]:
     count = int(min(latencies.size ** (2 / 3), MOST_EXCESSES))
     ordered = np.sort(latencies)[-count - 1 :]
     threshold, excesses = ordered[0], (ordered[1:] - ordered[0])[np.newaxis, :]
-    fit = _l_moment_fit(excesses) if excesses.any() else None
+    fit = _l_moment_fit(excesses) if excesses[0, 0] < excesses[0, -1] else None
     if fit is None or _anderson_darling(excesses, *fit)[0] > REJECTED:
         return float(ordered[-1]), math.inf
     shape, scale = min(float(fit[0][0]), 0.5), float(fit[1][0])
