@@ -128,6 +128,11 @@ def test_auto_shows_the_curve_and_says_why_it_stops(common: Words, file: Path) -
     assert means == sorted(means, reverse=True)
     assert 1 - means[chosen] / means[chosen - 1] < 0.02 <= 1 - means[chosen - 1] / means[chosen - 2]
     assert "less than 5.00%" in called(*common, "--least-gain", "5%").out
+    with file.open("a") as latencies:
+        latencies.write("98ms\n")
+    without = json_of(*common, "--percentile", "99.5")
+    assert without["choice"]["curve"][chosen - 1]["bands_ns"] == without["bands_ns"]
+    assert without["bands_ns"] == values["bands_ns"]
     assert "exists already" in refused(2, *common, "--curve", curve)
     other = curve.with_name("other.png")
     assert "add --bands auto" in refused(2, *common[:-1], "2", "--curve", other)

@@ -227,6 +227,10 @@ def test_bands_are_enough_when_another_gains_little() -> None:
         every.curve[-1],
         "stopped at 12: more bands are not tried",
     )
+    # Where a band may not have more than 30 %, the curve begins with four.
+    for gain, said in ((0.9, "stopped at 4: another"), (1e-9, "stopped at 12: more bands")):
+        limited = choose_bands(_plan(), LATENCIES, least_gain=gain, max_share=0.3)
+        assert limited.reason.startswith(said)
 
 
 def test_bands_replace_the_publish_slot_and_nothing_else() -> None:

@@ -16,9 +16,11 @@ from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.planning import (
     CallbackTimes,
     PlanRequest,
+    band_choice,
     plan_application,
     plan_chain,
     plan_warnings,
+    publish_slots,
 )
 from chainshaper.planning.application_plan import combined
 from chainshaper.planning.overruns import expected
@@ -160,6 +162,16 @@ def test_cycles_that_do_not_fit_into_the_period_do_not_hide_what_delays_the_othe
             both = [_profile("a", 40, stalls_ms), _profile("b", 20)]
             delayed = with_interference(both, groups, wishes, at_once=at_once)
             assert [(one.interference_ns or 0) / MS for one in delayed] == added_ms
+
+
+def test_the_curve_of_bands_is_from_what_the_plan_is_made_from() -> None:
+    """70 ms were measured, 40 of them the chain's own, which has 20 of the sink before it."""
+    chain = replace(_profile("a", 40), latencies_ns=np.full(300, 70 * MS))
+    sink, request = replace(_profile("b", 20), begins=chain.begins), PlanRequest(bands="auto")
+    plan = plan_chain(chain, request, [sink])
+    assert plan.evidence.max_latency_ns < 70 * MS
+    chosen = band_choice(plan, chain, request, [sink]).chosen
+    assert chosen.slot_ends_ns == tuple(end for _, end in publish_slots(plan))
 
 
 def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:

@@ -86,7 +86,7 @@ def plan(
         _print_several(joint.chains, remarks, output, json)
         return
     made = cs.plan_chain(planned[0], request, sinks)
-    choice = band_choice(made, planned[0], request) if request.bands == "auto" else None
+    choice = band_choice(made, planned[0], request, sinks) if request.bands == "auto" else None
     if output is not None:
         cs.save_plan(made, output)
     warnings = [*on_cores(profiles, request)[1], *outliers, *strange, *plan_warnings(made)]

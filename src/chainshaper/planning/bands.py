@@ -237,13 +237,15 @@ def choose_bands(
     if not 0 < least_gain < 1:
         raise InputError(f"the least gain is a share, such as 0.02: not {least_gain}")
     curve = placement_curve(_problem(plan, latencies_ns, limits), MOST_BANDS)
-    for number, (placement, following) in enumerate(pairwise(curve), start=1):
+    chosen, most = curve[-1], len(curve[-1].slot_ends_ns)
+    why = "no more bands can be placed" if most < MOST_BANDS else "more bands are not tried"
+    for placement, following in pairwise(curve):
         gain = 1 - following.mean_ns / placement.mean_ns
         if gain < least_gain:
             why = f"another band would lower the average by {gain:.2%}, less than {least_gain:.2%}"
-            return BandChoice(tuple(curve), placement, f"stopped at {number}: {why}")
-    why = "no more bands can be placed" if len(curve) < MOST_BANDS else "more bands are not tried"
-    return BandChoice(tuple(curve), curve[-1], f"stopped at {len(curve)}: {why}")
+            chosen = placement
+            break
+    return BandChoice(tuple(curve), chosen, f"stopped at {len(chosen.slot_ends_ns)}: {why}")
 
 
 def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:

@@ -117,15 +117,9 @@ def plan_chain(
 
 def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]) -> Plan:
     refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
-    every: Sequence[Profile] = (profile, *sinks)
-    if request.percentile is not None:
-        every = [up_to(one, request.percentile) for one in every]
-    every = [_apart(one) for one in every] if request.policy == "pipelined" else every
-    every, _ = on_cores(every, request)
-    refuse_entangled(every, request.policy, sinks=True)
-    refuse_simulated(every, request)
-    every = with_interference(every, [range(len(every))], request, at_once=False)
-    profile, *sinks = (_covered(one, request) for one in every)
+    refuse_entangled((profile, *sinks), request.policy, sinks=True)
+    refuse_simulated((profile, *sinks), request)
+    profile, *sinks = _prepared((profile, *sinks), request)
     if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":
         profile, margin, modes, finish = _together(profile, request, modes)
     else:
@@ -172,6 +166,16 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     plan = with_executors(plan, [one.executors for one in (profile, *sinks)])
     plan = with_turns(revised(plan, modes=modes), request.equal_priorities)
     return with_best_effort([plan], best_effort_cores([profile], request))[0]
+
+
+def _prepared(every: Sequence[Profile], request: PlanRequest) -> list[Profile]:
+    """The profiles of a chain, and of its sinks, with the latencies that they are planned from."""
+    if request.percentile is not None:
+        every = [up_to(one, request.percentile) for one in every]
+    every = [_apart(one) for one in every] if request.policy == "pipelined" else every
+    every, _ = on_cores(every, request)
+    every = with_interference(every, [range(len(every))], request, at_once=False)
+    return [_covered(one, request) for one in every]
 
 
 def _apart(profile: Profile) -> Profile:
@@ -260,9 +264,13 @@ def moved_to(
     return tuple(moved), doubts
 
 
-def band_choice(plan: Plan, profile: Profile, request: PlanRequest) -> BandChoice:
-    """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it."""
-    latencies = _covered(profile, request).measured
+def band_choice(
+    plan: Plan, profile: Profile, request: PlanRequest, sinks: Sequence[Profile] = ()
+) -> BandChoice:
+    """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it; with
+    what :func:`plan_chain` made the plan of.
+    """
+    latencies = _prepared((profile, *sinks), request)[0].measured
     return choose_bands(plan, latencies, **_of(request, *_LIMITS, "least_gain"))
 
 
