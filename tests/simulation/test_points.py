@@ -3,13 +3,14 @@
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from quick_chain import quick_chain
 
 from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.sweep import FIGURES, OTHER_RUN, grid_of, points_of, profile_at, row_at
 from chainshaper.planning import PlanRequest
-from chainshaper.simulation import simulate
+from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application
 
@@ -55,6 +56,14 @@ def test_a_share_of_late_cycles_is_judged_by_all_cycles_of_the_profile() -> None
     few, many = (_rows(quick_chain(VARYING), axes, cycles=cycles)[0] for cycles in (200, 300))
     assert "200 cycles are too few for an overrun probability of 0.01" in few["error"]
     assert many["error"] is None
+
+
+def test_a_percentile_is_of_all_cycles_of_the_profile() -> None:
+    """The 297th of 300 latencies, and the last."""
+    application = quick_chain(VARYING)
+    some, every = _rows(application, {"percentile": (99, 100)}, cycles=300)
+    latencies = np.sort(simulate_latencies(application, cycles=300))
+    assert (some["profile_max_ns"], every["profile_max_ns"]) == (latencies[296], latencies[299])
 
 
 def test_constant_times_by_hand() -> None:

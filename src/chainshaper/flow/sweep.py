@@ -397,9 +397,15 @@ def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> 
     except ChainshaperError as error:
         return str(error)
     complete = latencies[latencies >= 0]
-    lost = int(latencies.size - complete.size)
-    profile = dataclasses.replace(profile, latencies_ns=complete, every_latency_ns=complete)
-    return dataclasses.replace(profile, incomplete=lost, recording=None)
+    return dataclasses.replace(
+        profile,
+        latencies_ns=complete,
+        every_latency_ns=complete,
+        starts_ns=None,  # those known are of the cycles that were recorded
+        measured_ns=None,
+        incomplete=int(latencies.size - complete.size),
+        recording=None,
+    )
 
 
 def _urgent(application: Application) -> Application:
