@@ -175,6 +175,16 @@ def test_the_margin_covers_what_is_asked_for_and_says_the_rest(
     assert any(said in warning for warning in plan_warnings(plan)) or not said
 
 
+def test_a_percentile_holds_also_where_the_machine_disturbed_every_cycle() -> None:
+    """Ninety of a hundred take 45 ms at most; a margin would cover the longest, 50 ms."""
+    latencies = np.arange(1, 101) * MS // 2
+    profile = Profile(latencies, 100 * MS, disturbed=100, all_disturbed=True)
+    for percentile, longest_ms in ((90, 45), (None, 50)):
+        plan = plan_chain(profile, PlanRequest(percentile=percentile))
+        assert plan.evidence.max_latency_ns == longest_ms * MS
+        assert plan.servers[0].slots == ((0, (longest_ms + 1) * MS),)
+
+
 def test_more_cycles_than_measured_cannot_be_promised() -> None:
     with pytest.raises(OperationError, match=r"302 cycles are too few .* measure 2995 or more"):
         _planned(list(np.linspace(40, 60, 302)), disturbed=0, overrun_probability=0.001)

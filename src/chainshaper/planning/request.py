@@ -287,6 +287,8 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
             f"{profile.recording or profile.name}: the machine disturbed every cycle of"
             f" {profile.name}, but one at most: leave out --ideal-machine, or record again"
         )
+    if request.percentile is not None:  # what takes longer has been left out
+        return profile
     share = request.overrun_probability or OVERRUN_PROBABILITY
     latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
     every = profile.every
