@@ -299,6 +299,17 @@ def test_wishes_that_cannot_be_are_refused(wishes: dict[str, Any], said: str) ->
         plan_chain(profile, PlanRequest(**wishes))
 
 
+def test_the_first_node_has_its_slot_on_its_own_core() -> None:
+    """Timer on core 0, the rest on core 1: [0, 2) there, and [2, 41) ms here."""
+    profile = replace(_profile("a", 40), core_of={"/a1": 0, "/a2": 1})
+    plan = plan_chain(profile, PlanRequest(first_slot_ns=2 * MS))
+    assert {one.name: (one.core, one.slots) for one in plan.servers} == {
+        "first": (0, ((0, 2 * MS),)),
+        "chain": (1, ((2 * MS, 41 * MS),)),
+        "output": (1, ((41 * MS, 42 * MS),)),
+    }
+
+
 def test_a_list_of_chains_is_for_another_function_and_best_effort_is_no_stage() -> None:
     with pytest.raises(InputError, match="plan with `plan_application`"):
         plan_recording("absent", ["/a1../a2", "/b1../b2"])  # type: ignore[arg-type]

@@ -439,8 +439,8 @@ def _shaped(
     if request.first_slot_ns is not None:
         if not profile.nodes:
             raise InputError("a slot for the first node needs the chain's nodes: give a recording")
-        plan = with_first_node_apart(plan, profile.nodes[0], request.first_slot_ns)
-        core_of.pop(profile.nodes[0], None)
+        first = profile.nodes[0]
+        plan = with_first_node_apart(plan, first, request.first_slot_ns, core_of.pop(first, None))
     return over_cores(plan, core_of) if core_of else plan
 
 

@@ -219,8 +219,9 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
         return revised(plan, servers=(*split, *others))
 
 
-def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
-    """The chain's first node in a server of its own, [0, ``slot_end_ns``), the rest behind it.
+def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | None = None) -> Plan:
+    """The chain's first node in a server of its own, [0, ``slot_end_ns``), on a ``core`` (default:
+    the chain's), the rest behind it.
 
     Stopped until its slot, a first callback that is no timer starts every execution at the
     beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
@@ -232,7 +233,9 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int) -> Plan:
     if not start < slot_end_ns < end:
         limits = f"after {duration_text(start)} and before {duration_text(end)}"
         raise InputError(f"the first node's slot must end {limits}, where the chain's does")
-    alone = {"name": "first", "slots": ((start, slot_end_ns),), "threads": (thread,)}
+    own_core = chain.core if core is None else core
+    slots = ((start, slot_end_ns),)
+    alone = {"name": "first", "core": own_core, "slots": slots, "threads": (thread,)}
     rest = tuple(other for other in chain.threads if other != thread)
     behind = {"slots": ((slot_end_ns, end),), "threads": rest}
     split = (chain.model_copy(update=alone), chain.model_copy(update=behind))
