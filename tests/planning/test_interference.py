@@ -190,6 +190,29 @@ def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:
     assert "core for" not in str(refused.value)
 
 
+def test_chains_of_two_timers_of_one_node_take_turns() -> None:
+    """Written by nodes, both begin with one name; their servers differ in nothing but time."""
+    nodes = ("/source", "/filter")
+    both = [
+        replace(
+            one,
+            spec=f"/source..{one.topics[-1]}",
+            nodes=nodes,
+            core_of=dict.fromkeys(nodes, 1),
+            callbacks=tuple(
+                replace(callback, node=node, publishes=topic)
+                for callback, node, topic in zip(one.callbacks, nodes, one.topics, strict=True)
+            ),
+        )
+        for one in (_profile("a", 30), _profile("b", 30))
+    ]
+    plan, _ = plan_application(both)
+    (running, _), (other, _) = (chain.servers for chain in plan.chains)
+    assert (running.name, other.name) == ("chain", "chain_2")
+    assert (running.threads, running.slots) == (other.threads, other.slots)
+    assert plan.chains[1].offset_ns >= running.slots[0][1]
+
+
 def test_a_smaller_margin_that_is_proposed_was_planned() -> None:
     both = [_profile("a", 41), _profile("b", 41)]
     with pytest.raises(OperationError, match="too long") as refused:

@@ -87,15 +87,15 @@ def place_chains(
     Raises: as :func:`with_offsets`; OperationError also where chains that cannot take turns may not
     run at the same time, or nothing says how long they delay each other then.
     """
-    together = together or [[k] for k in range(len(plans))]
+    groups = together or [[k] for k in range(len(plans))]
     if at_once is None:
         _refuse_too_full(plans)
     try:
         return with_offsets(plans, together=together, time_limit_s=time_limit_s), []
     except OperationError as error:
-        if at_once is None or _shared_threads(plans, together):
-            raise OperationError(f"{error}. {_turns_only(plans, together)}") from error
-        ranked = _ranked(at_once(), together)
+        if at_once is None or _shared_threads(plans, groups):
+            raise OperationError(f"{error}. {_turns_only(plans, groups)}") from error
+        ranked = _ranked(at_once(), groups)
         remark = (
             f"{error}. Instead, the chains run at the same time at priorities of their own, and"
             " only their publish slots do not overlap."
@@ -200,9 +200,9 @@ def with_offsets(
         raise InputError("no plans to find offsets for: give one per chain")
     for one, two in combinations(plans, 2):
         refuse_common((chain_name(one), chain_name(two)), (one.chain.output, two.chain.output))
+        if together is None:  # else it is known which begin at one callback, not only their names
+            _refuse_same_beginning(one, two)
     together = together or [[k] for k in range(len(plans))]
-    for group, other in combinations(together, 2):
-        _refuse_same_beginning(plans[group[0]], plans[other[0]])
     own = [[plans[k] for k in one] for one in together]
     tables = [_timetable(one, _alone(one, plans, alone)) for one in own]
     found = _find_offsets(tables, time_limit_s, windows)

@@ -72,17 +72,24 @@ def plan_application(
         ) from error
 
 
-def with_own_names(plans: Sequence[Plan]) -> list[Plan]:
-    """The plans, whose servers have names of their own: each had a ``chain``, and an ``output``."""
-    known, renamed = dict[str, Server](), []
-    for place, plan in enumerate(plans, start=1):
+def with_own_names(plans: Sequence[Plan], together: Sequence[Sequence[int]] = ()) -> list[Plan]:
+    """The plans, whose servers have names of their own: each had a ``chain``, and an ``output``.
+
+    Equal servers are one in chains that are in one group of ``together``, or whose cycles start at
+    the same instants.
+    """
+    group_of = {k: number for number, group in enumerate(together) for k in group}
+    known, renamed = dict[str, tuple[object, Server]](), []
+    for place, plan in enumerate(plans):
+        group = group_of.get(place, (plan.cycle_ns, plan.offset_ns))
         servers = []
         for server in plan.servers:
-            name = next((n for n, one in known.items() if one == server), server.name)
-            while name in known and (known[name] != server or not server.threads):
-                name += f"_{place}"
+            own = (group, server)
+            name = next((n for n, one in known.items() if one == own), server.name)
+            while name in known and (known[name] != own or not server.threads):
+                name += f"_{place + 1}"
             servers.append(server.model_copy(update={"name": name}))
-            known[name] = server
+            known[name] = own
         renamed.append(revised(plan, servers=tuple(servers)))
     return renamed
 
@@ -137,7 +144,7 @@ def _planned(
         for group in groups:
             for k, plan in zip(group, _sharing_servers([found[k] for k in group]), strict=True):
                 found[k] = plan
-        return with_own_names(found)
+        return with_own_names(found, groups)
 
     placed, remarks = place_chains(
         plans(at_once=False),
