@@ -22,7 +22,7 @@ from chainshaper.planning import (
     plan_warnings,
     publish_slots,
 )
-from chainshaper.planning.application_plan import combined
+from chainshaper.planning.application_plan import combined, open_until_done
 from chainshaper.planning.overruns import expected
 from chainshaper.planning.profile import Profile, Rival, interference, with_interference
 from chainshaper.reporting.latency import expected_text
@@ -211,6 +211,23 @@ def test_chains_of_two_timers_of_one_node_take_turns() -> None:
     assert (running.name, other.name) == ("chain", "chain_2")
     assert (running.threads, running.slots) == (other.threads, other.slots)
     assert plan.chains[1].offset_ns >= running.slots[0][1]
+
+
+def test_asynchronous_publishers_stay_behind_their_executors_at_priorities_of_their_own() -> None:
+    """41 ms every 100 and 17 every 50 ms cannot take turns; each publishes in two bands."""
+    both = []
+    for one, period_ms in ((_profile("a", 40), 100), (_profile("b", 16), 50)):
+        steps = one.steps_ns.copy()
+        steps[::2, 1] -= 6 * MS
+        varied = {"latencies_ns": steps.sum(axis=1), "steps_ns": steps, "every_step_ns": steps}
+        both.append(replace(one, period_ns=period_ms * MS, every_latency_ns=None, **varied))
+    request = PlanRequest(publication="asynchronous", bands=2, overrun="wait")
+    plan, remarks = plan_application(both, request)
+    assert len(remarks) == 1
+    for carried_out in (plan, open_until_done(plan)):
+        priorities = [[one.priority for one in chain.servers] for chain in carried_out.chains]
+        assert priorities == [[4, 5], [2, 3]]
+        assert all(one.slots for chain in carried_out.chains for one in chain.servers)
 
 
 def test_a_smaller_margin_that_is_proposed_was_planned() -> None:

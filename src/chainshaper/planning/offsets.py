@@ -30,7 +30,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.overruns import slots_without
-from chainshaper.planning.plan import PER_CALLBACK, Plan, Slot, publishing_servers, revised
+from chainshaper.planning.plan import (
+    PER_CALLBACK,
+    Plan,
+    Slot,
+    below_executors,
+    publisher_servers,
+    publishing_servers,
+    revised,
+)
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
@@ -159,21 +167,21 @@ def _turns_only(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> str
 
 
 def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
-    """The plans with a priority for each group of chains."""
+    """The plans with a priority for each group of chains, and one behind it where the threads of
+    asynchronous publishers may have to run below their executors.
+    """
     ranked = list(plans)
     shortest_first = sorted(together, key=lambda group: (plans[group[0]].cycle_ns, group[0]))
-    last = {"priority": OUTPUT_PRIORITY + 1 + len(together)}
+    apart = 2 if any(any(publisher_servers(plan)) for plan in plans) else 1
     for rank, group in enumerate(shortest_first):
-        own = {"priority": OUTPUT_PRIORITY + 1 + rank}
+        own = {"priority": OUTPUT_PRIORITY + 1 + rank * apart}
         publishing = {server.name for k in group for server in publishing_servers(plans[k])}
         for k in group:
-            servers = tuple(
-                one
-                if one.name in publishing
-                else one.model_copy(update=last if one.best_effort else own)
+            servers = [
+                one if one.name in publishing else one.model_copy(update=own)
                 for one in plans[k].servers
-            )
-            ranked[k] = revised(plans[k], servers=servers)
+            ]
+            ranked[k] = revised(plans[k], servers=below_executors(servers))
     return ranked
 
 
