@@ -174,6 +174,11 @@ def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
     assert (slots[1] - slots[0]) % (50 * MS) in range(MS, 49 * MS + 1)
     # The worse chain begins while the better one's slot, 30 ms of 50, is closed.
     assert (placed[0].offset_ns - placed[1].offset_ns) % (50 * MS) >= 30 * MS
+    # A server for best effort, always open, is not what a chain begins with: 15 ms of its slot.
+    rest = Server(name="rest", core=1, priority=4, slots=((0, 100 * MS),), best_effort=True)
+    beside = [revised(placed[0], servers=(*placed[0].servers, rest)), placed[1]]
+    offsets_ns = [[one.offset_ns for one in with_offsets(p, alone=0.25)] for p in (placed, beside)]
+    assert offsets_ns[0] == offsets_ns[1]
     turns, none = place_chains([_shaped("a", 100, 40), _shaped("b", 100, 40)])
     assert none == []
     assert [plan.servers[0].priority for plan in turns] == [2, 2]

@@ -238,7 +238,8 @@ def _alone(
     own: Sequence[Plan], plans: Sequence[Plan], share: float | None
 ) -> Iterator[tuple[tuple[int, int], int]]:
     """Cores and priorities better than those with which a chain begins, and for how long (ns)."""
-    first = {one.core: one for plan in own for one in plan.servers if one.slots[0][0] == 0}
+    servers = [one for plan in own for one in plan.servers if not one.best_effort]
+    first = {one.core: one for one in servers if one.slots[0][0] == 0}
     for core, best in sorted({(one.core, one.priority) for p in plans for one in p.servers}):
         if share is not None and core in first and best < first[core].priority:
             yield (core, best), max(START_NS, int(share * first[core].slots[0][1]))
