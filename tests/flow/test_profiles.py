@@ -151,6 +151,8 @@ def test_a_chain_that_no_timer_starts_needs_its_period_and_leaves_out_what_feeds
     chain = "/rear_filtered../fused../pose"
     with pytest.raises(InputError, match=r"starts are 100 ms apart, mostly\): add --period"):
         profile_chains(_recorded(), [chain])
+    with pytest.raises(InputError, match="cannot have the period 0 ms: give one longer"):
+        profile_chains(_recorded(), [chain], period_ns=0)
     (profile,) = profile_chains(_recorded(), [chain], period_ns=100 * MS)
     assert profile.period_ns == 100 * MS
     assert [callback.node for callback in profile.callbacks] == [

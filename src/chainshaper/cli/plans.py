@@ -9,6 +9,7 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.cli.applying import recording_of
+from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback, NodeKind
 
@@ -118,6 +119,8 @@ def _profiles(
         return cs.profile_chains(recording, chains, period_ns=period, **how)
     if latencies is None or period is None:
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
+    if period <= 0:
+        raise InputError(f"--period {format_duration(period)}: write a period longer than 0 ms")
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
     first, last = (

@@ -216,6 +216,9 @@ def _period(analysis: LatencyAnalysis, given: int | None) -> int:
             f" {first.label} has its own period, leave it out"
         )
     period = given if first.period_ns is None else first.period_ns
+    if period is not None and period <= 0:
+        reason = f"chain {analysis.chain.spec} cannot have the period {duration_text(period)}"
+        raise InputError(f"{reason}: give one longer than 0 ms, or begin the chain at a timer")
     if period is not None:
         return period
     apart = _between_starts(analysis)

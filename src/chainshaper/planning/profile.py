@@ -153,8 +153,8 @@ def up_to(profile: Profile, percentile: float) -> Profile:
     """The profile up to a percentile of its latencies: what takes longer is taken to be late."""
     if not 0 < percentile <= 100:
         raise InputError(f"--percentile {percentile:g}: write more than 0, at most 100")
-    latencies = profile.latencies_ns
-    fit = max(min(2, latencies.size), math.ceil(percentile / 100 * latencies.size - 1e-6))
+    latencies = check_latencies(profile.latencies_ns)
+    fit = max(2, math.ceil(percentile / 100 * latencies.size - 1e-6))
     of_modes = {mode: up_to(one, percentile) for mode, one in profile.of_modes.items()}
     return replace(profile.chosen(latencies <= np.sort(latencies)[fit - 1]), of_modes=of_modes)
 
