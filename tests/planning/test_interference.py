@@ -190,6 +190,12 @@ def test_chains_that_do_not_fit_are_named_with_what_fits() -> None:
     assert "core for" not in str(refused.value)
 
 
+def test_chains_of_which_only_latencies_are_known_take_turns() -> None:
+    bare = Profile(np.array([20, 30]) * MS, 100 * MS)
+    plan, _ = plan_application([bare, bare], PlanRequest(epsilon_ns=0))
+    assert 30 * MS <= plan.chains[1].offset_ns - plan.chains[0].offset_ns <= 70 * MS
+
+
 def test_chains_of_two_timers_of_one_node_take_turns() -> None:
     """Written by nodes, both begin with one name; their servers differ in nothing but time."""
     nodes = ("/source", "/filter")

@@ -251,7 +251,7 @@ def with_interference(
             rivals += [_group(one, chains) for chains in better if at_once]
             for place, other in enumerate(undelayed):
                 cores = _cores(one, forked if place in group else _stages([one]))
-                if gates and place != k and other.core_of.get(other.nodes[-1]) in cores:
+                if gates and place != k and other.core_of.get(other.last or "") in cores:
                     rivals.append(_gate(other, wishes.spin_ns))
             delay = interference(_longest_in_time(one), rivals, one.period_ns)
             delayed[k] = _later(one, delay, profiles[k].latencies_ns)
