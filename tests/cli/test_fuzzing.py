@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 import polars as pl
 import pytest
 from command_line import called
@@ -23,7 +24,9 @@ from ctf_writing import write_lttng_trace
 from small_chain import small_chain_text
 
 from chainshaper import simulate
-from chainshaper.planning import Plan, dump_plan
+from chainshaper.planning import Plan, dump_plan, plan_shaping
+from chainshaper.planning.plan import revised
+from chainshaper.planning.plan_file import plans_as_text
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import load_application
 
@@ -208,10 +211,20 @@ def applications(chance: random.Random, folder: Path, recording: Recording) -> A
     return ("simulate", file, "-o", folder / "out", "--cycles", "3")
 
 
+def _with_a_branch(plan: Plan) -> str:
+    """The plan and that of a second output, [22 ms, 23 ms), in one file: they share a server."""
+    about = {"spec": "/t1../t2", "output": "/t2", "publisher": "/second"}
+    core, latencies = plan.servers[0].core, np.array([5_000_000, 21_000_000])
+    other = plan_shaping(latencies, plan.cycle_ns, core=core, **about)  # type: ignore[arg-type]
+    output = other.servers[1].model_copy(update={"name": "output_2"})
+    return plans_as_text([plan, revised(other, servers=(plan.servers[0], output))])
+
+
 def plans(chance: random.Random, folder: Path, recording: Recording, plan: Plan) -> Arguments:
-    """A plan, in use with an application and with a recording."""
+    """A plan of a chain, or of two, in use with an application and with a recording."""
     (folder / "application.yaml").write_text(small_chain_text())
-    file = _write_damaged(chance, folder / "plan.yaml", dump_plan(plan))
+    text = chance.choice([dump_plan, _with_a_branch])(plan)
+    file = _write_damaged(chance, folder / "plan.yaml", text)
     output = ("-o", folder / "out")
     launch = folder / "robot.launch.xml"
     launch.write_text('<launch><node pkg="p" exec="e" name="third"/></launch>')

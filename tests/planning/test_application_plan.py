@@ -147,6 +147,8 @@ def test_plans_of_one_chain_are_read_and_written_as_ever(
         ("offset: 20ms", "offset: 65ms", "'chain_2' meets [0 ms, 20 ms) of server 'chain' of /a.."),
         ("offset: 20ms", "ofset: 20ms", "offset"),
         ("  - chain\n", "  - {name: chain}\n", "slots"),
+        ("  - chain\n", "  - {name: {a: b}}\n", "what stands here is not a text"),
+        ("  - chain\n", "  - [{a: b}]\n", "what stands here is not a mapping of keys"),
     ],
 )
 def test_what_was_edited_wrongly_is_named_with_its_line(

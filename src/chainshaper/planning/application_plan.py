@@ -60,18 +60,21 @@ class ApplicationPlan(Part):
         chains = values.get("chains") if isinstance(values, dict) else None
         if not isinstance(chains, tuple | list) or not all(isinstance(one, dict) for one in chains):
             return values
-        known: dict[Any, Any] = {}
+        known: dict[str, Any] = {}
         complete = []
         for place, chain in enumerate(chains):
             servers = chain.get("servers")
             own = list(servers) if isinstance(servers, tuple | list) else []
             for number, server in enumerate(own):
+                name = server.get("name") if isinstance(server, dict) else server
+                if not isinstance(name, str):
+                    continue  # the server's own model refuses it
                 if isinstance(server, dict):
-                    known.setdefault(server.get("name"), server)
-                elif server in known:
-                    own[number] = known[server]
+                    known.setdefault(name, server)
+                elif name in known:
+                    own[number] = known[name]
                 else:
-                    reason = f"no chain before this one has a server {server!r}: write it out"
+                    reason = f"no chain before this one has a server {name!r}: write it out"
                     raise wrong_value(reason, "chains", place, "servers", number)
             complete.append({**chain, "servers": tuple(own)} if own else chain)
         return {**values, "chains": tuple(complete)}
