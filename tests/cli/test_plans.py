@@ -133,8 +133,11 @@ def test_auto_shows_the_curve_and_says_why_it_stops(common: Words, file: Path) -
     without = json_of(*common, "--percentile", "99.5")
     assert without["choice"]["curve"][chosen - 1]["bands_ns"] == without["bands_ns"]
     assert without["bands_ns"] == values["bands_ns"]
-    assert "exists already" in refused(2, *common, "--curve", curve)
-    other = curve.with_name("other.png")
+    plan, other = file.with_name("plan.yaml"), curve.with_name("other.png")
+    assert "exists already" in refused(2, *common, "--curve", curve, "-o", plan)
+    said = refused(2, *common, "--curve", curve.with_name("curve.txt"), "-o", plan)
+    assert "ends in .png or .pdf or .svg" in said
+    assert not plan.exists()
     assert "add --bands auto" in refused(2, *common[:-1], "2", "--curve", other)
 
 

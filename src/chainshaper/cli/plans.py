@@ -62,11 +62,14 @@ def plan(
     from chainshaper.planning.request import on_cores
     from chainshaper.reporting.figures import draw_curve
     from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
+    from chainshaper.values.files import new_file
 
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
+    if curve is not None:
+        curve = new_file(curve, (".png", ".pdf", ".svg"))  # before a plan is written
     wanted: list[str | None] = [*chain] if chain else [None]
     how: dict[str, Any] = {"modes": request.modes, "since_ns": since, "until_ns": until}
     how["mode_recordings"] = opt.mode_profiles(mode_profile, request)
