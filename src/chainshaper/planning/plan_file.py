@@ -11,14 +11,13 @@ from textwrap import indent
 from typing import Any
 
 import yaml
-from pydantic import model_validator
 
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.overruns import expected
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import new_file, write_whole
-from chainshaper.values.yaml_file import AS_YAML, read_model, wrong_value
+from chainshaper.values.yaml_file import AS_YAML, read_model
 
 _HEADER = """\
 # A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
@@ -49,17 +48,10 @@ _SECTION_COMMENTS = {
 
 def load_plan(path: str | Path) -> Plan:
     """Read a plan, however a person has laid it out. Raises: as :func:`.read_model`."""
-    several = ("chains", _OfSeveralChains)
-    return read_model(path, Plan, made_by="written by `chainshaper plan`", otherwise=several)
-
-
-class _OfSeveralChains(Plan):
-    """What a file is that has a plan where one chain's is wanted: refused."""
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refused(cls, _: object) -> object:
-        raise wrong_value("the plan is of several chains, and that of one is wanted here", "chains")
+    chain, *others = load_application_plan(path).chains
+    if others:
+        raise InputError(f"{path}: the plan is of several chains, and that of one is wanted here")
+    return chain
 
 
 def dump_plan(plan: Plan) -> str:
