@@ -57,7 +57,6 @@ def plan_shaping(
     margin: Margin | None = None,
     nodes: Sequence[str] = (),
     core: int = 1,
-    output_core: int | None = None,
     fifo_priority: int = 84,
     receivers: Sequence[str] = (),
     **values: Any,
@@ -67,7 +66,7 @@ def plan_shaping(
     With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the period,
     the chain's server R_m gets the slot [0, L̄ + ε) (eq. 1) and the output's server R_m° gets [L̄ +
     ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
-    same cycle (eq. 3), at the better priority, on ``output_core`` (default: the same core).
+    same cycle (eq. 3) and on the same core, at the better priority.
 
     ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process) unless
     the wishes say otherwise; Δ is 1 ms. ``nodes`` are those whose executors run the chain,
@@ -91,10 +90,9 @@ def plan_shaping(
     if (end := start + length) > period_ns:
         alone = values.get("interference_ns") is None
         _refuse_too_long(longest, epsilon, length, period_ns, alone=alone)
-    output_core = core if output_core is None else output_core
     with wrong_values_refused(Plan):
         chain = ChainOfPlan(period_ns=period_ns, **of_chain)
-        node, gated = _gate(chain, wishes, output_core, fifo_priority, receivers)
+        node, gated = _gate(chain, wishes, core, fifo_priority, receivers)
         threads = tuple(Thread(node=name) for name in nodes)
         running = Server(
             name="chain", core=core, priority=CHAIN_PRIORITY, slots=((0, start),), threads=threads
@@ -111,7 +109,7 @@ def plan_shaping(
             messages=wishes.messages,
             fallback=wishes.fallback,
             shaping_thread=wishes.shaping_thread,
-            servers=(running, _publishing("output", output_core, (start, end), gated)),
+            servers=(running, _publishing("output", core, (start, end), gated)),
             shaping_node=node,
             predicted=predict_bands(latencies, [end], length, wishes.into_open_slot),
         )
