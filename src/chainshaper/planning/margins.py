@@ -188,12 +188,8 @@ def covered_latency(
         >>> covered_latency(np.arange(1, 300), 0.01), covered_latency(np.arange(1, 601), 0.01)
         (299, 599)
     """
-    from scipy.special import bdtr
-
     ordered = np.sort(latencies_ns)
-    most = np.arange(math.ceil(overrun_probability * ordered.size) + 1)
-    place = int(np.count_nonzero(bdtr(most, ordered.size, overrun_probability) <= 1 - CONFIDENCE))
-    covered = ordered[-max(1, place)]
+    covered = ordered[-max(1, _by_chance(ordered.size, overrun_probability, CONFIDENCE))]
     if latest_ns is not None and covered > latest_ns:
         covered = ordered[ordered <= latest_ns].max(initial=0)
     return int(covered)

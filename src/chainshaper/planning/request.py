@@ -452,8 +452,6 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
         late = late_share(every, longest + request.epsilon_ns)
         return Margin(epsilon_ns=request.epsilon_ns, overrun_probability=late)
     covered = profile.latencies_ns if request.ideal_machine else every
-    if probability is not None and not 0 < probability < 1:
-        raise InputError(f"an overrun probability of {probability}: write one between 0 and 1")
     if probability is not None and probability < MOST_PROBABLE:
         return derive_margin(covered, probability, request.seed, longest_ns=longest)
     if probability is not None and covered.size < (needed := cycles_needed(probability)):
@@ -508,6 +506,8 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
         )
     if request.epsilon_ns is not None and request.overrun_probability is not None:
         raise InputError("the margin is either given or covers a share: leave out one of both")
+    if (share := request.overrun_probability) is not None and not 0 < share < 1:
+        raise InputError(f"an overrun probability of {share}: write one between 0 and 1")
     if request.policy != "one-long-slot" and request.slot_start_ns is not None:
         raise InputError("a slot's start goes with the policy one-long-slot: add it")
     cores = request.cores or ()
