@@ -101,6 +101,13 @@ def test_best_effort_comes_behind_all_others_in_a_server_that_is_always_open(
     )
     both, _ = plan_application([PROFILE, other], PlanRequest(best_effort=("/logger",)))
     assert [len(s.threads) for s in both.servers if s.best_effort] == [1], "one for all chains"
+    # Also behind the other chain's publisher, which is then ranked below its executor.
+    elsewhere = replace(other, core_of={"/third": 2})
+    request = PlanRequest(best_effort=("/noise",), publication="asynchronous")
+    gated = open_until_done(plan_application([PROFILE, elsewhere], request)[0])
+    on_core = [s for chain in gated.chains for s in chain.servers if s.core == 2]
+    ranks = [(s.priority, s.best_effort) for s in on_core]
+    assert sorted(ranks) == [(2, False), (3, False), (4, True)]
 
 
 def test_servers_of_one_priority_overlap_only_where_they_take_turns() -> None:

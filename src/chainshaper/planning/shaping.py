@@ -32,6 +32,7 @@ from chainshaper.planning.plan import (
     below_executors,
     output_server,
     publish_slots,
+    publisher_servers,
     publishing_servers,
     revised,
     until,
@@ -252,6 +253,8 @@ def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[
         reason = f"{node} is in the server {known[node]!r}"
         raise InputError(f"{reason}: best effort are nodes beside chains")
     worst = max(server.priority for plan in plans for server in plan.servers)
+    # Threads of publishers come behind their executors where overruns may finish.
+    worst += any(any(publisher_servers(plan)) for plan in plans)
     with wrong_values_refused(Plan):
         added = [
             Server(
