@@ -345,7 +345,9 @@ def test_points_keep_every_extreme_and_are_few(
         every = complete.filter(pl.col("disturbed") == kind)["latency_ns"]
         shown = drawn.filter(pl.col("disturbed") == kind)["latency_ns"]
         assert (every.min(), every.max()) == (shown.min(), shown.max())
-    assert set(points["incomplete"]) <= set(frame.filter(~pl.col("complete"))["start"])
+    broken = frame.filter(~pl.col("complete"))["start"].to_list()
+    assert set(points["incomplete"]) <= set(broken)
+    assert points["incomplete"][-1:] == broken[-1:]
 
 
 @given(st.lists(st.integers(0, 10**9), max_size=100), st.integers(2, 50))

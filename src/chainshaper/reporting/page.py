@@ -150,7 +150,8 @@ def _drawn(parts: Sequence[_Part], cycles: Sequence[int], number: int) -> dict[s
     """Everything that is drawn of a chain; ``n`` is what ids end in, nothing for the first."""
     suffix = f"-{number + 1}" if number else ""
     recordings = [_recording_data(part, cycles) for part in parts]
-    times = [time for one in recordings for time in one["points"]["time"][-1:]]
+    points = [one["points"] for one in recordings]
+    times = [time for one in points for time in (*one["time"][-1:], *one["incomplete"][-1:])]
     slots = enumerate(_plans_of(parts).values())
     bars = {f"slots-{place}{suffix}": _slot_bars(plan) for place, plan in slots}
     return {
@@ -469,6 +470,7 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
                 pl.col("row").get(pl.col("latency_ns").arg_min()).alias("shortest"),
                 pl.col("row").get(pl.col("latency_ns").arg_max()).alias("longest"),
             )
+    gaps = broken.gather_every(max(1, -(-len(broken) // limit)))
         )
         sample = pl.arange(0, complete.height, -(-2 * complete.height // limit), eager=True)
         rows = pl.concat([extremes["shortest"], extremes["longest"], sample]).unique().sort()
@@ -480,7 +482,7 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
         "time": (drawn["start"] - zero).to_list(),
         "latency": drawn["latency_ns"].to_list(),
         "disturbed": np.flatnonzero(drawn["disturbed"].to_numpy()).tolist(),
-        "incomplete": broken.gather_every(max(1, -(-len(broken) // limit))).to_list(),
+        "incomplete": sorted({*gaps, *broken.tail(1)}),
     }
 
 
