@@ -3,6 +3,7 @@
 import json
 import re
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import pytest
 from command_line import called, json_of, refused
 from hypothesis import given
 from hypothesis import strategies as st
+from known import known as known_value
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 
 from chainshaper import (
@@ -25,6 +27,7 @@ from chainshaper import (
     save_plan,
     write_report,
 )
+from chainshaper.reporting.latency import headline
 from chainshaper.reporting.page import (
     distinct_names,
     latency_histogram,
@@ -203,6 +206,35 @@ def test_incomplete_cycles_and_overruns_have_numbers_and_reasons(tmp_path: Path)
         ("arrived during their slot", "0"),
     ):
         assert [title, cell] in page.rows["figures"]
+
+
+def test_the_chart_over_time_reaches_to_incomplete_cycles_at_the_end(tmp_path: Path) -> None:
+    """Of six cycles, 100 ms apart, the last two have no output."""
+    page = _report(measure_latency(known_run(tmp_path / "known", 6, untaken=(4, 5))))
+    points = page.data["recordings"][0]["points"]
+    assert (points["time"][-1], points["incomplete"]) == (3 * PERIOD_NS, [4 * PERIOD_NS])
+    assert page.data["longest"] == 4 * PERIOD_NS
+
+
+def test_the_headline_says_as_predicted_only_of_what_was_judged_and_broke_no_promise(
+    known: Recording,
+) -> None:
+    measured = measure_latency(known)
+    judged = known_value(measured.prediction)
+    open_figures = {
+        name: replace(getattr(judged, name), holds=None) for name in ("mean", "max", "jitter")
+    }
+    said = "Jitter 0.000 ms (known); average 30.020 ms (known)"
+    for changes, verdict in (
+        ({}, "as predicted, 0 of 3 late"),
+        (open_figures, "not judged, 0 of 3 late"),
+        (
+            {"late_of_all": 12, "cycles": 320, "most_late": 0},
+            "differs from the prediction: 12 of 320 outputs late, none expected",
+        ),
+    ):
+        one = replace(measured, prediction=replace(judged, **changes))
+        assert headline(["known"], [one]) == f"{said}; {verdict}."
 
 
 def test_where_the_machine_was_not_watched_no_cycle_is_called_undisturbed(tmp_path: Path) -> None:

@@ -287,13 +287,14 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
         " → ".join(f"{ms(getattr(calm[n], field))} ms ({names[n]})" for n in ends)
         for field in ("jitter_ns", "mean_ns")
     )
-    said, prediction = f"Jitter {jitter}; average {average}", measurements[-1].prediction
-    if prediction is None:
+    said, judged = f"Jitter {jitter}; average {average}", measurements[-1].prediction
+    if judged is None:
         return f"{said}."
-    named = ("average", prediction.mean), ("maximum", prediction.max), ("jitter", prediction.jitter)
-    broken = ", ".join(name for name, figure in named if figure.worse)
-    verdict = f"differs from the prediction: {broken}" if broken else "as predicted"
-    return f"{said}; {verdict}, {count(calm[-1].late)} of {calm[-1].count:,} late."
+    if judged.broken:
+        return f"{said}; differs from the prediction: {'; '.join(judged.broken)}."
+    holds = {one.holds for one in (judged.mean, judged.max, judged.jitter)}
+    verdict = "not judged" if holds == {None} else "as predicted"
+    return f"{said}; {verdict}, {count(judged.late_of_all)} of {judged.cycles:,} late."
 
 
 def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ()) -> ResultTable:
