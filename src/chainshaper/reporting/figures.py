@@ -6,7 +6,8 @@ in grey print.
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from itertools import cycle
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 SIZE_INCHES = (9.0, 4.2)
 MOST_LINES = 12
 
+ENDINGS = (".png", ".pdf", ".svg")
 
 def write_comparison(comparison: Comparison, folder: Path) -> None:
     """Write `comparison.json`, `latency.png` and `distribution.png` into a folder.
@@ -53,6 +55,19 @@ def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> 
 
 
 def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
+@contextmanager
+def _own_style() -> Iterator[None]:
+    """Draw in the user's style, unless others may have written it; the caller's stays as it is."""
+    import matplotlib as mpl
+
+    with mpl.rc_context():
+        style = Path(mpl.matplotlib_fname())
+        if style.parent == Path.cwd() or why_distrusted(style) is not None:
+            mpl.rcdefaults()  # it may have TeX run, with a preamble of others
+        yield
+
+
+@_own_style()
     """End-to-end latency of every cycle, all recordings in one picture (paper, figure 6).
 
     Crosses mark cycles that the machine disturbed. The picture ends a little above the highest
@@ -73,6 +88,7 @@ def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
 
 
 def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
+@_own_style()
     """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
     figure, axes = _new_figure()
     for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
@@ -107,11 +123,13 @@ def _save_chain(
 
 
 def draw_curve(choice: BandChoice, path: str | Path) -> Path:
+@_own_style()
     """The average latency over the number of bands (paper, figure 7), the chosen number marked.
 
-    Raises InputError: the file exists already. OperationError: it cannot be written.
+    Raises InputError: the file exists already, or ends as no picture does. OperationError: it
+    cannot be written.
     """
-    path = new_file(path)
+    path = new_file(path, ENDINGS)
     figure, axes = _new_figure()
     bands = [len(placement.slot_ends_ns) for placement in choice.curve]
     means = [placement.mean_ns / 1e6 for placement in choice.curve]
@@ -126,6 +144,7 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
 
 
 def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
+@_own_style()
     """Average and jitter over the first axis, a line for each combination of the others.
 
     Raises OperationError: the picture cannot be written.
@@ -154,15 +173,10 @@ def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
 
 def _new_figure(panels: int = 1) -> tuple[Any, Any]:
     """A figure and its axes; of several panels, beside each other, a sequence of axes."""
-    import matplotlib as mpl
+    from matplotlib.figure import Figure
 
-    mpl.use("Agg")
-    style = Path(mpl.matplotlib_fname())
-    if style.parent == Path.cwd() or why_distrusted(style) is not None:
-        mpl.rcdefaults()  # it may have TeX run, with a preamble of others
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, panels, figsize=SIZE_INCHES, layout="constrained")
+    figure = Figure(SIZE_INCHES, layout="constrained")
+    axes = figure.subplots(1, panels)
     for one in figure.axes:
         one.grid(alpha=0.3)
     return figure, axes
@@ -173,7 +187,6 @@ def _save_figure(figure: Any, path: str | Path) -> Path:
 
     Raises OperationError: it cannot be written.
     """
-    from matplotlib import pyplot as plt
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):
@@ -182,5 +195,4 @@ def _save_figure(figure: Any, path: str | Path) -> Path:
             text.set_text(shown(text.get_text(), but="\n"))
     path, picture = Path(path), io.BytesIO()
     figure.savefig(picture, dpi=130, format=path.suffix.removeprefix(".") or None)
-    plt.close(figure)
     return write_whole(path, [picture.getvalue()])
