@@ -2,19 +2,25 @@
 
 import io
 import shutil
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import matplotlib as mpl
 import pytest
 from command_line import called, json_of
-from known_run import LATENCY_NS, MS, PERIOD_NS, known_run
+from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 from rich.console import Console
 
 from chainshaper import (
     compare_recordings,
+    draw_distribution,
+    draw_latency,
     measure_latency,
     open_recording,
 )
 from chainshaper.planning import Plan
+from chainshaper.reporting import figures
 from chainshaper.reporting.latency import comparison_json, comparison_table
 from chainshaper.reporting.overviews import plan_table
 from chainshaper.reporting.tables import ResultTable
@@ -104,3 +110,30 @@ def test_a_recording_from_before_says_nothing_and_is_read_whole(tmp_path: Path) 
     measured = measure_latency(open_recording(recording.path))
     assert measured.analysis.statistics.count == 3
     assert measured.left_out.text is None
+
+
+def test_publish_slots_are_shaded_where_outputs_leave(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Under LET in the slot [30 ms, 31 ms) of the next cycle, 100 ms later."""
+    drawn: list[Any] = []
+    monkeypatch.setattr(figures, "_save_figure", lambda figure, _: drawn.append(figure))
+    let = known_plan().model_copy(update={"policy": "let-per-chain"})
+    draw_distribution([replace(measure_latency(known_run(tmp_path / "known")), plan=let)], "")
+    (slot,) = drawn[0].axes[0].patches
+    assert (slot.get_x(), slot.get_width()) == pytest.approx((130, 1))
+
+
+def test_drawing_leaves_the_callers_backend_and_style(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # a style that may be others'
+    monkeypatch.setattr(mpl, "matplotlib_fname", lambda: str(tmp_path / "matplotlibrc"))
+    before = mpl.get_backend()
+    with mpl.rc_context({"lines.linewidth": 7}):
+        mpl.use("svg")
+        try:
+            draw_latency([measure_latency(known_run(tmp_path / "known"))], tmp_path / "latency.png")
+            assert (mpl.get_backend(), mpl.rcParams["lines.linewidth"]) == ("svg", 7)
+        finally:
+            mpl.use(before)

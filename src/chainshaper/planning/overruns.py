@@ -448,3 +448,9 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         )
     if used > NEARLY_FULL:
         yield f"the chain takes {used:.1%} of its core: latencies will pile up, whatever the slots."
+
+
+def slots_of_latency(plan: Plan) -> tuple[Slot, ...]:
+    """The publish slots as latencies: under LET, and in a pipeline, they are of a later cycle."""
+    delay = cycles_until_output(plan) * plan.cycle_ns
+    return tuple((start + delay, end + delay) for start, end in publish_slots(plan))

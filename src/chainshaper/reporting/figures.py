@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 import polars as pl
 
-from chainshaper.planning import BandChoice, publish_slots
+from chainshaper.planning import BandChoice
+from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting.latency import comparison_json
 from chainshaper.reporting.overviews import sweep_axes, sweep_value
 from chainshaper.values.errors import InputError, OperationError, shown
@@ -25,8 +26,8 @@ from chainshaper.verify.measure import Comparison, Measurement
 COLOURS = ("#d95f02", "#1b6ca8", "#4d9221", "#7b3294")
 SIZE_INCHES = (9.0, 4.2)
 MOST_LINES = 12
-
 ENDINGS = (".png", ".pdf", ".svg")
+
 
 def write_comparison(comparison: Comparison, folder: Path) -> None:
     """Write `comparison.json`, `latency.png` and `distribution.png` into a folder.
@@ -54,7 +55,6 @@ def draw_comparison(measurements: Sequence[Measurement], folder: str | Path) -> 
     return draw_latency(measurements, latency), draw_distribution(measurements, distribution)
 
 
-def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
 @contextmanager
 def _own_style() -> Iterator[None]:
     """Draw in the user's style, unless others may have written it; the caller's stays as it is."""
@@ -68,6 +68,7 @@ def _own_style() -> Iterator[None]:
 
 
 @_own_style()
+def draw_latency(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """End-to-end latency of every cycle, all recordings in one picture (paper, figure 6).
 
     Crosses mark cycles that the machine disturbed. The picture ends a little above the highest
@@ -87,8 +88,8 @@ def _own_style() -> Iterator[None]:
     return _save_chain(figure, axes, measurements, path)
 
 
-def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
 @_own_style()
+def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> Path:
     """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
     figure, axes = _new_figure()
     for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
@@ -97,7 +98,7 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
         share = np.arange(1, len(latency) + 1) / max(1, len(latency))
         label = f"{measurement.recording.path.name} ({len(latency)} cycles)"
         axes.step(latency, share, where="post", color=colour, label=label)
-        slots = () if measurement.plan is None else publish_slots(measurement.plan)
+        slots = () if measurement.plan is None else slots_of_latency(measurement.plan)
         for number, (start, end) in enumerate(slots):
             look = {"color": "0.8", "zorder": 0, "label": None if number else "publish slot"}
             axes.axvspan(start / 1e6, end / 1e6, **look)
@@ -122,8 +123,8 @@ def _save_chain(
     return _save_figure(figure, path)
 
 
-def draw_curve(choice: BandChoice, path: str | Path) -> Path:
 @_own_style()
+def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     """The average latency over the number of bands (paper, figure 7), the chosen number marked.
 
     Raises InputError: the file exists already, or ends as no picture does. OperationError: it
@@ -143,8 +144,8 @@ def draw_curve(choice: BandChoice, path: str | Path) -> Path:
     return _save_figure(figure, path)
 
 
-def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
 @_own_style()
+def draw_sweep(frame: pl.DataFrame, path: Path) -> Path:
     """Average and jitter over the first axis, a line for each combination of the others.
 
     Raises OperationError: the picture cannot be written.

@@ -27,7 +27,7 @@ import polars as pl
 
 from chainshaper.analysis import DataFlow, callback_statistics, data_flow
 from chainshaper.planning import Plan, dump_plan, publish_slots
-from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting import overviews
 from chainshaper.reporting.tables import ResultTable, figures, ms, slots_ms, words
@@ -391,18 +391,13 @@ def _lines(texts: Iterable[str]) -> str:
 
 
 def _recording_data(part: _Part, cycles: Sequence[int]) -> dict[str, Any]:
-    """Everything that is drawn of one recording; its timeline has ``cycles`` in any case.
-
-    ``slots`` are publish slots as latencies: under LET they belong to a later cycle.
-    """
+    """Everything that is drawn of one recording; its timeline has ``cycles`` in any case."""
     measurement, plan = part.measurement, part.measurement.plan
     traversals = measurement.analysis.traversals
     zero = next(iter(traversals["start"]), 0)
-    delay = 0 if plan is None else cycles_until_output(plan) * plan.cycle_ns
-    slots = () if plan is None else publish_slots(plan)
     return {
         "name": part.name,
-        "slots": [(start + delay, end + delay) for start, end in slots],
+        "slots": () if plan is None else slots_of_latency(plan),
         "points": latency_points(traversals, zero),
         "histogram": latency_histogram(traversals),
         "timeline": timeline_data(measurement, part.timeline, cycles, zero),
@@ -470,12 +465,12 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
                 pl.col("row").get(pl.col("latency_ns").arg_min()).alias("shortest"),
                 pl.col("row").get(pl.col("latency_ns").arg_max()).alias("longest"),
             )
-    gaps = broken.gather_every(max(1, -(-len(broken) // limit)))
         )
         sample = pl.arange(0, complete.height, -(-2 * complete.height // limit), eager=True)
         rows = pl.concat([extremes["shortest"], extremes["longest"], sample]).unique().sort()
         drawn = complete[rows]
     broken = traversals.filter(~pl.col("complete"))["start"] - zero
+    gaps = broken.gather_every(max(1, -(-len(broken) // limit)))
     return {
         "of": complete.height,
         "cycle": drawn["traversal"].to_list(),

@@ -27,8 +27,8 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
 from chainshaper.analysis.disturbance import Due
 from chainshaper.planning import Plan, publish_slots
-from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected
-from chainshaper.planning.plan import SHORTEST_SLOT_NS, publisher_servers, server_of
+from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected, slots_of_latency
+from chainshaper.planning.plan import SHORTEST_SLOT_NS, Slot, publisher_servers, server_of
 from chainshaper.values.durations import milliseconds
 
 STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
@@ -151,8 +151,7 @@ def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
 
     The analysis knows from :func:`due_of` when outputs were due.
     """
-    delay = cycles_until_output(plan) * plan.cycle_ns
-    slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
+    slots = slots_of_latency(plan)
     from_cycle = _from_cycle(plan)
     outputs = _outputs(slots, analysis, "place_ns" if from_cycle else "latency_ns")
     late = int(outputs["late"].sum())
@@ -192,7 +191,7 @@ def _most_late(plan: Plan, cycles: int) -> int:
 
 
 def _figures(
-    plan: Plan, slots: list[tuple[int, int]], measured: LatencyStatistics
+    plan: Plan, slots: Sequence[Slot], measured: LatencyStatistics
 ) -> tuple[JudgedFigure, JudgedFigure, JudgedFigure]:
     """Average, maximum and jitter: with outputs at slot starts and ends, with room, measured."""
     predicted = plan.predicted
@@ -245,7 +244,7 @@ def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
     return sum(share * value for share, value in zip(shares, values, strict=True))
 
 
-def _outputs(slots: list[tuple[int, int]], analysis: LatencyAnalysis, judged: str) -> pl.DataFrame:
+def _outputs(slots: Sequence[Slot], analysis: LatencyAnalysis, judged: str) -> pl.DataFrame:
     """Undisturbed complete traversals: ``judged_ns, place_ns, slot, mode, late``.
 
     The slot is the one that the gate says it released the message in. Without a gate's events it
