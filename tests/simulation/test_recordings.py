@@ -98,18 +98,39 @@ nodes:
 """
 
 
-@pytest.mark.parametrize("name", ["synthetic_chain", "asynchronous_chain", "fusion"])
+LATER = """
+chain: /t2../t3
+nodes:
+  a: {callbacks: [{timer: 100ms, execution: {uniform: [1ms, 50ms]}, publishes: [/t1]}]}
+  b: {callbacks: [{subscription: /t1, execution: {constant: 2ms}, publishes: [/t2]}]}
+  c: {callbacks: [{subscription: /t2, execution: {constant: 3ms}, publishes: [/t3]}]}
+"""
+SKIPPING = """
+chain: /t1../t2
+nodes:
+  a: {callbacks: [{timer: 100ms, execution: {samples: [20ms, 150ms]}, publishes: [/t1]}]}
+  b: {core: 2, callbacks: [{subscription: /t1, execution: {constant: 3ms}, publishes: [/t2]}]}
+"""
+SMALL = {  # and the latencies that they can have, in ms
+    "fusion": (FUSION, {9}),
+    "from a subscription on": (LATER, {5}),
+    "a timer that skips expiries": (SKIPPING, {23, 153}),
+}
+
+
+@pytest.mark.parametrize("name", ["synthetic_chain", "asynchronous_chain", *SMALL])
 def test_latencies_only_are_those_that_the_analysis_finds(tmp_path: Path, name: str) -> None:
-    is_fusion = name == "fusion"
-    described = application(FUSION) if is_fusion else load_application(EXAMPLES / f"{name}.yaml")
+    text, possible = SMALL.get(name, ("", set()))
+    described = application(text) if text else load_application(EXAMPLES / f"{name}.yaml")
     profile = simulate(described, tmp_path / "profile", cycles=200)
-    planned = None if is_fusion else plan_recording(profile)
+    planned = None if text else plan_recording(profile)
     shaped = simulate(described, tmp_path / "shaped", planned, cycles=500)
-    for recording, plan in ((profile, None), (shaped, planned)):
+    for recording, plan, cycles in ((profile, None, 200), (shaped, planned, 500)):
         table = analyse_latency(recording, described.chain).traversals.sort("start")
         found = table["latency_ns"].fill_null(-1).to_list()
-        assert simulate_latencies(described, plan, cycles=table.height).tolist() == found
-        assert not is_fusion or set(found) == {9_000_000}
+        assert simulate_latencies(described, plan, cycles=cycles).tolist() == found
+        assert not text or set(found) == {ms * 1_000_000 for ms in possible}
+        assert (len(found) < cycles) == (text == SKIPPING)
 
 
 def test_a_long_simulation_is_written_in_parts_that_read_as_one(

@@ -28,7 +28,7 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.execution import BLOCK, blocks
-from chainshaper.workload.live import WARM_UP_CYCLES, Timing
+from chainshaper.workload.live import Timing
 
 FIRST_PID, FIRST_TID = 1000, 100_000
 """Of processes, whose number the main thread has, and of threads beside it that execute."""
@@ -344,8 +344,8 @@ def build_machine(
 ) -> Machine:
     """The array of a system before anything has happened.
 
-    ``events`` and ``switches`` say what is logged, ``latencies`` for how many instances of the
-    chain the latency is noted, behind those of the warm-up.
+    ``events`` and ``switches`` say what is logged, ``latencies`` for how many recorded instances of
+    the chain the latency is noted.
     """
     rows = Rows([0] * X.COLUMNS)
     streams = Streams(system.application.seed, rows)
@@ -392,7 +392,6 @@ def build_machine(
         X.QUANTUM: described.quantum_ns if plan is not None and plan.takes_turns else at.FOREVER,
         X.AWAY: round(1e6 * described.interrupts / (1 - described.interrupts)),
         X.CYCLE: plan.cycle_ns if plan is not None else 0,
-        X.WARM_UP: WARM_UP_CYCLES,
     }.items():
         rows[column] = value
     m = np.zeros(end + latencies, dtype=np.int64)

@@ -275,8 +275,8 @@ def send(m, thread, message):
     """A message leaves now, sent by a thread; it is free afterwards, readers get copies."""
     publisher, now = m[message + M.PUBLISHER], m[X.NOW]
     if m[publisher + P.ENDS_CHAIN] == 1 and m[message + M.START] != NONE:
-        noted = m[X.LATENCIES] + m[message + M.NUMBER] - m[X.WARM_UP]
-        if m[X.LATENCIES] <= noted < m[X.LATENCIES_END] and m[noted] == NONE:
+        noted = m[X.LATENCIES] + m[message + M.NUMBER]
+        if noted < m[X.LATENCIES_END] and m[noted] == NONE:
             m[noted] = now - m[message + M.START]
     for reader in range(m[publisher + P.FIRST], m[publisher + P.END], R.COLUMNS):
         copy = new_message(m)

@@ -194,9 +194,7 @@ def _take(m, thread):
     entity, now = m[thread + T.ENTITY], m[X.NOW]
     m[thread + T.START] = NONE
     if m[entity + E.KIND] == at.TIMER:
-        m[thread + T.ORIGIN], m[thread + T.NUMBER] = now, m[entity + E.INSTANCES]
-        if m[entity + E.STARTS_CHAIN] == 1:
-            m[thread + T.START] = now
+        m[thread + T.ORIGIN] = now
     else:
         callbacks.drop_expired(m, entity)
         if m[entity + E.WAITING] == 0:
@@ -210,7 +208,9 @@ def _take(m, thread):
         entry = (m[entity + E.ROW], m[message + M.ADDRESS], m[message + M.SOURCE], 1)
         callbacks.log(m, at.L_TAKE, now, thread, entry)
         callbacks.free_message(m, message)
-    m[entity + E.INSTANCES] += 1
+    if m[entity + E.STARTS_CHAIN] == 1 and now >= m[X.RECORD_FROM]:
+        m[thread + T.START], m[thread + T.NUMBER] = now, m[X.STARTED]
+        m[X.STARTED] += 1
     callbacks.log(m, at.L_START, now, thread, (m[entity + E.ROW], m[thread + T.USED]))
     return callbacks.begin_body(m, thread)
 

@@ -54,7 +54,7 @@ SEND, SENT, RECEIVE, RECEIVED = range(7, 11)
 E = IntEnum(
     "E",
     "ROW THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION PUBLISHERS PUBLISHERS_END LIFESPAN"
-    " STARTS_CHAIN ON_CHAIN HISTORY DEPTH HEAD WAITING DUE READY INSTANCES COLUMNS",
+    " STARTS_CHAIN ON_CHAIN HISTORY DEPTH HEAD WAITING DUE READY COLUMNS",
     start=0,
 )
 
@@ -123,12 +123,12 @@ EXPIRY, DELIVERY, SLEEP_OVER = range(3)
 
 # The engine itself. HEAP to HEAP_END are the events to come, LOGS the rows of A, FREE the first of
 # the UNUSED messages. PAUSED: why the engine has to be left for a moment. AWAY: by how much longer
-# (ppm) everything takes because of interrupts. WARM_UP: chain instances before the recorded ones.
+# (ppm) everything takes because of interrupts. STARTED: recorded instances of the chain.
 _Engine = namedtuple(
     "_Engine",
     "NOW COUNTER CORES CORES_END HEAP HEAP_END HEAP_LIMIT LOGS LATENCIES LATENCIES_END FREE UNUSED"
     " PAUSED STOP LAST_TIMER RECORD_FROM LOGGING SWITCHES SWITCH_COST PREEMPTION_COST QUANTUM AWAY"
-    " CYCLE WARM_UP COLUMNS",
+    " CYCLE STARTED COLUMNS",
 )
 X = _Engine(*range(25))
 

@@ -108,11 +108,11 @@ def simulate_latencies(
     seed: int | None = None,
     progress: Progress | None = None,
 ) -> Int64s:
-    """The end-to-end latencies of an application's chain, by simulation (ns, one per cycle).
+    """The end-to-end latencies of an application's chain, by simulation (ns).
 
     What :func:`simulate` and the latency analysis of its recording give, without any event being
-    written. −1 stands for an instance that did not complete: its message was discarded, lost, or
-    merged with another's.
+    written: one per instance of the chain, ``cycles`` at most. −1 stands for an instance that did
+    not complete: its message was discarded, lost, or merged with another's.
 
     Raises: as :func:`simulate`.
     """
@@ -121,7 +121,7 @@ def simulate_latencies(
     _, machine = _built(application, joint, timing, latencies=cycles)
     for _ in _runs(machine, progress):
         pass
-    return machine.latencies
+    return machine.latencies[: machine.array[X.STARTED]]
 
 
 def _checked(
