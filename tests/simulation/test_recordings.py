@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from command_line import called, refused
+from known import known
 from measured_costs import measured_costs
 from schedules import application, simulated
 from small_chain import small_chain
@@ -97,7 +98,6 @@ nodes:
     callbacks: [{synchronises: [/front, /rear], execution: {constant: 2ms}, publishes: [/fused]}]
 """
 
-
 LATER = """
 chain: /t2../t3
 nodes:
@@ -105,6 +105,7 @@ nodes:
   b: {callbacks: [{subscription: /t1, execution: {constant: 2ms}, publishes: [/t2]}]}
   c: {callbacks: [{subscription: /t2, execution: {constant: 3ms}, publishes: [/t3]}]}
 """
+
 SKIPPING = """
 chain: /t1../t2
 nodes:
@@ -239,8 +240,47 @@ def test_costs_of_large_messages_are_told_apart_from_the_dds_threads_that_receiv
 def test_a_recording_without_the_applications_callbacks_is_no_source_of_times(
     tmp_path: Path, chain: Application, unshaped: Recording
 ) -> None:
-    with pytest.raises(InputError, match="has no CPU times of /node1's callback"):
+    said = "/node1 has CPU times of 0 callbacks of timers of 100 ms, and 1 are described"
+    with pytest.raises(InputError, match=said):
         with_recorded_times(chain, unshaped)
+
+
+def test_a_synchronising_callback_computes_when_it_publishes(tmp_path: Path) -> None:
+    """/front is the last that it names, and always comes first: it only leaves its message."""
+    described = application(FUSION.replace("[/front, /rear]", "[/rear, /front]"))
+    again = with_recorded_times(described, simulate(described, tmp_path / "recorded", cycles=20))
+    assert again.nodes["fusion"].callbacks[0].execution.samples_ns == (2_000_000,) * 20
+    silent = FUSION.replace("/front../fused", "/front").replace(", publishes: [/fused]", "")
+    sink = application(silent)
+    recorded = simulate(sink, tmp_path / "sink", cycles=20)
+    with pytest.raises(InputError, match="/fusion never published what it synchronises from"):
+        with_recorded_times(sink, recorded)
+
+
+ALIKE = """
+chain: /a
+nodes:
+  source:
+    callbacks:
+      - {timer: 100ms, execution: {constant: 1ms}, publishes: [/a]}
+      - {timer: 100ms, execution: {constant: 5ms}}
+  sink:
+    callbacks:
+      - {subscription: /a, execution: {constant: 7ms}}
+      - {subscription: /a, execution: {constant: 3ms}}
+"""
+
+
+def test_callbacks_with_the_same_trigger_keep_their_own_times(tmp_path: Path) -> None:
+    described = application(ALIKE)
+    recorded = simulate(described, tmp_path / "recorded", cycles=20)
+    again = with_recorded_times(described, recorded)
+    drawn = [set(known(one.execution.samples_ns)) for _, one in again.callbacks()]
+    assert drawn == [{1_000_000}, {5_000_000}, {7_000_000}, {3_000_000}]
+    fewer = application(ALIKE.replace("      - {timer: 100ms, execution: {constant: 5ms}}\n", ""))
+    said = "/source has CPU times of 2 callbacks of timers of 100 ms, and 1 are described"
+    with pytest.raises(InputError, match=said):
+        with_recorded_times(fewer, recorded)
 
 
 def test_what_piles_up_without_end_is_reported(tmp_path: Path) -> None:

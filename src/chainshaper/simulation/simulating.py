@@ -10,8 +10,10 @@ time. Callbacks that all ran once a cycle have as many, so that their stretches 
 cycles. What publishing costs is not in them: a callback computes before it publishes.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -40,7 +42,9 @@ from chainshaper.values.recording import (
 from chainshaper.workload import live
 from chainshaper.workload.description import (
     Application,
+    CallbackDescription,
     ExecutionTime,
+    NodeDescription,
     application_as_written,
     node_name,
 )
@@ -327,7 +331,8 @@ def with_recorded_times(
 ) -> Application:
     """The application with execution times drawn from a recording of it, in stretches of ``block``.
 
-    Gates keep what they have: they compute nothing.
+    Gates keep what they have: they compute nothing. Callbacks of a node with the same period or
+    topic are told apart by the order in which they were registered.
 
     Raises InputError: a callback of the application is not in the recording, or its CPU time is
     not.
@@ -335,44 +340,82 @@ def with_recorded_times(
     recording = recording if isinstance(recording, Recording) else open_source(recording)
     times = _computing_times(data_flow(recording.events, recording.info.clock_offset_ns))
     nodes = {}
-    for name, node in application.nodes.items():
-        callbacks = []
-        for callback in node.callbacks:
-            if callback.gate is not None:
-                callbacks.append(callback)
-                continue
-            trigger = callback.timer_ns or callback.subscription or callback.synchronises[-1]
-            if (node_name(name), trigger) not in times:
-                raise InputError(
-                    f"{recording.path} has no CPU times of {node_name(name)}'s callback"
-                    f" {callback.subscription or callback.synchronises or 'of its timer'}: record"
-                    " the application that is described, with its threads' CPU times or"
-                    " sched_switch"
-                )
-            drawn = samples(times[node_name(name), trigger]).model_copy(update={"block": block})
-            callbacks.append(callback.model_copy(update={"execution": drawn, "computes": None}))
-        nodes[name] = node.model_copy(update={"callbacks": tuple(callbacks)})
+    for key, node in application.nodes.items():
+        name = node_name(key)
+        own = {trigger: found for (of, trigger), found in times.items() if of == name}
+        callbacks = tuple(_with_times(node, own, f"{recording.path}: {name}", block))
+        nodes[key] = node.model_copy(update={"callbacks": callbacks})
     return application.model_copy(update={"nodes": nodes})
 
 
-def _computing_times(flow: DataFlow) -> Mapping[tuple[str, str | int], pl.Series]:
-    """CPU times up to the first publication, by node and topic or period, in order of start."""
+_Trigger: TypeAlias = str | int
+"""A topic, or a timer's period."""
+
+
+def _triggers(callback: CallbackDescription) -> tuple[_Trigger, ...]:
+    return callback.subscriptions if callback.timer_ns is None else (callback.timer_ns,)
+
+
+def _with_times(
+    node: NodeDescription,
+    recorded: Mapping[_Trigger, Sequence[pl.DataFrame]],
+    where: str,
+    block: int,
+) -> Iterator[CallbackDescription]:
+    """A node's callbacks with the times of those that were ``recorded``: a node's part of
+    :func:`_computing_times`."""
+    described = Counter(one for callback in node.callbacks for one in _triggers(callback))
+    before = Counter[_Trigger]()
+    for callback in node.callbacks:
+        parts: list[pl.DataFrame] = []
+        for trigger in _triggers(callback):
+            found, place = recorded.get(trigger, ()), before[trigger]
+            parts += found[place : place + 1]
+            before[trigger] += 1
+            if callback.gate is None and len(found) != described[trigger]:
+                timers = "" if isinstance(trigger, str) else f"timers of {duration_text(trigger)}"
+                raise InputError(
+                    f"{where} has CPU times of {len(found)} callbacks of {timers or trigger}, and"
+                    f" {described[trigger]} are described: record the application that is"
+                    " described, with its threads' CPU times or sched_switch"
+                )
+        if callback.gate is not None:
+            yield callback
+            continue
+        instances = pl.concat(parts).sort("start")
+        if callback.synchronises:  # the others only left their message
+            instances = instances.filter("published")
+        if instances.is_empty():
+            raise InputError(
+                f"{where} never published what it synchronises from"
+                f" {', '.join(callback.synchronises)}, by which instances that computed are told"
+                " from those that left a message: have it publish a topic"
+            )
+        drawn = samples(instances["used"]).model_copy(update={"block": block})
+        yield callback.model_copy(update={"execution": drawn, "computes": None})
+
+
+def _computing_times(flow: DataFlow) -> dict[tuple[str, _Trigger], list[pl.DataFrame]]:
+    """``start, used, published`` of each callback's instances, in order of registration by node and
+    trigger; what they ``used`` is CPU time up to the first publication."""
     published = flow.publications.group_by("instance").agg(first=pl.col("time").min())
+    callbacks = flow.objects.callbacks.select("callback_id", "node", "topic", "period_ns")
     frame = (
-        flow.instances.join(published, on="instance", how="left", maintain_order="left")
-        .join(
-            flow.objects.callbacks.select("callback_id", "node", "topic", "period_ns").unique(
-                "callback_id"
-            ),
-            on="callback_id",
+        flow.instances.join(published, on="instance", how="left")
+        .join(callbacks.unique("callback_id"), on="callback_id")
+        .with_columns(
+            used=pl.col("execution_ns") - (pl.col("end") - pl.col("first")).fill_null(0),
+            published=pl.col("first").is_not_null(),
         )
-        .with_columns(used=pl.col("execution_ns") - (pl.col("end") - pl.col("first")).fill_null(0))
         .drop_nulls("used")
-        .sort("start")
+        .sort("callback_id")  # they are numbered in order of registration
     )
-    found: dict[tuple[str, str | int], pl.Series] = {}
-    for (node, topic, period), group in frame.group_by("node", "topic", "period_ns"):
-        found[str(node), int(period) if period is not None else str(topic)] = group["used"]
+    found: dict[tuple[str, _Trigger], list[pl.DataFrame]] = {}
+    columns = ("callback_id", "node", "topic", "period_ns")
+    for (_, node, topic, period), own in frame.group_by(*columns, maintain_order=True):
+        trigger = str(topic) if period is None else int(period)
+        instances = own.select("start", "used", "published")
+        found.setdefault((str(node), trigger), []).append(instances)
     return found
 
 
