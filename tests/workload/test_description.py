@@ -15,6 +15,7 @@ from chainshaper.workload.description import (
     TopicDescription,
     application_as_written,
     load_application,
+    origin_timer,
 )
 
 _TABLE = yaml.safe_load(Path(__file__).with_name("description_mistakes.yaml").read_text())
@@ -107,6 +108,19 @@ def test_the_right_one_is_read(tmp_path: Path) -> None:
     assert application.scheduling_of("planner").priority == 80
     assert application.dds_scheduling_of("lidar").priority == 90
     assert application.cores() == {0: "node planner", 1: "node lidar"}
+
+
+def test_a_chain_begins_with_the_timer_that_leads_to_it_however_it_is_written(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(RIGHT.replace("/scan../command", "scan..command"))
+    application = load_application(path)
+    for chain in (None, "/command", "scan..command", "lidar..command", "/lidar../command"):
+        assert origin_timer(application, chain)[0] == "lidar"
+    said = "has no /scam, with which the chain scam../command begins"
+    with pytest.raises(InputError, match=said):
+        origin_timer(application, "scam../command")
 
 
 def test_the_examples_are_right(tmp_path: Path) -> None:

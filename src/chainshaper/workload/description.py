@@ -436,11 +436,12 @@ def origin_timer(
 
     The application's own chain, unless another is named.
     """
-    first = (chain or application.chain).split("..")[0].strip()
+    chain = chain or application.chain
+    first = chain.split("..")[0].strip().strip("/")
     starts = [
         (name, callback)
         for name, callback in application.callbacks()
-        if first in callback.publishes or first.strip("/") == name.strip("/")
+        if f"/{first}" in callback.publishes or first == name.strip("/")
     ]
     # Every topic has a publisher, and topics form no cycle: a timer is found.
     while starts and all(callback.timer_ns is None for _, callback in starts):
@@ -448,7 +449,7 @@ def origin_timer(
         starts = [one for one in application.callbacks() if inputs.intersection(one[1].publishes)]
     if not starts:
         raise InputError(
-            f"the application {application.name!r} has no {first}, with which the chain {chain}"
+            f"the application {application.name!r} has no /{first}, with which the chain {chain}"
             " begins: plan again from a recording of this application"
         )
     return next(one for one in starts if one[1].timer_ns is not None)
