@@ -34,12 +34,13 @@ nodes:
 """
 
 FUNCTIONS = """\
-import itertools, time
+import itertools, threading, time
 import numpy as np
 from chainshaper.workload.dds import data_message, data_of, number_in
 from chainshaper.gate.decision import origin_of
 
 COUNT = itertools.count()
+threading.Thread(target=threading.Event().wait, daemon=True).start()
 
 def numbers():
     values = np.arange(250_000, dtype=np.float32) % 7 + next(COUNT)
@@ -61,6 +62,30 @@ def check(message):
     assert 0 < time.time_ns() - origin_of(message) < 10**9
     assert np.frombuffer(data_of(message), np.float32).tolist() == [250_000, 250_000]
 """
+
+def fails_beside_the_main_thread():
+    if threading.current_thread() is not threading.main_thread():
+        1 / 0
+    time.sleep(0.2)
+"""
+
+BESIDE = f"""\
+name: beside
+chain: /out
+scheduling:
+  executors: {{core: {EXECUTOR_CORE}, priority: 80}}
+  dds: {{core: {DDS_CORE}, priority: 90}}
+nodes:
+  source:
+    executor: multi_threaded
+    threads: 2
+    callback_groups: {{one: mutually_exclusive, two: mutually_exclusive}}
+    callbacks:
+      - timer: 50ms
+        computes: "sums:fails_beside_the_main_thread"
+        group: one
+        publishes: [/out]
+      - {{timer: 50ms, computes: "sums:fails_beside_the_main_thread", group: two}}
 
 
 def _application(folder: Path, monkeypatch: pytest.MonkeyPatch, **change: str) -> Application:
@@ -95,6 +120,8 @@ def test_megabytes_are_computed_on_and_what_returns_nothing_publishes_nothing(
     # Three in four of the squares begin the chain with a message; the first five cycles warm up.
     assert analysis.statistics.count == 9
     totals = recording.events["rclcpp_publish"].filter(pid=_pid(recording, "/total"))
+    source = [one.role for one in recording.info.threads if one.node == "/source"]
+    assert source.count("executor") == 1, "what its module started executes nothing"
     assert totals.height == 9, "one a set"
     with pytest.raises(InputError, match=r"node source computes sums:numbers.*--execution-times"):
         simulate(application, tmp_path / "simulated")
@@ -116,6 +143,18 @@ def test_a_function_that_fails_ends_the_run_with_its_name(
 
 
 @pytest.mark.parametrize(
+def test_a_function_that_fails_in_another_thread_ends_the_run_as_well(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    _application(tmp_path, monkeypatch)
+    (tmp_path / "beside.yaml").write_text(BESIDE)
+    application = load_application(tmp_path / "beside.yaml")
+    said = r"ended with code 1 .*: sums:fails_beside\w+ failed at .*sums.py:\d+: ZeroDivisionError"
+    with pytest.raises(OperationError, match=said):
+        run_application(application, tmp_path / "rec", cycles=20, realtime=False)
+    assert not (tmp_path / "rec").exists()
+
+
     ("name", "said"),
     [
         ("nowhere:numbers", "nowhere:numbers cannot be loaded: ModuleNotFoundError"),

@@ -35,6 +35,7 @@ from which gates count, is the function's to pass on.
 """
 
 import importlib
+import os
 import queue
 import sys
 import threading
@@ -56,6 +57,7 @@ from chainshaper.workload import dds
 from chainshaper.workload.dds import Message, Subscription
 from chainshaper.workload.event_log import EventLog
 from chainshaper.workload.execution import ExecutionTimes, spend
+from chainshaper.workload.launcher import WORKER_NAME
 
 
 @dataclass
@@ -115,9 +117,12 @@ class Executor:
         self._busy: set[str] = set()  # groups
         self._begin: queue.SimpleQueue[tuple[int, int]] = queue.SimpleQueue()
         self._others: list[threading.Thread] = []
+        named = threading.Semaphore(0)
         for _ in range(1, threads):  # they exist before they run: their priorities have to be set
-            self._others.append(threading.Thread(target=self._join_in, daemon=True))
-            self._others[-1].start()
+            other = threading.Thread(target=self._join_in, args=(named,), daemon=True)
+            other.start()
+            named.acquire()
+            self._others.append(other)
 
     def end_early(self, *_: object) -> None:
         """A signal's handler: the executor ends when it next looks."""
@@ -139,8 +144,16 @@ class Executor:
         for other in self._others:
             other.join()
 
-    def _join_in(self) -> None:
-        self._spin(*self._begin.get())
+    def _join_in(self, named: threading.Semaphore) -> None:
+        set_thread_name(WORKER_NAME)
+        named.release()
+        try:
+            self._spin(*self._begin.get())
+        except BaseException as error:  # a thread would end alone, and its group stay busy
+            said = error.code if isinstance(error, SystemExit) else traceback.format_exc()
+            sys.stderr.write(f"{said}\n")
+            sys.stderr.flush()
+            os._exit(1)
 
     def _spin(self, stop_ns: int, last_timer_ns: int) -> None:
         while (entity := self._next(stop_ns, last_timer_ns)) is not None:

@@ -30,6 +30,9 @@ from chainshaper.values.errors import OperationError
 ENOUGH = signal.SIGUSR1
 """Has a child end its run early, and send what it recorded."""
 
+WORKER_NAME = "executor"
+"""The name of a node's threads that execute beside its main one."""
+
 
 @dataclass(frozen=True)
 class Child:

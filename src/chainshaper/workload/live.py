@@ -40,7 +40,14 @@ from chainshaper.workload.description import (
     origin_timer,
 )
 from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
-from chainshaper.workload.launcher import ENOUGH, Child, end_all, first_casualty, start_child
+from chainshaper.workload.launcher import (
+    ENOUGH,
+    WORKER_NAME,
+    Child,
+    end_all,
+    first_casualty,
+    start_child,
+)
 from chainshaper.workload.stall_meter import (
     far_from,
     meter_tables,
@@ -355,14 +362,11 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
 
 
 def _threads_of(child: Child) -> list[Thread]:
-    """The threads of a process. Those with the name of the main one execute with it, as rclcpp's
-    of a multi-threaded executor do: here, no other has that name."""
-    threads = list_threads(child.pid)
+    """The threads of a process. What a callback's module starts executes nothing, and has the name
+    of the thread that started it."""
     return [
-        replace(one, role="executor")
-        if (one.role, one.comm) == ("unknown", threads[0].comm)
-        else one
-        for one in threads
+        replace(one, role="executor") if one.comm == WORKER_NAME else one
+        for one in list_threads(child.pid)
     ]
 
 
