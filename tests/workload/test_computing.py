@@ -43,6 +43,7 @@ COUNT = itertools.count()
 threading.Thread(target=threading.Event().wait, daemon=True).start()
 
 def numbers():
+    print(3, flush=True)
     values = np.arange(250_000, dtype=np.float32) % 7 + next(COUNT)
     return data_message(values.data, time.time_ns())
 
@@ -61,7 +62,6 @@ def check(message):
     assert number_in(message) == 5
     assert 0 < time.time_ns() - origin_of(message) < 10**9
     assert np.frombuffer(data_of(message), np.float32).tolist() == [250_000, 250_000]
-"""
 
 def fails_beside_the_main_thread():
     if threading.current_thread() is not threading.main_thread():
@@ -86,6 +86,7 @@ nodes:
         group: one
         publishes: [/out]
       - {{timer: 50ms, computes: "sums:fails_beside_the_main_thread", group: two}}
+"""
 
 
 def _application(folder: Path, monkeypatch: pytest.MonkeyPatch, **change: str) -> Application:
@@ -119,9 +120,9 @@ def test_megabytes_are_computed_on_and_what_returns_nothing_publishes_nothing(
     analysis = analyse_latency(recording, application.chain)
     # Three in four of the squares begin the chain with a message; the first five cycles warm up.
     assert analysis.statistics.count == 9
-    totals = recording.events["rclcpp_publish"].filter(pid=_pid(recording, "/total"))
     source = [one.role for one in recording.info.threads if one.node == "/source"]
     assert source.count("executor") == 1, "what its module started executes nothing"
+    totals = recording.events["rclcpp_publish"].filter(pid=_pid(recording, "/total"))
     assert totals.height == 9, "one a set"
     with pytest.raises(InputError, match=r"node source computes sums:numbers.*--execution-times"):
         simulate(application, tmp_path / "simulated")
@@ -142,7 +143,6 @@ def test_a_function_that_fails_ends_the_run_with_its_name(
     assert not (tmp_path / "rec").exists()
 
 
-@pytest.mark.parametrize(
 def test_a_function_that_fails_in_another_thread_ends_the_run_as_well(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -155,6 +155,7 @@ def test_a_function_that_fails_in_another_thread_ends_the_run_as_well(
     assert not (tmp_path / "rec").exists()
 
 
+@pytest.mark.parametrize(
     ("name", "said"),
     [
         ("nowhere:numbers", "nowhere:numbers cannot be loaded: ModuleNotFoundError"),

@@ -1,7 +1,6 @@
 """The event log: what a process records is what the tables have, and arrives whole."""
 
 import json
-import sys
 import threading
 from array import array
 from typing import Any
@@ -171,12 +170,9 @@ class _Interrupted:
         pass
 
 
-def test_events_arrive_whole_when_the_writer_is_frozen_in_the_middle(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_events_arrive_whole_when_the_writer_is_frozen_in_the_middle() -> None:
     output, events = _Interrupted(), bytes(range(256)) * 3
-    monkeypatch.setattr(sys, "stdout", output)
-    send_events(events, objects=[])
+    send_events(output, events, objects=[])  # type: ignore[arg-type]
     line, _, rest = output.received.partition(b"\n")
     assert json.loads(line) == {"bytes": len(events), "objects": []}
     assert rest == events

@@ -22,7 +22,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import IO, Any
+from typing import IO, Any, TextIO
 
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
@@ -61,10 +61,11 @@ class Child:
         Raises OperationError: it died instead, or was silent.
         """
         line = self._take(lambda received: received.find(b"\n") + 1, within_s)
-        try:
-            heard: dict[str, Any] = json.loads(line)
-        except ValueError:
-            raise OperationError(self.obituary()) from None
+        heard = None
+        with contextlib.suppress(ValueError):
+            heard = json.loads(line)
+        if not isinstance(heard, dict):
+            raise OperationError(self.obituary())
         return heard
 
     def hear_bytes(self, size: int, within_s: float | None = None) -> bytes:
@@ -170,21 +171,29 @@ def receive() -> dict[str, Any]:
     return received
 
 
-def send(**fields: Any) -> None:
+def own_output() -> TextIO:
+    """Our end of the launcher's pipe; from now on what is printed goes to the error output."""
+    output = os.fdopen(os.dup(1), "w")
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    return output
+
+
+def send(output: TextIO, **fields: Any) -> None:
     """One line to the launcher."""
-    sys.stdout.write(json.dumps(fields) + "\n")
-    sys.stdout.flush()
+    output.write(json.dumps(fields) + "\n")
+    output.flush()
 
 
-def send_events(events: bytes, **fields: Any) -> None:
+def send_events(output: TextIO, events: bytes, **fields: Any) -> None:
     """What was recorded, behind a line that says how much it is."""
-    send(bytes=len(events), **fields)
+    send(output, bytes=len(events), **fields)
     # A process that is frozen while it writes has written a part; without a buffer
     # (PYTHONUNBUFFERED) no other layer writes the rest.
     left = memoryview(events)
     while left:
-        left = left[sys.stdout.buffer.write(left) :]
-    sys.stdout.buffer.flush()
+        left = left[output.buffer.write(left) :]
+    output.buffer.flush()
 
 
 def wait_for_leave() -> None:

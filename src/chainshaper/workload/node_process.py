@@ -28,7 +28,14 @@ from chainshaper.linux.scheduling import (
 from chainshaper.workload import dds, executor
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
-from chainshaper.workload.launcher import ENOUGH, receive, send, send_events, wait_for_leave
+from chainshaper.workload.launcher import (
+    ENOUGH,
+    own_output,
+    receive,
+    send,
+    send_events,
+    wait_for_leave,
+)
 
 NEVER_S = 1e6
 Body: TypeAlias = Callable[[dds.Message], None]
@@ -360,16 +367,17 @@ class NodeProcess:
 
 def main() -> None:
     """Run one node as the launcher says."""
+    output = own_output()  # what callbacks compute may print
     spec = receive()
     signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name(spec["node"].strip("/").replace("/", "."))
     node = NodeProcess(spec)
     signal.signal(ENOUGH, node.executor.end_early)
     missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
-    send(missing=missing, memory_locked=lock_memory())
+    send(output, missing=missing, memory_locked=lock_memory())
     times = receive()
     node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])
-    send_events(node.log.rows, objects=node.log.objects)
+    send_events(output, node.log.rows, objects=node.log.objects)
     wait_for_leave()
     os._exit(0)  # DDS teardown of a closed domain is of no use, and not always quick
 

@@ -13,6 +13,7 @@ runs, :func:`measure_stalls` answers "how badly does this machine stall?".
 
 import os
 import signal
+import sys
 import time
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -105,13 +106,13 @@ def main() -> None:
     set_thread_name("stall-meter")
     signals: list[int] = []
     signal.signal(ENOUGH, lambda number, _: signals.append(number))
-    send(missing=[], memory_locked=lock_memory())
+    send(sys.stdout, missing=[], memory_locked=lock_memory())
     times = receive()
     stop_garbage_collection()
     seen, wakeups, ordinary = watch(
         times["meter_from_ns"], times["stop_ns"], enough=lambda: bool(signals)
     )
-    send_events(seen.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
+    send_events(sys.stdout, seen.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
     wait_for_leave()
 
 
