@@ -12,6 +12,7 @@ from chainshaper.values import events
 from chainshaper.workload.event_log import (
     ABSENT,
     BLOCK,
+    EVENTS,
     LAYOUT,
     WIDTH,
     WORDS,
@@ -32,25 +33,33 @@ def _types(name: str, fields: tuple[str, ...]) -> dict[str, pl.DataType]:
     return {**events.COMMON_COLUMNS, **{field: known[field] for field in known if field in fields}}
 
 
-@pytest.mark.parametrize(("name", "fields"), LAYOUT.items())
-def test_every_event_is_read_back_as_it_was_recorded(name: str, fields: tuple[str, ...]) -> None:
+@pytest.mark.parametrize(("entry", "fields"), LAYOUT.items())
+def test_every_event_is_read_back_as_it_was_recorded(entry: str, fields: tuple[str, ...]) -> None:
     log = EventLog()
     values = dict(zip(fields, range(1, len(fields) + 1), strict=True))
     values |= {field: len(words) - 1 for field, words in WORDS.items() if field in fields}
-    values |= {"mode": 0} if "mode" in fields else {}
-    log.point(name)(5000, *values.values())
+    values |= {field: number for field, number in (("mode", 0), ("taken", 1)) if field in fields}
+    log.point(entry)(5000, *values.values())
     tables = event_tables([_process(log)], from_ns=0)
 
-    assert list(tables) == [name]
-    assert dict(tables[name].schema) == _types(name, fields)
+    assert set(tables) == set(EVENTS[entry])
     expected: dict[str, Any] = {"time": 5000, "pid": 100, "cpu": 1, **values}
     expected["tid"] = threading.get_native_id()
-    if name == "gate_release":
+    if entry == "gate_release":
         expected |= {"anchor": "cycle", "overrun": "next-slot", "mode": "city"}
         expected["dropped"] = "discarded"
-    if name == "asynchronous_send":
+    if entry == "asynchronous_send":
         expected["outcome"] = "overwritten"
-    assert tables[name].to_dicts() == [expected]
+    for name, table in tables.items():
+        types = _types(name, fields)
+        assert dict(table.schema) == types
+        assert table.to_dicts() == [{field: expected[field] for field in types}]
+
+
+def test_of_a_message_that_was_not_there_only_the_attempt_to_take_it_is_an_event() -> None:
+    log = EventLog()
+    log.point("take")(5000, 1, 2, 0, 0)
+    assert list(event_tables([_process(log)], from_ns=0)) == ["rmw_take"]
 
 
 def test_no_array_of_a_long_log_gets_long() -> None:
@@ -65,10 +74,13 @@ def test_no_array_of_a_long_log_gets_long() -> None:
 
 
 def test_the_layout_says_what_the_event_tables_say() -> None:
-    for name, fields in LAYOUT.items():
-        known = {**events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
-        assert set(events.FIELDS[name]) <= set(fields) <= {*known, *events.COMMON_COLUMNS}, name
-        assert 3 + len(fields) <= WIDTH, name
+    for entry, fields in LAYOUT.items():
+        known = set(events.COMMON_COLUMNS)
+        for name in EVENTS[entry]:
+            assert set(events.FIELDS[name]) <= set(fields), name
+            known |= {*events.FIELDS[name], *events.OPTIONAL_FIELDS.get(name, {})}
+        assert set(fields) <= known, entry
+        assert 3 + len(fields) <= WIDTH, entry
 
 
 def test_a_discarded_message_has_no_release_and_no_slot() -> None:
@@ -95,7 +107,7 @@ def test_another_threads_number_and_the_largest_numbers_fit() -> None:
     other = threading.Thread(target=send)
     other.start()
     other.join()
-    log.point("rmw_take")(2**62, 0x55D0_0000_0100, 2**47, 2**62, 1)
+    log.point("take")(2**62, 0x55D0_0000_0100, 2**47, 2**62, 1)
     tables = event_tables([_process(log)], from_ns=0)
     assert tables["asynchronous_send"]["tid"].to_list() == sends
     (row,) = tables["rmw_take"].to_dicts()

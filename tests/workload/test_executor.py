@@ -85,9 +85,9 @@ class Bench:
         now = time.monotonic_ns()
         self.executor.spin_until(now + for_ns, now + for_ns)
 
-    def recorded(self, event: str) -> list[list[int]]:
-        """Rows of one event: time, then its fields."""
-        number = list(LAYOUT).index(event)
+    def recorded(self, entry: str) -> list[list[int]]:
+        """What was recorded under a name: time, then its fields."""
+        number = list(LAYOUT).index(entry)
         rows = memoryview(self.log.rows).cast("q").tolist()
         all_rows = [rows[i : i + WIDTH] for i in range(0, len(rows), WIDTH)]
         return [[row[1], *row[3:]] for row in all_rows if row[0] == number]
@@ -230,10 +230,10 @@ def test_takes_are_recorded_with_the_source_timestamp(bench: Bench) -> None:
     payload = dds.data_message(bytes(8), 5)
     publisher.write(payload, source_timestamp=123_456_789)
     bench.spin()
-    (take,) = bench.recorded("rmw_take")
+    (take,) = bench.recorded("take")
     handle = bench.executor.subscriptions[0].rmw_handle
     assert (take[1], take[3], take[4]) == (handle, 123_456_789, 1)
-    (execute,) = bench.recorded("rclcpp_executor_execute")
+    (execute,) = bench.recorded("execute")
     assert execute[1] == bench.executor.subscriptions[0].handle
 
 

@@ -1,9 +1,5 @@
 """Simulate an application, with or without a plan in force, and write what the engine logs.
 
-One entry of the log often stands for several events of the same instant: what an executor chose
-is got ready and executed, a publication passes rclcpp, rcl and rmw, and so does a message that is
-taken.
-
 Instead of described times, measured ones may be drawn: the CPU times of each callback's instances
 in a recording, in the order in which they happened, so that stretches of them stay correlated in
 time. Callbacks that all ran once a cycle have as many, so that their stretches are of the same
@@ -13,7 +9,7 @@ cycles. What publishing costs is not in them: a callback computes before it publ
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -244,21 +240,18 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     return created, handles | dict(zip(names_of_publishers, by_publisher, strict=True))
 
 
-_LOGGED: dict[str, tuple[int, tuple[str, ...]]] = {
-    "callback_start": (at.L_START, ("callback", "thread_time")),
-    "callback_end": (at.L_END, ("callback", "thread_time")),
-    "rclcpp_publish": (at.L_PUBLISH, ("", "message")),
-    "rcl_publish": (at.L_PUBLISH, ("publisher_handle", "message")),
-    "rmw_publish": (at.L_PUBLISH, ("rmw_publisher_handle", "message")),
-    "rmw_take": (at.L_TAKE, LAYOUT["rmw_take"]),
-    "rcl_take": (at.L_TAKE, ("", "message", "", "taken")),
-    "rclcpp_executor_get_next_ready": (at.L_EXECUTE, ("",)),
-    "rclcpp_executor_execute": (at.L_EXECUTE, ("handle",)),
-    "rclcpp_executor_wait_for_work": (at.L_WAIT, ("timeout",)),
-    "asynchronous_send": (at.L_SEND, LAYOUT["asynchronous_send"]),
-    "gate_release": (at.L_RELEASE, LAYOUT["gate_release"]),
+_LOGGED = {
+    "callback_start": at.L_START,
+    "callback_end": at.L_END,
+    "publish": at.L_PUBLISH,
+    "take": at.L_TAKE,
+    "execute": at.L_EXECUTE,
+    "rclcpp_executor_wait_for_work": at.L_WAIT,
+    "asynchronous_send": at.L_SEND,
+    "gate_release": at.L_RELEASE,
 }
-"""Each event's kind of entry, and the event's columns for that entry's fields."""
+"""Kinds of entries by their names in :data:`LAYOUT`. Handles are those of the entity or publisher
+that the log's first field is; the others follow in order."""
 
 
 def _logged(system: System, machine: Machine, handles: Handles) -> dict[str, pl.DataFrame]:
@@ -268,37 +261,27 @@ def _logged(system: System, machine: Machine, handles: Handles) -> dict[str, pl.
         "tid": np.array([info.tid for info in system.threads], dtype=np.int32),
         "cpu": np.array([info.cores[0] for info in system.threads], dtype=np.int32),
     }
-    common: dict[int, list[pl.Series]] = {}
     tables = {"sched_switch": _switches(system, machine)}
-    for name, (kind, fields) in _LOGGED.items():
-        time, thread, *entries = machine.entries(kind)
-        if not time.size:
-            continue
-        if kind not in common:
-            common[kind] = [pl.Series("time", time)]
-            common[kind] += [pl.Series(key, each[thread]) for key, each in of_threads.items()]
-        columns = {column.name: column for column in common[kind]}
-        for field, numbers in zip(fields, entries, strict=True):
-            if field in handles:
-                columns[field] = pl.Series(field, handles[field][numbers])
-            elif field:
-                values = numbers.view(np.uint64) if field == "message" else numbers
-                columns[field] = pl.Series(field, values)
-        if name == "callback_start":
-            columns["is_intra_process"] = pl.zeros(time.size, dtype=pl.Int32(), eager=True)
-        elif name == "rmw_publish":
-            columns["timestamp"] = columns["time"]
-        elif name == "asynchronous_send":  # logged when it is over, an event when it began
-            columns["time"] -= columns["duration"]
+    for entry, kind in _LOGGED.items():
+        time, thread, *numbers = machine.entries(kind)
+        columns: dict[str, npt.NDArray[Any]] = {"time": time}
+        columns |= {key: each[thread] for key, each in of_threads.items()}
+        if named := handles.keys() & LAYOUT[entry]:
+            whose, *numbers = numbers
+            columns |= {field: handles[field][whose] for field in named}
+        others = (field for field in LAYOUT[entry] if field not in named)
+        columns |= dict(zip(others, numbers, strict=False))  # what is not logged follows
+        if entry == "callback_start":
+            columns["is_intra_process"] = np.zeros_like(time)
+        elif entry == "publish":
+            columns["timestamp"] = time
+        elif entry == "asynchronous_send":  # logged when it is over, an event when it began
+            columns["time"] = time - columns["duration"]
         frame = pl.DataFrame(columns)
-        if name == "rcl_take":
-            frame = frame.filter(pl.col("taken") == 1)
-        table = live.typed_table(name, frame, system.modes)
         if kind in {at.L_SEND, at.L_RELEASE}:  # which others were logged before
-            table = table.sort("time", maintain_order=True)
-        tables[name] = table
-    if "rcl_take" in tables:
-        tables["rclcpp_take"] = tables["rcl_take"]
+            frame = frame.sort("time", maintain_order=True)
+        for name, own in live.expanded(entry, frame):
+            tables[name] = live.typed_table(name, own, system.modes)
     return {name: table for name, table in tables.items() if table.height}
 
 

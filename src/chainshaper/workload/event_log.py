@@ -22,22 +22,28 @@ _RELEASE = "callback source_timestamp arrival origin release slot cycles_waited 
 LAYOUT: dict[str, tuple[str, ...]] = {
     "callback_start": ("callback", "thread_time", "is_intra_process"),
     "callback_end": ("callback", "thread_time"),
-    "rclcpp_publish": ("message",),
-    "rcl_publish": ("publisher_handle", "message"),
-    "rmw_publish": ("rmw_publisher_handle", "message", "timestamp"),
-    "rmw_take": ("rmw_subscription_handle", "message", "source_timestamp", "taken"),
-    "rcl_take": ("message",),
-    "rclcpp_take": ("message",),
-    "rclcpp_executor_get_next_ready": (),
+    "publish": ("publisher_handle", "rmw_publisher_handle", "message", "timestamp"),
+    "take": ("rmw_subscription_handle", "message", "source_timestamp", "taken"),
+    "execute": ("handle",),
     "rclcpp_executor_wait_for_work": ("timeout",),
-    "rclcpp_executor_execute": ("handle",),
     "gate_release": (*_RELEASE.split(), "dropped", "moved"),
     "asynchronous_send": ("rmw_publisher_handle", "timestamp", "outcome", "duration"),
     "machine_stall": ("duration",),
 }
-"""Event names and the order of their fields; an event's number is its place in this list."""
+"""What is recorded, and the order of its fields; its number is its place in this list."""
 
-WIDTH = 15  # event number, time, thread, and up to twelve fields
+ALSO_TAKEN = ("rcl_take", "rclcpp_take")
+"""The events of a take that there are only where a message was taken."""
+
+EVENTS: dict[str, tuple[str, ...]] = {
+    **{name: (name,) for name in LAYOUT},
+    "publish": ("rclcpp_publish", "rcl_publish", "rmw_publish"),
+    "take": ("rmw_take", *ALSO_TAKEN),
+    "execute": ("rclcpp_executor_get_next_ready", "rclcpp_executor_execute"),
+}
+"""The events that each stands for, all of the same instant."""
+
+WIDTH = 15  # number of what is recorded, time, thread, and up to twelve fields
 BLOCK = 1_000 * WIDTH  # numbers in an array, when the next one is begun
 
 ABSENT = -1
@@ -67,7 +73,7 @@ def number_of(field: str, word: str | None) -> int:
 class EventLog:
     """Events of one process, and the objects of its node with their handles.
 
-    :meth:`point` makes a fast recording function for one event.
+    :meth:`point` makes a fast recording function for one entry of :data:`LAYOUT`.
     """
 
     def __init__(self, clock: Callable[[], int] = monotonic_ns) -> None:
@@ -120,12 +126,12 @@ class EventLog:
         self.init("rclcpp_subscription_callback_added", subscription=above, callback=callback)
         return handle, rmw_handle
 
-    def point(self, event: str) -> Callable[..., None]:
-        """A function of (time, *fields) that records one event of its thread; fields as in
+    def point(self, entry: str) -> Callable[..., None]:
+        """A function of (time, *fields) that records what its thread does; fields as in
         :data:`LAYOUT`."""
-        number = list(LAYOUT).index(event)
+        number = list(LAYOUT).index(entry)
         blocks = self._blocks
-        padding = (0,) * (WIDTH - 3 - len(LAYOUT[event]))
+        padding = (0,) * (WIDTH - 3 - len(LAYOUT[entry]))
 
         def record(time_ns: int, *fields: int) -> None:
             block = blocks[-1]
@@ -137,5 +143,5 @@ class EventLog:
 
     @property
     def rows(self) -> bytes:
-        """All that was recorded: :data:`WIDTH` signed 64-bit numbers for each event."""
+        """All that was recorded: :data:`WIDTH` signed 64-bit numbers for each entry."""
         return b"".join(block.tobytes() for block in self._blocks)

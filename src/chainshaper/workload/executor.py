@@ -107,11 +107,8 @@ class Executor:
         self._guard = dds.GuardCondition(participant)
         self._wait_set.attach(self._guard)
         self._wait_for_work = log.point("rclcpp_executor_wait_for_work")
-        self._next_ready = log.point("rclcpp_executor_get_next_ready")
+        self._execute, self._take = log.point("execute"), log.point("take")
         self.over = False
-        self._execute = log.point("rclcpp_executor_execute")
-        takes = map(log.point, ("rmw_take", "rcl_take", "rclcpp_take"))
-        self._rmw_take, self._rcl_take, self._rclcpp_take = takes
         self._turn = threading.Lock()
         self._snapshot: deque[Entity] = deque()
         self._busy: set[str] = set()  # groups
@@ -160,7 +157,7 @@ class Executor:
             if isinstance(entity, Timer):
                 entity.callback()
             elif (message := entity.subscription.take()) is None:
-                self._rmw_take(monotonic_ns(), entity.rmw_handle, id(message), 0, 0)
+                self._take(monotonic_ns(), entity.rmw_handle, id(message), 0, 0)
             else:
                 self.record_take(entity.rmw_handle, message)
                 entity.callback(message)
@@ -206,16 +203,12 @@ class Executor:
     def _chosen(self, handle: int) -> int:
         """Record that a timer or subscription is executed next; when that is (ns)."""
         now = monotonic_ns()
-        self._next_ready(now)
         self._execute(now, handle)
         return now
 
     def record_take(self, rmw_handle: int, message: Message) -> None:
         """Record that a message was taken for the callback that starts next."""
-        now, address = monotonic_ns(), id(message)
-        self._rmw_take(now, rmw_handle, address, message.source_timestamp, 1)
-        self._rcl_take(now, address)
-        self._rclcpp_take(now, address)
+        self._take(monotonic_ns(), rmw_handle, id(message), message.source_timestamp, 1)
 
 
 Input = TypeVar("Input")

@@ -39,7 +39,7 @@ from chainshaper.workload.description import (
     node_name,
     origin_timer,
 )
-from chainshaper.workload.event_log import ABSENT, LAYOUT, WIDTH, WORDS
+from chainshaper.workload.event_log import ABSENT, ALSO_TAKEN, EVENTS, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import (
     ENOUGH,
     WORKER_NAME,
@@ -392,11 +392,11 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
         rows = rows[rows[:, 1] >= from_ns]
         common = {"pid": log.pid, "tid": log.pid, "cpu": log.core}  # objects: the main thread
         found: list[tuple[str, pl.DataFrame]] = []
-        for number, (name, fields) in enumerate(LAYOUT.items()):
+        for number, (entry, fields) in enumerate(LAYOUT.items()):
             mine = rows[rows[:, 0] == number]
             if len(mine):
                 own = mine[:, 1 : 3 + len(fields)]
-                found.append((name, pl.DataFrame(own, schema=["time", "tid", *fields])))
+                found += expanded(entry, pl.DataFrame(own, schema=["time", "tid", *fields]))
         for name in dict.fromkeys(created["event"] for created in log.objects):
             own_objects = [created for created in log.objects if created["event"] == name]
             found.append((name, pl.DataFrame(own_objects)))
@@ -408,6 +408,14 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
         name: pl.concat(frames).sort("time", maintain_order=True)
         for name, frames in sorted(parts.items())
     }
+
+
+def expanded(entry: str, frame: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
+    """The events that entries of a log stand for; each has the columns of all."""
+    for name in EVENTS[entry]:
+        own = frame.filter(pl.col("taken") == 1) if name in ALSO_TAKEN else frame
+        if own.height:
+            yield name, own
 
 
 def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl.DataFrame:

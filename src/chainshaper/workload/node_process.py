@@ -43,13 +43,13 @@ Body: TypeAlias = Callable[[dds.Message], None]
 
 @dataclass(frozen=True)
 class TracedPublisher:
-    """A publisher with its trace points, which are recorded apart from sending."""
+    """A publisher with its trace point, which is recorded apart from sending."""
 
     write: Callable[[bytes, int], None]
     template: bytes
     handle: int
     rmw_handle: int
-    point: dict[str, Callable[..., None]]
+    point: Callable[..., None]
 
     def send(self, payload: bytes) -> tuple[int, int]:
         """Publish; the time of publication (ns) and the source timestamp.
@@ -63,10 +63,7 @@ class TracedPublisher:
 
     def record(self, payload: bytes, now: int, source_timestamp: int) -> None:
         """Record what :meth:`send` did."""
-        address = id(payload)
-        self.point["rclcpp_publish"](now, address)
-        self.point["rcl_publish"](now, self.handle, address)
-        self.point["rmw_publish"](now, self.rmw_handle, address, source_timestamp)
+        self.point(now, self.handle, self.rmw_handle, id(payload), source_timestamp)
 
 
 class NodeProcess:
@@ -159,7 +156,8 @@ class NodeProcess:
             sent = partial(self._note_send, rmw_handle)
             writer = executor.AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], sent)
             write = partial(self.publisher_thread.publish, writer)
-        return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, self._point)
+        point = self._point["publish"]
+        return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, point)
 
     def _note_send(self, handle: int, at_ns: int, stamp: int, outcome: str, lasted: int) -> None:
         """Record what became of a message, in whichever thread."""
