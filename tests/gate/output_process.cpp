@@ -8,6 +8,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <iostream>
 #include <string>
 
 #include "chainshaper_shaping/handover.hpp"
@@ -19,10 +20,26 @@ void publish(char word, std::int64_t number) {
   if (write(1, record, sizeof(record)) != sizeof(record)) std::_Exit(1);
 }
 
-// The folder of pages, "shaping" or "counting", the page's name, the port to listen at, how long to
+// In place of a gate: writes what it is asked for.
+struct Asked {
+  struct {
+    chainshaper::Gate gate;
+  } queue;
+
+  void set_phase(std::int64_t phase_ns, std::int64_t) { std::cout << phase_ns; }
+  void announce(const std::string & mode, std::int64_t) { std::cout << ' ' << mode; }
+};
+
+// The folder of pages, "shaping", "starting" or "counting", the page's name, the port to listen at, how long to
 // hold (ns).
 int main(int, char ** argv) {
   chainshaper::Turn turn(argv[3], "/t5", {argv[1]});
+  if (std::string(argv[2]) == "starting") {
+    Asked asked;
+    asked.queue.gate.modes = chainshaper::Modes{{"city", "highway"}, {0, 0}};
+    turn.go_on(asked);
+    return 0;
+  }
   if (std::string(argv[2]) == "counting") {
     for (std::size_t number = 0; number < chainshaper::dropped_names.size(); ++number)
       for (std::size_t i = 0; i <= number; ++i)

@@ -6,7 +6,7 @@ and then one that was published.
 
 Arguments: the folder of pages, ``shaping`` or ``standby``, the name of the page, the port to
 listen at, and for how long the shaping node holds a message (ns). A message is its number, which
-names it as well.
+names it as well. ``starting`` writes with which phase and mode a node goes on, in words.
 """
 
 import os
@@ -26,6 +26,11 @@ def publish(word: bytes, number: int) -> None:
 def main() -> None:
     folder, what, name, port, hold = sys.argv[1:]
     handover.page_folders = lambda: iter([folder])
+    if what == "starting":
+        turn = handover.Turn(name, "/t5")
+        if turn.phase_ns is not None or turn.page["mode"]:
+            print(turn.phase_ns, ("city", "highway")[turn.page["mode"] - 1])  # noqa: T201
+        return
     if what == "counting":
         turn = handover.Turn(name, "/t5")
         for number, reason in enumerate(decision.DROPPED):

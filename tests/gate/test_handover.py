@@ -213,7 +213,7 @@ def test_a_page_that_is_removed_while_it_is_used_is_made_again(
     output.kill("shaping")
     output.send_many(5)
     output.check(begun)
-    assert [path.name for path in folder.iterdir()] == ["t5.0.v2"]
+    assert [path.name for path in folder.iterdir()] == ["t5.0.v3"]
 
 
 # Pages ------------------------------------------------------------------------------------------
@@ -238,14 +238,40 @@ def test_starting_over_and_over_takes_longer_each_time_until_a_message_is_dealt_
 def test_a_node_that_starts_again_goes_on_where_cycles_began(folder: Path) -> None:
     turn = Turn("t5", "/t5")
     assert turn.phase_ns is None
+    assert turn.take(1)
     turn.hold(None, 12_345, 2)
     again = Turn("t5", "/t5")
     assert (again.phase_ns, again.page["mode"], again.page.topic) == (12_345, 2, "/t5")
-    seen = Page(str(folder), "t5.0.v2")  # by who only looks
+    seen = Page(str(folder), "t5.0.v3")  # by who only looks
     assert (seen["starts"], seen.topic) == (2, "/t5")
     (folder / "other").write_bytes(b"short")
     with pytest.raises(ValueError, match="no page"):
         Page(str(folder), "other")
+
+
+@pytest.mark.parametrize("language", ["python", "cpp"])
+def test_only_a_node_of_the_same_launch_goes_on_in_its_cycle_and_mode(
+    folder: Path, in_cpp: Path, language: str
+) -> None:
+    program = [str(in_cpp)] if language == "cpp" else [sys.executable, str(PROCESS)]
+    command = [*program, str(folder), "starting", "t5", "0", "0"]
+    launch = ["sh", "-c", '"$@"; true', "launch"]  # a parent of its own
+
+    def started(*before: str) -> str:
+        done = subprocess.run([*before, *command], check=True, timeout=60, stdout=subprocess.PIPE)
+        return done.stdout.decode().strip()
+
+    assert started() == ""
+    page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
+    for age_ns, before, wanted in (
+        (0, [], "12345 highway"),
+        (40_000 * MS, [], ""),  # its parent may be that of all launches
+        (0, launch, ""),
+        (0, [], ""),
+    ):
+        page["phase_ns"], page["phase_known"], page["mode"] = 12_345, 1, 2
+        page["until_ns"] = time.monotonic_ns() - age_ns
+        assert started(*before) == wanted
 
 
 @pytest.mark.parametrize("language", ["python", "cpp"])
@@ -256,12 +282,12 @@ def test_what_a_node_counts_is_in_the_page_for_those_who_look(
     command = [*program, str(folder), "counting", "t5", "0", "0"]
     for times in (1, 2):  # a node that starts again goes on counting
         subprocess.run(command, check=True, timeout=60)
-        page = Page(str(folder), "t5.0.v2")
+        page = Page(str(folder), "t5.0.v3")
         assert [page[reason] for reason in DROPPED] == [times, 2 * times, 3 * times, 4 * times]
         assert page["published"] == times
         assert page["lost_by_dds"] == times * (0 + 2 * 1 + 3 * 2 + 4 * 3)
         assert page["late"] == times * (2 + 4)
-    page = Page(str(folder), "t5.0.v2", "/t5", os.O_RDWR)
+    page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
     page["moved_ns"], page["moved_from_ns"] = -5, time.monotonic_ns() + 10**15
     assert page.lock(MOVING)
     subprocess.run(command, check=True, timeout=60)
@@ -290,14 +316,14 @@ def test_a_folder_that_is_not_ours_alone_is_not_used(
         folder.mkdir()
         folder.chmod(0o777 if how == "mode" else 0o700)
     if how == "foreign page":
-        (folder / "t5.0.v2").touch()
+        (folder / "t5.0.v3").touch()
     if how in ("owner", "foreign page"):
-        os.chown(folder if how == "owner" else folder / "t5.0.v2", 65534, -1)
+        os.chown(folder if how == "owner" else folder / "t5.0.v3", 65534, -1)
     with pytest.raises(OSError, match=r"outputs: .*(not a folder|exists|not a file of)"):
         open_page("t5", "/t5")
     spare = str(tmp_path / "spare")
     monkeypatch.setattr(FOLDERS, lambda: iter([str(folder), spare]))
-    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v2"
+    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v3"
 
 
 def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
@@ -306,7 +332,7 @@ def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
     folders = [f"{full_disk}/outputs", str(folder)]
     monkeypatch.setattr(FOLDERS, lambda: iter(folders))
     page = open_page("t5", "/t5")
-    assert page.path == f"{folder}/t5.0.v2"
+    assert page.path == f"{folder}/t5.0.v3"
     folders[0] = f"{folder.parent}/room"
     assert open_page("t5", "/t5").path == page.path
 

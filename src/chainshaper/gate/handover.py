@@ -43,7 +43,7 @@ FIELDS = (
     "acknowledged",  # the same, once the standby has passed on all that came before it
     "until_ns",  # what the node has in hand is released then; CLOCK_MONOTONIC, as all times here
     "released",  # how many messages shaping nodes have dealt with: so many are in their ring
-    "phase_ns",  # where cycles begin; a node that starts again goes on from there
+    "phase_ns",  # where cycles begin; a node that its launch starts again goes on from there
     "phase_known",
     "mode",  # the mode in force, from 1 in their order; 0: there are no modes
     "started_ns",  # when a shaping node started last
@@ -65,10 +65,11 @@ FIELDS = (
     "in_process",  # 1: the gate is in the publisher's process, which needs no standby,
     "asked_phase_ns",  # and no ROS parameter: where its cycles are asked to begin,
     "phases_asked",  # so often so far
+    "parent",  # of the shaping node that started last: the process that launched it
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 
-VERSION = 2  # of the page's layout: part of its name
+VERSION = 3  # of the page's layout: part of its name
 RING = 1024
 RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings,
 TOPIC = 32 + 3 * RING  # and of the name
@@ -247,14 +248,20 @@ class Turn:
         self.page["failed_starts"] += 1
 
     def _open(self) -> None:
-        self.page = open_page(self._name, self._topic)
+        self.page, parent = open_page(self._name, self._topic), os.getppid()
+        # Phase and mode are one launch's. All launches have one parent in some containers, and of
+        # systemd: there it is the same one if little time has passed.
+        idle_ns = abs(time.monotonic_ns() - self.page["until_ns"])
+        if parent != self.page["parent"] or idle_ns > AT_ONCE_NS:
+            self.page["mode"] = self.page["phase_known"] = 0
+        self.page["parent"] = parent
         self._in_force = False
         # Of the standby's messages: how many there were at the last look, and which.
         self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
 
     @property
     def phase_ns(self) -> int | None:
-        """Where cycles began for the shaping node before this one."""
+        """Where cycles began for the shaping node before this one, if that is the same launch's."""
         return self.page["phase_ns"] if self.page["phase_known"] else None
 
     @property

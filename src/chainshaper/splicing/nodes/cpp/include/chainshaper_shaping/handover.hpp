@@ -169,6 +169,13 @@ public:
        bool in_process = false)
       : name_(std::move(name)), topic_(std::move(topic)), folders_(std::move(folders)) {
     page_ = open_page(name_, topic_, folders_);
+    const auto parent = getppid();
+    const auto idle_ns = std::abs(monotonic_ns() - page_->get(Field::until_ns));
+    if (parent != page_->get(Field::parent) || idle_ns > schema::at_once_ns) {
+      page_->set(Field::mode, 0);  // another launch's
+      page_->set(Field::phase_known, 0);
+    }
+    page_->set(Field::parent, parent);
     page_->set(Field::in_process, in_process ? 1 : 0);
     phases_asked_ = page_->get(Field::phases_asked);
     const auto now = monotonic_ns();
@@ -189,7 +196,7 @@ public:
     return failed < 0 ? 0.0 : std::min(10.0, std::ldexp(0.5, static_cast<int>(failed)));
   }
 
-  // Have cycles of a gate begin where they did for the one before it, in its mode.
+  // Have cycles of a gate begin where they did for the one before it in the same launch, in its mode.
   template <typename Shaper>
   void go_on(Shaper & shaper) const {
     const auto & gate = shaper.queue.gate;
