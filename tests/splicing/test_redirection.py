@@ -113,7 +113,30 @@ def test_a_command_line_is_redirected_if_it_starts_the_node(
     assert shlex.split(" ".join(words)) == wanted.format(command).split()
 
 
-@pytest.mark.parametrize("command", ["ros2 run l n; ls", "ros2 run l $N", "ros2 run 'l n", ""])
+RULE = "--ros-args -r ndt:/pose:=/pose_tmp"
+
+
+@pytest.mark.parametrize(
+    ("command", "wanted"),
+    [
+        ("F='[{x}] $y' ros2 run l n", f"F='[{{x}}] $y' ros2 run l n {RULE}"),
+        ("A= B='' C=c ros2 run l 'n m'", f"A='' B='' C=c ros2 run l 'n m' {RULE}"),
+        ("F='[{x}] $y' ros2 run l n --ros-args -r __node:='icp'", "{0}"),  # not meant: as it was
+    ],
+)
+def test_a_shell_sees_variables_that_are_set_before_a_command(command: str, wanted: str) -> None:
+    words = [command]
+    redirect_command(words, [pose()], "n-1", SimpleNamespace(shell=True))
+    assert words == [command if wanted == "{0}" else wanted]
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        *("ros2 run l n; ls", "ros2 run l $N", "ros2 run 'l n", "", "ros2 run l [a-n]"),
+        *("ros2 run l \"'$N'\"", "ros2 run l \\' $N \\'"),  # these quotes are none
+    ],
+)
 def test_what_only_a_shell_understands_is_left_alone(command: str) -> None:
     words, action = [command], SimpleNamespace(**{"shell": True})
     redirect_command(words, [pose()], "n-1", action)

@@ -35,7 +35,9 @@ _NOT_LOADED = (
     "component load` loads cannot be redirected: load it in a launch file; if it is a process, "
     "splice with another --node)"
 )
-_FOR_A_SHELL = re.compile(r"[;&|<>()$`*?~#\n]")
+_FOR_A_SHELL = re.compile(r"[\[;&|<>()$`*?~#\n]")
+_LITERAL = re.compile(r"""'[^']*'|("(?:\\.|[^"\\])*"|\\.)""", re.DOTALL)
+"""What is between single quotes; or, to be kept, what has no such beginning in it."""
 
 
 @dataclass
@@ -182,18 +184,20 @@ def redirect_command(
 ) -> None:
     """Add rules to a command line in place, as far as it starts a node of ROS 2.
 
-    Of what a shell carries out, one plain command is understood.
+    Of what a shell carries out, one plain command is understood, with variables set before it.
     """
     shell, parts = getattr(action, "shell", False), words
     if shell:
         text = " ".join(words)
         try:
-            parts = [] if _FOR_A_SHELL.search(text) else shlex.split(text)
+            understood = not _FOR_A_SHELL.search(_LITERAL.sub(r"\1", text))
+            parts = shlex.split(text) if understood else []
         except ValueError:
             parts = []
     runs = (one.endswith("ros2") and two == "run" for one, two in itertools.pairwise(parts))
     if "--ros-args" not in parts and not any(runs):
         return
+    changed = False
     for redirect in redirects:
         if redirect.component is not None:  # for containers only
             redirect.others.append(label)
@@ -202,13 +206,21 @@ def redirect_command(
         rules = [parts[place + 1] for place in places]
         name = _of_rule(rules, "__node", "__name")
         added = redirect.see(rules, name, _of_rule(rules, "__ns"), label, action)
+        changed = changed or bool(added)
         for number, rule in reversed(added):
             if number < len(places):
                 parts[places[number] : places[number]] = ["-r", rule]
             else:
                 parts += ["--ros-args", "-r", rule]
-    if shell:
-        words[:] = [shlex.join(parts)]
+    if shell and changed:
+        words[:] = [" ".join(map(_quoted, parts))]
+
+
+def _quoted(word: str) -> str:
+    """A word for a shell, for which a variable's name in quotes would be a command."""
+    found = re.match(r"\w+=", word)
+    name = found[0] if found else ""
+    return name + shlex.quote(word.removeprefix(name))
 
 
 def redirect_request(request: Any, redirects: Sequence[Redirect]) -> list[Redirect]:
