@@ -216,6 +216,41 @@ def test_a_page_that_is_removed_while_it_is_used_is_made_again(
     assert [path.name for path in folder.iterdir()] == ["t5.0.v3"]
 
 
+def test_a_node_that_finds_its_page_made_anew_puts_its_slots_back(folder: Path) -> None:
+    turn = Turn("t5", "/t5")
+    assert turn.take(1)
+    follower = open_page("t5", "/t5")
+    assert follower.lock(MOVING)
+    follower["moved_ns"], follower["moved_from_ns"] = 5, 1000
+    assert turn.moved() == (5, 1000)
+    shutil.rmtree(folder)
+    turn.done(1)
+    assert (turn.moved() or (None,))[0] == 0
+    assert turn.moved() is None
+
+
+def test_a_standby_that_finds_its_page_made_anew_begins_anew_but_is_silent_still(
+    folder: Path,
+) -> None:
+    turn, passed = Turn("t5", "/t5"), list[int]()
+    standby = Standby(
+        *("t5", "/t5", lambda _, key, __: passed.append(key or 0), lambda _: None, 0), silent=True
+    )
+    assert turn.take(1)
+    time.sleep(0.001)
+    standby.arrived(b"", 1)
+    time.sleep(0.001)
+    standby.look()
+    assert passed == [1], "the node has taken one message, and hangs"
+    shutil.rmtree(folder)
+    turn.done(1)
+    assert turn.take(2)
+    turn.hold(time.monotonic_ns() + 3600_000 * MS, 0)
+    standby.arrived(b"", 2)
+    assert standby.page["silent"] == turn.page["silent"] == 1
+    assert passed == [1], "it has taken one of those on the new page, too"
+
+
 # Pages ------------------------------------------------------------------------------------------
 
 

@@ -347,6 +347,34 @@ def test_no_receiver_waits_longer_than_that(run: Callable[..., Run]) -> None:
     assert DELIVERY_NS <= future < 100 * DELIVERY_NS
 
 
+def test_a_page_that_is_made_anew_moves_no_cycle_and_puts_slots_back(
+    run: Callable[..., Run],
+) -> None:
+    """Pages of a session may be removed when its user logs out."""
+    gate, times = replace(SLOT, anchor="cycle"), [n * 100 * MS + 20 * MS for n in range(12)]
+    states = list[str]()
+
+    def log_out(pid: int, _: Path) -> None:
+        time.sleep(0.5)
+        (page,) = (one.page for one in find_outputs() if one.shaping_node == pid)
+        followed = FollowedOutput("/t5", (pid,))
+        followed.move(10 * MS, time.monotonic_ns())
+        time.sleep(0.3)
+        Path(page).unlink()
+        time.sleep(0.4)
+        states.extend(one.state for one in find_outputs() if one.shaping_node == pid)
+        with pytest.raises(OperationError, match=r"cannot be followed: .* was removed; start"):
+            followed.latencies()
+        followed.close()
+
+    done = run({"/t5": gate}, [at(ns) for ns in times], log_out)
+    rows = done.logs["/t5"]
+    assert {(row["origin"] - done.start_ns) % (100 * MS) for row in rows} == {0}
+    assert {row["moved"] for row in rows} == {0, 10 * MS}
+    assert rows[-1]["moved"] == 0
+    assert states == ["in process"]
+
+
 def test_its_output_is_shown_and_its_slots_move_while_they_are_followed(
     run: Callable[..., Run],
 ) -> None:

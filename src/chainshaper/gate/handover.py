@@ -158,7 +158,11 @@ class Page:
         self._numbers[_AT[field]] = value
 
     def look(self) -> None:
-        """Read how the page is now, for who only looks. ValueError: it has become shorter."""
+        """Read how the page is now, for who only looks. ValueError: it has become shorter, or was
+        removed.
+        """
+        if not os.fstat(self._file).st_nlink:
+            raise ValueError(f"{self.path} was removed")
         content = os.pread(self._file, _SIZE, 0)
         if len(content) < _SIZE:
             raise ValueError(f"{self.path} is no page of an output")
@@ -239,6 +243,7 @@ class Turn:
 
     def __init__(self, name: str, topic: str) -> None:
         self._name, self._topic, self._gave_up = name, topic, False
+        self._move_back = False
         self._open()
         now = time.monotonic_ns()
         if now - self.page["started_ns"] > AT_ONCE_NS:
@@ -312,14 +317,18 @@ class Turn:
             with suppress(OSError):  # without a folder this page has to do
                 left = self.page
                 self._open()
+                self._move_back = left["moved_from_ns"] != 0
                 for one in left.noted(bypassed=False):  # a standby that lags has to know them
                     self.page.note(one, bypassed=False)
                 left.close()
 
     def moved(self) -> tuple[int, int] | None:
         """How slots are to be moved, for :meth:`.Shaper.move_slots` (None: as they are): back, if
-        the process that moved them is not there any more.
+        the process that moved them is not there any more, or on a page that was left.
         """
+        if self._move_back:
+            self._move_back = False
+            return 0, time.monotonic_ns()
         since, by = self.page["moved_from_ns"], self.page["moved_ns"]
         if since == 0 or since != self.page["moved_from_ns"]:
             return None
@@ -372,7 +381,7 @@ class Standby:
 
     ``publish`` gets the payload, the source timestamp and the arrival of each message that is
     passed on; ``changed`` a text when a shaping node goes or is back. One that is late by more than
-    ``patience_ns`` is taken to hang.
+    ``patience_ns`` is taken to hang. ``silent``: others are told that ``publish`` does not.
     """
 
     def __init__(  # noqa: PLR0917 - each is used once
@@ -383,13 +392,15 @@ class Standby:
         changed: Callable[[str], None],
         patience_ns: int,
         depth: int = 1000,
+        *,
+        silent: bool = False,
     ) -> None:
         self._name, self._topic, self._publish = name, topic, publish
         self._changed, self._patience_ns = changed, patience_ns
         self._pending: deque[_Waiting] = deque(maxlen=depth)
         self._mutex = threading.Lock()
         self._why = ""
-        self._stuck_at = -1  # what the node had taken when it was found to hang
+        self._silent = silent
         self._woken, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self._open()
 
@@ -401,7 +412,8 @@ class Standby:
                 raise OSError(f"{self.page.path}: another process is the standby of this output")
             time.sleep(0.01)
         self.page["standby"], self.page["listening"] = os.getpid(), 0
-        self.page["bypassing_since_ns"] = 0
+        self.page["bypassing_since_ns"], self.page["silent"] = 0, int(self._silent)
+        self._stuck_at = -1  # what the node had taken when it was found to hang
 
     def arrived(self, payload: bytes, key: int | None) -> None:
         """A message has come, for the shaping node and for the standby alike."""

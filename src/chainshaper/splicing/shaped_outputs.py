@@ -175,7 +175,7 @@ class FollowedOutput:
             self._page.look()
         except (OSError, ValueError) as error:
             raise OperationError(
-                f"{self._page.path}: its gate cannot be followed: {error}"
+                f"{self._page.path}: its gate cannot be followed: {error}; start this run again"
             ) from error
         new = self._page.latest("measured", MEASURED, self._seen)
         self._seen = self._page["measured"]

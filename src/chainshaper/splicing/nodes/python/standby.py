@@ -123,11 +123,11 @@ def set_up(node: Node) -> Callable[[], bool]:
                 *(parameters.handover, topic, publish, changed),
                 patience_ns=parameters.patience_ns,
                 depth=asked.depth,
+                silent=silent,
             )
         except OSError as error:
             logger.error(f"{topic} falls silent when {shaping_node} does: {error}")
             wait(10.0)
-    standby.page["silent"] = int(silent)
 
     def without_info(payload: bytes) -> None:  # so what the shaping node holds is lost with it
         standby.arrived(payload, None)

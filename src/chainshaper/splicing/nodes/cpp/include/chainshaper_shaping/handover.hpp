@@ -167,17 +167,11 @@ class Turn {
 public:
   Turn(std::string name, std::string topic, std::vector<std::string> folders = page_folders(),
        bool in_process = false)
-      : name_(std::move(name)), topic_(std::move(topic)), folders_(std::move(folders)) {
-    page_ = open_page(name_, topic_, folders_);
-    const auto parent = getppid();
-    const auto idle_ns = std::abs(monotonic_ns() - page_->get(Field::until_ns));
-    if (parent != page_->get(Field::parent) || idle_ns > schema::at_once_ns) {
-      page_->set(Field::mode, 0);  // another launch's
-      page_->set(Field::phase_known, 0);
-    }
-    page_->set(Field::parent, parent);
-    page_->set(Field::in_process, in_process ? 1 : 0);
-    phases_asked_ = page_->get(Field::phases_asked);
+      : name_(std::move(name)),
+        topic_(std::move(topic)),
+        folders_(std::move(folders)),
+        in_process_(in_process) {
+    page_ = opened();
     const auto now = monotonic_ns();
     if (now - page_->get(Field::started_ns) > schema::at_once_ns)
       page_->set(Field::failed_starts, 0);
@@ -247,7 +241,8 @@ public:
     page_->set(Field::failed_starts, 0);
     if (page_->is_current()) return;
     try {
-      auto next = open_page(name_, topic_, folders_);
+      auto next = opened();
+      move_back_ = page_->get(Field::moved_from_ns) != 0;
       for (const auto one : page_->noted(schema::released))
         next->note(Field::released, schema::released, one);  // a standby that lags has to know them
       page_ = std::move(next);
@@ -271,7 +266,8 @@ public:
   }
 
   // By how much slots are to be moved, and from when on; none: as they are.
-  std::optional<std::pair<std::int64_t, std::int64_t>> moved() const {
+  std::optional<std::pair<std::int64_t, std::int64_t>> moved() {
+    if (std::exchange(move_back_, false)) return std::make_pair(std::int64_t{0}, monotonic_ns());
     const auto since = page_->get(Field::moved_from_ns);
     const auto by = page_->get(Field::moved_ns);
     if (since == 0 || since != page_->get(Field::moved_from_ns)) return std::nullopt;
@@ -288,6 +284,21 @@ public:
   }
 
 private:
+  // The page as it is found by this node, of whose launch it is from now on.
+  std::unique_ptr<Page> opened() {
+    auto page = open_page(name_, topic_, folders_);
+    const auto parent = getppid();
+    const auto idle_ns = std::abs(monotonic_ns() - page->get(Field::until_ns));
+    if (parent != page->get(Field::parent) || idle_ns > schema::at_once_ns) {
+      page->set(Field::mode, 0);  // another launch's
+      page->set(Field::phase_known, 0);
+    }
+    page->set(Field::parent, parent);
+    page->set(Field::in_process, in_process_ ? 1 : 0);
+    phases_asked_ = page->get(Field::phases_asked);
+    return page;
+  }
+
   bool come_into_force(std::int64_t key) {
     const auto give_up = monotonic_ns() + schema::give_up_ns;
     while (!(in_force_ = page_->lock(schema::publishing))) {
@@ -318,9 +329,11 @@ private:
   std::string name_;
   std::string topic_;
   std::vector<std::string> folders_;
+  bool in_process_;
   std::unique_ptr<Page> page_;
   bool in_force_{false};
   bool gave_up_{false};
+  bool move_back_{false};  // slots were moved by way of a page that was left
   std::int64_t phases_asked_{0};
   // Of the standby's messages: how many there were at the last look, and which.
   std::int64_t seen_{-1};
