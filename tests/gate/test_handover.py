@@ -19,7 +19,16 @@ from cpp_program import compiled
 from processes import wait_for
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import MEASURED, MOVING, RING, Page, Standby, Turn, open_page
+from chainshaper.gate.handover import (
+    MEASURED,
+    MOVING,
+    RING,
+    STANDING_BY,
+    Page,
+    Standby,
+    Turn,
+    open_page,
+)
 
 MS = 1_000_000
 PROCESS = Path(__file__).parent / "output_process.py"
@@ -173,6 +182,33 @@ def test_a_standby_that_is_stopped_is_in_nobody_s_way(output: Output) -> None:
     output.receive(0.2)
     late = [number for number in output.numbers if number > begun]
     assert len(late) == len(set(late)), "twice"
+
+
+@pytest.mark.parametrize("language", ["python", "cpp"])
+def test_a_standby_that_is_stopped_with_the_lock_silences_no_node(
+    folder: Path, in_cpp: Path, language: str
+) -> None:
+    page = open_page("t5", "/t5")
+    assert page.lock()
+    assert page.lock(STANDING_BY)
+    page["listening"] = 1
+    program = [str(in_cpp)] if language == "cpp" else [sys.executable, str(PROCESS)]
+    output = Output({"shaping": [*program, str(folder)]})
+    try:
+        output.start("shaping")
+        output.await_ready("shaping")
+        output.receive(0.2)
+        begun = output.sent
+        output.send_many(20)
+        output.check(begun)
+        page.unlock()  # the standby goes on
+        output.send_many(3)
+        output.check(begun)
+        assert page.is_locked(), "the node is in force"
+    finally:
+        for process in output.running.values():
+            process.kill()
+            process.wait()
 
 
 def test_when_both_are_killed_nothing_comes_twice_and_either_goes_on(output: Output) -> None:

@@ -349,7 +349,7 @@ class Turn:
     def _come_into_force(self, key: int | None) -> bool:
         page, give_up = self.page, time.monotonic_ns() + GIVE_UP_NS
         while not page.lock():
-            if _is_alive(page["holder"]):  # another shaping node
+            if page["holder"] != os.getpid() and _is_alive(page["holder"]):  # another shaping node
                 return False
             if self._gave_up or time.monotonic_ns() > give_up:
                 self._gave_up = True  # the standby was stopped while it published
@@ -360,7 +360,7 @@ class Turn:
         page["until_ns"] = time.monotonic_ns()
         page["first"], page["holder"] = key or 0, os.getpid()
         # A standby still deals with what came before this node's first message.
-        if page["listening"] and key is not None:
+        if page["listening"] and key is not None and not self._gave_up:
             while page.is_locked(STANDING_BY) and time.monotonic_ns() < give_up:
                 if key == page["acknowledged"] or key in page.noted(bypassed=True):
                     break

@@ -303,8 +303,8 @@ private:
     const auto give_up = monotonic_ns() + schema::give_up_ns;
     while (!(in_force_ = page_->lock(schema::publishing))) {
       const auto holder = page_->get(Field::holder);
-      if (holder > 0 && kill(static_cast<pid_t>(holder), 0) == 0)  // another shaping node
-        return false;
+      if (holder > 0 && holder != getpid() && kill(static_cast<pid_t>(holder), 0) == 0)
+        return false;  // another shaping node
       gave_up_ = gave_up_ || monotonic_ns() > give_up;  // the standby was stopped while it published
       if (gave_up_) break;
       sleep_until(monotonic_ns() + 1'000'000);
@@ -314,7 +314,7 @@ private:
     page_->set(Field::first, key);
     page_->set(Field::holder, getpid());
     // A standby still deals with what came before this node's first message.
-    const bool listening = page_->get(Field::listening) > 0;
+    const bool listening = page_->get(Field::listening) > 0 && !gave_up_;
     while (listening && has_standby() && !is_acknowledged(key) && monotonic_ns() < give_up)
       sleep_until(monotonic_ns() + 200'000);
     return true;
