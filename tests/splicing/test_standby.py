@@ -20,8 +20,14 @@ from chainshaper.gate.handover import Page, open_page
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
-from chainshaper.splicing.shaped_outputs import find_outputs, output_text
+from chainshaper.splicing.shaped_outputs import (
+    FollowedOutput,
+    ask_phase,
+    find_outputs,
+    output_text,
+)
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
+from chainshaper.values.errors import OperationError
 
 MS = 1_000_000
 
@@ -290,6 +296,27 @@ def test_pages_of_others_are_looked_at_without_trust(
     (output,) = find_outputs([str(folder), str(tmp_path / "missing")])
     assert (output.topic, output.state) == ("/t5", "no standby")
     assert "it falls silent when that ends" in output_text(output)
+
+
+def test_an_output_is_that_of_the_processes_that_are_meant_and_of_its_page_s_owner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another robot, in another domain, has an output of the same name."""
+    folder = tmp_path / "outputs"
+    monkeypatch.setattr("chainshaper.gate.handover.page_folders", lambda: iter([str(folder)]))
+    monkeypatch.setattr("chainshaper.splicing.shaped_outputs.page_folders", lambda: [str(folder)])
+    page = open_page("t5", "/t5")
+    assert page.lock()
+    page["holder"] = os.getpid()
+    FollowedOutput("/t5", {1, os.getpid()}).close()
+    FollowedOutput("/t5").close()
+    with pytest.raises(OperationError, match="no gates publish it now"):
+        ask_phase("/t5", {1}, 5)
+    if os.geteuid():
+        pytest.skip("giving files to another user takes root")
+    os.chown(folder, 65534, -1)
+    os.chown(page.path, 65534, -1)
+    assert find_outputs([str(folder)]) == (), "root's process is named on another user's page"
 
 
 def test_a_program_is_started_again_until_it_is_to_end(tmp_path: Path, plan: Plan) -> None:

@@ -146,7 +146,7 @@ class Page:
         except BaseException:
             os.close(self._file)
             raise
-        self._inode = found.st_ino
+        self._inode, self.owner = found.st_ino, found.st_uid
         self._numbers = memoryview(self._memory).cast("q")
         if topic is not None:
             self._memory[8 * TOPIC :] = topic.encode()[:TOPIC_BYTES].ljust(TOPIC_BYTES, b"\0")

@@ -24,7 +24,7 @@ from chainshaper.gate.handover import (
     Page,
     page_folders,
 )
-from chainshaper.linux.threads import innermost_id, parents, read_proc
+from chainshaper.linux.threads import innermost_id, parents, read_proc, status_field
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 from chainshaper.values.yaml_file import FullName
@@ -137,7 +137,7 @@ def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
 
 def _page_of(topic: str, pids: Collection[int]) -> Page:
     found = [one for one in find_outputs() if one.topic == topic and one.shaping_node]
-    found = [one for one in found if one.shaping_node in pids] or found
+    found = [one for one in found if not pids or one.shaping_node in pids]
     if len(found) != 1:
         raise OperationError(
             f"slots of {topic} cannot follow: {len(found) or 'no'} gates publish it now that show"
@@ -150,8 +150,8 @@ def _page_of(topic: str, pids: Collection[int]) -> Page:
 class FollowedOutput:
     """An output whose latencies are read, and whose slots are moved, until it is closed.
 
-    ``pids`` are processes that it may be of, where several have a gate for it. Raises
-    OperationError: no shaping node of it runs, several do, or another run moves its slots.
+    ``pids`` are processes that it may be of, if they are known. Raises OperationError: no shaping
+    node of it runs, several do, or another run moves its slots.
     """
 
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
@@ -192,10 +192,19 @@ class FollowedOutput:
         self._page.close()
 
 
+def _user_of(pid: int) -> int | None:
+    """The real user of a process, None if there is none: any user may write its id into a page."""
+    try:
+        return next(iter(status_field(read_proc(f"/proc/{pid}/status"), "Uid")), None)
+    except OSError:
+        return None
+
+
 def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
     holder = page["holder"] if page.is_locked() else 0
     standby = page["standby"] if page.is_locked(STANDING_BY) else 0
     holder, standby = pid_of.get(holder, holder), pid_of.get(standby, standby)
+    holder = holder if _user_of(holder) == page.owner else 0
     if not holder and not standby:
         return []
     since = page["bypassing_since_ns"] if standby else 0
