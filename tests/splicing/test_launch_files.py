@@ -196,6 +196,21 @@ def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
     assert launched(again)["PROCESSES"][-1]["cmd"] == words
 
 
+@pytest.mark.parametrize(
+    "options", [["--prefix", "/usr/bin/time"], ["--prefix=nice -n 5"], ["-h", "--prefix", "a b"]]
+)
+@pytest.mark.parametrize("executable", ["n", "scripts/n.py", "/opt/n"])
+def test_options_of_ros2_run_are_not_what_it_starts(
+    tmp_path: Path, options: list[str], executable: str
+) -> None:
+    words = ["ros2", "run", *options, "l", executable, "--ros-args", "-r", "__node:=ndt"]
+    (tmp_path / "here").mkdir()
+    spliced = splice_launch_files(PLAN, words, tmp_path / "here/out")
+    assert [*spliced.launch.values()] == [tmp_path / "here/out/n.launch.py"]
+    assert launched(spliced)["PROCESSES"][-1]["cmd"] == words
+    assert [path.name for path in tmp_path.iterdir()] == ["here"]
+
+
 def test_splicing_again_or_from_the_spliced_one_gives_the_same(robot: Path) -> None:
     out = robot.parent / "out"
     first = splice_launch_files(PLAN, [robot], out)

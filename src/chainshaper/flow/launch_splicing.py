@@ -35,6 +35,7 @@ from chainshaper.splicing.shaping_process import (
 from chainshaper.splicing.spliced_launch import (
     LOGS,
     NODES,
+    executable_of,
     is_run,
     launch_file_name,
     launch_text,
@@ -232,7 +233,8 @@ def _spliced(
     """The folder, or with launch arguments for a ``dry`` run none; ``written`` writes our nodes."""
     given = [str(word) for word in launch_files]
     words = original_words(given, throttled=not throttled)
-    files = [Path(given[3])] if is_run(given) else [Path(word).absolute() for word in given]
+    executable = executable_of(given)
+    files = [Path(executable)] if executable else [Path(word).absolute() for word in given]
     name = launch_file_name(words)
     copy, found = folder / name, []
     place: AbstractContextManager[str | Path] = (
@@ -257,7 +259,7 @@ def _spliced(
         notes=tuple(
             f"{file}: spliced from its original, {', '.join(words)}"
             for file in files
-            if not is_run(given) and str(file) not in words
+            if not executable and str(file) not in words
         ),
         redirects=tuple(redirects),
         redirected=tuple(found),

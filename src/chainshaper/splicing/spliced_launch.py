@@ -32,7 +32,7 @@ NODES = "shaping_nodes"
 LOGS = "logs"
 _FORMAT = 1
 _DERIVED = {LOGS, *(f"{NODES}/{name}" for name in ("build", "install", "log"))}
-_WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter")
+_WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter", "--prefix")
 _SIGNS = {  # what the text of a launch file has in it, by the end of its name
     ".py": "generate_launch_description",
     ".xml": "<launch",
@@ -89,9 +89,7 @@ def parse_launch_command(command: Sequence[str]) -> LaunchCommand:
             f"`{' '.join(command)}` is not `ros2 launch …`: a shaping node can be added to launch "
             "files only; for other ways of starting see `chainshaper run` and `chainshaper splice`"
         )
-    at = 2
-    while at < len(words) and words[at].startswith("-"):
-        at += 2 if words[at] in _WITH_VALUE else 1
+    at = _behind_options(words)
     first, second = [*words[at : at + 2], "", ""][:2]
     if not first:
         raise InputError("no launch file given: `ros2 launch PACKAGE FILE`, or `ros2 launch FILE`")
@@ -101,6 +99,14 @@ def parse_launch_command(command: Sequence[str]) -> LaunchCommand:
     after = words[end:]
     arguments = dict(word.split(":=", 1) for word in after if ":=" in word)
     return LaunchCommand(tuple(words[:at]), file.absolute(), tuple(after), arguments)
+
+
+def _behind_options(words: Sequence[str]) -> int:
+    """The place of the first word behind `ros2 launch`, or `ros2 run`, and its options."""
+    at = 2
+    while at < len(words) and words[at].startswith("-"):
+        at += 2 if words[at] in _WITH_VALUE else 1
+    return at
 
 
 def _file_of_package(package: str, name: str) -> Path:
@@ -129,7 +135,7 @@ def _file_of_package(package: str, name: str) -> Path:
 
 def launch_file_name(words: Sequence[str]) -> str:
     """The name of the launch file that stands for others, or for `ros2 run …`."""
-    name = words[3] if is_run(words) else Path(words[0]).name
+    name = executable_of(words) or Path(words[0]).name
     return re.sub(r"([.]launch)?([.](py|xml|ya?ml|launch))?$", "", name, count=1) + ".launch.py"
 
 
@@ -150,7 +156,7 @@ def launch_text(
         for one in (process, process.standby)
         if one is not None and one.plugin is None
     ]
-    what = words[3] if run else ", ".join(Path(word).name for word in words)
+    what = executable_of(words) or ", ".join(Path(word).name for word in words)
     return _TEXT.format(
         what=re.sub(r"[^\w., -]", "_", what),  # a file's name cannot end the text it stands in
         files=pformat([] if run else list(words), width=96),
@@ -162,7 +168,18 @@ def launch_text(
 
 def is_run(words: Sequence[str]) -> bool:
     """Whether words are `ros2 run PACKAGE EXECUTABLE …` in place of launch files."""
-    return len(words) > 3 and Path(words[0]).name == "ros2" and words[1] == "run"
+    return executable_of(words) is not None
+
+
+def executable_of(words: Sequence[str]) -> str | None:
+    """The name of what `ros2 run [--prefix PREFIX] PACKAGE EXECUTABLE …` starts; None: it is none.
+
+    Upstream: ros2run, `command/run.py`.
+    """
+    if words[1:2] != ["run"] or Path(words[0]).name != "ros2":
+        return None
+    behind = words[_behind_options(words) :]
+    return Path(behind[1]).name if len(behind) > 1 else None
 
 
 def _keywords(process: ShapingProcess) -> dict[str, Any]:
