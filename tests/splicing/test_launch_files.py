@@ -194,6 +194,11 @@ def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
     assert (written["LAUNCH_FILES"], written["PROCESSES"][-1]["cmd"]) == ([], words)
     again = splice_launch_files(PLAN, [*spliced.launch.values()], tmp_path / "again")
     assert launched(again)["PROCESSES"][-1]["cmd"] == words
+    other = tmp_path / "robot.launch.xml"
+    other.write_text(NDT)
+    for both in ([*spliced.launch.values(), other], [other, *spliced.launch.values()]):
+        with pytest.raises(InputError, match="stands for `ros2 run l n .*, which is spliced alone"):
+            splice_launch_files(PLAN, both, tmp_path / "third")
 
 
 @pytest.mark.parametrize(

@@ -201,7 +201,7 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
     """Launch files as they were before splicing, each once, or `ros2 run …` as it is.
 
     With ``throttled`` a launch file that has a throttler is an original too. Raises InputError: one
-    of them is not there, or is no launch file.
+    of them is not there, or is no launch file, or stands for `ros2 run …` beside others.
     """
     if is_run(words):
         return list(words)
@@ -214,7 +214,13 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
             _check_launch_file(file)
             found.append(str(file))
         else:
-            found += original_words(manifest["copies"][file.name], throttled=throttled)
+            copied = original_words(manifest["copies"][file.name], throttled=throttled)
+            if is_run(copied) and len(words) > 1:
+                raise InputError(
+                    f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it into"
+                    " another folder, or write a launch file that starts it"
+                )
+            found += copied
     return list(dict.fromkeys(found)) if not is_run(found) else found
 
 
