@@ -6,8 +6,10 @@ from typing import TypeAlias
 
 import pytest
 from command_line import called, json_of, refused
+from known import known
 
 from chainshaper.planning import Plan, save_plan
+from chainshaper.planning.plan import revised
 
 ROBOT = '<launch>\n  <node pkg="robot" exec="third" name="third"/>\n</launch>\n'
 
@@ -57,6 +59,21 @@ def test_notes_go_to_standard_error(files: Files) -> None:
     assert called("splice", plan, robot, "-o", folder).code == 0
     finished = called("splice", plan, folder / "robot.launch.py", "-o", folder)
     assert f"note: {folder}/robot.launch.py: spliced from its original, {robot}" in finished.err
+
+
+def test_a_dry_run_of_a_gate_in_the_publishers_process_names_nothing_that_is_not_there(
+    files: Files, plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No ROS 2 is needed here: such a gate redirects no topic."""
+    file, robot, folder = files
+    inside = known(plan.shaping_node).model_copy(update={"in_process": True})
+    save_plan(revised(plan, shaping_node=inside, anchor="cycle"), file)
+    flow = "chainshaper.flow.launch_splicing"
+    monkeypatch.setattr(f"{flow}.gate_library", lambda: Path("/gate.so"))
+    monkeypatch.setattr(f"{flow}._tried", lambda *_: [])
+    finished = called("splice", file, robot, "-o", folder, "--dry-run")
+    assert (finished.code, finished.out) == (0, "what is launched would get the gate\n")
+    assert not folder.exists()
 
 
 def test_what_ros2_run_starts_is_given_behind_two_dashes(files: Files) -> None:

@@ -338,7 +338,7 @@ def splice(
     if json:
         out.print_json(_splicing_json(splicing, setup))
         return
-    _show_splicing(splicing, arguments, setup)
+    _show_splicing(splicing, arguments, setup, dry_run=dry_run)
 
 
 def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":
@@ -364,12 +364,16 @@ def _opened(recording: Path | None) -> "cs.Recording | None":
     return None if recording is None else cs.open_source(recording)
 
 
-def _show_splicing(splicing: "cs.Splicing", arguments: dict[str, str], setup: Path | None) -> None:
+def _show_splicing(
+    splicing: "cs.Splicing", arguments: dict[str, str], setup: Path | None, *, dry_run: bool
+) -> None:
     for one in splicing.redirects:
         verb = "publishes" if one.kind == "publisher" else "subscribes to"
         for node in one.nodes:
             out.show_line(f"{node} {verb} {one.target} in place of {one.topic}, for {one.added[0]}")
-    if splicing.environment:
+    if splicing.environment and dry_run:
+        out.show_line("what is launched would get the gate")
+    elif splicing.environment:
         loads = [f"{key}={value}" for key, value in splicing.environment.items()]
         out.show_line("what is launched gets the gate; what starts otherwise, as a service, by:")
         out.show_line(shlex.join(["env", *loads, "COMMAND"]))
@@ -379,7 +383,7 @@ def _show_splicing(splicing: "cs.Splicing", arguments: dict[str, str], setup: Pa
                 f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}"
             )
     out.notes(splicing.notes)
-    if splicing.redirected:
+    if dry_run:
         return
     if setup is not None:
         out.show_line(f"source {setup}")
