@@ -76,7 +76,7 @@ class NodeRun:
         self.process.stdin.write(json.dumps(what) + "\n")
         self.process.stdin.flush()
 
-    def send(self, payload: bytes, source: int = 1, **more: Any) -> None:
+    def send(self, payload: bytes, source: int | None = 1, **more: Any) -> None:
         """Give it a message of its input."""
         self.tell(topic="/t3_tmp", payload=payload.hex(), source=source, **more)
 

@@ -158,7 +158,7 @@ def get_global_executor() -> _Executor:
 
 
 def _taken(message: dict[str, Any]) -> tuple[bytes, dict[str, Any]]:
-    info = {"source_timestamp": message["source"]}
+    info = {} if message["source"] is None else {"source_timestamp": message["source"]}
     if "number" in message:
         info["publication_sequence_number"] = message["number"]
     return bytes.fromhex(message["payload"]), info

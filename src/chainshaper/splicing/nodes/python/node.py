@@ -259,8 +259,8 @@ def create_subscription(
     """`Node.create_subscription`, with the events of rclcpp's.
 
     On Humble a raw one emits the event of each take, too. In place of the source timestamp, which
-    is not known there, stands the time of the call: the publication that the analysis looks for is
-    the latest before.
+    is not known there, stands the time of the call, or the one that it is given: the publication
+    that the analysis looks for is the latest before.
     """
     traced = _traced(callback)
     subscription = node.create_subscription(message_type, topic, traced, qos, raw=raw)
@@ -270,8 +270,8 @@ def create_subscription(
     if raw and HUMBLE:
         take, executed = take_event(subscription), subscription.callback
 
-        def taken(payload: bytes) -> None:
-            take(id(payload), time.time_ns())
+        def taken(payload: bytes, stamp: int | None = None) -> None:
+            take(id(payload), time.time_ns() if stamp is None else stamp)
             executed(payload)
 
         subscription.callback = taken

@@ -21,7 +21,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from std_msgs.msg import Empty, String
 
 from chainshaper.gate.clear_core import ClearCore
-from chainshaper.gate.decision import Outcome, Release, Shaper
+from chainshaper.gate.decision import Outcome, Release, Shaper, clock_offset
 from chainshaper.gate.handover import STANDING_BY, Turn
 from chainshaper.splicing.nodes.python.node import (
     HUMBLE,
@@ -215,9 +215,13 @@ class Shaping:
             if not waiting or (served and self._shaper.nothing_due()):
                 break
             oldest, self._its_turn = waiting[0], True
-            if not HUMBLE:  # others were taken since, and a callback is for the last that was
+            # Others were taken since, and a callback is for the last that was.
+            if HUMBLE:
+                came = oldest.arrival_ns + clock_offset()
+                self._input.callback(oldest.payload, oldest.about or came)
+            else:
                 self._take(id(self._input), oldest.about or 0)
-            self._input.callback(oldest.payload, *([] if HUMBLE else [{}]))
+                self._input.callback(oldest.payload, {})
             self._its_turn, served = False, True
         return bool(waiting)
 

@@ -26,6 +26,7 @@ namespace {
 using chainshaper::Message;
 using Publisher = rclcpp::Publisher<Message>;
 using Input = rclcpp::Subscription<Message>;
+constexpr bool input_tells_takes = false;  // where a callback is executed
 #ifdef CHAINSHAPER_COMPONENT
 using Pointer = std::unique_ptr<Message>;
 #else
@@ -110,6 +111,7 @@ using Message = rclcpp::SerializedMessage;
 using Publisher = rclcpp::GenericPublisher;
 using Input = rclcpp::GenericSubscription;
 using Pointer = std::shared_ptr<Message>;
+constexpr bool input_tells_takes = chainshaper::serialized_tells_takes;
 
 chainshaper::Maybe stamp_of(const Message & message) {
   const auto & bytes = message.get_rcl_serialized_message();
@@ -263,9 +265,12 @@ public:
       if (shaper_.queue.waiting.empty() || (served && !ahead_ && shaper_.nothing_due())) break;
       const auto & oldest = shaper_.queue.waiting.front();
       const bool within = !oldest.source_timestamp;
-      if (!within) take_again(*input_, oldest.message.get(), oldest.source_timestamp);
+      auto info = rclcpp::MessageInfo();
+      info.get_rmw_message_info().source_timestamp = oldest.source_timestamp.value_or(0);
+      if (!within && !input_tells_takes)
+        take_again(*input_, oldest.message.get(), oldest.source_timestamp);
       its_turn_ = true;
-      execute(*input_, oldest.message, within, rclcpp::MessageInfo());
+      execute(*input_, oldest.message, within, info);
       its_turn_ = false;
     }
     return !shaper_.queue.waiting.empty();

@@ -159,7 +159,14 @@ int run(int argc, char ** argv, const std::string & name, SetUp && set_up) {
 using Taken =
     std::function<void(std::shared_ptr<rclcpp::SerializedMessage>, const rclcpp::MessageInfo &)>;
 
-#if !RCLCPP_VERSION_GTE(25, 0, 0)
+#if RCLCPP_VERSION_GTE(25, 0, 0)
+
+inline constexpr bool serialized_tells_takes = false;
+
+#else
+
+// Executing a callback emits the event of a take.
+inline constexpr bool serialized_tells_takes = true;
 
 class SerializedSubscription : public rclcpp::GenericSubscription {
 public:
