@@ -21,6 +21,7 @@ class Case:
     arrivals: tuple[tuple[int, int | None], ...]
     changes: tuple[tuple[int, str], ...] = ()
     moves: tuple[tuple[int, int], ...] = ()
+    steps: tuple[int, ...] = ()  # of the wall clock, which the first message behind it shows
     name: str = ""
     leave: tuple[int | str, ...] = ()
     late_ns: int = 0  # a thread that slept wakes up so late
@@ -61,6 +62,7 @@ def _case(entry: dict[str, Any]) -> Case:
         arrivals=tuple((_ns(arrival), _ns(stamp)) for arrival, stamp in both),
         changes=tuple((_ns(time), mode) for time, mode in entry.get("changes", ())),
         moves=tuple((_ns(time), _ns(by)) for time, by in entry.get("moves", ())),
+        steps=tuple(_ns(time) for time in entry.get("steps", ())),
         name=entry["name"],
         leave=tuple(one if isinstance(one, str) else _ns(one) for one in entry["leave"]),
     )
@@ -72,11 +74,14 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
     queue.changes.extend(case.changes)
     queue.moves.extend(case.moves)
     found: dict[int, Outcome] = {}
-    coming = deque(enumerate(case.arrivals))
+    coming, steps = deque(enumerate(case.arrivals)), deque(case.steps)
 
     def come_until(time: int) -> None:
         while coming and coming[0][1][0] <= time:
             number, (arrival, stamp) = coming.popleft()
+            if steps and steps[0] <= arrival:
+                steps.popleft()
+                queue.doubt_stamps(arrival)
             if (full := queue.arrive(b"", arrival, stamp, number)) is not None:
                 found[full.message.about] = Outcome(None, full.release, full.dropped)
 

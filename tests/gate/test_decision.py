@@ -430,6 +430,7 @@ def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.Monkey
     assert passing(serialized(started + offset), 30) == ("stamp", started + 60 * MS)
     offset += 3600 * SECOND
     assert passing(under_way, 130) == ("cycle", started + 160 * MS)
+    assert passing(under_way, 135) == ("cycle", started + 160 * MS), "another that was"
     later = serialized(started + 200 * MS + offset)
     assert passing(later, 230) == ("stamp", started + 260 * MS)
     assert passing(serialized(0), 330) == ("cycle", started + 360 * MS)

@@ -152,7 +152,9 @@ def as_application(case: Case) -> Application:
     return application(text, publish={"constant": f"{PUBLISHING_NS}ns"})
 
 
-@pytest.mark.parametrize("case", cases(), ids=lambda case: case.name)
+@pytest.mark.parametrize(  # a simulated machine has one clock, which nothing steps
+    "case", [case for case in cases() if not case.steps], ids=lambda case: case.name
+)
 def test_the_simulated_gate_does_what_the_table_says(tmp_path: Path, case: Case) -> None:
     # Publishing takes the sources' time as well: they are done so much earlier.
     recording = simulated(tmp_path, as_application(case))

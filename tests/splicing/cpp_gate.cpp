@@ -76,6 +76,8 @@ void walk() {
     const auto time = number();
     queue.moves.emplace_back(time, number());
   }
+  std::deque<std::int64_t> steps;
+  for (auto count = number(); count > 0; --count) steps.push_back(number());
   const auto publishing_ns = number();
   const auto late_ns = number();
   std::vector<std::pair<std::int64_t, Maybe>> arrivals;
@@ -88,6 +90,10 @@ void walk() {
   std::int64_t now = 0;
   const auto come_until = [&](std::int64_t time) {
     for (; next < arrivals.size() && arrivals[next].first <= time; ++next) {
+      if (!steps.empty() && steps.front() <= arrivals[next].first) {
+        steps.pop_front();
+        queue.doubt_stamps(arrivals[next].first);
+      }
       const auto full = queue.arrive(next, arrivals[next].first, arrivals[next].second);
       if (full) found[full->waiting.message] = {std::nullopt, full->release, full->dropped};
     }

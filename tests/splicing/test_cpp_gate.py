@@ -49,6 +49,7 @@ def as_text(case: Case) -> str:
     words += [len(case.changes)]
     words += [word for time, mode in case.changes for word in (time, names.index(mode))]
     words += [len(case.moves), *(word for move in case.moves for word in move)]
+    words += [len(case.steps), *case.steps]
     words += [PUBLISHING_NS, case.late_ns, len(case.arrivals)]
     words += [word for arrival, stamp in case.arrivals for word in (arrival, _or_dash(stamp))]
     return " ".join(map(str, words))
@@ -110,7 +111,8 @@ def _any_case(draw: random.Random) -> Case:
         (draw.randint(0, 300) * scale, draw.randint(earliest, latest))
         for _ in range(draw.choice([0, 1, 3]))
     )
-    return Case(gate, arrivals, tuple(changes), tuple(moves), late_ns=late_ns)
+    steps = tuple(sorted(draw.randint(0, 300) * scale for _ in range(draw.choice([0, 0, 0, 1, 2]))))
+    return Case(gate, arrivals, tuple(changes), tuple(moves), steps, late_ns=late_ns)
 
 
 def test_both_gates_decide_alike(driver: Path) -> None:

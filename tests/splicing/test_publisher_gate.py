@@ -178,7 +178,8 @@ def test_it_does_what_the_table_of_all_gates_says(run: Callable[..., Run]) -> No
     """All cases at once, one that the machine disturbed again; in real time, so without those that
     need it to the microsecond.
     """
-    unmoved = [case for case in cases() if not case.moves]  # these have a test of their own
+    # Moves have a test of their own; the machine's clock is not stepped.
+    unmoved = [case for case in cases() if not case.moves and not case.steps]
     left = {f"/t{number}": case for number, case in enumerate(filter(in_real_time, unmoved))}
     assert len(left) > len(unmoved) * 0.8
     wrong: dict[str, Any] = {}

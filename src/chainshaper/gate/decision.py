@@ -422,6 +422,13 @@ class Queue:
         # that in which one has left.
         self._leaving: int | None = None
         self._left: int | None = None
+        self._unsure_until_ns = 0
+
+    def doubt_stamps(self, now_ns: int) -> None:
+        """The wall clock was stepped: stamps of messages that are under way may be of either side
+        of the step. They are of no use until the last of these has come.
+        """
+        self._unsure_until_ns = now_ns + (self.gate.due_cycles + 1) * self.gate.cycle_ns
 
     def arrive(
         self,
@@ -432,6 +439,7 @@ class Queue:
         lost: int | None = None,
     ) -> Outcome | None:
         """A message came; the one for which there is no room any more."""
+        stamp_ns = None if arrival_ns < self._unsure_until_ns else stamp_ns
         message = Waiting(payload, arrival_ns, stamp_ns, self.phase_ns, about, lost)
         self.waiting.append(message)
         if stamp_ns is not None and self.gate.counts_from(stamp_ns, arrival_ns):
@@ -495,9 +503,9 @@ class Shaper:
     """A gate at work: holds each message until its release, and minds the clocks.
 
     Stamps are CLOCK_REALTIME, sleeping is CLOCK_MONOTONIC; the offset between the two is taken
-    anew for every message, since the wall clock may be stepped. The stamp of a message under way
-    during a step may be of either side: it is anchored to the cycle instead, at the phase that the
-    last good stamp had.
+    anew for every message, since the wall clock may be stepped. Messages under way during a step
+    (:meth:`Queue.doubt_stamps`) are anchored to the cycle instead, at the phase that the last good
+    stamp had.
 
     One shaper belongs to one thread, which does nothing else at the time of a release. ``look`` has
     new messages :meth:`arrive`, while others wait, before each release and behind it. ``moved``
@@ -560,7 +568,9 @@ class Shaper:
         offset = clock_offset()
         stepped = abs(offset - self._offset) > STEP_NS
         self._offset = offset
-        stamp, arrival = (None if stepped else origin_of(payload)), now_ns
+        if stepped:
+            self.queue.doubt_stamps(now_ns)
+        stamp, arrival = origin_of(payload), now_ns
         if source_ns is not None and not stepped:
             arrival = min(now_ns, max(self._looked_ns, source_ns - offset))
         if self._next_phase is not None and arrival >= self._next_phase[0]:

@@ -287,8 +287,14 @@ public:
     check(this->gate);
   }
 
+  // The wall clock was stepped: stamps are of no use until what is under way has come.
+  void doubt_stamps(std::int64_t now_ns) {
+    unsure_until_ns_ = now_ns + (gate.due_cycles + 1) * gate.cycle_ns;
+  }
+
   std::optional<Outcome<Message>> arrive(Message message, std::int64_t arrival_ns, Maybe stamp_ns,
                                          Maybe source_timestamp = {}, Maybe lost = {}) {
+    if (arrival_ns < unsure_until_ns_) stamp_ns.reset();
     waiting.push_back(
         {std::move(message), arrival_ns, stamp_ns, phase_ns, source_timestamp, lost, number_++});
     if (gate.counts_from(stamp_ns, arrival_ns)) phase_ns = *stamp_ns % gate.cycle_ns;
@@ -356,6 +362,7 @@ private:
 
   Maybe leaving_;
   Maybe left_;
+  std::int64_t unsure_until_ns_{0};
   std::uint64_t number_{0};
 };
 
@@ -492,8 +499,9 @@ public:
     const bool stepped = std::abs(offset - offset_) > schema::step_ns;
     offset_ = offset;
     Maybe origin;
-    if (stamp_ns && !stepped) origin = *stamp_ns - offset;
+    if (stamp_ns) origin = *stamp_ns - offset;
     std::int64_t arrival_ns = monotonic_ns();
+    if (stepped) queue.doubt_stamps(arrival_ns);
     if (waited && source_timestamp && !stepped)
       arrival_ns = std::min(arrival_ns, std::max(looked_ns_, *source_timestamp - offset));
     if (next_phase_ && arrival_ns >= next_phase_->first) {
