@@ -20,6 +20,16 @@ void publish(char word, std::int64_t number) {
   if (write(1, record, sizeof(record)) != sizeof(record)) std::_Exit(1);
 }
 
+chainshaper::Outcome<int> outcome(std::optional<chainshaper::Dropped> dropped,
+                                  chainshaper::Maybe lost, bool late, std::int64_t latency_ns) {
+  chainshaper::Outcome<int> made{};
+  made.dropped = dropped;
+  made.waiting.lost = lost;
+  made.waiting.arrival_ns = latency_ns;
+  if (late) made.release.overrun = chainshaper::Policy::wait;
+  return made;
+}
+
 // In place of a gate: writes what it is asked for.
 struct Asked {
   struct {
@@ -41,11 +51,12 @@ int main(int, char ** argv) {
     return 0;
   }
   if (std::string(argv[2]) == "counting") {
-    for (std::size_t number = 0; number < chainshaper::dropped_names.size(); ++number)
-      for (std::size_t i = 0; i <= number; ++i)
-        turn.count(static_cast<chainshaper::Dropped>(number), static_cast<std::int64_t>(number),
-                   number % 2 == 1);
-    turn.count({}, {}, false, turn.moved() ? turn.moved()->first : 77);
+    constexpr auto reasons = static_cast<std::int64_t>(chainshaper::dropped_names.size());
+    for (std::int64_t number = 0; number < reasons; ++number)
+      for (std::int64_t i = 0; i <= number; ++i)
+        turn.count(outcome(static_cast<chainshaper::Dropped>(number), number, number % 2 == 1,
+                           number));
+    turn.count(outcome({}, {}, false, turn.moved() ? turn.moved()->first : 77));
     return 0;
   }
   const int inbox = socket(AF_INET, SOCK_DGRAM, 0);

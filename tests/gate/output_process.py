@@ -23,6 +23,14 @@ def publish(word: bytes, number: int) -> None:
     os.write(1, word + number.to_bytes(8, "little"))
 
 
+def outcome(
+    dropped: str | None, lost: int | None, *, late: bool, latency_ns: int
+) -> decision.Outcome:
+    message = decision.Waiting(b"", latency_ns, None, 0, lost=lost)
+    release = decision.Release(None, 0, None, 0, "cycle", "wait" if late else None)
+    return decision.Outcome(message, release, 0, dropped)
+
+
 def main() -> None:
     folder, what, name, port, hold = sys.argv[1:]
     handover.page_folders = lambda: iter([folder])
@@ -35,9 +43,9 @@ def main() -> None:
         turn = handover.Turn(name, "/t5")
         for number, reason in enumerate(decision.DROPPED):
             for _ in range(number + 1):
-                turn.count(reason, number, late=number % 2 == 1)
+                turn.count(outcome(reason, number, late=number % 2 == 1, latency_ns=number))
         moved, _ = turn.moved() or (77, 0)
-        turn.count(None, None, late=False, latency_ns=moved)
+        turn.count(outcome(None, None, late=False, latency_ns=moved))
         return
     inbox = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     if what == "shaping":

@@ -34,7 +34,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from typing import NamedTuple
 
-from chainshaper.gate.decision import DROPPED
+from chainshaper.gate.decision import DROPPED, Outcome
 
 FIELDS = (
     "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
@@ -334,17 +334,13 @@ class Turn:
             return None
         return (by, since) if self.page.is_locked(MOVING) else (0, time.monotonic_ns())
 
-    def count(
-        self, dropped: str | None, lost: int | None, *, late: bool, latency_ns: int | None = None
-    ) -> None:
-        """A message has been published, or was ``dropped`` for that reason; ``lost`` are missing
-        before it, ``latency_ns`` is from its origin to its arrival (None: not known).
-        """
-        if latency_ns is not None:
-            self.page.add("measured", MEASURED, latency_ns)
-        self.page[dropped or "published"] += 1
-        self.page["lost_by_dds"] += lost or 0
-        self.page["late"] += late
+    def count(self, outcome: Outcome) -> None:
+        """A message has been published or dropped: it counts, and its latency to its arrival."""
+        message, release = outcome.message, outcome.release
+        self.page.add("measured", MEASURED, message.arrival_ns - release.origin_ns)
+        self.page[outcome.dropped or "published"] += 1
+        self.page["lost_by_dds"] += message.lost or 0
+        self.page["late"] += release.overrun is not None
 
     def _come_into_force(self, key: int | None) -> bool:
         page, give_up = self.page, time.monotonic_ns() + GIVE_UP_NS

@@ -314,8 +314,7 @@ class NodeProcess:
         modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
         message, release = outcome.message, outcome.release
         if turn is not None:
-            late, latency = release.overrun is not None, message.arrival_ns - release.origin_ns
-            turn.count(outcome.dropped, message.lost, late=late, latency_ns=latency)
+            turn.count(outcome)
         self._point["gate_release"](
             outcome.awake_ns,
             handle,

@@ -228,9 +228,7 @@ private:
 
   void note(const Outcome<Message> & outcome, Maybe published_ns = {}, Maybe stalled_ns = {}) {
     log_.write(shaper_.queue.gate, outcome, published_ns, stalled_ns);
-    if (turn_)
-      turn_->count(outcome.dropped, {}, outcome.release.overrun.has_value(),
-                   outcome.waiting.arrival_ns - outcome.release.origin_ns);
+    if (turn_) turn_->count(outcome);
   }
 
   // Of CLOCK_REALTIME, and each once: it tells a message from the others.

@@ -269,9 +269,7 @@ class Shaping:
         """Note what became of a message: in the log, and for the standby and `status`."""
         self._log.write(outcome, published, stalled)
         if self._turn is not None:
-            message, release = outcome.message, outcome.release
-            late, latency = release.overrun is not None, message.arrival_ns - release.origin_ns
-            self._turn.count(outcome.dropped, message.lost, late=late, latency_ns=latency)
+            self._turn.count(outcome)
 
     def _arrive(self, payload: bytes, info: dict[str, int], *, waited: bool) -> None:
         source, number = info.get("source_timestamp"), info.get("publication_sequence_number")

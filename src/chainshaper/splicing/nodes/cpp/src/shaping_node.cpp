@@ -380,9 +380,7 @@ private:
   // Losses are said when they happen, at most every ten seconds.
   void note(const Outcome<Pointer> & outcome, Maybe published_ns = {}, Maybe stalled_ns = {}) {
     log_.write(shaper_.queue.gate, outcome, published_ns, stalled_ns);
-    if (turn_)
-      turn_->count(outcome.dropped, outcome.waiting.lost, outcome.release.overrun.has_value(),
-                   outcome.waiting.arrival_ns - outcome.release.origin_ns);
+    if (turn_) turn_->count(outcome);
     const std::int64_t now = monotonic_ns();
     if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) return;
     const std::string losses = log_.losses();

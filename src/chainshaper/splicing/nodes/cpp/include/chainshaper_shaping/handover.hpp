@@ -275,12 +275,14 @@ public:
     return std::make_pair(by, since);
   }
 
-  void count(std::optional<Dropped> dropped, Maybe lost, bool late, Maybe latency_ns = {}) {
-    if (latency_ns) page_->note(Field::measured, schema::measured, *latency_ns);
+  template <typename Message>
+  void count(const Outcome<Message> & outcome) {
+    const auto & [message, release, awake_ns, dropped] = outcome;
+    page_->note(Field::measured, schema::measured, message.arrival_ns - release.origin_ns);
     // Reasons stand in the page in their order.
     page_->add(dropped ? Field::replaced + static_cast<std::size_t>(*dropped) : Field::published);
-    page_->add(Field::lost_by_dds, lost.value_or(0));
-    page_->add(Field::late, late ? 1 : 0);
+    page_->add(Field::lost_by_dds, message.lost.value_or(0));
+    page_->add(Field::late, release.overrun ? 1 : 0);
   }
 
 private:
