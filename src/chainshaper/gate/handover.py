@@ -32,9 +32,8 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from typing import NamedTuple
 
-from chainshaper.gate.decision import DROPPED, Outcome
+from chainshaper.gate.decision import DROPPED, Outcome, Waiting
 
 FIELDS = (
     "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
@@ -364,14 +363,6 @@ class Turn:
         return True
 
 
-class _Waiting(NamedTuple):
-    """A message that is the shaping node's, unless that fails."""
-
-    key: int
-    payload: bytes
-    arrival_ns: int
-
-
 class Standby:
     """The standby's side: passes messages on while no shaping node is in force.
 
@@ -393,7 +384,7 @@ class Standby:
     ) -> None:
         self._name, self._topic, self._publish = name, topic, publish
         self._changed, self._patience_ns = changed, patience_ns
-        self._pending: deque[_Waiting] = deque(maxlen=depth)
+        self._pending: deque[Waiting] = deque(maxlen=depth)  # about: the source timestamp, or 0
         self._mutex = threading.Lock()
         self._why = ""
         self._silent = silent
@@ -417,7 +408,7 @@ class Standby:
         with self._mutex:
             self._follow()
             self.page["listening"] = 1
-            self._pending.append(_Waiting(key or 0, payload, now))
+            self._pending.append(Waiting(payload, now, None, 0, about=key or 0))
             if key is not None:
                 self._look(now)
             elif self._none_in_force():
@@ -486,13 +477,13 @@ class Standby:
             self._gone("is late for its own release: it hangs, or was stopped")
             self.page.lock(PASSING)
             for waiting in self._pending:  # the node is there, and could go on at any time
-                self.page.note(waiting.key, bypassed=True)
+                self.page.note(waiting.about, bypassed=True)
             self._pass_on(len(self._pending), noted=True)
             self.page.unlock(PASSING)
         elif taken != self._stuck_at:
             self._back()
             # What came before the first message of the node in force came to this process alone.
-            first, keys = self.page["first"], [waiting.key for waiting in self._pending]
+            first, keys = self.page["first"], [waiting.about for waiting in self._pending]
             if first != self.page["acknowledged"] and first in keys:
                 self._pass_on(keys.index(first))
                 self.page["acknowledged"] = first
@@ -507,16 +498,16 @@ class Standby:
     def _forget(self) -> None:
         """Leave out what was dealt with, and what came before: order is not to be broken."""
         known = {*self.page.noted(bypassed=False), *self.page.noted(bypassed=True)}
-        dealt_with = [place for place, one in enumerate(self._pending, 1) if one.key in known]
+        dealt_with = [place for place, one in enumerate(self._pending, 1) if one.about in known]
         for _ in range(max(dealt_with, default=0)):
             self._pending.popleft()
 
     def _pass_on(self, count: int, *, noted: bool = False) -> None:
         for _ in range(count):
             waiting = self._pending.popleft()
-            self._publish(waiting.payload, waiting.key or None, waiting.arrival_ns)
+            self._publish(waiting.payload, waiting.about or None, waiting.arrival_ns)
             if not noted:
-                self.page.note(waiting.key, bypassed=True)
+                self.page.note(waiting.about, bypassed=True)
 
     def _gone(self, why: str) -> None:
         if not self.page["bypassing_since_ns"]:
