@@ -58,7 +58,7 @@ def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
     InputError: the application lacks a chain of the plan, or it has another period there.
     """
     for chain in joint.chains:
-        _, timer = origin_timer(application, chain.chain.spec)
+        name, timer = origin_timer(application, chain.chain.spec)
         if timer.timer_ns != chain.chain.period_ns:
             raise InputError(
                 "the plan is for a chain with the period"
@@ -67,20 +67,13 @@ def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
                 f" {duration_text(timer.timer_ns or 0)}: plan again from a recording of this"
                 " application"
             )
-        application = _at_offset(application, joint, chain)
+        if joint.moves_timers:
+            node = application.nodes[name]
+            moved = timer.model_copy(update={"phase_ns": chain.offset_ns})
+            callbacks = tuple(moved if one is timer else one for one in node.callbacks)
+            nodes = {**application.nodes, name: node.model_copy(update={"callbacks": callbacks})}
+            application = application.model_copy(update={"nodes": nodes})
     return application
-
-
-def _at_offset(application: Application, joint: ApplicationPlan, chain: Plan) -> Application:
-    """The application with the timer that starts a chain expiring at the chain's offset."""
-    if not joint.moves_timers:
-        return application
-    name, timer = origin_timer(application, chain.chain.spec)
-    node = application.nodes[name]
-    moved = timer.model_copy(update={"phase_ns": chain.offset_ns})
-    callbacks = tuple(moved if one is timer else one for one in node.callbacks)
-    nodes = {**application.nodes, name: node.model_copy(update={"callbacks": callbacks})}
-    return application.model_copy(update={"nodes": nodes})
 
 
 def _with_chain(application: Application, plan: Plan) -> Application:
