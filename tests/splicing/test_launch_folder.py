@@ -1,6 +1,5 @@
 """The folder of a spliced launch file: whole or absent, replaced or removed only while ours."""
 
-import json
 import shutil
 from pathlib import Path
 from unittest import mock
@@ -165,18 +164,6 @@ def test_a_copy_whose_original_is_gone_names_the_original(
     shutil.move(robot, tmp_path / "elsewhere.launch.xml")
     with pytest.raises(InputError, match=r"robot\.launch\.xml: cannot be read \(No such file"):
         splice_launch_files(plan, [spliced.folder / "robot.launch.py"], tmp_path / "again")
-
-
-def test_a_folder_of_copies_from_an_earlier_version_is_known(
-    spliced: Splicing, robot: Path, plan: Plan, tmp_path: Path
-) -> None:
-    path = spliced.folder / "splice.json"
-    manifest = json.loads(path.read_text())
-    assert manifest["copies"] == {"robot.launch.py": [str(robot)]}
-    path.write_text(json.dumps({**manifest, "copies": {"robot.launch.py": str(robot)}}))
-    (again,) = splice_launch_files(plan, [*spliced.launch.values()], tmp_path / "again").originals
-    assert f"LAUNCH_FILES = [{str(robot)!r}]" in again.read_text()
-    undo_splice(spliced.folder)
 
 
 def test_a_folder_that_cannot_be_written_leaves_nothing(

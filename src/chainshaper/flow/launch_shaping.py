@@ -192,7 +192,6 @@ def shape_launch(
         splicing = splice_launch_files(
             *(plan, [launch.file], folder / "launch"),
             node=node,
-            arguments=launch.arguments,
             recording=first,
         )
         found += splicing.notes

@@ -70,7 +70,6 @@ class LaunchCommand:
     before: tuple[str, ...]  # the words before those that name the launch file
     file: Path
     after: tuple[str, ...]
-    arguments: dict[str, str]  # of the launch, by name
 
     def with_file(self, file: Path) -> list[str]:
         """The command that launches another file in the same way."""
@@ -96,9 +95,7 @@ def parse_launch_command(command: Sequence[str]) -> LaunchCommand:
     file, end = Path(first), at + 1
     if not file.is_file():
         file, end = _file_of_package(first, second), at + 2
-    after = words[end:]
-    arguments = dict(word.split(":=", 1) for word in after if ":=" in word)
-    return LaunchCommand(tuple(words[:at]), file.absolute(), tuple(after), arguments)
+    return LaunchCommand(tuple(words[:at]), file.absolute(), tuple(words[end:]))
 
 
 def _behind_options(words: Sequence[str]) -> int:
@@ -272,10 +269,7 @@ def _manifest(folder: Path) -> dict[str, Any] | None:
         values = json.loads((folder / MANIFEST).read_text(encoding="utf-8"))
         if values["format"] != _FORMAT:
             return None
-        copies = {  # earlier versions copied each launch file
-            name: [words] if isinstance(words, str) else list(words)
-            for name, words in values["copies"].items()
-        }
+        copies = {name: list(words) for name, words in values["copies"].items()}
         throttled = bool(values.get("throttled"))
         return {"copies": copies, "files": dict(values["files"]), "throttled": throttled}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
