@@ -363,10 +363,10 @@ def test_a_page_that_is_made_anew_moves_no_cycle_and_puts_slots_back(
         time.sleep(0.3)
         Path(page).unlink()
         time.sleep(0.4)
-        states.extend(one.state for one in find_outputs() if one.shaping_node == pid)
         with pytest.raises(OperationError, match=r"cannot be followed: .* was removed; start"):
             followed.latencies()
         followed.close()
+        states.extend(one.state for one in find_outputs() if one.shaping_node == pid)
 
     done = run({"/t5": gate}, [at(ns) for ns in times], log_out)
     rows = done.logs["/t5"]

@@ -305,13 +305,14 @@ def test_an_output_is_that_of_the_processes_that_are_meant_and_of_its_page_s_own
     folder = tmp_path / "outputs"
     monkeypatch.setattr("chainshaper.gate.handover.page_folders", lambda: iter([str(folder)]))
     monkeypatch.setattr("chainshaper.splicing.shaped_outputs.page_folders", lambda: [str(folder)])
-    page = open_page("t5", "/t5")
+    topic = f"/of_{os.getpid()}"
+    page = open_page("t5", topic)
     assert page.lock()
     page["holder"] = os.getpid()
-    FollowedOutput("/t5", {1, os.getpid()}).close()
-    FollowedOutput("/t5").close()
+    FollowedOutput(topic, {1, os.getpid()}).close()
+    FollowedOutput(topic).close()
     with pytest.raises(OperationError, match="no gates publish it now"):
-        ask_phase("/t5", {1}, 5)
+        ask_phase(topic, {1}, 5)
     if os.geteuid():
         pytest.skip("giving files to another user takes root")
     os.chown(folder, 65534, -1)
