@@ -149,6 +149,16 @@ def test_a_chain_begins_with_its_timer_unless_its_server_is_closed_then(
     assert run.begins(0) == 50 * MS - early_ns
 
 
+def test_under_priorities_alone_each_chain_begins_with_its_own_timer(tmp_path: Path) -> None:
+    """Slots of chains that share a core wait for the latest timer: 2 ms by themselves, or more."""
+    plan = whole(one_server_plan())
+    here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None)
+    run = _Run(plan, plan, Choice("fifo", ""), here, (), frozenset(), Event())
+    assert run.early(0) == LEAD_NS
+    run.waits_ns, run.anchor_ns = [22 * MS], 50 * MS
+    assert (run.early(0), run.begins(0)) == (22 * MS, 28 * MS)
+
+
 @pytest.mark.parametrize(("end", "slots"), [(30, ((0, 30 * MS),)), (100, ())])
 def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: int, slots: tuple[tuple[int, int], ...]

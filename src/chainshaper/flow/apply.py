@@ -340,7 +340,7 @@ class _Run:
         """How long before its slot a chain begins: with its timer, unless a server stops it."""
         chain = self.plan.chains[place]
         if not gates(self.choice.name):
-            return LEAD_NS
+            return self.waits_ns[place] if self.waits_ns else LEAD_NS
         if not self.waits_ns:
             return 0
         return self.waits_ns[place] if allocation.closed_before(chain) is None else 0
