@@ -1,13 +1,29 @@
 """When servers open and close: the boundaries of cycles, and moving to another anchor."""
 
+import os
+import time
 from itertools import chain, takewhile
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.enforcement.freezer import Anchoring, first_anchoring, next_anchoring
-from chainshaper.enforcement.slot_dispatcher import Boundary, boundaries_of, instants, moved
+from chainshaper.enforcement.freezer import (
+    Anchoring,
+    CoreNumbers,
+    ServerNumbers,
+    first_anchoring,
+    next_anchoring,
+)
+from chainshaper.enforcement.slot_dispatcher import (
+    Boundary,
+    Dispatcher,
+    boundaries_of,
+    instants,
+    moved,
+)
 
+MS = 1_000_000
 Slots = tuple[tuple[tuple[int, int], ...], ...]
 
 
@@ -133,3 +149,32 @@ def test_the_first_cycle_begins_as_soon_as_it_may() -> None:
     assert first_anchoring(30, 100, 950) == Anchoring(1030, 1030)
     assert first_anchoring(30, 100, 1030) == Anchoring(1030, 1030)
     assert first_anchoring(5_030, 100, 950) == Anchoring(1030, 1030), "an anchor yet to come"
+
+
+def test_a_slot_whose_start_passed_in_a_stall_is_late_and_one_that_passed_was_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """50 ms into a cycle of 1 s: of [0, 900), [20, 30) and [40, 900) ms the second is over."""
+    slots = (((0, 900 * MS),), ((20 * MS, 30 * MS),), ((40 * MS, 900 * MS),))
+    dispatcher, looks = object.__new__(Dispatcher), iter([None])
+
+    def wait_for_boundary(_: Dispatcher) -> None:
+        next(looks)  # the second look is the end
+
+    monkeypatch.setattr(Dispatcher, "_tick_until_boundary", wait_for_boundary)
+    monkeypatch.setattr(Dispatcher, "_obey", lambda _: None)
+    dispatcher.groups, dispatcher.all = [{}, {}, {}], frozenset({0, 1, 2})
+    dispatcher.own, dispatcher.counters = CoreNumbers(), [ServerNumbers() for _ in slots]
+    dispatcher.open, dispatcher.unexamined, dispatcher.begun = frozenset(), set(), []
+    dispatcher.let_go, dispatcher.owner = 0, os.getppid()
+    dispatcher.last_sign = now = time.monotonic_ns()
+    dispatcher.ahead = instants(boundaries_of(1000 * MS, slots), 1000 * MS, now - 50 * MS)
+    dispatcher.upcoming = next(dispatcher.ahead)
+    with pytest.raises(StopIteration):
+        dispatcher.run()
+    dispatcher._tick()
+    assert [one.slots for one in dispatcher.counters] == [1, 0, 1]
+    assert [one.late for one in dispatcher.counters] == [1, 0, 1]
+    first, _, third = (one.longest for one in dispatcher.counters)
+    assert first >= 50 * MS
+    assert first - third == 40 * MS

@@ -134,7 +134,7 @@ class Dispatcher:
         self.upcoming = (_FAR, self.boundaries[0])
         self.ahead: Iterator[tuple[int, Boundary]] = iter(())
         self.rest_until = 0  # no tick before
-        self.switched: list[tuple[Boundary, int]] = []  # and how late, since the last tick
+        self.begun: list[tuple[int, int]] = []  # servers, and how late, since the last tick
         self.unexamined: set[int] = set()
         self.last_tick = self.last_sign = time.monotonic_ns()
         self.let_go = self.own.let_go
@@ -147,6 +147,7 @@ class Dispatcher:
             at, boundary = self.upcoming
             following = next(self.ahead)
             before = self.all if self.open is None else self.open
+            begun = dict.fromkeys(boundary.starts, at)
             if boundary.open and not before:
                 # Waking an idle core takes longest, and delays no thread of ours now.
                 sleep_until(at - _WATCH_NS)
@@ -156,11 +157,13 @@ class Dispatcher:
             while following[0] <= time.monotonic_ns():
                 # A stall took more than a boundary: what should be open by now counts.
                 (at, boundary), following = following, next(self.ahead)
+                begun = {one: since for one, since in begun.items() if one in boundary.open}
+                begun.update(dict.fromkeys(boundary.starts, at))
             closing = before - boundary.open
             self._write(closing, b"1")
             self._write(boundary.open - before, b"0")
             switched = time.monotonic_ns()
-            self.switched.append((boundary, switched - at))
+            self.begun += [(server, switched - since) for server, since in begun.items()]
             if self.open is not None:
                 self.unexamined |= closing
             self.open, self.upcoming, self.rest_until = boundary.open, following, at + _REST_NS
@@ -195,12 +198,11 @@ class Dispatcher:
     def _tick(self) -> None:
         """A sign of life, and all that has waited."""
         self.last_tick = time.monotonic_ns()
-        for boundary, late_ns in self.switched:
-            for counters in (self.counters[server] for server in boundary.starts):
-                counters.slots += 1
-                counters.late += late_ns > _LATE_NS
-                counters.longest = max(counters.longest, late_ns)
-        self.switched.clear()
+        for counters, late_ns in ((self.counters[server], late) for server, late in self.begun):
+            counters.slots += 1
+            counters.late += late_ns > _LATE_NS
+            counters.longest = max(counters.longest, late_ns)
+        self.begun.clear()
         self._give_sign(self.last_tick)
         if os.getppid() != self.owner:
             raise OperationError("the owner is gone")
