@@ -11,6 +11,8 @@ from typing import Any
 
 import pytest
 from applied_plans import one_server_plan
+from known import known
+from processes import wait_for
 from small_chain import small_chain_plan
 
 from chainshaper.enforcement.back_ends import Choice
@@ -20,6 +22,7 @@ from chainshaper.flow import apply as applying
 from chainshaper.flow import threads
 from chainshaper.flow.apply import _Run
 from chainshaper.flow.drift import TimerTrack
+from chainshaper.flow.phase import DriftWatch
 from chainshaper.planning.application_plan import open_until_done, whole
 from chainshaper.planning.plan import revised
 from chainshaper.reporting.overviews import servers_table
@@ -107,6 +110,34 @@ def test_every_back_end_that_gates_follows_a_phase_that_was_measured(
     moved = next(run.follow(here, [here]))
     assert bool(moved) == (measured and back_end != "fifo")
     assert armed == [moved % plan.cycle_ns] * bool(moved)
+
+
+def test_a_timer_that_comes_earlier_is_not_counted_twice(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """-50 ppm are -0.5 ms in the 10 s until the first look. Slots move there, and what was seen is
+    none of it any more: it had been told as 1 ms.
+    """
+    (chain,) = whole(one_server_plan()).chains
+    server = chain.servers[0].model_copy(update={"slots": ((0, 100 * MS),)})  # nothing stops it
+    plan, looks = whole(chain.model_copy(update={"servers": (server,)})), iter([-MS // 2])
+
+    def look(_: DriftWatch, _near: int | None, _expected: int) -> int:
+        for seen in looks:
+            return seen
+        raise OperationError("the thread has ended")
+
+    monkeypatch.setattr(DriftWatch, "_look", look)
+    monkeypatch.setattr(DriftWatch, "EVERY_S", 0.0)
+    watch = DriftWatch(1, 1, 100 * MS, 48 * MS)
+    wait_for(lambda: watch.looks == 1, "the look")
+    here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None, arm=lambda _: None)
+    run = _Run(plan, plan, Choice("freezer", ""), here, (), frozenset(), Event())
+    run.waits_ns, run.anchor_ns, run.found = [LEAD_NS], 50 * MS, here
+    run.begin_state((), "")
+    moved_ns = next(run.follow(here, [watch]))
+    assert moved_ns == run.anchor_ns - 50 * MS == -MS // 2
+    assert moved_ns + known(watch.surely_ns) == -MS // 2
 
 
 def test_a_run_that_is_to_end_while_its_slots_move_has_not_failed(tmp_path: Path) -> None:

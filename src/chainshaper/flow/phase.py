@@ -201,6 +201,8 @@ class DriftWatch:
     def expect(self, expected_ns: int) -> None:
         """The thread is to begin elsewhere from now on; what is seen of it till then is void."""
         self._expected_ns, self._before_ns = expected_ns, 0
+        if self.latest_ns is not None:
+            self.latest_ns = 0
 
     @property
     def surely_ns(self) -> int | None:
