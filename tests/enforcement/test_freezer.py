@@ -27,11 +27,12 @@ from gated import (
     stamping,
 )
 from known import known
-from processes import children_of, wait_for
+from processes import children_of, is_alive, wait_for
 
 from chainshaper.enforcement.freezer import Freezer
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.slot_dispatcher import PRIORITY, overrun
+from chainshaper.linux import cgroups
 from chainshaper.linux.cgroups import (
     QUICK_MOVES,
     cgroup_of,
@@ -388,6 +389,21 @@ def test_what_cannot_be_assigned_is_refused_and_changes_nothing(tmp_path: Path) 
         with pytest.raises(InputError, match="no server is named c: a, b are"):
             back_end.assign(os.getpid(), "c")
         back_end.assign(ended.pid, "a")
+        assert groups_left(os.getpid()) == []
+
+
+def test_a_thread_that_ends_while_its_cgroup_is_looked_up_is_passed_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with freezer(tmp_path, server("a", (5, 12))) as back_end, sleeping() as pid:
+
+        def ends(tid: int) -> Path:
+            kill(tid)
+            wait_for(lambda: not is_alive(tid), "its end")
+            raise PlatformError(f"thread {tid} is in a cgroup that is gone")
+
+        monkeypatch.setattr(cgroups, "cgroup_of", ends)
+        back_end.assign(pid, "a")
         assert groups_left(os.getpid()) == []
 
 

@@ -282,7 +282,7 @@ class Freezer(BackEnd):
                     self._await_answers()
             if cgroups.move_thread(tid, folder):
                 self._born[tid] = born
-        except OperationError:
+        except (OperationError, PlatformError):
             if not has_ended(tid, born):
                 raise
 

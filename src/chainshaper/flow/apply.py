@@ -52,7 +52,7 @@ from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import OperationError, PlatformError
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
@@ -548,7 +548,7 @@ class _Run:
             if new:
                 self.schedule()
                 self.assign(servers)
-        except OperationError as error:
+        except (OperationError, PlatformError) as error:
             self.found = before
             reason = f"threads that have appeared are as they were: {error}"
             return new, "" if self.stop.is_set() else reason
