@@ -16,7 +16,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from types import SimpleNamespace
+from typing import TypeAlias, cast
 
 import pytest
 from applied_plans import Governed, needs_fifo, node_to_govern
@@ -24,11 +25,11 @@ from gated import CORE, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroup
 from known import known
 from processes import is_alive, wait_for
 
-from chainshaper.enforcement.freezer import CounterPage, run_of
-from chainshaper.enforcement.guardian import GROUP, let_go
+from chainshaper.enforcement.freezer import CoreNumbers, CounterPage, run_of
+from chainshaper.enforcement.guardian import GROUP, _Watch, let_go
 from chainshaper.enforcement.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
-from chainshaper.linux.runs import find_journals
+from chainshaper.linux.runs import Journal, find_journals
 from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import list_threads
 
@@ -256,6 +257,21 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
         time.sleep(0.2)
         assert all(map(is_alive, run.guardians))
         assert run.ask("failure") == "None"
+
+
+def test_once_it_knows_all_dispatchers_a_journal_that_grows_is_read_no_more() -> None:
+    """It does so above all servers, and an application's helpers make the journal long."""
+
+    def read(*_: object) -> tuple[str, ...]:
+        raise AssertionError("it was read")
+
+    watch, reading = object.__new__(_Watch), SimpleNamespace(size=lambda: 1, read=read)
+    watch.journal, watch.read_until, watch.beats = cast("Journal", reading), 0, {CORE: (7, 0)}
+    watch.page = cast("CounterPage", SimpleNamespace(cores={CORE: None}))
+    assert watch.look_for_dispatchers() is False
+    watch.page.cores[CORE + 1] = CoreNumbers()
+    with pytest.raises(AssertionError):
+        watch.look_for_dispatchers()
 
 
 @pytest.mark.parametrize("victim", ["owner", "dispatcher"])

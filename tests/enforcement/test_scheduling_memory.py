@@ -309,8 +309,10 @@ def test_a_descendant_is_known_by_what_was_written_down_when_its_parent_has_ende
         change_all(journal, [(actor.thread("main"), WANTED)])
         time.sleep(0.05)
         between = actor.fork()  # dies with its parent, unless that is told otherwise
-        note_descendants(journal)
-        note_descendants(journal)
+        seen: set[tuple[int, int]] = set()
+        for noted in ([], [between], [between]):
+            seen = note_descendants(journal, seen)
+            assert [entry["pid"] for entry in journal.entries("descendant")] == noted
         assert [entry["pid"] for entry in journal.entries("descendant")] == [between]
         text = journal.path.read_text()
         # As if it had lost its parent: the thread of the journal is another process's.

@@ -155,6 +155,8 @@ class _Watch:
 
     def look_for_dispatchers(self) -> bool:
         """Learn of new ones; whether one of them has ended already."""
+        if self.page is not None and self.beats.keys() >= self.page.cores.keys():
+            return False  # all are known: whatever else is written down is nothing to read up here
         lost, size = False, self.journal.size()
         run = None if size == self.read_until else run_of(self.journal)
         self.read_until = size

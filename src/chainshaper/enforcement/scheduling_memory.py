@@ -5,13 +5,13 @@ that is as we set it goes back to what it was; one that another program has chan
 
 Threads inherit class and cores from those that create them. What an application starts while it is
 changed is put back as well, if it is the application's beyond doubt: in a process of the journal
-(the same id *and* start), or one that descends from these, or did when it was last looked; or in a
+(the same id *and* start), or one that descends from these, or did at two looks in a row; or in a
 cgroup of the run. What of these started after the change, and has what we gave to its family, gets
-its parent's original. All others are strangers, and so is a daemon whose parent ended before a
-look: :func:`look_alikes` names them, and they are left alone.
+its parent's original. All others are strangers, and so is a daemon whose parent ended before
+these: :func:`look_alikes` names them, and they are left alone.
 """
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -161,14 +161,22 @@ def remembered_threads(journal: Journal) -> list[Change]:
     return list(threads.values())
 
 
-def note_descendants(journal: Journal) -> None:
-    """Write down processes that the journal's have started meanwhile. Raises: as ``note_all``."""
+def note_descendants(
+    journal: Journal, before: Collection[tuple[int, int]]
+) -> set[tuple[int, int]]:
+    """Write down processes that the journal's have started meanwhile, of those that were there at
+    the look ``before``, too: helpers come and go as long as a run lasts. Returns all that are new.
+
+    Raises: as ``note_all``.
+    """
     remembered = remembered_threads(journal)
     known = {one.pid for one in remembered}
-    known |= {pid for pid, _ in journal.read(DESCENDANTS, process_of)}
-    new = ((pid, start_of(pid, pid)) for pid in _families(journal, remembered) if pid not in known)
-    if entries := [{"pid": pid, "started": when} for pid, when in new if when is not None]:
+    found = ((pid, start_of(pid, pid)) for pid in _families(journal, remembered))
+    new = {(pid, when) for pid, when in found if pid not in known and when is not None}
+    new -= set(journal.read(DESCENDANTS, process_of))
+    if entries := [{"pid": pid, "started": when} for pid, when in sorted(new.intersection(before))]:
         journal.note_all(DESCENDANTS, entries)
+    return new
 
 
 def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:

@@ -182,6 +182,7 @@ class _Run:
     followers: dict[int, SlotFollower] = field(default_factory=dict)  # by their chains' places
     moved_ns: dict[int, int] = field(default_factory=dict)  # by how much their slots are
     arming: threading.Lock = field(default_factory=threading.Lock)  # followers move slots as well
+    descendants: set[tuple[int, int]] = field(default_factory=set)  # at the last look
     found: Allocation = field(init=False)
     state: RunState = field(init=False)
 
@@ -544,7 +545,7 @@ class _Run:
         self.show_servers(threads=left)
         self.found = now
         try:
-            note_descendants(self.journal)
+            self.descendants = note_descendants(self.journal, self.descendants)
             if new:
                 self.schedule()
                 self.assign(servers)
