@@ -30,11 +30,14 @@ from applied_plans import (
 )
 from command_line import called
 from gated import CORE, OTHER_CORE, cpu_ns, groups_left, kill, needs_cgroups, own_cgroup
+from known import known
 from processes import wait_for
 
+from chainshaper.enforcement import undoing
 from chainshaper.enforcement.guardian import GROUP
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import apply_plan
+from chainshaper.linux import own_processes
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
 from chainshaper.linux.runs import find_journals
 from chainshaper.linux.scheduling import state_of
@@ -188,6 +191,38 @@ def test_a_process_that_was_never_ours_stays_as_it_is(tmp_path: Path) -> None:
         assert state_of(pid) == before
         governed.check_as_before()
         assert f"thread {pid} (sleep) is left as it is" in said
+
+
+SLOW = """
+import signal, sys, time
+from pathlib import Path
+from chainshaper.linux.runs import discard_journal, open_journal
+
+journal = open_journal(Path(sys.argv[1]))
+
+def end(*_):
+    time.sleep(1)
+    discard_journal(journal)
+    sys.exit(7)
+
+signal.signal(signal.SIGTERM, end)
+print("ready", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_run_that_is_ending_its_command_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Killed, it would leave the command running. What ending one takes: three times 0.5 s here."""
+    monkeypatch.setattr(undoing, "PATIENCE_S", 0.2)
+    monkeypatch.setattr(own_processes, "PATIENCE_S", 0.5)
+    command = [sys.executable, "-c", SLOW, str(tmp_path)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as owner:
+        assert known(owner.stdout).readline() == b"ready\n"
+        (journal,) = find_journals(tmp_path)
+        assert undoing.end_run(journal) == ()
+        assert owner.wait(timeout=20) == 7
 
 
 def test_what_a_node_forks_under_fifo_is_put_back_and_found_although_its_parent_has_ended(

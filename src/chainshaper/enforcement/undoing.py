@@ -25,7 +25,7 @@ from chainshaper.enforcement.scheduling_memory import (
     release_threads,
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters
-from chainshaper.linux import cgroups, runs
+from chainshaper.linux import cgroups, own_processes, runs
 from chainshaper.linux.runs import Journal, find_journals, locked, process_of
 from chainshaper.linux.scheduling import state_of, state_text
 from chainshaper.linux.threads import find_thread, open_process
@@ -34,7 +34,8 @@ from chainshaper.values.errors import OperationError, PlatformError
 
 CLAIMS = "claims"
 PATIENCE_S = 20.0
-"""A run has so long to begin, or to end when asked; who undoes one has half of that."""
+"""A run has so long to begin, or to end when asked, beside what ending its command takes; who undoes
+one has half of that."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +240,8 @@ def end_run(journal: Journal) -> tuple[str, ...]:
 
 
 def _wait_for_end(journal: Journal) -> bool:
-    deadline = time.monotonic() + PATIENCE_S
+    # Its command, which it ends on its way, has so long as well, and would run on without it.
+    deadline = time.monotonic() + PATIENCE_S + 3 * own_processes.PATIENCE_S
     while journal.path.exists() and journal.owner is not None:
         if time.monotonic() > deadline:
             return False
