@@ -42,9 +42,7 @@ from chainshaper.linux.cgroups import (
     mount_options,
     move_thread,
     moves_are_quick,
-    options_before_ours,
     remount,
-    restore_mount,
 )
 from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import may_use_fifo
@@ -304,39 +302,43 @@ def test_threads_that_end_inside_and_outside_their_slots_are_no_failure(tmp_path
 @pytest.fixture
 def plain() -> Iterator[str]:
     """The mount options without the one that freezers set; afterwards they are as they were."""
-    found, ours = mount_options(), options_before_ours()
-    plain = ",".join(name for name in found.split(",") if name != QUICK_MOVES)
+    found = mount_options()
+    cgroups.restore_mount()
+    theirs = moves_are_quick()  # not by a run of ours, then
+    plain = ",".join(name for name in mount_options().split(",") if name != QUICK_MOVES)
     try:
-        remount(f"{plain},{QUICK_MOVES}")
+        remount(plain)
+        make_moves_quick()
         allowed = moves_are_quick()
-        restore_mount(plain)
+        cgroups.restore_mount()
         if not allowed or moves_are_quick():
             pytest.skip(f"this kernel, or our privileges, do not let us set {QUICK_MOVES}")
         yield plain
     finally:
-        restore_mount(plain)
-        if found != plain:
-            remount(found) if ours is None else make_moves_quick(ours)
+        cgroups.restore_mount()
+        if found != mount_options():
+            remount(found) if theirs else make_moves_quick()
         assert mount_options() == found
 
 
 def test_others_that_move_processes_make_nobody_wait_meanwhile(tmp_path: Path, plain: str) -> None:
-    remount(f"{plain},{QUICK_MOVES}")
-    with freezer(tmp_path / "theirs", server("a", (0, 1))) as back_end:
-        back_end.release()
-        assert moves_are_quick(), "somebody else wanted it so"
-    remount(plain)
-    with freezer(tmp_path / "ours", server("a", (0, 1))):
-        assert mount_options() == f"{plain},{QUICK_MOVES}"
-    with pytest.raises(PlatformError), freezer(tmp_path, server("a", (0, 1), core=99)):
-        pass
-    assert mount_options() == plain
+    with sleeping() as pid:
+        remount(f"{plain},{QUICK_MOVES}")
+        with freezer(tmp_path / "theirs", server("a", (0, 1))) as back_end:
+            back_end.assign(pid, "a")
+            back_end.release()
+            assert moves_are_quick(), "somebody else wanted it so"
+        remount(plain)
+        with freezer(tmp_path / "ours", server("a", (0, 1))) as back_end:
+            back_end.assign(pid, "a")
+            assert mount_options() == f"{plain},{QUICK_MOVES}"
+        assert mount_options() == plain
 
 
 def test_what_a_run_without_a_journal_left_mounted_is_not_taken_for_another_program_s(
     tmp_path: Path, plain: str
 ) -> None:
-    make_moves_quick(plain)  # and nothing else says who did
+    make_moves_quick()  # and nothing else says who did
     journal = open_journal(tmp_path)
     Freezer(ServerTable(CYCLE, (server("a", (0, 1)),)), journal).release()
     discard_journal(journal)
@@ -347,12 +349,19 @@ def test_the_last_of_two_runs_at_once_leaves_it_mounted_as_the_first_found_it(
     tmp_path: Path, plain: str
 ) -> None:
     table = ServerTable(CYCLE, (server("a", (0, 1)),))
-    journals = [open_journal(tmp_path, name) for name in ("first", "second")]
-    runs = [Freezer(table, journal) for journal in journals]
-    for run, journal in zip(runs, journals, strict=True):
-        run.release()
-        discard_journal(journal)
-    assert mount_options() == plain
+    with sleeping() as one, sleeping() as other:
+        journals = [open_journal(tmp_path, name) for name in ("first", "second")]
+        runs = [Freezer(table, journal) for journal in journals]
+        try:
+            for run, pid in zip(runs, (one, other), strict=True):
+                run.assign(pid, "a")
+            runs[0].release()
+            assert moves_are_quick(), "the second is in force still"
+        finally:
+            for run, journal in zip(runs, journals, strict=True):
+                run.release()
+                discard_journal(journal)
+        assert mount_options() == plain
 
 
 def test_a_thread_that_is_moved_away_and_a_group_that_is_removed_are_told(tmp_path: Path) -> None:

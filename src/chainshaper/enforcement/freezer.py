@@ -53,14 +53,13 @@ _LOOK_S = 0.002
 
 @dataclass(frozen=True)
 class FreezerRun:
-    """The servers that are enforced, id and start of the owner, the path of its counters while it
-    lives, and the mount options that the hierarchy had, where we have it mounted differently.
+    """The servers that are enforced, id and start of the owner, and the path of its counters while it
+    lives.
     """
 
     owner: tuple[int, int]
     table: ServerTable
     page: Path
-    mount_options: str | None = None
 
 
 def read_run(entry: Mapping[str, Any]) -> FreezerRun:
@@ -71,7 +70,7 @@ def read_run(entry: Mapping[str, Any]) -> FreezerRun:
         for one in table["servers"]
     )
     table = ServerTable(int(table["cycle_ns"]), servers)
-    return FreezerRun((int(pid), int(started)), table, Path(entry["page"]), entry["mount_options"])
+    return FreezerRun((int(pid), int(started)), table, Path(entry["page"]))
 
 
 def run_of(journal: Journal) -> FreezerRun | None:
@@ -129,18 +128,15 @@ def restore(run: FreezerRun | None) -> tuple[str, ...]:
     groups = groups_of(run)
     thaw(groups)
     left = tuple(why for folder in groups if (why := cgroups.dissolve(folder)) is not None)
-    if run is not None and run.mount_options is not None:
-        cgroups.restore_mount(run.mount_options)
+    restore_mount()
     return left
 
 
-def restore_stray_mount() -> None:
-    """Mount the hierarchy as it was before a run whose journal is gone, if no group is in use."""
-    with contextlib.suppress(PlatformError):
-        in_use = not cgroups.moves_are_quick() or _all_groups()
-        before = None if in_use else cgroups.options_before_ours()
-        if before is not None:
-            cgroups.restore_mount(before)
+def restore_mount() -> None:
+    """Mount the hierarchy as it was before the first of our runs, when no group of any is left."""
+    if not _all_groups():
+        with contextlib.suppress(PlatformError):  # there is no hierarchy
+            cgroups.restore_mount()
 
 
 def _numbers(*names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
@@ -219,15 +215,15 @@ class Freezer(BackEnd):
     """A table of servers in force by freezing; see :class:`BackEnd` for what each method does.
 
     Making one starts a dispatcher per core; ``go_on`` is called again and again while something is
-    waited for, and may raise. Raises OperationError: a dispatcher does not start. PlatformError: no
-    cgroup v2 here, or a core is missing.
+    waited for, and may raise. Raises OperationError: a dispatcher does not start. PlatformError: a
+    core is missing.
     """
 
     def __init__(
         self, table: ServerTable, journal: Journal, go_on: Callable[[], None] = lambda: None
     ) -> None:
-        mounts, pid = cgroups.options_before_ours(), os.getpid()
         super().__init__(table)
+        pid = os.getpid()
         self._journal = journal
         self._go_on = go_on
         self._groups: dict[Path, str] = {}
@@ -242,14 +238,12 @@ class Freezer(BackEnd):
         os.truncate(self._memory, 8 + 80 * len(table.servers))  # there are not more cores
         page = Path(f"/proc/{pid}/fd/{self._memory}")
         self._page = CounterPage(page, table)
-        self._run = FreezerRun((pid, start_of(pid, pid) or 0), table, page, mounts)
+        self._run = FreezerRun((pid, start_of(pid, pid) or 0), table, page)
         try:
             journal.note(FREEZER, **{**asdict(self._run), "page": str(page)})
             for core in sorted({server.core for server in table.servers}):
                 self._dispatchers[core] = self._start_dispatcher(core)
             self._await(_START_S, "start", lambda core: self._page.cores[core].beats > 0)
-            if mounts is not None:
-                cgroups.make_moves_quick(mounts)
         except BaseException:
             self._end()
             raise
@@ -276,6 +270,7 @@ class Freezer(BackEnd):
             folder = parent / f"{_PREFIX}{pid}.{started}.{page}-{number}-{readable}"
             if folder not in self._groups:
                 cgroups.make_threaded_child(parent, folder.name)
+                cgroups.make_moves_quick()  # for as long as there are groups of any run
                 self._groups[folder] = server
                 self._send(self._table.servers[number].core, server=server, folder=str(folder))
                 if self._anchoring is not None:

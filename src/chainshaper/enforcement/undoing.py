@@ -347,7 +347,7 @@ def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple
                     f"{state_text(state_of(thread.tid))}, and what it had before is not known: "
                     f"`chrt --other --pid 0 {thread.tid}`, `taskset -pc CORES {thread.tid}`"
                 )
-    freezer.restore_stray_mount()
+    freezer.restore_mount()
     if left and cgroups.moves_are_quick():
         left.append(
             f"{cgroups.mount_point()} is mounted with {cgroups.QUICK_MOVES}, perhaps by that run: "

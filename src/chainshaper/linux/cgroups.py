@@ -24,8 +24,8 @@ Without it whoever moves a process to another group (a service manager, a contai
 for a grace period of RCU, 10 to 30 ms, and blocks freezing meanwhile: a slot opens so much later.
 """
 _BEFORE = "trusted.chainshaper.mount"
-"""Attribute of the hierarchy's root: its mount options before a run of ours, as in the journal, but
-never lost: it is in the kernel's memory, as the option is."""
+"""Attribute of the hierarchy's root: its mount options before runs of ours. All of these share it,
+and none can lose it: it is in the kernel's memory, as the option is."""
 _REMOUNT = 32
 _MOUNT_FLAGS = {
     "rw": 0,
@@ -82,27 +82,22 @@ def remount(options: str) -> None:
     ctypes.CDLL(None).mount(b"none", folder, b"cgroup2", ctypes.c_ulong(flags), own.encode())
 
 
-def options_before_ours() -> str | None:
-    """The mount options that a run which begins now has to restore; None: they stay."""
-    if not moves_are_quick():
-        return mount_options()
-    with contextlib.suppress(OSError):
-        return os.getxattr(mount_point(), _BEFORE).decode()
-    return None
-
-
-def make_moves_quick(before: str) -> None:
-    """Have the hierarchy mounted with :data:`QUICK_MOVES` besides the options ``before``."""
+def make_moves_quick() -> None:
+    """Have the hierarchy mounted with :data:`QUICK_MOVES` besides what it has."""
+    if moves_are_quick():
+        return
+    before = mount_options()
     with contextlib.suppress(OSError):  # without the privilege there is no remounting either
         os.setxattr(mount_point(), _BEFORE, before.encode())
-    remount(f"{before},{QUICK_MOVES}")
+        remount(f"{before},{QUICK_MOVES}")
 
 
-def restore_mount(before: str) -> None:
-    """Undo :func:`make_moves_quick`; harmless when repeated."""
-    if moves_are_quick():
-        remount(before)
-    with contextlib.suppress(OSError):  # it is gone already
+def restore_mount() -> None:
+    """Undo :func:`make_moves_quick`, where a run of ours did it; harmless when repeated."""
+    with contextlib.suppress(OSError):  # none did
+        before = os.getxattr(mount_point(), _BEFORE).decode()
+        if moves_are_quick():
+            remount(before)
         os.removexattr(mount_point(), _BEFORE)
 
 
