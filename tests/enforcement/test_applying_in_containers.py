@@ -21,10 +21,11 @@ from applied_plans import (
 )
 from command_line import called
 from containers import contained, needs_namespaces
-from gated import needs_cgroups
+from gated import needs_cgroups, own_cgroup
 from processes import wait_for
 
-from chainshaper.linux.threads import list_threads
+from chainshaper.enforcement.freezer import stray_groups
+from chainshaper.linux.threads import list_threads, start_of
 
 pytestmark = [needs_fifo, needs_cgroups, needs_namespaces, pytest.mark.timed]
 PLAN = plan_for(server("first", "origin", (0, 30)), server("second", "other", (40, 70)))
@@ -66,3 +67,16 @@ def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> 
         assert sum(pause > 60 * MS for pause in pauses) > 8, "closed for 70 ms in every cycle"
         assert {name: scheduling(pid) for name, pid in pids.items()} == before
     wait_for(lambda: not leftovers(), "runs and cgroups to be removed")
+
+
+def test_what_a_run_in_a_container_has_in_force_is_no_stray() -> None:
+    """It calls itself process 1, as another program does here."""
+    with own_cgroup("inside") as home:
+        with contained(["sleep", "60"]) as (_, process):
+            started = start_of(process.pid, process.pid)
+            group = home / f"chainshaper-{process.inner_pid}.{started}.9-0-first"
+            group.mkdir()
+            assert process.inner_pid == 1
+            assert group not in stray_groups(())
+        assert group in stray_groups(())
+        group.rmdir()

@@ -36,7 +36,7 @@ from chainshaper.enforcement.servers import (
 from chainshaper.linux import cgroups
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.linux.runs import DISPATCHER, Journal, note_process
-from chainshaper.linux.threads import has_ended, start_of
+from chainshaper.linux.threads import has_ended, living_processes, start_of
 from chainshaper.values.errors import OperationError, PlatformError
 
 FREEZER = "freezer"
@@ -92,15 +92,19 @@ def groups_of(run: FreezerRun | None, core: int | None = None) -> tuple[Path, ..
 
 
 def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
-    """Groups of ours of none of these journals, whose owner has ended."""
+    """Groups of ours of none of these journals, whose owner has ended; one in a container has made
+    them by its number there.
+    """
+    if not (groups := _all_groups()):
+        return ()
     known = {run.owner for journal in journals if (run := run_of(journal)) is not None}
+    owners = known.union(living_processes())
     strays = []
-    for folder, name in _all_groups():
+    for folder, name in groups:
         pid = int(name[1])
         started = start_of(pid, pid) if name[2] is None else int(name[2])
-        owned = (pid, started) in known or not (started is None or has_ended(pid, started))
-        if not owned and not cgroups.has_unseen_threads(folder):  # else another container's
-            strays.append(folder)
+        if (pid, started) not in owners and not cgroups.has_unseen_threads(folder):
+            strays.append(folder)  # where some are not to be seen, it is another container's
     return tuple(strays)
 
 

@@ -191,6 +191,15 @@ def all_stats() -> Iterator[tuple[int, list[bytes]]]:
             yield pid, read_stat(f"/proc/{pid}")[1]
 
 
+def living_processes() -> Iterator[tuple[int, int]]:
+    """All processes but zombies by id and start, those of containers by their ids there, too."""
+    for pid, fields in all_stats():
+        with suppress(OSError):  # it ended meanwhile
+            if fields[0] not in (b"Z", b"X"):
+                status = read_proc(f"/proc/{pid}/status")
+                yield from ((one, int(fields[19])) for one in {pid, innermost_id(status) or pid})
+
+
 def parents() -> dict[int, int]:
     """All processes with their parents, by id."""
     return {pid: int(fields[1]) for pid, fields in all_stats()}
