@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from applied_plans import one_server_plan
@@ -21,12 +21,14 @@ from chainshaper.enforcement.undoing import SlotMove
 from chainshaper.flow import apply as applying
 from chainshaper.flow import threads
 from chainshaper.flow.apply import _Run
-from chainshaper.flow.drift import TimerTrack
+from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch
 from chainshaper.planning.application_plan import open_until_done, whole
-from chainshaper.planning.plan import revised
+from chainshaper.planning.margins import Tail
+from chainshaper.planning.plan import Plan, revised
 from chainshaper.reporting.overviews import servers_table
-from chainshaper.values.errors import OperationError
+from chainshaper.splicing.shaped_outputs import FollowedOutput
+from chainshaper.values.errors import InputError, OperationError
 
 MS, S = 1_000_000, 1_000_000_000
 LEAD_NS, LOOK_NS, NOISE_NS = 2 * MS, 10 * S, 30_000
@@ -209,6 +211,23 @@ def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
     monkeypatch.setattr(applying, "DriftWatch", lambda *given, **_: watched.append(given[-1]))
     run.drift_watches()
     assert watched == [slots]
+
+
+def test_a_place_that_another_chain_has_is_why_slots_do_not_follow() -> None:
+    """It had been a traceback, and no word of it in the run."""
+
+    def refuse(_: int) -> int:
+        raise InputError("there is another chain's slot")
+
+    follower = object.__new__(SlotFollower)
+    follower._cores, follower._stop, follower.failure = (), Event(), None
+    follower._chain, follower._planned_ns = cast("Plan", SimpleNamespace(cycle_ns=MS)), 0
+    tail = SimpleNamespace(start_ns=0)
+    tail.saw = lambda seen_ns: setattr(tail, "start_ns", seen_ns)
+    follower._tail, follower._put_in_force = cast("Tail", tail), refuse
+    follower._output = cast("FollowedOutput", SimpleNamespace(latencies=lambda: [MS]))
+    follower._follow()
+    assert str(follower.failure) == "there is another chain's slot"
 
 
 @pytest.mark.parametrize("thread", ["free", "in-slots"])

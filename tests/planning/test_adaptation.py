@@ -197,6 +197,37 @@ def test_slots_do_not_move_into_another_chains() -> None:
         with_slots_moved(both, {0: 9_001_000})
 
 
+def test_slots_do_not_jump_over_another_chains() -> None:
+    """By hand: an output of 1 ms at [21 ms, 22 ms), and another's at [30 ms, 31 ms): 8 ms."""
+    one, other = small(), small().model_copy(deep=True)
+    _, output = other.servers
+    output = output.model_copy(
+        update={"name": "other", "slots": ((30 * MS, 31 * MS),), "threads": ()}
+    )
+    bare = other.chain.model_copy(update={"spec": "/b..", "output": None, "publisher": None})
+    other = revised(other, chain=bare, servers=(output,), shaping_node=None)
+    both = combined([one, other])
+    assert reach(both, 0)[1] == 8 * MS
+    with_slots_moved(both, {0: 10 * MS})
+
+
+def test_of_chains_that_share_a_server_one_follows() -> None:
+    """Each would move what the other has moved."""
+    one, other = small(), small().model_copy(deep=True)
+    chain, output = other.servers
+    thread = Thread(node="/other_gate")
+    output = output.model_copy(update={"name": "out", "priority": 9, "threads": (thread,)})
+    assert other.shaping_node is not None
+    gate = other.shaping_node.model_copy(
+        update={"name": "other_gate", "input": "/b_tmp", "output": "/b"}
+    )
+    spec = other.chain.model_copy(update={"spec": "/b..", "output": "/b", "publisher": "/b"})
+    other = revised(other, chain=spec, servers=(chain, output), shaping_node=gate)
+    _, reaches_ns, (why,) = followed_chains(combined([one, other]), "freezer")
+    assert list(reaches_ns) == [0]
+    assert "latencies: its server chain is /t1../t3's too, which follows its own" in why
+
+
 @pytest.mark.parametrize(
     ("due_until", "opened"),
     [(47.5, [(0, 30)]), (47, [(0, 30), (46.5, 47)]), (46.9, [(0, 30), (46.5, 47)])],

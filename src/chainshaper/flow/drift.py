@@ -33,7 +33,7 @@ from chainshaper.planning.margins import OVERRUN_PROBABILITY, Tail
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.plan import Adaptation, Plan, publish_slots
 from chainshaper.splicing.shaped_outputs import FollowedOutput
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import ChainshaperError
 
 SEEN_NS = 250_000  # later than usual by so much, a thread was woken by its timer, not the slot
 MOVE_NS = 250_000  # slots move by no less
@@ -159,7 +159,7 @@ class SlotFollower:
         cores: Collection[int] = (),
     ) -> None:
         self.moves: tuple[SlotMove, ...] = ()
-        self.failure: OperationError | None = None
+        self.failure: ChainshaperError | None = None
         self._chain, self._put_in_force = chain, put_in_force
         assert chain.shaping_node is not None  # noqa: S101 - else the chain cannot be followed
         self._output = FollowedOutput(chain.shaping_node.output, pids)
@@ -190,7 +190,7 @@ class SlotFollower:
                     self._tail.saw(latency_ns)
                 if self._tail.start_ns != before_ns:
                     self._move(self._tail.start_ns, before_ns)
-        except OperationError as error:
+        except ChainshaperError as error:  # also a place where slots may not be, beside others'
             if not self._stop.is_set():
                 self.failure = error
 

@@ -327,6 +327,10 @@ def followed_chains(
         try:
             if (reason := why_not_followed(chain)) is not None:
                 raise InputError(reason)
+            followed = {s.name: plan.chains[k] for k in reaches for s in plan.chains[k].servers}
+            for server in (one for one in chain.servers if one.name in followed):
+                other = chain_name(followed[server.name])
+                raise InputError(f"its server {server.name} is {other}'s too, which follows its own")
             chains[place] = revised(chain, adaptation=rules)
             found = reach(plan, place, rules.max_latency_ns)
             furthest = (with_slots_moved(plan, {place: by}) for by in found)

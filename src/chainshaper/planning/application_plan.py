@@ -257,17 +257,20 @@ def reach(plan: ApplicationPlan, place: int, latest_ns: int | None = None) -> tu
     latest = min(cycle_ns, cycle_ns if latest_ns is None else latest_ns)
     reason = "they begin and end where they have to"
     found = [0, 0]
-    for side, most in enumerate((-slots[0][0], latest - slots[-1][1])):
-        step = _GRID_NS << (abs(most) // _GRID_NS).bit_length()
-        while (step := step // 2) >= _GRID_NS:
+    shortest = min(end - start for start, end in slots)
+    for side, room in enumerate((slots[0][0], latest - slots[-1][1])):
+        # No step is longer than a slot, which would jump over another chain's.
+        step = _GRID_NS << max(0, (shortest // _GRID_NS).bit_length() - 1)
+        while step >= _GRID_NS:
             further = found[side] + (step if side else -step)
-            if abs(further) > abs(most):
-                continue
             try:
-                with_slots_moved(plan, {place: further})
-                found[side] = further
+                if abs(further) <= room:
+                    with_slots_moved(plan, {place: further})
+                    found[side] = further
+                    continue
             except InputError as error:
                 reason = str(error)
+            step //= 2
     if found == [0, 0]:
         raise InputError(reason)
     return found[0], found[1]
