@@ -16,6 +16,7 @@ from command_line import called
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from litmus_stand_in import StandIn, install
+from small_chain import small_chain_plan
 
 from chainshaper.enforcement import litmus
 from chainshaper.enforcement.litmus import (
@@ -28,9 +29,14 @@ from chainshaper.enforcement.litmus import (
 )
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
+from chainshaper.enforcement.threads import Allocation
+from chainshaper.flow import threads
+from chainshaper.flow.phase import Phase
+from chainshaper.flow.threads import planned_changes
 from chainshaper.linux.runs import Journal, find_journals, open_journal
 from chainshaper.linux.scheduling import available_cores, state_of
 from chainshaper.planning import save_plan
+from chainshaper.planning.plan import revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 MS = 1_000_000
@@ -63,6 +69,26 @@ def test_litmus_commands_are_printed_on_any_kernel(tmp_path: Path) -> None:
         f"resctl -n {number} -t table-driven -c {core} -m 100 -q 1 '[0,30)'",
         f"resctl -a TID:/origin -r {number} -c {core}",
     ]
+
+
+def test_printed_commands_have_the_slots_that_apply_would_enforce() -> None:
+    """A timer at 17 ms, cycles of 100 that start 20 ms behind the anchor: the slot opens at 19."""
+    plan = revised(one_server_plan(), offset_ns=20 * MS)
+    changes = planned_changes(plan, "litmus", phase_ns=17 * MS)
+    assert [command[-1] for command in changes.commands if "-n" in command] == ["[19,49)"]
+
+
+def test_printed_commands_open_servers_for_overruns_as_apply_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A timer at 17 ms of 50: the slot opens at 19, an overrun may go on until 1 ms before the next.
+    Cycles start 10 ms behind the anchor, at 9: the server is open for the first 7 ms from there.
+    """
+    plan = revised(small_chain_plan(10 * MS, 20 * MS), offset_ns=10 * MS)
+    monkeypatch.setattr(threads, "chain_phases", lambda *_: [Phase(17 * MS, 0)])
+    monkeypatch.setattr(threads, "find_threads", lambda *_, **__: Allocation((), ()))
+    _, created, *_ = planned_changes(plan, "litmus").commands
+    assert created[-3:] == ("[0,9)", "[9,16)", "[19,50)")
 
 
 @pytest.mark.parametrize(

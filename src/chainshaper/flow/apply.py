@@ -283,31 +283,24 @@ class _Run:
             self.go_on()
             progress(share, "measuring where in a cycle the chain begins")
 
-        if phase_ns is None:
-            phases = threads.chain_phases(self.plan, self.found, measured)
-            self.note(
-                *(
-                    f"the beginning of {chain_name(chain)} varies by"
-                    f" {duration_text(phase.spread_ns)} from cycle to cycle: it is started by"
-                    " something less regular than a timer"
-                    for chain, phase in zip(self.plan.chains, phases, strict=True)
-                    if phase.spread_ns > LEAD_NS
-                )
+        gated = gates(self.choice.name)
+        self.given, self.anchor_ns, self.waits_ns, phases = threads.carried_out(
+            self.given, self.found, phase_ns, gated=gated, progress=measured
+        )
+        self.note(
+            *(
+                f"the beginning of {chain_name(chain)} varies by {duration_text(phase.spread_ns)}"
+                " from cycle to cycle: it is started by something less regular than a timer"
+                for chain, phase in zip(self.given.chains, phases, strict=False)
+                if phase.spread_ns > LEAD_NS
             )
-            gated = gates(self.choice.name)
-            self.given, self.anchor_ns = threads.placed(self.given, phases, gated=gated)
-            self.waits_ns = [
-                (self.anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
-                for chain, phase in zip(self.given.chains, phases, strict=True)
-            ]
+        )
+        if phases:
             self.show(phase_spread_ns=max(phase.spread_ns for phase in phases))
-        else:
-            anchor_ns = phase_ns + LEAD_NS - self.given.chains[0].offset_ns
-            self.anchor_ns = anchor_ns % self.given.cycle_ns
-            if gates(self.choice.name):
-                self.note("slots stay where --phase puts them, also when the chain's timer drifts")
+        elif gated:
+            self.note("slots stay where --phase puts them, also when the chain's timer drifts")
         self.plan = open_until_done(self.given, self.waits_ns)
-        keeper = self.choice.name if gates(self.choice.name) else "none: priority only"
+        keeper = self.choice.name if gated else "none: priority only"
         kept_by = {one.name: keeper for one in threads.server_table(self.plan).servers}
         servers = (
             ServerState(

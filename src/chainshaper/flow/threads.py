@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
@@ -283,11 +283,10 @@ def planned_changes(
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         notes = (*found.notes, *allocation.waiting_receivers(plan, threads))
         return Changes(choice.name, choice.reason, threads, (), notes)
-    notes, anchor_ns = found.notes, 0 if phase_ns is None else phase_ns + LEAD_NS
+    notes, anchor_ns = found.notes, 0
     try:
-        if phase_ns is None:
-            given, anchor_ns = placed(given, chain_phases(given, found))
-            table = server_table(open_until_done(given))
+        given, anchor_ns, waits_ns, _ = carried_out(given, found, phase_ns)
+        table = server_table(open_until_done(given, waits_ns))
         members: dict[str, list[int | str]] = {
             name: [member.thread.tid for member in group]
             for name, group in allocation.server_members(plan, found).items()
@@ -395,6 +394,41 @@ def chain_phases(
         report = partial(lambda number, share: progress((number + share) / len(parts)), number)
         phases[one] = measure_phase(*one, progress=report)
     return [phases[one] for one in wanted]
+
+
+class CarriedOut(NamedTuple):
+    """A plan as it is carried out, from when on its cycles count (CLOCK_MONOTONIC, modulo the
+    hyper-period); and, where these were measured, its timers and how long before slots they expire.
+    """
+
+    plan: ApplicationPlan
+    anchor_ns: int
+    waits_ns: list[int]
+    phases: list[Phase]
+
+
+def carried_out(
+    plan: ApplicationPlan,
+    found: Allocation,
+    phase_ns: int | None,
+    *,
+    gated: bool = True,
+    progress: Callable[[float], None] = lambda _: None,
+) -> CarriedOut:
+    """A plan on what runs, whose first timer expires at ``phase_ns`` (None: all are measured).
+
+    Raises OperationError: a chain has no regular beginning, or as :func:`placed`.
+    """
+    if phase_ns is not None:
+        anchor_ns = phase_ns + LEAD_NS - plan.chains[0].offset_ns
+        return CarriedOut(plan, anchor_ns % plan.cycle_ns, [], [])
+    phases = chain_phases(plan, found, progress)
+    plan, anchor_ns = placed(plan, phases, gated=gated)
+    waits_ns = [
+        (anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
+        for chain, phase in zip(plan.chains, phases, strict=True)
+    ]
+    return CarriedOut(plan, anchor_ns, waits_ns, phases)
 
 
 def placed(
