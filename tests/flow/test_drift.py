@@ -205,7 +205,7 @@ def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
     run.waits_ns, run.found = [3 * MS], here
     governed = SimpleNamespace(name=server.name, threads=(7,))
     run.state = SimpleNamespace(servers=[governed], anchor_ns=0)  # type: ignore[assignment]
-    first = SimpleNamespace(pid=7, tid=7)
+    first = SimpleNamespace(pid=7, tid=7, identity=(7, 1))
     watched: list[Any] = []
     monkeypatch.setattr(threads, "first_threads", lambda *_: [first])
     monkeypatch.setattr(applying, "DriftWatch", lambda *given, **_: watched.append(given[-1]))

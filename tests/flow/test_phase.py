@@ -278,6 +278,16 @@ def test_one_look_at_a_busy_machine_moves_nothing(monkeypatch: pytest.MonkeyPatc
     assert watch.looks == 5
 
 
+def test_a_watch_ends_when_it_is_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A program that has applied a plan and goes on had kept each one, at a real-time priority."""
+    monkeypatch.setattr(DriftWatch, "_look", lambda *_: 0)
+    before, watch = set(threading.enumerate()), DriftWatch(1, 1, CYCLE, 0)
+    (thread,) = set(threading.enumerate()) - before
+    watch.end()
+    thread.join(5)
+    assert not thread.is_alive()
+
+
 @needs_fifo
 def test_it_can_be_stopped_before_the_nodes_were_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -34,7 +34,7 @@ from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProc
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
-from chainshaper.flow.phase import DriftWatch, Telling, tell_phase
+from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
 from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
@@ -52,7 +52,7 @@ from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import OperationError, PlatformError
+from chainshaper.values.errors import ChainshaperError, OperationError
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
@@ -180,6 +180,8 @@ class _Run:
     anchor_ns: int = 0  # from when on slots count, where they have been moved to by now
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     followers: dict[int, SlotFollower] = field(default_factory=dict)  # by their chains' places
+    drifts: list[DriftWatch] = field(default_factory=list)  # one for each chain
+    origins: list[tuple[int, int]] = field(default_factory=list)  # the threads that these watch
     moved_ns: dict[int, int] = field(default_factory=dict)  # by how much their slots are
     arming: threading.Lock = field(default_factory=threading.Lock)  # followers move slots as well
     descendants: set[tuple[int, int]] = field(default_factory=set)  # at the last look
@@ -321,9 +323,12 @@ class _Run:
         self.assign(servers)
         servers.arm(anchor)
         since = servers.in_force_from() or time.monotonic_ns()
+        self.save_plan()
+        self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
+
+    def save_plan(self) -> None:
         with contextlib.suppress(OSError):  # a full /run ends no plan; recordings lack it then
             (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
-        self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
 
     def begins(self, place: int) -> int:
         """Where the chain at this place begins in its cycles."""
@@ -402,11 +407,12 @@ class _Run:
 
     def watch_over(self, servers: BackEnd, watch: Callable[[RunState], None]) -> None:
         """Watch over the run until it is to end; the state is then as it was last."""
-        drifts, sent, said = self.drift_watches(), dict[int, int](), list[str]()
-        following = self.follow(servers, drifts)
         latest: tuple[NodeThread, ...] = ()
         unsaved = untaken = ""
         while True:
+            if not self.drifts:  # at first, and when a chain begins anew
+                drifts = self.drifts = self.drift_watches()
+                following, sent, said = self.follow(servers, drifts), dict[int, int](), list[str]()
             is_over = self.command_ended or self.stop.is_set()
             followed_ns = next(following)
             seen = {k: ns for k, one in enumerate(drifts) if (ns := one.surely_ns) is not None}
@@ -492,6 +498,7 @@ class _Run:
         gated, cores = gates(self.choice.name), {server.core for server in self.plan.servers}
         watches: dict[int, DriftWatch] = {}
         origins = threads.first_threads(self.plan, self.found)
+        self.origins = [origin.identity for origin in origins]
         for place, (chain, origin) in enumerate(zip(self.plan.chains, origins, strict=True)):
             own = (
                 one.slots
@@ -541,12 +548,68 @@ class _Run:
             self.descendants = note_descendants(self.journal, self.descendants)
             if new:
                 self.schedule()
+                self.anchor_again(servers)
                 self.assign(servers)
-        except (OperationError, PlatformError) as error:
+        except ChainshaperError as error:
             self.found = before
             reason = f"threads that have appeared are as they were: {error}"
             return new, "" if self.stop.is_set() else reason
         return new, ""
+
+    def anchor_again(self, servers: BackEnd) -> None:
+        """Where a node that begins a chain was started again, slots count from its new timer. That
+        is measured before a server stops its thread, which would hide it.
+
+        Raises OperationError: it has no regular beginning yet, or slots cannot be moved there.
+        """
+        origins = [one.identity for one in threads.first_threads(self.plan, self.found)]
+        if origins == self.origins:
+            return
+        again = {place for place, one in enumerate(origins) if one != self.origins[place]}
+        if self.waits_ns:
+            timers = zip(self.plan.chains, self.waits_ns, strict=True)
+            known = {
+                place: Phase((self.anchor_ns + chain.offset_ns - wait_ns) % chain.cycle_ns, 0)
+                for place, (chain, wait_ns) in enumerate(timers)
+                if place not in again
+            }
+            gated = gates(self.choice.name)
+            given, anchor_ns, waits_ns, _ = threads.carried_out(
+                *(self.given, self.found, None),
+                gated=gated,
+                progress=lambda _: self.go_on(),
+                known=known,
+            )
+            with self.arming:
+                plan = open_until_done(with_slots_moved(given, self.moved_ns), waits_ns)
+                table = threads.server_table(plan)
+                if isinstance(servers, Freezer):
+                    servers.change(table, anchor_ns)
+                elif gated and table != threads.server_table(self.plan):
+                    raise OperationError(
+                        f"the back end {self.choice.name} cannot move slots of some chains only:"
+                        " end the run, and apply the plan again"
+                    )
+                else:
+                    servers.arm(anchor_ns)
+                self.given, self.plan = given, plan
+                self.anchor_ns, self.waits_ns = anchor_ns, waits_ns
+            self.save_plan()
+            self.show(anchor_ns=anchor_ns)
+            self.tell(dict.fromkeys(range(len(origins)), 0))
+            self.note(
+                *(
+                    f"the node that begins {chain_name(self.plan.chains[place])} was started again:"
+                    " slots count from its new timer since"
+                    for place in sorted(again)
+                )
+            )
+        self.end_drifts()
+
+    def end_drifts(self) -> None:
+        """Watch no longer where chains begin."""
+        while self.drifts:
+            self.drifts.pop().end()
 
     def name_strangers(self, found: Allocation) -> None:
         """One line about strangers who say they are nodes: the latest replaces the one before."""
@@ -568,6 +631,7 @@ class _Run:
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""
         problems: list[str] = []
+        self.end_drifts()
         for follower in self.followers.values():
             follower.end()
         if self.servers is not None:

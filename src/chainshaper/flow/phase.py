@@ -175,6 +175,7 @@ class DriftWatch:
     thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
     takes a tenth of a core: it is done on ``cores``, if there are any, and only near where the
     thread began last. A thread that is not seen there any more is looked for in the whole cycle.
+    It ends with the thread, or when it is to.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -195,7 +196,7 @@ class DriftWatch:
         self._before_ns = 0  # what the look before saw
         self.looks, self.look_soon = 0, False
         self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
-        self._slots, self._cores = slots, cores
+        self._slots, self._cores, self._stop = slots, cores, threading.Event()
         threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
 
     def expect(self, expected_ns: int) -> None:
@@ -203,6 +204,10 @@ class DriftWatch:
         self._expected_ns, self._before_ns = expected_ns, 0
         if self.latest_ns is not None:
             self.latest_ns = 0
+
+    def end(self) -> None:
+        """Look no more, when a look that is under way is over."""
+        self._stop.set()
 
     @property
     def surely_ns(self) -> int | None:
@@ -213,10 +218,11 @@ class DriftWatch:
             os.sched_setaffinity(0, self._cores)  # the calling thread's alone
         near_ns: int | None = self._expected_ns
         with contextlib.suppress(OperationError):  # the thread has ended
-            while True:
+            while not self._stop.is_set():
                 until = time.monotonic() + self.EVERY_S
                 while time.monotonic() < until and not self.look_soon:
-                    time.sleep(self.SOON_S)
+                    if self._stop.wait(self.SOON_S):
+                        return
                 self.look_soon = False
                 expected_ns = self._expected_ns
                 drift = self._look(near_ns, expected_ns)

@@ -11,12 +11,13 @@ import platform
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, NamedTuple, cast
 from xml.etree import ElementTree
 
@@ -381,19 +382,24 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
 
 
 def chain_phases(
-    plan: ApplicationPlan, found: Allocation, progress: Callable[[float], None] = lambda _: None
+    plan: ApplicationPlan,
+    found: Allocation,
+    progress: Callable[[float], None] = lambda _: None,
+    known: Mapping[int, Phase] = MappingProxyType({}),
 ) -> list[Phase]:
-    """Where in its cycle each chain begins, watched one after the other."""
+    """Where in its cycle each chain begins, watched one after the other; some are ``known``, by
+    their chains' places.
+    """
     wanted = [
         (origin.pid, origin.tid, chain.cycle_ns)
         for chain, origin in zip(plan.chains, first_threads(plan, found), strict=True)
     ]
     phases: dict[tuple[int, int, int], Phase] = {}
-    parts = dict.fromkeys(wanted)  # chains of one graph begin alike
+    parts = dict.fromkeys(w for k, w in enumerate(wanted) if k not in known)  # chains of one graph begin alike
     for number, one in enumerate(parts):
         report = partial(lambda number, share: progress((number + share) / len(parts)), number)
         phases[one] = measure_phase(*one, progress=report)
-    return [phases[one] for one in wanted]
+    return [known[k] if k in known else phases[one] for k, one in enumerate(wanted)]
 
 
 class CarriedOut(NamedTuple):
@@ -414,15 +420,17 @@ def carried_out(
     *,
     gated: bool = True,
     progress: Callable[[float], None] = lambda _: None,
+    known: Mapping[int, Phase] = MappingProxyType({}),
 ) -> CarriedOut:
-    """A plan on what runs, whose first timer expires at ``phase_ns`` (None: all are measured).
+    """A plan on what runs, whose first timer expires at ``phase_ns`` (None: all are measured that
+    are not ``known``, see :func:`chain_phases`).
 
     Raises OperationError: a chain has no regular beginning, or as :func:`placed`.
     """
     if phase_ns is not None:
         anchor_ns = phase_ns + LEAD_NS - plan.chains[0].offset_ns
         return CarriedOut(plan, anchor_ns % plan.cycle_ns, [], [])
-    phases = chain_phases(plan, found, progress)
+    phases = chain_phases(plan, found, progress, known)
     plan, anchor_ns = placed(plan, phases, gated=gated)
     waits_ns = [
         (anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
