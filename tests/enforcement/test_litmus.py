@@ -81,7 +81,7 @@ def test_printed_commands_have_the_slots_that_apply_would_enforce() -> None:
 def test_printed_commands_open_servers_for_overruns_as_apply_does(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A timer at 17 ms of 50: the slot opens at 19, an overrun may go on until 1 ms before the next.
+    """A timer at 17 ms of 50: the slot opens at 19, and is open until 1 ms before the next timer.
     Cycles start 10 ms behind the anchor, at 9: the server is open for the first 7 ms from there.
     """
     plan = revised(small_chain_plan(10 * MS, 20 * MS), offset_ns=10 * MS)

@@ -225,7 +225,7 @@ def test_of_chains_that_share_a_server_one_follows() -> None:
     other = revised(other, chain=spec, servers=(chain, output), shaping_node=gate)
     _, reaches_ns, (why,) = followed_chains(combined([one, other]), "freezer")
     assert list(reaches_ns) == [0]
-    assert "latencies: its server chain is /t1../t3's too, which follows its own" in why
+    assert "latencies: its server chain is also that of /t1../t3, which follows" in why
 
 
 @pytest.mark.parametrize(

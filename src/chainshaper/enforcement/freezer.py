@@ -53,7 +53,7 @@ _LOOK_S = 0.002
 
 @dataclass(frozen=True)
 class FreezerRun:
-    """The servers that are enforced, id and start of the owner, and the path of its counters while it
+    """The servers that are enforced, id and start of the owner, the path of its counters while it
     lives.
     """
 

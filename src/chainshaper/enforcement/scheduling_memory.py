@@ -161,9 +161,7 @@ def remembered_threads(journal: Journal) -> list[Change]:
     return list(threads.values())
 
 
-def note_descendants(
-    journal: Journal, before: Collection[tuple[int, int]]
-) -> set[tuple[int, int]]:
+def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> set[tuple[int, int]]:
     """Write down processes that the journal's have started meanwhile, of those that were there at
     the look ``before``, too: helpers come and go as long as a run lasts. Returns all that are new.
 

@@ -34,8 +34,8 @@ from chainshaper.values.errors import OperationError, PlatformError
 
 CLAIMS = "claims"
 PATIENCE_S = 20.0
-"""A run has so long to begin, or to end when asked, beside what ending its command takes; who undoes
-one has half of that."""
+"""A run has so long to begin, or to end when asked (its command not counted); who undoes one has
+half of that."""
 
 
 @dataclass(frozen=True)

@@ -330,7 +330,7 @@ def followed_chains(
             followed = {s.name: plan.chains[k] for k in reaches for s in plan.chains[k].servers}
             for server in (one for one in chain.servers if one.name in followed):
                 other = chain_name(followed[server.name])
-                raise InputError(f"its server {server.name} is {other}'s too, which follows its own")
+                raise InputError(f"its server {server.name} is also that of {other}, which follows")
             chains[place] = revised(chain, adaptation=rules)
             found = reach(plan, place, rules.max_latency_ns)
             furthest = (with_slots_moved(plan, {place: by}) for by in found)
@@ -395,7 +395,8 @@ def chain_phases(
         for chain, origin in zip(plan.chains, first_threads(plan, found), strict=True)
     ]
     phases: dict[tuple[int, int, int], Phase] = {}
-    parts = dict.fromkeys(w for k, w in enumerate(wanted) if k not in known)  # chains of one graph begin alike
+    # Chains of one graph begin alike.
+    parts = dict.fromkeys(one for place, one in enumerate(wanted) if place not in known)
     for number, one in enumerate(parts):
         report = partial(lambda number, share: progress((number + share) / len(parts)), number)
         phases[one] = measure_phase(*one, progress=report)
