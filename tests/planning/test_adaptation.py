@@ -19,6 +19,7 @@ from small_chain import small_chain_plan
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.threads import followed_chains
 from chainshaper.gate import handover
+from chainshaper.gate.decision import Outcome, Release, Waiting
 from chainshaper.gate.handover import Turn
 from chainshaper.planning import margins
 from chainshaper.planning.application_plan import (
@@ -313,8 +314,10 @@ def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> N
         SlotFollower(plan, (), (0, 8 * MS), put_in_force)
     by, _ = known(turn.moved())
     assert by == 0
+    late = Release(25 * MS, 0, slot=None, cycles_waited=0, anchor="cycle", overrun="publish")
+    outcome = Outcome(Waiting(b"", arrival_ns=25 * MS, stamp_ns=None, phase_ns=0), late, 0)
     for _ in range(20):
-        turn.count(None, None, late=True, latency_ns=25 * MS)
+        turn.count(outcome)
     wait_for(lambda: known(turn.moved())[0] != 0, "a move")
     (move,) = follower.moves
     assert turn.moved() == (move.moved_ns, 1_000)

@@ -300,7 +300,7 @@ def test_a_publishers_thread_may_send_late_outputs_below_its_executor() -> None:
     chain, output = enforced.servers
     assert output.priority > chain.priority, "it must not out-rank what holds its locks"
     # What is best effort on that core runs behind both, and prevents neither.
-    beside = open_until_done(*with_best_effort([plan], {"/logger": 0}))
+    beside = open_until_done(with_best_effort([plan], {"/logger": 0})[0])
     assert slots(beside) == {
         "chain": ((0, 100),),
         "output": ((59, 100),),

@@ -197,7 +197,7 @@ def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
     other = tmp_path / "robot.launch.xml"
     other.write_text(NDT)
     for both in ([*spliced.launch.values(), other], [other, *spliced.launch.values()]):
-        with pytest.raises(InputError, match="stands for `ros2 run l n .*, which is spliced alone"):
+        with pytest.raises(InputError, match=r"for `ros2 run l n .*, which is spliced alone"):
             splice_launch_files(PLAN, both, tmp_path / "third")
 
 

@@ -126,7 +126,7 @@ RULE = "--ros-args -r ndt:/pose:=/pose_tmp"
 )
 def test_a_shell_sees_variables_that_are_set_before_a_command(command: str, wanted: str) -> None:
     words = [command]
-    redirect_command(words, [pose()], "n-1", SimpleNamespace(shell=True))
+    redirect_command(words, [pose()], "n-1", SimpleNamespace(shell=True))  # noqa: S604 - none is called
     assert words == [command if wanted == "{0}" else wanted]
 
 

@@ -81,7 +81,7 @@ def test_the_compiler_runs_once_elsewhere_and_again_when_the_source_changed(
     anybodys.mkdir()
     (anybodys / "hashlib.py").write_text("raise SystemExit('imported from the current folder')")
     for _ in range(2):
-        command = [sys.executable, folder / "call.py"]
+        command = [sys.executable, str(folder / "call.py")]
         found = subprocess.run(
             command, env=environment, cwd=anybodys, capture_output=True, text=True, check=True
         )

@@ -214,8 +214,8 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
             copied = original_words(manifest["copies"][file.name], throttled=throttled)
             if is_run(copied) and len(words) > 1:
                 raise InputError(
-                    f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it into"
-                    " another folder, or write a launch file that starts it"
+                    f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it"
+                    " into another folder, or write a launch file that starts it"
                 )
             found += copied
     return list(dict.fromkeys(found)) if not is_run(found) else found
