@@ -65,7 +65,8 @@ def test_a_dry_run_of_a_gate_in_the_publishers_process_names_nothing_that_is_not
     files: Files, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No ROS 2 is needed here: such a gate redirects no topic."""
-    file, robot, folder = files
+    _, robot, folder = files
+    file = folder.with_name("inside.yaml")
     inside = known(plan.shaping_node).model_copy(update={"in_process": True})
     save_plan(revised(plan, shaping_node=inside, anchor="cycle"), file)
     flow = "chainshaper.flow.launch_splicing"

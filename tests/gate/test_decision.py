@@ -430,10 +430,15 @@ def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.Monkey
     assert passing(serialized(started + offset), 30) == ("stamp", started + 60 * MS)
     offset += 3600 * SECOND
     assert passing(under_way, 130) == ("cycle", started + 160 * MS)
-    assert passing(under_way, 135) == ("cycle", started + 160 * MS), "another that was"
     later = serialized(started + 200 * MS + offset)
     assert passing(later, 230) == ("stamp", started + 260 * MS)
     assert passing(serialized(0), 330) == ("cycle", started + 360 * MS)
+    before = offset
+    offset += 20 * MS  # so little that a stamp of before could be one
+    for after_ms in (430, 435, 529):
+        under_way = serialized(started + 400 * MS + before)
+        assert passing(under_way, after_ms)[0] == "cycle"
+    assert passing(serialized(started + 500 * MS + offset), 530)[0] == "stamp"
 
 
 def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.MonkeyPatch) -> None:
