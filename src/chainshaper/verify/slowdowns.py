@@ -203,7 +203,7 @@ def find_slowdowns(
             if min(np.count_nonzero(~np.isnan(one)) for one in own) < FEWEST:
                 continue
             ratios = [_ratios(own[0], one) for one in own]
-            if min(one.size for one in ratios) >= FEWEST:
+            if min(one.size for one in ratios) >= BLOCKS:
                 times[name], beside[name] = (time, own), ratios
             break
     if not times:
