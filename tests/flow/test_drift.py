@@ -268,4 +268,7 @@ def test_servers_and_gate_move_with_the_same_cycle(
     )
     assert run.state.notes[-1] == "slots are as planned, and do not follow any more: gone"
     assert not run.followers
+    assert run.plan == open_until_done(plan)
+    if thread == "in-slots":
+        assert {s.name: s.slots for s in changed[-1][0].servers}["output"] == ((16 * MS, 50 * MS),)
     assert "begins at 24 ms now: its promise did not hold" in str(servers_table(run.state).caption)

@@ -390,6 +390,8 @@ class _Run:
             if follower.failure is not None:
                 del self.followers[place]
                 follower.end()
+                with contextlib.suppress(OperationError):  # as it ends, or is lost
+                    self.move_slots(place, 0)  # the gate's are there already
                 self.note(f"slots are as planned, and do not follow any more: {follower.failure}")
 
     def assign(self, servers: BackEnd) -> None:
