@@ -153,10 +153,11 @@ def demo_puts_everything_into_one_folder(folder: Path) -> None:
     assert (folder / "application.yaml").read_text() == example
     assert open_recording(folder / "after").info.plan is not None
     # Every figure can be recomputed from what is on disk.
-    compared = json_of("compare", folder / "before", folder / "after")
-    kept = json.loads((folder / "comparison.json").read_text())
-    assert compared["recordings"] == kept["recordings"]
-    assert len(compared["recordings"]) == 2
+    compared = json_of("compare", folder / "before", folder / "after")["recordings"]
+    written = json.loads((folder / "comparison.json").read_text())["recordings"]
+    paths = [Path(one.pop("recording")).name for one in (*compared, *written)]
+    assert compared == written
+    assert paths == ["before", "after"] * 2
 
 
 @pytest.mark.timed
