@@ -123,10 +123,11 @@ def test_rows_of_another_sweep_are_not_mixed_in(
 
 
 def test_rows_that_are_in_use_or_something_else_are_left_alone(tmp_path: Path) -> None:
-    rows_beside(tmp_path / "mine.parquet").write_text("my notes\n")
-    with pytest.raises(InputError, match="these are no rows of a sweep"):
-        swept(tmp_path / "mine.parquet")
-    assert rows_beside(tmp_path / "mine.parquet").read_text() == "my notes\n"
+    for mine in (b"my notes\n", b'{"a\xff": 1}\nand more'):  # a text, and none
+        rows_beside(tmp_path / "mine.parquet").write_bytes(mine)
+        with pytest.raises(InputError, match="these are no rows of a sweep"):
+            swept(tmp_path / "mine.parquet")
+        assert rows_beside(tmp_path / "mine.parquet").read_bytes() == mine
     rows = _first_rows(tmp_path / "out.parquet", 1)
     with rows.open() as other:
         fcntl.flock(other, fcntl.LOCK_EX)

@@ -556,7 +556,7 @@ def finished_rows(
     """
     about = json.loads(json.dumps(about))
     try:
-        with path.open("a+", encoding="utf-8") as file:
+        with path.open("a+", encoding="utf-8", errors="surrogateescape") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -594,8 +594,8 @@ def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]
     file.seek(0)
     text = file.read()
     whole = text[: text.rfind("\n") + 1]
-    file.truncate(len(whole.encode()))
     try:
+        length = len(whole.encode())  # ValueError, as below: not all of it is UTF-8
         first, *rows = map(json.loads, whole.splitlines() or [json.dumps(about)])
         finished = {row["number"]: row["row"] for row in rows}
         changed = [name for name in about if first[name] != about[name]]
@@ -608,4 +608,5 @@ def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]
             f"{path} has {len(finished)} finished rows of another sweep: {' and '.join(changed)}"
             " changed since. Undo that to go on with them, name another output, or remove the file"
         )
+    file.truncate(length)
     return finished
