@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -116,7 +116,11 @@ def named_callbacks(flow: DataFlow) -> pl.DataFrame:
     return found.with_columns(starts=pl.Series(starts, dtype=pl.String))
 
 
-def longest_times(flow: DataFlow) -> dict[tuple[str, str], tuple[float | None, float | None]]:
+Longest: TypeAlias = tuple[float | None, float | None]
+"""A response and an execution time (ns; None: not known)."""
+
+
+def longest_times(flow: DataFlow) -> dict[tuple[str, str], Longest]:
     """The longest response and execution time (ns) of each name of :func:`named_callbacks`."""
     named = named_callbacks(flow).group_by("node", "starts", maintain_order=True)
     rows = named.agg(

@@ -24,7 +24,7 @@ from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.files import open_to_all
+from chainshaper.values.files import folder_beside, open_to_all
 from chainshaper.values.yaml_file import read_text
 
 MANIFEST = "splice.json"
@@ -296,23 +296,20 @@ def new_folder(
     ``copies`` are the launch files in it, with the words that they stand for. Raises
     OperationError: it cannot be written; nothing is left behind, an older one stays.
     """
-    partial: Path | None = None
     try:
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
-        shutil.copyfile(redirection.__file__, partial / "redirection.py")
-        yield partial
-        (partial / LOGS).mkdir()
-        manifest = {"throttled": throttled, "copies": dict(copies), "files": _hashes(partial)}
-        text = json.dumps({"format": _FORMAT, **manifest}, indent=2) + "\n"
-        (partial / MANIFEST).write_text(text, encoding="utf-8")
-        open_to_all(partial)
-        if _manifest(folder) != manifest or _hashes(folder) != manifest["files"]:
-            _replace(folder, partial)
+        with folder_beside(folder) as made:
+            partial = Path(made)
+            shutil.copyfile(redirection.__file__, partial / "redirection.py")
+            yield partial
+            (partial / LOGS).mkdir()
+            manifest = {"throttled": throttled, "copies": dict(copies), "files": _hashes(partial)}
+            text = json.dumps({"format": _FORMAT, **manifest}, indent=2) + "\n"
+            (partial / MANIFEST).write_text(text, encoding="utf-8")
+            open_to_all(partial)
+            if _manifest(folder) != manifest or _hashes(folder) != manifest["files"]:
+                _replace(folder, partial)
     except OSError as error:
         raise OperationError(f"{folder}: cannot be written: {error}") from error
-    finally:
-        if partial is not None and partial.exists():
-            shutil.rmtree(partial, ignore_errors=True)
 
 
 def _replace(folder: Path, new: Path) -> None:

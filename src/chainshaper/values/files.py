@@ -115,6 +115,12 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
     return path
 
 
+def folder_beside(path: Path) -> "tempfile.TemporaryDirectory[str]":
+    """A new folder to fill, and to rename to ``path``; if it is not, it is gone at the end."""
+    name, parent = f".{path.name}.partial-", path.absolute().parent
+    return tempfile.TemporaryDirectory(prefix=name, dir=parent, ignore_cleanup_errors=True)
+
+
 def open_to_all(folder: Path) -> None:
     """Let everybody read a folder that we have made; never what a link in its place leads to.
 

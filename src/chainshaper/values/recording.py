@@ -8,7 +8,6 @@ import io
 import json
 import os
 import platform
-import tempfile
 import zlib
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from pydantic import BaseModel, Field
 
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import EventTables, as_table, column_problems
-from chainshaper.values.files import free_place, open_to_all
+from chainshaper.values.files import folder_beside, free_place, open_to_all
 from chainshaper.values.yaml_file import wrong_values_refused
 
 INFO_FILE = "recording.json"
@@ -270,9 +269,7 @@ def write_recording(
     """
     path = refuse_existing(path)
     try:
-        with tempfile.TemporaryDirectory(
-            prefix=f".{path.name}.partial-", dir=path.absolute().parent, ignore_cleanup_errors=True
-        ) as made:
+        with folder_beside(path) as made:
             partial, checksums = Path(made), dict[str, str]()
             for part in [tables] if isinstance(tables, Mapping) else tables:
                 for name, frame in part.items():

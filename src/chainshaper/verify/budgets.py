@@ -15,7 +15,7 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 from xml.etree import ElementTree
 
 import polars as pl
@@ -27,6 +27,7 @@ from chainshaper.analysis.latency import (
     PERCENTILES,
     LatencyAnalysis,
     LatencyStatistics,
+    Longest,
     latency_statistics,
     longest_times,
 )
@@ -49,8 +50,6 @@ GRAIN_NS = 10_000
 """Proposed limits are whole multiples of it."""
 LEAST_MISSING = 0.01
 EVENTS = "its events"  # what a recording lacks that cannot be read
-
-_Longest: TypeAlias = tuple[float | None, float | None]
 
 
 def _share_in(value: object) -> object:
@@ -346,9 +345,7 @@ def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
     return float(gone) / over.height
 
 
-def _judged_hops(
-    name: str, chain: ChainBudget, longest: Mapping[str, _Longest]
-) -> Iterator[Judged]:
+def _judged_hops(name: str, chain: ChainBudget, longest: Mapping[str, Longest]) -> Iterator[Judged]:
     """The limits of hops; ``longest`` are communication and computation by topic."""
     for hop in chain.hops:
         limits = zip(
@@ -365,7 +362,7 @@ def _judged_hops(
 
 
 def _judged_callbacks(
-    name: str, callbacks: Sequence[CallbackBudget], longest: Mapping[tuple[str, str], _Longest]
+    name: str, callbacks: Sequence[CallbackBudget], longest: Mapping[tuple[str, str], Longest]
 ) -> Iterator[Judged]:
     """Their limits; ``longest`` are response and execution times by node and what starts it."""
     for one in callbacks:

@@ -13,7 +13,7 @@ hour, and only as three numbers each.
 import contextlib
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -32,7 +32,12 @@ from chainshaper.analysis import (
     with_restarts,
 )
 from chainshaper.analysis.disturbance import with_punctuality
-from chainshaper.analysis.latency import LatencyStatistics, latency_statistics, longest_times
+from chainshaper.analysis.latency import (
+    LatencyStatistics,
+    Longest,
+    latency_statistics,
+    longest_times,
+)
 from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.gate.decision import clock_offset
 from chainshaper.planning import ApplicationPlan
@@ -92,7 +97,7 @@ class CallbackNow:
 
     node: str
     starts: str
-    longest_ns: tuple[float | None, float | None]
+    longest_ns: Longest
 
 
 @dataclass(frozen=True)
@@ -389,7 +394,7 @@ class Watch:
             processes=processes_of(tables, dict.fromkeys(self.processes, "")),
             lost=self.lost,
             chains=tuple(self._now(one, over, moved) for one in self.chains),
-            callbacks=tuple(_callbacks(own for _, own in self.callbacks or ())),
+            callbacks=tuple(_callbacks([own for _, own in self.callbacks or ()])),
         )
 
     def _objects(self, tables: EventTables, since_ns: int) -> Objects:
@@ -502,18 +507,13 @@ def _hops(one: _Chain) -> Iterator[Hop]:
         yield Hop(node, topic, communication / count, computation / count, most)
 
 
-_Longest: TypeAlias = tuple[float | None, float | None]
-"""A callback's response and execution time."""
-
-
-def _callbacks(looks: Iterable[Mapping[tuple[str, str], _Longest]]) -> Iterator[CallbackNow]:
-    every: dict[tuple[str, str], list[_Longest]] = {}
-    for own in looks:
-        for name, times in own.items():
-            every.setdefault(name, []).append(times)
-    for (node, starts), found in every.items():
-        response = max((one for one, _ in found if one is not None), default=None)
-        execution = max((one for _, one in found if one is not None), default=None)
+def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[CallbackNow]:
+    for node, starts in dict.fromkeys(name for own in looks for name in own):
+        found = [own[node, starts] for own in looks if (node, starts) in own]
+        response, execution = (
+            max((one for one in times if one is not None), default=None)
+            for times in zip(*found, strict=True)
+        )
         yield CallbackNow(node, starts, (response, execution))
 
 

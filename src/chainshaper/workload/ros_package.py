@@ -9,13 +9,11 @@ the distribution is the same, the sequence is not.
 
 import os
 import re
-import shutil
-import tempfile
 from pathlib import Path
 from typing import Any
 
 from chainshaper.values.errors import InputError, OperationError, escape
-from chainshaper.values.files import free_place, open_to_all, write_whole
+from chainshaper.values.files import folder_beside, free_place, open_to_all, write_whole
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -56,20 +54,16 @@ def generate_package(application: Application, folder: str | Path) -> list[Path]
             "digits and single underscores, beginning with a letter, such as src/my_robot"
         )
     files = _files(application, folder.name)  # what is refused is refused before writing
-    partial: Path | None = None
     try:
-        partial = Path(tempfile.mkdtemp(prefix=f".{folder.name}.partial-", dir=folder.parent))
-        for name, text in files.items():
-            path = partial / name
-            path.parent.mkdir(exist_ok=True)
-            write_whole(path, [text.encode()])
-        open_to_all(partial)
-        partial.rename(folder)
+        with folder_beside(folder) as partial:
+            for name, text in files.items():
+                path = Path(partial, name)
+                path.parent.mkdir(exist_ok=True)
+                write_whole(path, [text.encode()])
+            open_to_all(Path(partial))
+            Path(partial).rename(folder)
     except OSError as error:
         raise OperationError(f"{folder}: cannot be written: {error.strerror}") from error
-    finally:
-        if partial is not None:
-            shutil.rmtree(partial, ignore_errors=True)
     return [folder / name for name in files]
 
 

@@ -3,7 +3,7 @@
 import ctypes
 import mmap
 import struct
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -42,17 +42,14 @@ class CtfStream:
 class CtfTrace:
     """Traces opened together.
 
-    ``env`` is the first folder's environment (``hostname``, ``domain``, ``tracer_name``, …) and
-    the clock its clock: ``clock_offset_ns`` added to an event's time gives ns since the Epoch.
-    ``discarded_events`` and ``lost_packets`` are what the tracer says that it dropped.
+    ``clock_offset_ns`` added to an event's time gives ns since the Epoch; ``discarded_events`` and
+    ``lost_packets`` are what the tracer says that it dropped.
     """
 
     folders: tuple[CtfFolder, ...]
     streams: tuple[CtfStream, ...]
     event_names: tuple[str, ...]
-    env: Mapping[str, str | int]
     clock_offset_ns: int
-    packets: int
     discarded_events: int
     lost_packets: int
     warnings: tuple[str, ...]
@@ -105,9 +102,7 @@ def open_trace(*paths: Path | str) -> CtfTrace:
         folders=tuple(folders),
         streams=tuple(streams),
         event_names=tuple(sorted({e.name for s in classes for e in s.events.values()})),
-        env=folders[0].declared.env,
         clock_offset_ns=first.offset_ns,
-        packets=sum(len(stream.table) for stream in streams),
         discarded_events=all_discarded,
         lost_packets=all_lost,
         warnings=tuple(warnings),
