@@ -100,6 +100,8 @@ def init() -> None:
 
     _running[0] = True
     signal.signal(signal.SIGTERM, stop)
+    # As upstream, it has handlers of its own, also where a shell's background job ignores Ctrl-C.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def ok() -> bool:
