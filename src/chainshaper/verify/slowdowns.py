@@ -47,7 +47,7 @@ LEAST = log1p(0.005)
 """Less is no slowdown: another build of the same program differs by as much."""
 COMMON = log1p(0.1)
 PRIOR = 12
-RUN_SHARE, RUN_LEAST, RUN_MOST = 0.15, 0.001, 0.01
+RUN_SHARE, RUN_LEAST, RUN_MOST = 0.25, 0.001, 0.015
 """Standard deviation from run to run: this share of that of ratios of instances, and limits."""
 WINDOW, ALIKE, SHIFT = 32, 0.8, 128
 BLOCKS, FEWEST = 20, 40
