@@ -23,6 +23,7 @@ from chainshaper.gate.decision import Outcome, Release, Waiting
 from chainshaper.gate.handover import Turn
 from chainshaper.planning import margins
 from chainshaper.planning.application_plan import (
+    ApplicationPlan,
     combined,
     open_until_done,
     reach,
@@ -183,16 +184,18 @@ def test_the_chains_slot_and_the_outputs_move_together() -> None:
     assert (first, last) == ((9 * MS, 10 * MS), (19 * MS, 20 * MS))
 
 
+def beside_another(place: int, slot: tuple[int, int]) -> ApplicationPlan:
+    """The small chain, and one whose only server has a slot, like its own at a place."""
+    one, other = small(), small().model_copy(deep=True)
+    alike = {"name": "other", "slots": (slot,), "threads": ()}
+    server = other.servers[place].model_copy(update=alike)
+    bare = other.chain.model_copy(update={"spec": "/b..", "output": None, "publisher": None})
+    return combined([one, revised(other, chain=bare, servers=(server,), shaping_node=None)])
+
+
 def test_slots_do_not_move_into_another_chains() -> None:
     """One whose chain has [30 ms, 40 ms) of the same core and priority."""
-    one, other = small(), small().model_copy(deep=True)
-    chain, _ = other.servers
-    chain = chain.model_copy(
-        update={"name": "other", "slots": ((30 * MS, 40 * MS),), "threads": ()}
-    )
-    bare = other.chain.model_copy(update={"spec": "/b..", "output": None, "publisher": None})
-    other = revised(other, chain=bare, servers=(chain,), shaping_node=None)
-    both = combined([one, other])
+    both = beside_another(0, (30 * MS, 40 * MS))
     assert reach(both, 0)[1] == 9 * MS
     with pytest.raises(InputError, match=r"meets \[0 ms, 30\.001 ms\)"):
         with_slots_moved(both, {0: 9_001_000})
@@ -200,14 +203,7 @@ def test_slots_do_not_move_into_another_chains() -> None:
 
 def test_slots_do_not_jump_over_another_chains() -> None:
     """By hand: an output of 1 ms at [21 ms, 22 ms), and another's at [30 ms, 31 ms): 8 ms."""
-    one, other = small(), small().model_copy(deep=True)
-    _, output = other.servers
-    output = output.model_copy(
-        update={"name": "other", "slots": ((30 * MS, 31 * MS),), "threads": ()}
-    )
-    bare = other.chain.model_copy(update={"spec": "/b..", "output": None, "publisher": None})
-    other = revised(other, chain=bare, servers=(output,), shaping_node=None)
-    both = combined([one, other])
+    both = beside_another(1, (30 * MS, 31 * MS))
     assert reach(both, 0)[1] == 8 * MS
     with_slots_moved(both, {0: 10 * MS})
 

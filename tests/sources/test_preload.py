@@ -10,6 +10,8 @@ import subprocess
 import sys
 import time
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -344,25 +346,29 @@ def test_what_comes_faster_than_it_is_read_is_counted(tmp_path: Path) -> None:
     assert ("events were lost" in "".join(run.info.notes)) == (run.info.lost["lost_events"] > 0)
 
 
-def test_a_ring_that_runs_over_has_the_newest_and_counts_the_others(tmp_path: Path) -> None:
-    """Read once, behind ten rings' worth of events: a reader that was not scheduled meanwhile."""
-    library = build_library(tmp_path)
-    reading, writing = os.pipe()
-    program = f"for n in range(10 * {RING} + 7): take(n)\nprint(os.getpid(), flush=True)\ninput()"
+@contextmanager
+def memory_behind(program: str, folder: Path) -> Iterator[Path]:
+    """The file of the memory of a process that has run a program, and waits until the end."""
     with subprocess.Popen(
-        [sys.executable, "-c", CALLER + program],
-        env={**os.environ, "LD_PRELOAD": str(library)},
-        stdin=reading,
+        [sys.executable, "-c", f"{CALLER}{program}\nprint(os.getpid(), flush=True)\ninput()"],
+        env={**os.environ, "LD_PRELOAD": str(build_library(folder))},
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
     ) as process:
         assert process.stdout is not None
         assert int(process.stdout.readline()) == process.pid
-        folder = Path(f"/proc/{process.pid}/fd")
-        (found,) = (one for one in folder.iterdir() if "chainshaper-trace" in str(one.readlink()))
-        descriptor = os.open(found, os.O_RDONLY)
-        memory = TracedProcess(descriptor)
-        os.close(descriptor)
+        files = Path(f"/proc/{process.pid}/fd").iterdir()
+        (found,) = (one for one in files if "chainshaper-trace" in str(one.readlink()))
+        yield found
+        process.communicate("\n")
+
+
+def test_a_ring_that_runs_over_has_the_newest_and_counts_the_others(tmp_path: Path) -> None:
+    """Read once, behind ten rings' worth of events: a reader that was not scheduled meanwhile."""
+    with memory_behind(f"for n in range(10 * {RING} + 7): take(n)", tmp_path) as file:
+        with file.open("rb") as opened:
+            memory = TracedProcess(opened.fileno())
         (records,) = memory.new_records()
         messages = records["values"][:, 0]
         assert messages[-1] == 10 * RING + 6
@@ -370,9 +376,6 @@ def test_a_ring_that_runs_over_has_the_newest_and_counts_the_others(tmp_path: Pa
         assert records.size == RING - 1  # the room of the oldest may be being written
         assert memory.lost + records.size == 10 * RING + 7
         assert memory.new_records() == []
-        os.write(writing, b"\n")
-    os.close(reading)
-    os.close(writing)
 
 
 def test_a_process_that_is_killed_has_lost_nothing_and_leaves_nothing(tmp_path: Path) -> None:
@@ -586,29 +589,15 @@ def test_an_environment_with_other_libraries_in_front_has_them_still(
 
 def test_a_ring_whose_count_is_damaged_costs_no_other(tmp_path: Path) -> None:
     """A node may write where it should not: what its memory says then is no count of events."""
-    program = "take(1)\nprint(os.getpid(), flush=True)\ninput()"
-    environment = {**os.environ, "LD_PRELOAD": str(build_library(tmp_path))}
-    with subprocess.Popen(
-        [sys.executable, "-c", CALLER + program],
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        folder = Path(f"/proc/{process.pid}/fd")
-        (found,) = (one for one in folder.iterdir() if "chainshaper-trace" in str(one.readlink()))
-        with found.open("r+b") as file:
-            memory = TracedProcess(file.fileno())
-            counts = [(1 << 63) + 5, 1]
-            for count in counts:
-                file.seek(64)  # behind the header: how much the first thread has written
-                file.write(count.to_bytes(8, "little"))
-                file.flush()
-                assert memory.new_records() == []
+    with memory_behind("take(1)", tmp_path) as path, path.open("r+b") as file:
+        memory = TracedProcess(file.fileno())
+        counts = [(1 << 63) + 5, 1]
+        for count in counts:
+            file.seek(64)  # behind the header: how much the first thread has written
+            file.write(count.to_bytes(8, "little"))
+            file.flush()
+            assert memory.new_records() == []
         assert memory.lost == len(counts)
-        process.communicate("\n")
 
 
 def test_root_builds_nothing_where_others_may_write(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ def plan(
     )
     from chainshaper.planning.profile import deciding_cycles
     from chainshaper.planning.request import on_cores
-    from chainshaper.reporting.figures import draw_curve
+    from chainshaper.reporting.figures import ENDINGS, draw_curve
     from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
     from chainshaper.values.files import new_file
 
@@ -69,7 +69,7 @@ def plan(
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     if curve is not None:
-        curve = new_file(curve, (".png", ".pdf", ".svg"))  # before a plan is written
+        curve = new_file(curve, ENDINGS)  # before a plan is written
     wanted: list[str | None] = [*chain] if chain else [None]
     how: dict[str, Any] = {"modes": request.modes, "since_ns": since, "until_ns": until}
     how["mode_recordings"] = opt.mode_profiles(mode_profile, request)
@@ -213,14 +213,14 @@ def sweep(
     command goes on with the others.
     """
     from chainshaper.flow.sweep import parse_axis, rows_beside
-    from chainshaper.reporting.figures import draw_sweep
+    from chainshaper.reporting.figures import ENDINGS, draw_sweep
     from chainshaper.reporting.overviews import sweep_table
     from chainshaper.values.files import new_file
 
     if workers is not None and scheduler is not None:
         raise InputError("a cluster has workers of its own: leave out --workers, or --scheduler")
     if draw is not None:
-        draw = new_file(draw, (".png", ".pdf", ".svg"))
+        draw = new_file(draw, ENDINGS)
     described = cs.load_application(application)
     in_force = None if plan is None else cs.load_plan(plan)
     axes = [parse_axis(text) for text in vary]

@@ -44,8 +44,8 @@ from chainshaper.analysis.latency import PERCENTILES
 from chainshaper.flow.plan import profile_chains
 from chainshaper.linux.computing import engine
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain, publish_slots
-from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.arrays import build_system
 from chainshaper.values.durations import format_duration, parse_duration
@@ -456,8 +456,7 @@ def row_at(
 
 def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
     """What the plan says, and what became of its bands."""
-    delay = cycles_until_output(plan) * plan.cycle_ns
-    slots = [(start + delay, end + delay) for start, end in publish_slots(plan)]
+    slots = slots_of_latency(plan)
     shares: Sequence[float | None] = plan.predicted.shares
     if len(shares) != len(slots):  # slots were edited in number
         shares = [None] * len(slots)

@@ -24,8 +24,8 @@ from chainshaper.analysis.messages import with_overrun
 from chainshaper.analysis.objects import named_nodes
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
-from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publish_slots, publisher_servers, shaping_nodes
+from chainshaper.planning.overruns import cycles_until_output, slots_of_latency
+from chainshaper.planning.plan import publisher_servers, shaping_nodes
 from chainshaper.splicing.shaping_process import STANDBY
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
@@ -142,7 +142,7 @@ def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outco
 
 def _slots_end(plan: Plan) -> int:
     """Where the last slot in which an output is in time ends, from the start of its cycle (ns)."""
-    return publish_slots(plan)[-1][1] + cycles_until_output(plan) * plan.cycle_ns
+    return slots_of_latency(plan)[-1][1]
 
 
 def next_cycles(outcomes: Mapping[str, Outcome]) -> str:
