@@ -19,9 +19,10 @@ from applied_plans import leftovers, needs_fifo
 from calm_runs import calm_run
 from command_line import called, json_of
 from gated import needs_cgroups
+from known import known
 from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan, with_times
 
-from chainshaper import measure_latency, save_plan, shape_application, simulate
+from chainshaper import LatencyAnalysis, measure_latency, save_plan, shape_application, simulate
 from chainshaper.flow.apply import apply_plan
 from chainshaper.gate.decision import Overrun, sleep_until
 from chainshaper.planning import Plan, plan_shaping, publish_slots
@@ -31,10 +32,8 @@ from chainshaper.reporting.latency import doubts_text, latency_json
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
     Outcome,
-    dropped_in,
     dropped_text,
     gate_releases,
-    into_open_slots,
     overruns_in,
     overruns_text,
 )
@@ -228,9 +227,9 @@ def test_what_a_gate_lost_is_shown_wherever_recordings_are_compared(tmp_path: Pa
     profile = simulate(application, tmp_path / "profile", cycles=24)
     plan = _too_early(messages="newest")
     shaped = simulate(application, tmp_path / "shaped", plan, cycles=24)
-    count = (dropped_in(shaped) or {})["replaced"]
-    assert dropped_in(shaped) == {"replaced": count}
-    assert dropped_in(profile) is None
+    dropped = known(measure_latency(shaped).dropped)
+    count = dropped["replaced"]
+    assert dropped == {"replaced": count}
 
     said = dropped_text({"replaced": count})
     assert said in " ".join(called("latency", shaped.path).out.split())
@@ -264,9 +263,14 @@ def test_counts_in_words(
 
 
 def test_an_unshaped_recording_has_no_overruns(unshaped: Recording) -> None:
-    assert overruns_in(unshaped, None) is None
-    assert measure_latency(unshaped).overruns is None
-    assert into_open_slots(unshaped, None) is None
+    measured = measure_latency(unshaped)
+    assert (measured.overruns, measured.into_open_slots, measured.dropped) == (None, None, None)
+
+
+def _overran(
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis
+) -> dict[str, int] | None:
+    return overruns_in(recording, plan, analysis, gate_releases(recording, plan, analysis))
 
 
 def _without_column(recording: Recording, cycles_waited: list[int]) -> Recording:
@@ -282,12 +286,13 @@ def test_older_recordings_are_read_by_the_cycles_their_outputs_waited(
     shaped: Recording, plan: Plan
 ) -> None:
     old = _without_column(shaped, [0, 1, 2, 0])
-    decided = gate_releases(old, plan)
-    assert decided is not None
+    analysis = measure_latency(old).analysis
+    decided = known(gate_releases(old, plan, analysis))
     assert decided["overrun"].to_list() == [None, "wait", "wait", None]
-    assert overruns_in(old, plan) == {"wait": 2}
-    assert overruns_in(old, None) == {"wait": 2}
-    assert overruns_in(old, let_per_chain(plan)) == {"wait": 1}, "they are due a cycle later"
+    assert _overran(old, plan, analysis) == {"wait": 2}
+    assert _overran(old, None, analysis) == {"wait": 2}
+    late = _overran(old, let_per_chain(plan), analysis)
+    assert late == {"wait": 1}, "they are due a cycle later"
 
 
 def test_of_a_gated_publisher_what_was_not_sent_was_discarded(unshaped: Recording) -> None:
@@ -303,15 +308,15 @@ def test_of_a_gated_publisher_what_was_not_sent_was_discarded(unshaped: Recordin
     pids = {node: pid for pid, node in unshaped.info.processes.items()}
     sends = pl.DataFrame({"outcome": outcomes, "pid": [pids["/third"]] * 4})
     gated = replace(unshaped, events={**unshaped.events, "asynchronous_send": sends})
-    assert overruns_in(gated, plan) == {"discard": 2}
     analysis = measure_latency(unshaped).analysis
+    assert _overran(gated, plan, analysis) == {"discard": 2}
     later = analysis.traversals.with_columns(
         latency_ns=pl.Series([PERIOD_NS - 1, PERIOD_NS]).extend_constant(
             5 * MS, analysis.traversals.height - 2
         )
     )
     late = replace(analysis, traversals=later)
-    assert overruns_in(gated, plan, late) == {"wait": 1, "discard": 2}
+    assert _overran(gated, plan, late) == {"wait": 1, "discard": 2}
 
 
 @contextmanager
@@ -371,6 +376,5 @@ def test_of_gates_in_one_process_each_chain_has_its_own_rows(shaped: Recording, 
     rows = shaped.events["gate_release"]
     own, others = (rows.with_columns(gate=pl.lit(name)) for name in ("chainshaper_t3", "another"))
     both = replace(shaped, events={**shaped.events, "gate_release": pl.concat([own, others])})
-    decided = gate_releases(both, plan)
-    assert decided is not None
+    decided = known(gate_releases(both, plan, measure_latency(shaped).analysis))
     assert decided.height == rows.height

@@ -12,7 +12,6 @@ from chainshaper.planning import PlanRequest
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML
 from chainshaper.verify.measure import measure_latency
-from chainshaper.verify.overruns import dropped_in
 from chainshaper.workload.description import Application
 
 
@@ -77,10 +76,10 @@ def test_what_comes_in_comes_out_or_is_counted(
     rows = recording.events["gate_release"]
     # What DDS loses on a machine that is busy with others has no row; the traversals count it.
     unseen = timestamps("/source") - set(rows["source_timestamp"])
-    incomplete = measure_latency(recording).analysis.incomplete
+    measured = measure_latency(recording)
+    incomplete, dropped = measured.analysis.incomplete, measured.dropped
     assert len(unseen) == sum(n for why, n in incomplete.items() if why != "discarded")
     assert len(unseen) <= 0.1 * rows.height
-    dropped = dropped_in(recording)
     assert dropped is not None
     assert rows.height == len(timestamps("/shaper")) + sum(dropped.values())
     if not lost:  # a gate that a busy machine keeps from its core for long loses some

@@ -34,6 +34,7 @@ from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
     Outcome,
     dropped_in,
+    gate_releases,
     into_open_slots,
     outcomes_in,
     overruns_in,
@@ -164,15 +165,16 @@ def _measured(
         output = analysis.chain.topics[-1]
         own = None if joint is None else plan_of_chain(joint, output)
         planned_for = own is not None and own.chain.output in (None, output)
+        decided = gate_releases(recording, own, analysis)
         measurements.append(
             Measurement(
                 recording=recording,
                 analysis=analysis,
                 longest_stall_ns=longest_stall(recording),
-                overruns=overruns_in(recording, own, analysis),
+                overruns=overruns_in(recording, own, analysis, decided),
                 outcomes=outcomes_in(analysis, own),
-                into_open_slots=into_open_slots(recording, own, analysis),
-                dropped=dropped_in(recording, own, analysis),
+                into_open_slots=into_open_slots(decided),
+                dropped=dropped_in(decided),
                 plan=own,
                 prediction=judge_prediction(own, analysis) if own and planned_for else None,
                 left_out=left_out,

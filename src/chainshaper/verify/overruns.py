@@ -14,6 +14,7 @@ Whatever the policy, an overrun is to be late by itself: the **next cycle** was 
 missed its slot too, or did not come, whatever the cause.
 """
 
+from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -45,12 +46,12 @@ _MOVES_SHOWN = 8
 
 
 def gate_releases(
-    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis
 ) -> pl.DataFrame | None:
     """The table `gate_release` with ``overrun``, which older recordings lack; None: there is none.
 
-    Of a plan it has the rows of its shaping nodes and their standbys; with ``analysis`` only those
-    of shaping nodes on that chain, not those of the plan's other sinks.
+    Of a plan it has the rows of its shaping nodes on the analysed chain and of their standbys, not
+    those of the plan's other sinks.
     """
     if "gate_release" not in recording.events:
         return None
@@ -58,7 +59,7 @@ def gate_releases(
     table = with_overrun(table, 0 if plan is None else cycles_until_output(plan))
     if plan is None:
         return table
-    nodes = [n for n in shaping_nodes(plan) if not analysis or n.output in analysis.chain.topics]
+    nodes = [one for one in shaping_nodes(plan) if one.output in analysis.chain.topics]
     names = [f"{one.name}{ending}" for one in nodes for ending in ("", STANDBY)]
     table = table.filter(pl.col("gate").is_in(names) | pl.col("gate").is_null())
     return _of_nodes(recording, table, [f"/{name}" for name in names]) if names else None
@@ -73,33 +74,29 @@ def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -
 
 
 def overruns_in(
-    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
+    recording: Recording,
+    plan: Plan | None,
+    analysis: LatencyAnalysis,
+    decided: pl.DataFrame | None,
 ) -> dict[str, int] | None:
     """How many outputs overran, per policy that was applied to them; None: nothing was gated.
 
-    Those that a standby dealt with, while the shaping node was not there, count as overruns too.
-    ``analysis`` is that of the plan's chain; without it, outputs of an asynchronous publisher that
-    waited cannot be counted.
+    ``decided`` is that of :func:`gate_releases`. Those that a standby dealt with, while the shaping
+    node was not there, count as overruns too.
     """
-    gated = plan is not None and any(publisher_servers(plan))
-    decided = gate_releases(recording, plan, analysis)
+    gated = [] if plan is None else [n for *_, nodes in publisher_servers(plan) for n in nodes]
     if decided is None and not gated:
         return None
-    treated = pl.Series(dtype=pl.String) if decided is None else decided["overrun"].drop_nulls()
-    counts = {policy: int((treated == policy).sum()) for policy in (*_DONE, *_WITHOUT_NODE)}
-    if gated and plan is not None:
-        publishers = [node for *_, nodes in publisher_servers(plan) for node in nodes]
-        sends = events.table(recording.events, "asynchronous_send")
-        outcomes = _of_nodes(recording, sends, publishers)["outcome"]
-        counts["discard"] += int((outcomes != "sent").sum())
-        if analysis is not None:
-            due_until = (cycles_until_output(plan) + 1) * plan.cycle_ns
-            late = analysis.traversals["latency_ns"].drop_nulls() >= due_until
-            counts["wait"] += int(late.sum())
-            if plan.overrun == "publish":
-                behind = analysis.traversals["place_ns"] >= _slots_end(plan)
-                counts["publish"] += int((behind & ~analysis.traversals["late"]).sum())
-    return {policy: count for policy, count in counts.items() if count}
+    counts = Counter[str](() if decided is None else decided["overrun"].drop_nulls())
+    if plan is not None and gated:
+        sends = _of_nodes(recording, events.table(recording.events, "asynchronous_send"), gated)
+        counts["discard"] += sends.filter(pl.col("outcome") != "sent").height
+        cycles, due_until = analysis.traversals, (cycles_until_output(plan) + 1) * plan.cycle_ns
+        counts["wait"] += cycles.filter(pl.col("latency_ns") >= due_until).height
+        if plan.overrun == "publish":
+            behind = pl.col("place_ns") >= _slots_end(plan)
+            counts["publish"] += cycles.filter(behind & ~pl.col("late")).height
+    return {policy: counts[policy] for policy in (*_DONE, *_WITHOUT_NODE) if counts[policy]}
 
 
 @dataclass(frozen=True)
@@ -151,18 +148,15 @@ def next_cycles(outcomes: Mapping[str, Outcome]) -> str:
     return f"{hit} of {sum(one.followed for one in outcomes.values())}"
 
 
-def into_open_slots(
-    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis | None = None
-) -> int | None:
+def into_open_slots(decided: pl.DataFrame | None) -> int | None:
     """How many outputs came into their slot when it was open already; None: no gate decided.
 
     They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
     """
-    decided = gate_releases(recording, plan, analysis)
     if decided is None:
         return None
-    table = decided.filter(pl.col("overrun").is_null())
-    return int((table["release"] == table["arrival"]).sum())
+    at_once = pl.col("release") == pl.col("arrival")
+    return decided.filter(pl.col("overrun").is_null() & at_once).height
 
 
 def moves_in(analysis: LatencyAnalysis) -> list[dict[str, int]]:
@@ -182,23 +176,19 @@ def moves_text(moves: Sequence[Mapping[str, int]]) -> str:
     return f"moved {len(moves)} {'time' if len(moves) == 1 else 'times'}, {more}by {last} ms"
 
 
-def dropped_in(
-    recording: Recording, plan: Plan | None = None, analysis: LatencyAnalysis | None = None
-) -> dict[str, int] | None:
+def dropped_in(decided: pl.DataFrame | None) -> dict[str, int] | None:
     """How many messages gates received and did not let out, per reason, and how many DDS lost
     before they reached one, where its numbers say so; None: no gate decided.
 
     The reasons are those of ``dropped`` in :mod:`chainshaper.values.events`.
     """
-    table = gate_releases(recording, plan, analysis)
-    if table is None:
+    if decided is None:
         return None
     discarded = pl.col("release").is_null() & (pl.col("overrun") == "discard")
     reason = pl.coalesce("dropped", pl.when(discarded).then(pl.lit("discarded")))
-    reasons = table.select(reason).to_series()
-    counts = {name: int((reasons == name).sum()) for name in DROPPED}
-    counts["lost by DDS"] = int(table["lost"].sum())
-    return {name: count for name, count in counts.items() if count}
+    counts = Counter[str](decided.select(reason).to_series().drop_nulls())
+    counts["lost by DDS"] = int(decided["lost"].sum())
+    return {name: counts[name] for name in (*DROPPED, "lost by DDS") if counts[name]}
 
 
 def dropped_text(dropped: dict[str, int]) -> str:
