@@ -22,7 +22,7 @@ from difflib import SequenceMatcher
 from itertools import count as counting
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
@@ -45,6 +45,7 @@ WORSE = 0.15  # how much less alike than the best one a name may be
 Vertex: TypeAlias = int | str  # a callback's id, or a topic's name
 State: TypeAlias = tuple[Vertex, int]  # a vertex, and how many way points have been met with it
 GraphPath: TypeAlias = tuple[Vertex, ...]
+_V = TypeVar("_V")
 
 
 def close_names(name: str, names: Iterable[str]) -> list[str]:
@@ -243,7 +244,7 @@ class _Search:
         self.edges: dict[Vertex, list[Vertex]] = {}
         for (vertex, _), following in self.successors.items():
             self.edges.setdefault(vertex, []).extend(after for after, _ in following)
-        self.order = _depth_first_order(self.edges, [vertex for vertex, _ in self.roots])
+        self.order = depth_first_order(self.edges, [vertex for vertex, _ in self.roots])
         self.cyclic = any(
             self.order[after] >= self.order[vertex]
             for vertex, onward in self.edges.items()
@@ -556,13 +557,13 @@ def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) 
     return distance
 
 
-def _depth_first_order(
-    edges: Mapping[Vertex, Sequence[Vertex]], roots: Sequence[Vertex]
-) -> dict[Vertex, int]:
-    """Vertices ranked as a depth-first search leaves them; all edges lead forwards if they can."""
-    rank: dict[Vertex, int] = {}
-    entered: set[Vertex] = set()
-    stack: list[tuple[Vertex | None, Iterator[Vertex]]] = [(None, iter(roots))]
+def depth_first_order(edges: Mapping[_V, Sequence[_V]], roots: Sequence[_V]) -> dict[_V, int]:
+    """Vertices ranked as a depth-first search leaves them; all edges lead to lower ranks if they
+    can, and those that close cycles do not.
+    """
+    rank: dict[_V, int] = {}
+    entered: set[_V] = set()
+    stack: list[tuple[_V | None, Iterator[_V]]] = [(None, iter(roots))]
     while stack:
         vertex, rest = stack[-1]
         after = next((v for v in rest if v not in entered), None)

@@ -18,13 +18,13 @@ import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from graphlib import TopologicalSorter
 from itertools import accumulate, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
+from chainshaper.analysis.chains import depth_first_order
 from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.planning.offsets import linked
 from chainshaper.reporting.tables import Column, ResultTable, words
@@ -443,11 +443,20 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
 def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge]) -> _Part:
     """Columns by the longest path from the sources, and places for edges that pass columns.
 
-    Sources then move right, next to what they feed.
+    Edges that close a cycle are those that lead back in the order of a depth-first search from the
+    sources. Sources then move right, next to what they feed.
     """
-    ends = {number: (edge.source, edge.target) for number, edge in edges.items()}
-    for number in _closing_cycles(chosen, edges):
-        ends[number] = ends[number][::-1]
+    follows: dict[int, list[int]] = {vertex: [] for vertex in chosen}
+    for edge in edges.values():
+        follows[edge.source].append(edge.target)
+    entered = {edge.target for edge in edges.values()}
+    rank = depth_first_order(follows, sorted(chosen, key=entered.__contains__))
+    ends = {
+        number: (edge.source, edge.target)
+        if rank[edge.target] < rank[edge.source]
+        else (edge.target, edge.source)
+        for number, edge in edges.items()
+    }
     before: dict[int, set[int]] = {vertex: set() for vertex in chosen}
     onward: dict[int, set[int]] = {vertex: set() for vertex in chosen}
     for left, right in ends.values():
@@ -455,7 +464,7 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
             before[right].add(left)
             onward[left].add(right)
     layer: dict[int, int] = {}
-    for vertex in TopologicalSorter(before).static_order():
+    for vertex in sorted(chosen, key=rank.__getitem__, reverse=True):
         layer[vertex] = max((layer[left] + 1 for left in before[vertex]), default=0)
     for vertex in chosen:
         if onward[vertex] and not before[vertex]:
@@ -478,29 +487,6 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
     for vertex, column in part.layer.items():
         part.columns[column].append(vertex)
     return part
-
-
-def _closing_cycles(chosen: list[int], edges: Mapping[int, Edge]) -> Iterator[int]:
-    """Edges that close a cycle, met by a depth-first search that begins at the sources."""
-    onward: dict[int, list[tuple[int, int]]] = {vertex: [] for vertex in chosen}
-    for number, edge in edges.items():
-        onward[edge.source].append((number, edge.target))
-    entered = {edge.target for edge in edges.values()}
-    on_path: dict[int, bool] = {}  # of those that were met
-    for start in sorted(chosen, key=lambda vertex: vertex in entered):
-        stack = [] if start in on_path else [(start, iter(onward[start]))]
-        on_path.setdefault(start, True)
-        while stack:
-            vertex, rest = stack[-1]
-            number, after = next(rest, (-1, -1))
-            if number < 0:
-                on_path[vertex] = False
-                stack.pop()
-            elif after not in on_path:
-                on_path[after] = True
-                stack.append((after, iter(onward[after])))
-            elif on_path[after]:
-                yield number
 
 
 def _sort_columns(part: _Part) -> None:
