@@ -14,7 +14,6 @@ over the edges that lead forwards in one order of the vertices: exact without cy
 closer the more edges agree with the order, for which two are tried.
 """
 
-import heapq
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -482,36 +481,17 @@ class _Search:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).
 
         Paths on which a response goes to another node than the request's count as well. If
-        ``cyclic``, of those that never step back in one order of the vertices: the depth-first
-        one, or the greedy one if more paths agree with it.
+        ``cyclic``, of those that never step back in one order of the vertices: that of a
+        depth-first search which goes to the nearest ends first, or, where more paths agree with
+        it, last. The latter's paths are longer, and there are more of them as a rule.
         """
-        results = [self._counted_in(self.order, weights)]
+        orders = [self.order]
         if self.cyclic:
-            results.append(self._counted_in(self._greedy(), weights))
+            onward = {vertex: following[::-1] for vertex, following in self.edges.items()}
+            orders.append(depth_first_order(onward, [vertex for vertex, _ in self.roots[::-1]]))
+        results = [self._counted_in(order, weights) for order in orders]
         _, heaviest, weight = max(results, key=lambda result: result[2])
         return max(count for count, _, _ in results), heaviest, weight
-
-    def _greedy(self) -> dict[Vertex, int]:
-        """The greedy order of topics, every callback just after the topic it subscribes to.
-
-        Callbacks have one edge in and thus no choice: ordered by themselves they would all come
-        before their topics. Roots are first, no path comes back to them.
-        """
-        roots = [vertex for vertex, _ in self.roots]
-        between: dict[Vertex, list[Vertex]] = {}
-        for vertex, onward in self.edges.items():
-            topic = self.callbacks[vertex].trigger if isinstance(vertex, int) else None
-            if topic is not None and vertex not in roots:
-                between.setdefault(topic, []).extend(onward)
-        rank: dict[Vertex, int] = {}
-        for heard, place in _greedy_order(between).items():
-            rank[heard] = 2 * place
-            for callback in self.subscribers.get(heard, ()):
-                rank[callback] = 2 * place - 1
-        last = min(rank.values(), default=0)
-        for vertex in self.edges:
-            rank.setdefault(vertex, last - 1)  # topics that only a root publishes, and that end
-        return rank | dict.fromkeys(roots, max(rank.values(), default=0) + 1)
 
     def _counted_in(
         self, order: Mapping[Vertex, int], weights: Mapping[int, float]
@@ -575,50 +555,6 @@ def depth_first_order(edges: Mapping[_V, Sequence[_V]], roots: Sequence[_V]) -> 
             if vertex is not None:
                 rank[vertex] = len(rank)
     return rank
-
-
-def _greedy_order(edges: Mapping[Vertex, Sequence[Vertex]]) -> dict[Vertex, int]:
-    """An order with few backward edges: the heuristic of Eades, Lin and Smyth (1993).
-
-    Sinks go to the back, sources to the front, and when there are neither the vertex with the
-    greatest surplus of outgoing edges goes to the front. Cost is edges · log.
-    """
-    after: dict[Vertex, set[Vertex]] = {
-        vertex: set(following) for vertex, following in edges.items()
-    }
-    before: dict[Vertex, set[Vertex]] = {vertex: set() for vertex in after}
-    for vertex in list(after):
-        for following in edges[vertex]:
-            after.setdefault(following, set())
-            before.setdefault(following, set()).add(vertex)
-    number = {vertex: index for index, vertex in enumerate(after)}
-
-    def urgency(vertex: Vertex) -> tuple[int, int]:
-        """0 for sinks, 1 for sources, then by surplus."""
-        if not after[vertex]:
-            return 0, 0
-        return (1, 0) if not before[vertex] else (2, len(before[vertex]) - len(after[vertex]))
-
-    heap = [(urgency(vertex), number[vertex], vertex) for vertex in after]
-    heapq.heapify(heap)
-    front: list[Vertex] = []
-    back: list[Vertex] = []
-    placed: set[Vertex] = set()
-    while heap:
-        noted, _, vertex = heapq.heappop(heap)
-        if vertex in placed or noted != urgency(vertex):
-            continue  # an entry from before its neighbours went
-        placed.add(vertex)
-        (front if after[vertex] else back).append(vertex)
-        touched = [*before[vertex], *after[vertex]]
-        for neighbour in before[vertex]:
-            after[neighbour].discard(vertex)
-        for neighbour in after[vertex]:
-            before[neighbour].discard(vertex)
-        for neighbour in touched:
-            heapq.heappush(heap, (urgency(neighbour), number[neighbour], neighbour))
-    order = [*front, *reversed(back)]
-    return {vertex: len(order) - place for place, vertex in enumerate(order)}
 
 
 class _PathNode(BaseModel):
