@@ -1,13 +1,31 @@
 """Which traversals a stall of the machine counts against."""
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from story import Story
 
-from chainshaper.analysis import data_flow, disturbed, find_chain, graph_of, traverse
+from chainshaper.analysis import data_flow, disturbance, disturbed, find_chain, graph_of, traverse
 from chainshaper.analysis.disturbance import Due, overlapping, stalled_within, with_punctuality
+
+
+@pytest.fixture(autouse=True, scope="module")
+def small_thresholds() -> Iterator[None]:
+    """Single stalls count from 50, computing ones from 200 in all, and gates wake up within 100."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, ns in (("STALL_NS", 50), ("COMPUTING_THRESHOLD_NS", 200), ("WAKING_NS", 100)):
+            patch.setattr(disturbance, name, ns)
+        yield
+
+
+def masked(story: Story, spec: str, due: Due | None = None) -> list[bool]:
+    """Which traversals are disturbed."""
+    flow = data_flow(story.tables())
+    frame, _ = with_punctuality(flow, traverse(flow, find_chain(graph_of(flow), spec)), due)
+    return list(disturbed(flow, frame, 0 if due is None else due.margin_ns))
 
 
 def one_traversal(
@@ -19,7 +37,7 @@ def one_traversal(
 ) -> bool:
     """A traversal from 1,000 to 100 behind ``release``, or to 10,000 without a gate.
 
-    The gate has the origin 1,300. Single stalls count from 50, computing ones from 200 in all.
+    The gate has the origin 1,300.
     """
     end = 10_000 if release is None else release + 100
     story = Story()
@@ -33,13 +51,7 @@ def one_traversal(
         story.gate(hold, 1_100, arrival, release, origin=1_300, **waited)
     for time, duration in stalls:
         story.event("machine_stall", time, 9, duration=duration)
-    flow = data_flow(story.tables())
-    found = traverse(flow, find_chain(graph_of(flow), "/tmp../t1"))
-    frame, _ = with_punctuality(flow, found, due)
-    margin = 0 if due is None else due.margin_ns
-    (mask,) = disturbed(
-        flow, frame, margin, threshold_ns=50, computing_threshold_ns=200, waking_ns=100
-    )
+    (mask,) = masked(story, "/tmp../t1", due)
     return bool(mask)
 
 
@@ -55,6 +67,7 @@ def one_traversal(
         ([(9_800, 5_000)], True),  # 200 of it inside
         ([(9_801, 5_000)], False),
         ([(0, 50_000)], True),  # longer than the traversal
+        ([], False),
     ],
 )
 def test_stalls_of_a_computing_traversal_add_up(stalls: list[tuple[int, int]], hit: bool) -> None:
@@ -106,19 +119,12 @@ def two_traversals(first_end: int) -> list[bool]:
     story.runs(timer, 1_000, first_end, writes=((t1, first_end),), tid=1)
     story.runs(timer, 2_000, 2_150, writes=((t1, 2_150),), tid=2)
     story.event("machine_stall", 1_200, 9, duration=300)
-    flow = data_flow(story.tables())
-    found = traverse(flow, find_chain(graph_of(flow), "/source../t1"))
-    frame, _ = with_punctuality(flow, found, None)
-    return list(disturbed(flow, frame, threshold_ns=50, computing_threshold_ns=200))
+    return masked(story, "/source../t1")
 
 
 def test_who_queued_behind_a_disturbed_traversal_is_disturbed_with_it() -> None:
     assert two_traversals(first_end=2_100) == [True, True]
     assert two_traversals(first_end=1_900) == [True, False]
-
-
-def test_without_stalls_nothing_is_disturbed() -> None:
-    assert not one_traversal([])
 
 
 SPANS = st.lists(st.tuples(st.integers(0, 30), st.integers(0, 8)), max_size=12)

@@ -153,29 +153,21 @@ def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
     return opens, closes
 
 
-def disturbed(
-    flow: DataFlow,
-    frame: pl.DataFrame,
-    margin_ns: int = 0,
-    *,
-    threshold_ns: int = STALL_NS,
-    computing_threshold_ns: int = COMPUTING_THRESHOLD_NS,
-    waking_ns: int = WAKING_NS,
-) -> Mask:
+def disturbed(flow: DataFlow, frame: pl.DataFrame, margin_ns: int = 0) -> Mask:
     """A mask over the rows of ``frame``; incomplete traversals are never marked.
 
     ``frame`` is that of :func:`with_punctuality`, ``margin_ns`` the margin of the plan in force.
     """
-    began, ended, core = _stalls(flow, threshold_ns)
+    began, ended, core = _stalls(flow)
     complete, gated = frame["complete"].to_numpy(), frame["origin"].is_not_null().to_numpy()
     start, due, origin, computed = (
         frame[name].fill_null(frame["start"]).to_numpy()
         for name in ("start", "due_at", "origin", "computed_at")
     )
     at_instants = overlapping(np.minimum(start, origin), np.maximum(start, origin), began, ended)
-    at_instants |= overlapping(due - waking_ns, due + waking_ns, began, ended)
+    at_instants |= overlapping(due - WAKING_NS, due + WAKING_NS, began, ended)
     lost = stalled_within(start, due, began, ended, core)
-    most = np.where(gated, max(computing_threshold_ns, margin_ns + 1), computing_threshold_ns)
+    most = np.where(gated, max(COMPUTING_THRESHOLD_NS, margin_ns + 1), COMPUTING_THRESHOLD_NS)
     hit = complete & ((gated & at_instants) | (lost >= most))
     # A predecessor that was to be out later than the next began is not waited for.
     following = np.append(start[1:], np.iinfo(np.int64).max)[: len(start)]
@@ -185,16 +177,16 @@ def disturbed(
     return complete & (hit | _queued_behind(hit, start, busy_until, complete))
 
 
-def stalled_after(flow: DataFlow, start: Times, end: Times, threshold_ns: int = STALL_NS) -> Mask:
+def stalled_after(flow: DataFlow, start: Times, end: Times) -> Mask:
     """Which windows [start, end] any stall meets: a delivery that the machine disturbed."""
-    began, ended, _ = _stalls(flow, threshold_ns)
+    began, ended, _ = _stalls(flow)
     return overlapping(start, end, began, ended)
 
 
-def _stalls(flow: DataFlow, threshold_ns: int) -> tuple[Times, Times, Times]:
-    """Stalls from a length on: when they began and ended, and their cores (−1: not known)."""
+def _stalls(flow: DataFlow) -> tuple[Times, Times, Times]:
+    """Stalls of STALL_NS or more: when they began and ended, and their cores (−1: not known)."""
     table = events.table(flow.events, "machine_stall", ["cpu"])
-    table = table.filter(pl.col("duration") >= threshold_ns)
+    table = table.filter(pl.col("duration") >= STALL_NS)
     core = table["cpu"].fill_null(-1).cast(pl.Int64).to_numpy()
     return table["time"].to_numpy(), (table["time"] + table["duration"]).to_numpy(), core
 
