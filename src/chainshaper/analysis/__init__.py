@@ -8,35 +8,24 @@ write the same tables (:mod:`chainshaper.values.events`). :func:`analyse_latency
 one chain; every step is a function of its own.
 """
 
-from chainshaper.analysis.chains import (
-    ChainEnumeration,
-    SeveralPathsError,
-    enumerate_chains,
-    find_chain,
-    load_named_paths,
-)
-from chainshaper.analysis.disturbance import disturbed
-from chainshaper.analysis.flow import DataFlow, callback_instances, data_flow, with_restarts
-from chainshaper.analysis.graph import application_graph, graph_of
-from chainshaper.analysis.latency import (
-    LatencyAnalysis,
-    LatencyStatistics,
-    analyse_latency,
-    callback_statistics,
-    executors,
-    latency_statistics,
-)
-from chainshaper.analysis.objects import resolve_objects
-from chainshaper.analysis.traversals import REASONS, traverse
-
-__all__ = ["REASONS", "ChainEnumeration", "DataFlow", "LatencyAnalysis", "LatencyStatistics"]
-__all__ += [
-    "SeveralPathsError",
-    "analyse_latency",
-    "application_graph",
-    "callback_instances",
-    "callback_statistics",
-]
-__all__ += ["data_flow", "disturbed", "enumerate_chains", "executors", "find_chain", "graph_of"]
-__all__ += ["latency_statistics", "load_named_paths", "resolve_objects", "traverse"]
-__all__ += ["with_restarts"]
+from chainshaper.analysis.chains import ChainEnumeration as ChainEnumeration
+from chainshaper.analysis.chains import SeveralPathsError as SeveralPathsError
+from chainshaper.analysis.chains import enumerate_chains as enumerate_chains
+from chainshaper.analysis.chains import find_chain as find_chain
+from chainshaper.analysis.chains import load_named_paths as load_named_paths
+from chainshaper.analysis.disturbance import disturbed as disturbed
+from chainshaper.analysis.flow import DataFlow as DataFlow
+from chainshaper.analysis.flow import callback_instances as callback_instances
+from chainshaper.analysis.flow import data_flow as data_flow
+from chainshaper.analysis.flow import with_restarts as with_restarts
+from chainshaper.analysis.graph import application_graph as application_graph
+from chainshaper.analysis.graph import graph_of as graph_of
+from chainshaper.analysis.latency import LatencyAnalysis as LatencyAnalysis
+from chainshaper.analysis.latency import LatencyStatistics as LatencyStatistics
+from chainshaper.analysis.latency import analyse_latency as analyse_latency
+from chainshaper.analysis.latency import callback_statistics as callback_statistics
+from chainshaper.analysis.latency import executors as executors
+from chainshaper.analysis.latency import latency_statistics as latency_statistics
+from chainshaper.analysis.objects import resolve_objects as resolve_objects
+from chainshaper.analysis.traversals import REASONS as REASONS
+from chainshaper.analysis.traversals import traverse as traverse
