@@ -15,12 +15,12 @@ forbids itself, by its content security policy, to run any script but its own an
 import base64
 import hashlib
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from string import Template
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import polars as pl
@@ -116,14 +116,14 @@ def report_page(
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
     embedded = json.dumps(_safe(drawn), ensure_ascii=True, separators=(",", ":"))
     about = f"{len(chains)} chains" if several else chains[0].chain
-    headline = _verdict(of_chain.headline(names, shared))
+    headline = _paragraph(of_chain.headline(names, shared), "verdict")
     if several:
         headline = of_chain.overview_table(chains, names).html()
     left_out = [(name, one.left_out.text) for name, one in zip(names, shared, strict=True)]
     return Template(page).substitute(
         title=escape(f"End-to-end latency of {about}"),
         headline=headline + "".join(_paragraph(f"{n}: {t}.") for n, t in left_out if t),
-        chains=_lines(blocks),
+        chains="\n".join(blocks),
         conditions=_conditions(names, chains),
         style=style,
         # JSON in which nothing can end the block that it stands in.
@@ -192,28 +192,28 @@ def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str
     measurements = [one.measurement for one in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))
     incomplete = of_chain.incomplete_table(names, measurements)
-    heading = (
-        f"<h1>{escape(compared.chain)}</h1>\n{_verdict(of_chain.headline(names, measurements))}"
-    )
-    callbacks = f"<h2>Callbacks</h2>\n{_lines(map(_callbacks, parts))}"
+    verdict = _paragraph(of_chain.headline(names, measurements), "verdict")
+    callbacks = "\n".join(map(_callbacks, parts))
     hops = (
         _paragraph(f"{one.name}, all complete cycles [ms]:")
         + of_chain.breakdown_table(one.measurement.analysis).html()
         for one in parts
     )
     return {
-        "heading": heading if several else "",
-        "callbacks": "" if suffix else f'<section id="callbacks">\n{callbacks}\n</section>',
+        "heading": f"<h1>{escape(compared.chain)}</h1>\n{verdict}" if several else "",
+        "callbacks": ""
+        if suffix
+        else f'<section id="callbacks">\n<h2>Callbacks</h2>\n{callbacks}\n</section>',
         "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
         "comparison": of_chain.comparison_table(compared, names).html(),
-        "predictions": _lines(map(_prediction, parts)),
-        "hops": _lines(hops),
-        "overruns": _lines(_overruns(part) + _moves(part) for part in parts),
+        "predictions": "\n".join(map(_prediction, parts)),
+        "hops": "\n".join(hops),
+        "overruns": "\n".join(_overruns(part) + _moves(part) for part in parts),
         "incomplete": incomplete.html()
         if incomplete.rows
         else _paragraph("Every cycle that began is complete."),
-        "stalls": _lines(map(_stalls, parts)),
-        "plans": _lines(
+        "stalls": "\n".join(map(_stalls, parts)),
+        "plans": "\n".join(
             _plan(f"{n}{suffix}", *one) for n, one in enumerate(_plans_of(parts).items())
         ),
     }
@@ -230,7 +230,7 @@ def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:
     threads = (_recorded_threads(name, own[0]) for name, own in zip(names, recordings, strict=True))
     items = "".join(f"<li>{escape(note)}</li>" for note in notes)
     table = overviews.condition_table(names, recordings).html()
-    return _lines([table, *threads, f'<ul class="notes">{items}</ul>'])
+    return "\n".join([table, *threads, f'<ul class="notes">{items}</ul>'])
 
 
 def _beside_charts(parts: Sequence[_Part], data: Sequence[dict[str, Any]]) -> dict[str, str]:
@@ -373,21 +373,13 @@ def _recorded_threads(name: str, measurement: Measurement) -> str:
     return _details(f"Threads of {name} ({len(threads)})", table) if threads else ""
 
 
-def _paragraph(text: str) -> str:
-    return f'<p class="about">{escape(text)}</p>' if text else ""
-
-
-def _verdict(text: str) -> str:
-    return f'<p class="verdict">{escape(text)}</p>'
+def _paragraph(text: str, kind: Literal["about", "verdict"] = "about") -> str:
+    return f'<p class="{kind}">{escape(text)}</p>' if text else ""
 
 
 def _details(summary: str, content: str, *, unfolded: bool = False) -> str:
     state = " open" if unfolded else ""
     return f"<details{state}><summary>{escape(summary)}</summary>\n{content}\n</details>"
-
-
-def _lines(texts: Iterable[str]) -> str:
-    return "\n".join(texts)
 
 
 def _recording_data(part: _Part, cycles: Sequence[int]) -> dict[str, Any]:
