@@ -38,7 +38,7 @@ from chainshaper.values.errors import ChainshaperError, InputError, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
-from chainshaper.verify.measure import chain_of, hop_breakdown, measure_latency
+from chainshaper.verify.measure import PARTS, chain_of, hop_breakdown, measure_latency
 
 if TYPE_CHECKING:
     from chainshaper.verify.slowdowns import Compared
@@ -177,12 +177,8 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
         wanted: tuple[Percentile, ...] = ("50", "99")
         percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}
         hops = tuple(
-            HopBudget(
-                topic=hop["topic"],
-                communication_ns=limit(_most(hop["communication_ns"])),
-                computation_ns=limit(_most(hop["computation_ns"])),
-            )
-            for hop in hop_breakdown(analysis).to_dicts()
+            HopBudget(topic=topic, communication_ns=limit(waits), computation_ns=limit(computes))
+            for topic, (waits, computes) in _longest_parts(hop_breakdown(analysis)).items()
         )
         missing = _missing(analysis.traversals, _under_way_from(flow, analysis)) or 0.0
         of_chains.append(
@@ -196,13 +192,8 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             )
         )
     callbacks = tuple(
-        CallbackBudget(
-            node=node,
-            starts=starts,
-            response_ns=limit(response),
-            execution_ns=limit(execution),
-        )
-        for (node, starts), (response, execution) in longest_times(flow).items()
+        CallbackBudget(node=node, starts=starts, response_ns=limit(took), execution_ns=limit(used))
+        for (node, starts), (took, used) in longest_times(flow).items()
     )
     return Budget(chains=tuple(of_chains), callbacks=callbacks)
 
@@ -225,11 +216,7 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
             )
             continue
         parts = hop_breakdown(analysis)
-        longest = {
-            one["topic"]: (_most(one["communication_ns"]), _most(one["computation_ns"]))
-            for one in parts.to_dicts()
-        }
-        hops = list(_judged_hops(name, chain, longest))
+        hops = list(_judged_hops(name, chain, _longest_parts(parts)))
         because = _from_where(hops, parts) or "no cycle was complete"
         cycles, open_ns = analysis.traversals, _under_way_from(flow, analysis)
         calm = _missing(cycles.filter(~pl.col("disturbed")), open_ns)
@@ -345,20 +332,20 @@ def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
     return float(gone) / over.height
 
 
+def _longest_parts(parts: pl.DataFrame) -> dict[str, Longest]:
+    """The longest communication and computation of each hop, by its topic."""
+    most = (pl.col(f"{part}_ns").struct.field("max").alias(part) for part in PARTS)
+    rows = parts.select("topic", *most).iter_rows()
+    return {topic: (waits, computes) for topic, waits, computes in rows}
+
+
 def _judged_hops(name: str, chain: ChainBudget, longest: Mapping[str, Longest]) -> Iterator[Judged]:
     """The limits of hops; ``longest`` are communication and computation by topic."""
     for hop in chain.hops:
-        limits = zip(
-            ("communication", "computation"),
-            (hop.communication_ns, hop.computation_ns),
-            longest.get(hop.topic, (None, None)),
-            strict=True,
-        )
-        for part, limit, most in limits:
-            if limit is not None:
-                why = None if most is not None else "the chain has no such hop here"
-                what = f"{part} of {hop.topic}"
-                yield Judged(name, chain.chain, what, limit, most, because=why)
+        limits = zip(PARTS, (hop.communication_ns, hop.computation_ns), strict=True)
+        named = {f"{part} of {hop.topic}": limit for part, limit in limits}
+        why = "the chain has no such hop here"
+        yield from _judged(name, chain.chain, named, longest.get(hop.topic), why)
 
 
 def _judged_callbacks(
@@ -366,16 +353,19 @@ def _judged_callbacks(
 ) -> Iterator[Judged]:
     """Their limits; ``longest`` are response and execution times by node and what starts it."""
     for one in callbacks:
-        key = (one.node, one.starts)
-        lacks = "time" if key in longest else "callback"
-        times = longest.get(key, (None, None))
-        for what, limit, most in zip(
-            ("response", "execution"), (one.response_ns, one.execution_ns), times, strict=True
-        ):
-            if limit is not None:
-                why = None if most is not None else f"the recording has no such {lacks}"
-                where = f"{one.node} ({one.starts})"
-                yield Judged(name, where, what, limit, most, because=why)
+        times = longest.get((one.node, one.starts))
+        limits = {"response": one.response_ns, "execution": one.execution_ns}
+        why = f"the recording has no such {'time' if times else 'callback'}"
+        yield from _judged(name, f"{one.node} ({one.starts})", limits, times, why)
+
+
+def _judged(
+    name: str, where: str, limits: Mapping[str, int | None], times: Longest | None, why: str
+) -> Iterator[Judged]:
+    """Those of two limits that there are, beside the times; ``why`` one of these is not known."""
+    for (what, limit), most in zip(limits.items(), times or (None, None), strict=True):
+        if limit is not None:
+            yield Judged(name, where, what, limit, most, because=why if most is None else None)
 
 
 def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
@@ -390,10 +380,6 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
     longest = parts.row(0, named=True)
     mean = duration_text(round(longest["computation_ns"]["mean"]))
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
-
-
-def _most(times: dict[str, float] | None) -> float | None:
-    return None if times is None else times["max"]
 
 
 def junit_report(judged: "Sequence[Judged | Compared]") -> str:
