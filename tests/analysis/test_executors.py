@@ -3,17 +3,15 @@
 import polars as pl
 import pytest
 from story import Callback, Publisher, Story
+from test_traversals import spans, traversals
 
-from chainshaper.analysis import data_flow, executors, find_chain, graph_of, traverse
+from chainshaper.analysis import data_flow, executors
 from chainshaper.flow.plan import _instances_apart_from
 
 
 def latencies(story: Story, spec: str) -> list[tuple[int, int | None]]:
     """Start and end of each traversal."""
-    flow = data_flow(story.tables())
-    graph = graph_of(flow)
-    found = traverse(flow, find_chain(graph, spec), graph)
-    return found.frame.select("start", "end").rows()
+    return spans(traversals(story, spec))
 
 
 def threads(story: Story) -> list[set[int]]:

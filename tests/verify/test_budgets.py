@@ -38,12 +38,12 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return simulate(small_chain(folder), folder / "recording", cycles=200)
 
 
-def slowed(recording: Recording, folder: Path, node: str, by_ns: int) -> Recording:
-    """The same application, whose node computes longer by a constant."""
-    application = small_chain(folder)
-    low, high = application.nodes[node].callbacks[0].execution.uniform_ns or (0, 0)
-    longer = {node: ExecutionTime(uniform_ns=(low + by_ns, high + by_ns))}
-    return simulate(with_times(application, longer), folder / "slowed", cycles=200)
+@pytest.fixture(scope="module")
+def slowed(tmp_path_factory: pytest.TempPathFactory) -> Recording:
+    """The same application, whose node `second` computes for 3 ms longer."""
+    folder = tmp_path_factory.mktemp("slowed")
+    longer = {"second": ExecutionTime(uniform_ns=(4 * MS, 7 * MS))}
+    return simulate(with_times(small_chain(folder), longer), folder / "slowed", cycles=200)
 
 
 def test_a_recording_keeps_the_budget_that_was_proposed_from_it(
@@ -71,44 +71,42 @@ def test_a_recording_keeps_the_budget_that_was_proposed_from_it(
     assert len(judged) == 5 + 5 + 8
 
 
-def test_a_slower_callback_breaks_limits_and_is_named(recording: Recording, tmp_path: Path) -> None:
-    budget = propose_budget(recording)
-    after = slowed(recording, tmp_path, "second", 3 * MS)
-    broken = [one for one in check_budget(after, budget) if not one.met]
+def test_a_slower_callback_breaks_limits_and_is_named(
+    recording: Recording, slowed: Recording
+) -> None:
+    broken = [one for one in check_budget(slowed, propose_budget(recording)) if not one.met]
     found = {(one.where, one.what) for one in broken}
     assert {("/t1../t3", "maximum"), ("/t1../t3", "p50"), ("/t1../t3", "p99")} <= found
     assert ("/t1../t3", "computation of /t2") in found
     assert {("/second (/t1)", "response"), ("/second (/t1)", "execution")} <= found
     assert not any("/third" in where or "/first" in where for where, _ in found)
     (maximum,) = (one for one in broken if one.what == "maximum")
-    assert maximum.found == measure_latency(after).analysis.statistics.max_ns
+    assert maximum.found == measure_latency(slowed).analysis.statistics.max_ns
     assert "from computation of /t2" in (maximum.because or "")
     assert maximum.text.startswith("/t1../t3: maximum ")
 
 
 def test_what_is_missing_in_a_recording_breaks_its_limits(recording: Recording) -> None:
-    budget = Budget(
-        chains=(ChainBudget(chain="/t1../nothing", maximum_ns=MS, missing=0.5),),
-    )
+    budget = Budget(chains=(ChainBudget(chain="/t1../nothing", maximum_ns=MS, missing=0.5),))
     judged = check_budget(recording, budget)
     assert [one.met for one in judged] == [False, False]
     assert all("/nothing" in (one.because or "") for one in judged)
+
+
+def without_takes(recording: Recording, place: Path, after: int, every: int = 1) -> Recording:
+    """The last node of the chain takes no message of each such cycle behind so many."""
+    hops = measure_latency(recording).analysis.hops.filter(hop=2).sort("start")
+    gone = hops["source_timestamp"][after:].gather_every(every)
+    left = recording.events["rmw_take"].filter(~pl.col("source_timestamp").is_in(gone.implode()))
+    return write_recording(place, {**recording.events, "rmw_take": left}, recording.info)
 
 
 def test_missing_counts_late_outputs_and_those_that_never_came(
     recording: Recording, tmp_path: Path
 ) -> None:
     """Every tenth message of /t2 is not taken; the last is under way and does not count."""
-    takes = recording.events["rmw_take"]
-    third = measure_latency(recording).analysis.hops.filter(hop=2)["source_timestamp"]
-    gone = third.gather_every(10)
-    events = {
-        **recording.events,
-        "rmw_take": takes.filter(~pl.col("source_timestamp").is_in(gone.implode())),
-    }
-    holes = write_recording(tmp_path / "holes", events, recording.info)
     budget = Budget(chains=(ChainBudget(chain="/t1../t3", missing=0.05),))
-    (judged,) = check_budget(holes, budget)
+    (judged,) = check_budget(without_takes(recording, tmp_path / "holes", 0, 10), budget)
     assert judged.found == pytest.approx(0.1, abs=0.006)
     assert not judged.met
     assert "missing 10" in judged.text
@@ -129,7 +127,7 @@ def test_a_limit_that_only_disturbed_cycles_break_says_so(recording: Recording) 
     assert "where the machine disturbed nothing" in judged.text
 
 
-def test_the_commands(recording: Recording, tmp_path: Path) -> None:
+def test_the_commands(recording: Recording, slowed: Recording, tmp_path: Path) -> None:
     file, junit, markdown = (tmp_path / name for name in ("b.yaml", "j.xml", "m.md"))
     assert called("budget", recording.path, "-o", file).code == 0
     again = called("budget", recording.path, "-o", file)
@@ -137,27 +135,25 @@ def test_the_commands(recording: Recording, tmp_path: Path) -> None:
     met = called("check", recording.path, "--budget", file)
     assert met.code == 0, met.err
     assert "limits of" in met.out
-    after = slowed(recording, tmp_path, "second", 3 * MS)
     words = ("--budget", file, "--junit", junit, "--markdown", markdown)
-    broken = called("check", recording.path, after.path, *words)
+    broken = called("check", recording.path, slowed.path, *words)
     assert broken.code == 1
     assert "computation of /t2" in broken.out
     suites = ElementTree.parse(junit).getroot()  # noqa: S314 - ours
     assert [one.get("failures") for one in suites] == ["0", str(len(list(suites.iter("failure"))))]
     assert "limits are broken**" in markdown.read_text()
-    assert "| /t1../t3: maximum" in markdown.read_text().replace(str(after.path), "").replace(
-        "|  |", "|"
-    )
-    values = json.loads(called("check", after.path, "--budget", file, "--json").out)
+    assert f"| {slowed.path} | /t1../t3: maximum" in markdown.read_text()
+    values = json.loads(called("check", slowed.path, "--budget", file, "--json").out)
     assert any(not one["met"] for one in values["limits"])
     assert json_of("check", recording.path, "--budget", file)["limits"][0]["met"]
 
 
-def test_a_fleet_is_judged_side_by_side(recording: Recording, tmp_path: Path) -> None:
+def test_a_fleet_is_judged_side_by_side(
+    recording: Recording, slowed: Recording, tmp_path: Path
+) -> None:
     """As one by one; what cannot be read is named, and the others are judged all the same."""
     file = save_budget(propose_budget(recording), tmp_path / "b.yaml")
-    after = slowed(recording, tmp_path, "second", 3 * MS)
-    paths = [recording.path, after.path, tmp_path / "gone", recording.path]
+    paths = [recording.path, slowed.path, tmp_path / "gone", recording.path]
     found = check_budgets(paths, load_budget(file))
     assert [[replace(one, recording="") for one in own] for own in (found[0], found[3])] == [
         [replace(one, recording="") for one in check_budget(recording, load_budget(file))]
@@ -196,22 +192,12 @@ def test_wrong_budgets_are_refused_with_their_line(tmp_path: Path, text: str, me
     assert f"{file}:2" in str(refused.value)
 
 
-def ending(recording: Recording, folder: Path, after: int) -> Recording:
-    """The last node of the chain takes no message of a cycle behind so many any more."""
-    hops = measure_latency(recording).analysis.hops
-    gone = hops.filter(hop=2).sort("start")["source_timestamp"][after:]
-    takes = recording.events["rmw_take"]
-    left = takes.filter(~pl.col("source_timestamp").is_in(gone.implode()))
-    events = {**recording.events, "rmw_take": left}
-    return write_recording(folder / f"ending{after}", events, recording.info)
-
-
 @pytest.mark.parametrize(("after", "missing"), [(50, 0.75), (0, 1.0)])
 def test_outputs_are_missing_of_a_chain_whose_last_node_died(
     recording: Recording, tmp_path: Path, after: int, missing: float
 ) -> None:
     budget = Budget(chains=(ChainBudget(chain="/t1../t3", maximum_ns=MS, missing=0.01),))
-    longest, gone = check_budget(ending(recording, tmp_path, after), budget)
+    longest, gone = check_budget(without_takes(recording, tmp_path / "ending", after), budget)
     assert gone.found == pytest.approx(missing, abs=0.006)
     assert not (longest.met or gone.met)
     assert ("no cycle was complete" in longest.text) == (after == 0)

@@ -171,10 +171,8 @@ def test_a_median_with_equal_weights_is_the_median(values: list[float]) -> None:
 def simulated(folder: Path, factor: float = 1.0) -> Recording:
     """The small chain, whose node `second` takes ``factor`` times as long."""
     folder.mkdir()
-    application = small_chain(folder)
-    low, high = application.nodes["second"].callbacks[0].execution.uniform_ns or (0, 0)
-    longer = {"second": ExecutionTime(uniform_ns=(round(low * factor), round(high * factor)))}
-    return simulate(with_times(application, longer), folder / "recording", cycles=200)
+    times = {"second": ExecutionTime(uniform_ns=(round(factor * MS), round(factor * 4 * MS)))}
+    return simulate(with_times(small_chain(folder), times), folder / "recording", cycles=200)
 
 
 def test_the_command(tmp_path: Path) -> None:

@@ -68,13 +68,15 @@ def simulated(monkeypatch: pytest.MonkeyPatch) -> "Callable[..., Simulated]":
     week = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(week)
 
-    def begin(rate: int = 1000) -> Simulated:
+    def begin(rate: int = 1000, attach: bool = True) -> Simulated:
         one = Simulated(week, rate)
         clock = SimpleNamespace(monotonic_ns=lambda: one.application.now)
         monkeypatch.setattr(watch_module, "time", clock)
         monkeypatch.setattr(watch_module, "clock_offset", lambda: one.application.offset)
         monkeypatch.setattr(watch_module, "memories", one.memories)
         monkeypatch.setattr(watch_module, "Path", one.path)
+        if attach:
+            one.attach()
         return one
 
     return begin
@@ -88,7 +90,6 @@ def test_cycles_that_never_arrive_are_counted_while_a_node_is_dead_and_once_afte
     simulated: "Callable[..., Simulated]", monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one = simulated()
-    one.attach()
     before = one.go_on(20)[-1]
     assert not broken_limits(BUDGET, before)
     complete = one.application.cycles["complete"]
@@ -118,7 +119,6 @@ def test_a_node_that_is_started_again_is_no_second_path(
     simulated: "Callable[..., Simulated]",
 ) -> None:
     one = simulated()
-    one.attach()
     seen = one.go_on(10)
     one.start_again()
     seen += one.go_on(20)
@@ -132,7 +132,6 @@ def test_two_that_run_with_the_same_names_stay_unclear(
     simulated: "Callable[..., Simulated]",
 ) -> None:
     one = simulated()
-    one.attach()
     one.go_on(10)
     one.stay = True
     one.start_again()
@@ -145,7 +144,7 @@ def test_what_was_before_the_watch_is_none_of_it(
     simulated: "Callable[..., Simulated]", tmp_path: Path
 ) -> None:
     """Rings have run over long before: nothing is lost, and nodes are known all the same."""
-    one = simulated(20_000)
+    one = simulated(20_000, attach=False)
     one.go_on(12, look=False)
     one.attach()
     began = one.application.now
@@ -163,7 +162,6 @@ def test_the_recorder_has_ten_seconds_and_all_of_the_last_look(
     simulated: "Callable[..., Simulated]", tmp_path: Path, every: int
 ) -> None:
     one = simulated()
-    one.attach()
     one.go_on(20)
     for _ in range(20 // every):
         one.go_on(every, look=False)
