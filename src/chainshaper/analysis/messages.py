@@ -112,9 +112,7 @@ def _gid_text(column: str) -> pl.Expr:
     return pl.col(column).list.head(_GID).cast(pl.List(pl.String)).list.join(".")
 
 
-def publications(
-    tables: events.EventTables, objects: Objects, calls: pl.DataFrame | None = None
-) -> pl.DataFrame:
+def publications(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
     """All publications of known publishers, sorted by time.
 
     Columns: ``publication`` (numbered from 0), ``time`` (of `rmw_publish`, the write to DDS; of
@@ -140,12 +138,10 @@ def publications(
     return in_order(every, "time", "pid", "tid").with_row_index("publication")
 
 
-def _written(
-    tables: events.EventTables, objects: Objects, calls: pl.DataFrame | None
-) -> pl.DataFrame:
+def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
     """Messages given to DDS: ``time, pid, tid, publisher, node, topic, source_timestamp``."""
     writes = _writes(tables)
-    if calls is not None and calls.height:
+    if calls.height:
         names = {"rmw_handle": "rmw_publisher_handle", "call": "source_timestamp"}
         writes = pl.concat([writes, calls.rename(names)], how="diagonal")
     by_rmw = objects.publishers.select(
@@ -214,9 +210,7 @@ def _handed_over(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     return found.select("handed", "intra_time", "pid", "tid", *_PUBLISHER)
 
 
-def takes(
-    tables: events.EventTables, objects: Objects, calls: pl.DataFrame | None = None
-) -> pl.DataFrame:
+def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
     """All messages taken by known subscriptions, sorted by time.
 
     Columns: ``take`` (numbered from 0), ``time``, ``pid``, ``tid``, ``callback_id`` (null if the
@@ -237,7 +231,7 @@ def takes(
     key = ["pid", "rmw_subscription_handle"]
     from_dds = subscriptions.select(*key, *columns, "created")
     parts = [latest_before(taken, from_dds, key, "time", "created")]
-    if calls is not None and calls.height:
+    if calls.height:
         calls = calls.rename({"rmw_handle": "rmw_subscription_handle", "call": "source_timestamp"})
         parts.append(latest_before(calls, from_dds, key, "time", "created"))
     if taken.is_empty():
