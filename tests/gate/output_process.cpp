@@ -35,6 +35,7 @@ struct Asked {
   struct {
     chainshaper::Gate gate;
   } queue;
+  std::function<void(const chainshaper::Release &, std::int64_t)> on_decision;
 
   void set_phase(std::int64_t phase_ns, std::int64_t) { std::cout << phase_ns; }
   void announce(const std::string & mode, std::int64_t) { std::cout << ' ' << mode; }

@@ -507,27 +507,21 @@ class Shaper:
     (:meth:`Queue.doubt_stamps`) are anchored to the cycle instead, at the phase that the last good
     stamp had.
 
-    One shaper belongs to one thread, which does nothing else at the time of a release. ``look`` has
-    new messages :meth:`arrive`, while others wait, before each release and behind it. ``moved``
-    says with each message how slots are to be moved (:meth:`move_slots`; None: as before).
-    ``on_waking`` gets the time of a release ``spin_ns`` before it; ``on_decision`` each decision,
-    before it is waited for, and where cycles begin.
+    One shaper belongs to one thread, which does nothing else at the time of a release. Its owner
+    sets what it calls: ``look`` has new messages :meth:`arrive`, while others wait, before each
+    release and behind it. ``moved`` says with each message how slots are to be moved
+    (:meth:`move_slots`; None: as before). ``on_waking`` gets the time of a release ``spin_ns``
+    before it; ``on_decision`` each decision, before it is waited for, and where cycles begin.
     """
 
-    def __init__(
-        self,
-        gate: Gate,
-        spin_ns: int = 0,
-        on_waking: Callable[[int], None] = lambda _: None,
-        look: Callable[[], None] = lambda: None,
-        on_decision: Callable[[Release, int], None] = lambda *_: None,
-    ) -> None:
+    def __init__(self, gate: Gate, spin_ns: int = 0) -> None:
         self.gate, self.queue = gate, Queue(gate)
         self.spin_ns = spin_ns
         self.overflowed: list[Outcome] = []  # since the owner has emptied it
-        self.look = look
+        self.look: Callable[[], None] = lambda: None
         self.moved: Callable[[], tuple[int, int] | None] = lambda: None
-        self._on_waking, self._on_decision = on_waking, on_decision
+        self.on_waking: Callable[[int], None] = lambda _: None
+        self.on_decision: Callable[[Release, int], None] = lambda *_: None
         self._looked_ns = self._waited_ns = self._turn_ns = 0
         self._offset = clock_offset()
         self._next_phase: tuple[int, int] | None = None  # from when on, and which
@@ -592,7 +586,7 @@ class Shaper:
         message, now = queue.waiting[0], time.monotonic_ns()
         self._turn_ns = now  # before, this thread was busy with the message before it
         release, dropped = queue.decide()
-        self._on_decision(release, queue.phase_ns)
+        self.on_decision(release, queue.phase_ns)
         if release.at_ns is not None:
             self._waited_ns = self._others_ran_ns()
             slept = release.at_ns > now
@@ -610,7 +604,7 @@ class Shaper:
             queue.leave(release, now)
             return Outcome(message, release, now, dropped)
         if slept:
-            self._on_waking(release.at_ns)
+            self.on_waking(release.at_ns)
             if time.monotonic_ns() < release.at_ns:
                 # Awake in time: what other threads took before is of no consequence.
                 self._waited_ns = self._others_ran_ns()

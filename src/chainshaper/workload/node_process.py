@@ -264,12 +264,6 @@ class NodeProcess:
 
     def _shaper(self, gate: dict[str, Any], turn: Turn | None) -> Shaper:
         modes, core = gate["modes"], self.spec["delivery_core"]
-        delivery_core = None if core is None else ClearCore(core)
-
-        def get_ready(release_ns: int) -> None:
-            if delivery_core is not None:
-                delivery_core.clear_until(release_ns + gate["pause_ns"])
-
         if gate["phase_ns"] is None:
             gate["phase_ns"] = self.spec["origin_phase"]
         own = Gate(
@@ -277,7 +271,10 @@ class NodeProcess:
             modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
             **{name: gate[name] for name in (*decision.SAME, "depth")},
         )
-        shaper, first = Shaper(own, gate["spin_ns"], get_ready), own.slots[0][0]
+        shaper, first = Shaper(own, gate["spin_ns"]), own.slots[0][0]
+        if core is not None:
+            clear_until, pause_ns = ClearCore(core).clear_until, gate["pause_ns"]
+            shaper.on_waking = lambda release_ns: clear_until(release_ns + pause_ns)
         if turn is not None:
             shaper.moved = turn.moved
         self.shapers.append((shaper, [(since, begin - first) for since, begin in gate["moves"]]))

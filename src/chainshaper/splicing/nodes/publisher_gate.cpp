@@ -149,12 +149,8 @@ public:
         settings_(std::move(settings)),
         node_(node),
         type_support_(type_support),
-        shaper_(
-            gate_of(settings_.parameters, depth), settings_.parameters.spin_ns,
-            [](std::int64_t) {}, [this] { look(); },
-            [this](const Release & release, std::int64_t phase_ns) {
-              if (turn_) turn_->hold(release.at_ns, phase_ns, release.mode);
-            }) {
+        shaper_(gate_of(settings_.parameters, depth), settings_.parameters.spin_ns) {
+    shaper_.look = [this] { look(); };
     show();
     const auto & parameters = settings_.parameters;
     if (!parameters.log.empty() && !log_.open_file(parameters.log, parameters.log_bytes))

@@ -153,9 +153,8 @@ class Shaping:
         depth, offered, asked = room_of(node, info)
         gate = parameters.gate(depth)
         self._modes = [] if gate.modes is None else list(gate.modes.bands)
-        self._shaper = Shaper(
-            *(gate, parameters.spin_ns, self._readiness.get_ready, self._look, self._decided)
-        )
+        self._shaper = Shaper(gate, parameters.spin_ns)
+        self._shaper.on_waking, self._shaper.look = self._readiness.get_ready, self._look
         if self._turn is not None:
             self._go_on(self._turn)
         self._number: int | None = None  # the publisher's, of the last message
@@ -173,8 +172,15 @@ class Shaping:
         self._await_receivers(node, publisher)
 
     def _go_on(self, turn: Turn) -> None:
-        """Have cycles begin where they did for the node before this one, in its mode."""
-        self._shaper.moved = turn.moved
+        """Have cycles begin where they did for the node before this one, in its mode; the standby
+        sees each decision.
+        """
+
+        def decided(release: Release, phase_ns: int) -> None:
+            mode = 0 if release.mode is None else self._modes.index(release.mode) + 1
+            turn.hold(release.at_ns, phase_ns, mode)
+
+        self._shaper.moved, self._shaper.on_decision = turn.moved, decided
         if turn.phase_ns is not None:  # from now on, not the next cycle
             now = time.monotonic_ns() - self._shaper.gate.cycle_ns
             self._shaper.set_phase(turn.phase_ns, now)
@@ -287,12 +293,6 @@ class Shaping:
             overflowed.pop()
         else:
             self._turn.page.note(gone, bypassed=False)
-
-    def _decided(self, release: Release, phase_ns: int) -> None:
-        """The standby sees it."""
-        if self._turn is not None:
-            mode = 0 if release.mode is None else self._modes.index(release.mode) + 1
-            self._turn.hold(release.at_ns, phase_ns, mode)
 
     def _look(self) -> None:
         """Take all that has come."""

@@ -206,14 +206,10 @@ public:
         parameters_(parameters_of(node)),
         turn_(std::move(turn)),
         readiness_(node, delivery_core(parameters_.server_cores), parameters_.pause_ns),
-        shaper_(
-            gate_of(parameters_, depth_of(parameters_, offer.publisher.depth())),
-            parameters_.spin_ns,
-            [this](std::int64_t release_ns) { readiness_.get_ready(release_ns); },
-            [this] { look(); },
-            [this](const Release & release, std::int64_t phase_ns) {
-              if (turn_) turn_->hold(release.at_ns, phase_ns, release.mode);
-            }) {
+        shaper_(gate_of(parameters_, depth_of(parameters_, offer.publisher.depth())),
+                parameters_.spin_ns) {
+    shaper_.on_waking = [this](std::int64_t release_ns) { readiness_.get_ready(release_ns); };
+    shaper_.look = [this] { look(); };
     if (turn_) turn_->go_on(shaper_);
     const auto & log = parameters_.log;
     if (!log.empty() && !log_.open_file(log, parameters_.log_bytes)) {

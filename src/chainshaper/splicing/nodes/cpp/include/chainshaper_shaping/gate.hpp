@@ -442,22 +442,12 @@ inline std::int64_t clock_offset() {
   return best;
 }
 
-// A gate at work; `Message` is what the queue holds.
+// A gate at work; `Message` is what the queue holds. Its owner sets the functions that it calls.
 template <typename Message>
 class Shaper {
 public:
-  Shaper(
-      Gate gate, std::int64_t spin_ns,
-      std::function<void(std::int64_t)> on_waking = [](std::int64_t) {},
-      std::function<void()> look = [] {},
-      std::function<void(const Release &, std::int64_t)> on_decision = [](const Release &,
-                                                                          std::int64_t) {})
-      : queue(std::move(gate)),
-        look(std::move(look)),
-        spin_ns_(spin_ns),
-        on_waking_(std::move(on_waking)),
-        on_decision_(std::move(on_decision)),
-        offset_(clock_offset()) {}
+  Shaper(Gate gate, std::int64_t spin_ns)
+      : queue(std::move(gate)), spin_ns_(spin_ns), offset_(clock_offset()) {}
 
   Shaper(const Shaper &) = delete;
   Shaper & operator=(const Shaper &) = delete;
@@ -518,7 +508,7 @@ public:
     std::int64_t now = monotonic_ns();
     turn_ns_ = now;  // before, this thread was busy with the message before it
     auto [release, dropped] = queue.decide();
-    on_decision_(release, queue.phase_ns);
+    on_decision(release, queue.phase_ns);
     bool slept = false;
     if (release.at_ns) {
       waited_ns_ = others_ran_ns();
@@ -537,7 +527,7 @@ public:
     }
     if (!release.at_ns) return Outcome<Message>{queue.leave(release, now), release, now, dropped};
     if (slept) {
-      on_waking_(*release.at_ns);
+      on_waking(*release.at_ns);
       // Awake in time: what other threads took before is of no consequence.
       if (monotonic_ns() < *release.at_ns) waited_ns_ = others_ran_ns();
     }
@@ -577,7 +567,9 @@ public:
 
   Queue<Message> queue;
   std::vector<Outcome<Message>> overflowed;  // since the owner has emptied it
-  std::function<void()> look;
+  std::function<void()> look = [] {};
+  std::function<void(std::int64_t)> on_waking = [](std::int64_t) {};
+  std::function<void(const Release &, std::int64_t)> on_decision = [](const auto &...) {};
 
 private:
   void look_again() {
@@ -603,8 +595,6 @@ private:
   }
 
   std::int64_t spin_ns_;
-  std::function<void(std::int64_t)> on_waking_;
-  std::function<void(const Release &, std::int64_t)> on_decision_;
   std::int64_t offset_;
   std::int64_t looked_ns_{0};
   std::int64_t waited_ns_{0};

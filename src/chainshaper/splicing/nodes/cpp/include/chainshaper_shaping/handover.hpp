@@ -190,9 +190,13 @@ public:
     return failed < 0 ? 0.0 : std::min(10.0, std::ldexp(0.5, static_cast<int>(failed)));
   }
 
-  // Have cycles of a gate begin where they did for the one before it in the same launch, in its mode.
+  // Have cycles of a gate begin where they did for the one before it in the same launch, in its mode;
+  // the page shows each decision.
   template <typename Shaper>
-  void go_on(Shaper & shaper) const {
+  void go_on(Shaper & shaper) {
+    shaper.on_decision = [this](const Release & release, std::int64_t phase_ns) {
+      hold(release.at_ns, phase_ns, release.mode);
+    };
     const auto & gate = shaper.queue.gate;
     if (page_->get(Field::phase_known) != 0)  // from now on, not the next cycle
       shaper.set_phase(page_->get(Field::phase_ns), monotonic_ns() - gate.cycle_ns);
