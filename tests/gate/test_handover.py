@@ -125,13 +125,17 @@ def in_cpp(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(params=["python", "cpp"])
-def output(
-    request: pytest.FixtureRequest, tmp_path: Path, folder: Path, in_cpp: Path
-) -> Iterator[Output]:
+def program(request: pytest.FixtureRequest, folder: Path, in_cpp: Path) -> list[str]:
+    """The command of a process with the shaping node's side, in either language."""
+    started = [str(in_cpp)] if request.param == "cpp" else [sys.executable, str(PROCESS)]
+    return [*started, str(folder)]
+
+
+@pytest.fixture
+def output(program: list[str], folder: Path) -> Iterator[Output]:
     """The two processes of an output, with a shaping node in either language."""
-    python = [sys.executable, str(PROCESS), str(folder)]
-    shaping = python if request.param == "python" else [str(in_cpp), str(folder)]
-    made = Output({"shaping": shaping, "standby": python})
+    standby = [sys.executable, str(PROCESS), str(folder)]
+    made = Output({"shaping": program, "standby": standby})
     try:
         for what in ("standby", "shaping"):
             made.start(what)
@@ -184,16 +188,12 @@ def test_a_standby_that_is_stopped_is_in_nobody_s_way(output: Output) -> None:
     assert len(late) == len(set(late)), "twice"
 
 
-@pytest.mark.parametrize("language", ["python", "cpp"])
-def test_a_standby_that_is_stopped_with_the_lock_silences_no_node(
-    folder: Path, in_cpp: Path, language: str
-) -> None:
+def test_a_standby_that_is_stopped_with_the_lock_silences_no_node(program: list[str]) -> None:
     page = open_page("t5", "/t5")
     assert page.lock()
     assert page.lock(STANDING_BY)
     page["listening"] = 1
-    program = [str(in_cpp)] if language == "cpp" else [sys.executable, str(PROCESS)]
-    output = Output({"shaping": [*program, str(folder)]})
+    output = Output({"shaping": program})
     try:
         output.start("shaping")
         output.await_ready("shaping")
@@ -320,12 +320,10 @@ def test_a_node_that_starts_again_goes_on_where_cycles_began(folder: Path) -> No
         Page(str(folder), "other")
 
 
-@pytest.mark.parametrize("language", ["python", "cpp"])
 def test_only_a_node_of_the_same_launch_goes_on_in_its_cycle_and_mode(
-    folder: Path, in_cpp: Path, language: str
+    folder: Path, program: list[str]
 ) -> None:
-    program = [str(in_cpp)] if language == "cpp" else [sys.executable, str(PROCESS)]
-    command = [*program, str(folder), "starting", "t5", "0", "0"]
+    command = [*program, "starting", "t5", "0", "0"]
     launch = ["sh", "-c", '"$@"; true', "launch"]  # a parent of its own
 
     def started(*before: str) -> str:
@@ -345,12 +343,10 @@ def test_only_a_node_of_the_same_launch_goes_on_in_its_cycle_and_mode(
         assert started(*before) == wanted
 
 
-@pytest.mark.parametrize("language", ["python", "cpp"])
 def test_what_a_node_counts_is_in_the_page_for_those_who_look(
-    folder: Path, in_cpp: Path, language: str
+    folder: Path, program: list[str]
 ) -> None:
-    program = [str(in_cpp)] if language == "cpp" else [sys.executable, str(PROCESS)]
-    command = [*program, str(folder), "counting", "t5", "0", "0"]
+    command = [*program, "counting", "t5", "0", "0"]
     for times in (1, 2):  # a node that starts again goes on counting
         subprocess.run(command, check=True, timeout=60)
         page = Page(str(folder), "t5.0.v3")

@@ -14,11 +14,12 @@ from pathlib import Path
 from queue import Empty, Queue
 from typing import Any
 
+import yaml
 from known import known
 from passing import serialized
 
 from chainshaper.planning import Modes, Plan
-from chainshaper.planning.plan import revised
+from chainshaper.planning.plan import revised, with_slots
 from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
 from chainshaper.splicing.shaping_process import ShapingProcess
 
@@ -41,19 +42,25 @@ RELIABLE = {
 PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
 
 
-def with_slots(plan: Plan, *slots: tuple[int, int]) -> Plan:
-    """The plan with these publish slots."""
-    servers = tuple(
-        server.model_copy(update={"slots": slots}) if server.name == "output" else server
-        for server in plan.servers
-    )
-    return revised(plan, servers=servers)
+def leaving_in(plan: Plan, *slots: tuple[int, int], **changes: Any) -> Plan:
+    """The plan with these publish slots, and other changes."""
+    return revised(plan, servers=with_slots(plan.servers, {"output": slots}), **changes)
 
 
 def banded(plan: Plan) -> Plan:
     """Two slots, one for each mode."""
     modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
-    return revised(with_slots(plan, *SLOTS), modes=modes)
+    return leaving_in(plan, *SLOTS, modes=modes)
+
+
+def parameters_of(process: ShapingProcess, **changes: object) -> dict[str, Any]:
+    """The parameters that were written for a process, which then has others in their place."""
+    values: dict[str, Any] = yaml.safe_load(process.parameters_file.read_text())
+    written: dict[str, Any] = values["/**"]["ros__parameters"]
+    if changes:
+        text = yaml.safe_dump({"/**": {"ros__parameters": written | changes}})
+        process.parameters_file.write_text(text)
+    return written
 
 
 class NodeRun:

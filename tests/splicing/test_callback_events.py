@@ -8,9 +8,8 @@ import time
 from pathlib import Path
 
 import pytest
-import yaml
 from known import known
-from node_run import RELIABLE, running_node, stamped
+from node_run import RELIABLE, parameters_of, running_node, stamped
 
 from chainshaper.planning import Plan
 from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
@@ -166,9 +165,7 @@ def test_on_humble_what_waited_was_taken_when_it_came(tmp_path: Path, plan: Plan
     the first waited for its slot, one without a source timestamp.
     """
     process = write_shaping_process(plan, known(plan.shaping_node), "python", tmp_path)
-    values = yaml.safe_load(process.parameters_file.read_text())["/**"]["ros__parameters"]
-    values |= {"cycle_ns": 1000 * MS, "slots_ns": [400 * MS, 600 * MS]}
-    process.parameters_file.write_text(yaml.safe_dump({"/**": {"ros__parameters": values}}))
+    parameters_of(process, cycle_ns=1000 * MS, slots_ns=[400 * MS, 600 * MS])
     environment = {**preloaded(tmp_path), "STAND_IN_HUMBLE": "1"}
     with running_node(process, tmp_path, environment=environment) as run:
         for source in (77, 78, None):

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from launch_cases import NDT, ROBOTS, plan_for
+from node_run import parameters_of
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
 from chainshaper.planning.application_plan import whole
@@ -161,8 +161,8 @@ def test_a_component_goes_into_its_publishers_container_and_has_no_standby(robot
         "remappings": (("input", "/pose_tmp"), ("output", "/pose")),
         "parameters": str(nodes / "chainshaper_pose.yaml"),
     }
-    (values,) = yaml.safe_load((nodes / "chainshaper_pose.yaml").read_text()).values()
-    assert [] not in values["ros__parameters"].values(), "a list without elements has no type"
+    parameters = parameters_of(spliced.processes[0]).values()
+    assert [] not in parameters, "a list without elements has no type"
     assert [log.name for log in spliced.logs] == ["chainshaper_pose.csv"]
     assert not list(nodes.glob("*standby*"))
 
@@ -272,8 +272,7 @@ def test_an_input_reaches_its_subscribers_by_way_of_one_throttler(
     wanted = {topic: (f"{topic}_throttled", ("/fusion",)) for topic in ("/rear", "/front")}
     assert redirects(spliced) == wanted
     assert {one["kind"] for one in launched(spliced)["REDIRECTS"]} == {"subscription"}
-    read = yaml.safe_load(spliced.processes[0].parameters_file.read_text())
-    parameters = read["/**"]["ros__parameters"]
+    parameters = parameters_of(spliced.processes[0])
     assert parameters["inputs"] == ["/rear", "/front"]
     assert parameters["outputs"] == ["/rear_throttled", "/front_throttled"]
     assert (parameters["period_ns"], parameters["fifo_priority"]) == (100 * MS, 85)

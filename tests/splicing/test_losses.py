@@ -13,11 +13,10 @@ from typing import Any
 import polars as pl
 import pytest
 from known import known
-from node_run import NodeRun, outputs, running_node, stamped, with_slots
+from node_run import NodeRun, leaving_in, outputs, parameters_of, running_node, stamped
 from processes import wait_for
 
 from chainshaper.planning import Plan
-from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, rows_missing
 from chainshaper.splicing.shaped_outputs import output_text
 from chainshaper.splicing.shaping_process import write_shaping_process
@@ -32,10 +31,9 @@ def at_work(
 ) -> Iterator[NodeRun]:
     """The node of a plan with one slot; ``log_bytes`` is no part of a plan."""
     log_bytes = changes.pop("log_bytes", 100_000_000)
-    plan = revised(with_slots(plan, slot), anchor="cycle", **changes)
+    plan = leaving_in(plan, slot, anchor="cycle", **changes)
     process = write_shaping_process(plan, known(plan.shaping_node), "python", folder, log=log)
-    with process.parameters_file.open("a") as file:
-        file.write(f"    log_bytes: {log_bytes}\n")
+    parameters_of(process, log_bytes=log_bytes)
     with running_node(process, folder) as run:
         yield run
 

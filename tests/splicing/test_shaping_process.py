@@ -15,9 +15,17 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import pytest
-import yaml
 from known import known
-from node_run import PUBLISHERS, RELIABLE, SLOTS, NodeRun, banded, running_node, stamped
+from node_run import (
+    PUBLISHERS,
+    RELIABLE,
+    SLOTS,
+    NodeRun,
+    banded,
+    parameters_of,
+    running_node,
+    stamped,
+)
 from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
@@ -43,11 +51,6 @@ LATENCY = Path("/dev/cpu_dma_latency")
 @pytest.fixture
 def node(plan: Plan) -> ShapingNode:
     return known(plan.shaping_node)
-
-
-def parameters_of(process: ShapingProcess) -> dict[str, Any]:
-    written: dict[str, Any] = yaml.safe_load(process.parameters_file.read_text())
-    return written["/**"]["ros__parameters"]  # type: ignore[no-any-return]
 
 
 def test_a_python_node_is_one_file_with_the_gate_of_the_live_workload(
@@ -190,15 +193,13 @@ def at_work(
     plan: Plan,
     folder: Path,
     publishers: dict[str, Any] | None = None,
-    change: tuple[str, str] = ("", ""),
+    change: dict[str, object] | None = None,
     **more: Any,
 ) -> Iterator[NodeRun]:
-    """The plan's node in Python, with its log in the folder; a text of its parameters changed."""
+    """The plan's node in Python, with its log in the folder, and parameters changed."""
     log = more.pop("log", folder / "gate.csv")
     process = write_shaping_process(plan, known(plan.shaping_node), "python", folder, log=log)
-    text = process.parameters_file.read_text()
-    assert change[0] in text
-    process.parameters_file.write_text(text.replace(*change) if change[0] else text)
+    parameters_of(process, **(change or {}))
     with running_node(process, folder, publishers, **more) as run:
         yield run
 
@@ -346,9 +347,8 @@ def test_the_phase_of_the_cycle_can_be_set_while_it_runs(tmp_path: Path, plan: P
 
 
 def test_without_its_log_core_or_class_it_works_on_and_says_so(tmp_path: Path, plan: Plan) -> None:
-    # A core that no machine has is refused to all.
-    change = (f"core: {EXECUTOR_CORE}", "core: 1023")
-    with at_work(plan, tmp_path, change=change, log=tmp_path / "nowhere/gate.csv") as run:
+    no_core = {"core": 1023}  # is refused to all
+    with at_work(plan, tmp_path, change=no_core, log=tmp_path / "nowhere/gate.csv") as run:
         run.send(stamped())
         run.hear_published()
         policy = os.sched_getscheduler(run.process.pid)
@@ -359,8 +359,7 @@ def test_without_its_log_core_or_class_it_works_on_and_says_so(tmp_path: Path, p
 
 
 def test_parameters_that_make_no_gate_are_named(tmp_path: Path, plan: Plan) -> None:
-    wrong = ("cycle_ns: 50000000", "cycle_ns: 5")
-    with at_work(plan, tmp_path, change=wrong, spinning=False) as run:
+    with at_work(plan, tmp_path, change={"cycle_ns": 5}, spinning=False) as run:
         assert run.end() == 1
     assert any("slots must ascend" in text for text in run.logged)
 

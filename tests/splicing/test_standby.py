@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from known import known
-from node_run import NodeRun, banded, outputs, running_node, stamped
+from node_run import NodeRun, banded, outputs, parameters_of, running_node, stamped
 from processes import wait_for
 
 from chainshaper.gate.handover import Page, open_page
@@ -40,17 +39,9 @@ def written(
         plan, known(plan.shaping_node), "python", folder, log=folder / "gate.csv"
     )
     assert process.standby is not None
-    before = change(process.standby, patience_ns=patience_ns)
+    before = parameters_of(process.standby, patience_ns=patience_ns)
     assert before["patience_ns"] == max(plan.cycle_ns // 2, 10 * MS)
     return process, process.standby
-
-
-def change(process: ShapingProcess, **parameters: object) -> dict[str, Any]:
-    """Give a process other parameters than the plan's; what it had."""
-    values = yaml.safe_load(process.parameters_file.read_text())["/**"]["ros__parameters"]
-    text = yaml.safe_dump({"/**": {"ros__parameters": values | parameters}})
-    process.parameters_file.write_text(text)
-    return values  # type: ignore[no-any-return]
 
 
 @contextmanager
@@ -100,7 +91,7 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
     tmp_path: Path, plan: Plan
 ) -> None:
     process, beside = written(plan, tmp_path)
-    change(process, cycle_ns=1_000 * MS, slots_ns=[400 * MS, 401 * MS])
+    parameters_of(process, cycle_ns=1_000 * MS, slots_ns=[400 * MS, 401 * MS])
     with running_node(beside, tmp_path) as standby:
         with running_node(process, tmp_path) as shaping:
             take_over(1, tmp_path, shaping)
@@ -154,7 +145,7 @@ def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
     slot = [59_000 * MS, 59_500 * MS]
     timing = {"cycle_ns": 60_000 * MS, "slots_ns": slot, "anchor": "cycle"}
     phase = (time.monotonic_ns() - 1000 * MS) % (60_000 * MS)
-    change(process, **{**timing, "phase_ns": phase, "overrun": "wait", **changes})
+    parameters_of(process, **{**timing, "phase_ns": phase, "overrun": "wait", **changes})
 
     def dealt_with() -> int:
         (output,) = outputs(tmp_path)
@@ -179,7 +170,7 @@ def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counte
     tmp_path: Path, plan: Plan
 ) -> None:
     process, beside = written(plan, tmp_path, patience_ns=300 * MS)
-    change(process, depth=3, cycle_ns=600 * MS, slots_ns=[300 * MS, 450 * MS])
+    parameters_of(process, depth=3, cycle_ns=600 * MS, slots_ns=[300 * MS, 450 * MS])
     with both(process, beside, tmp_path) as (shaping, standby):
         shaping.process.send_signal(signal.SIGSTOP)  # while it waits for the slot
         say(1, standby)
@@ -242,7 +233,7 @@ def test_a_node_that_fails_at_once_waits_longer_each_time_and_says_so(
     process, _ = written(plan, tmp_path)
     for failed in range(4):
         if failed == 2:  # for another reason
-            change(process, cycle_ns=5)
+            parameters_of(process, cycle_ns=5)
         unknown = {"/t3_tmp": [{"type": "no/msg/T", "qos": {}}]}
         with running_node(process, tmp_path, unknown, spinning=False) as run:
             assert run.end() == 1
