@@ -19,16 +19,7 @@ from cpp_program import compiled
 from processes import wait_for
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import (
-    MEASURED,
-    MOVING,
-    RING,
-    STANDING_BY,
-    Page,
-    Standby,
-    Turn,
-    open_page,
-)
+from chainshaper.gate.handover import MOVING, RING, STANDING_BY, Page, Standby, Turn, open_page
 
 MS = 1_000_000
 PROCESS = Path(__file__).parent / "output_process.py"
@@ -362,9 +353,9 @@ def test_what_a_node_counts_is_in_the_page_for_those_who_look(
     subprocess.run(command, check=True, timeout=60)
     page["moved_from_ns"] = 0  # what follows is being written
     subprocess.run(command, check=True, timeout=60)
-    latencies, each = page.latest("measured", MEASURED, 0), [0, 1, 1, 2, 2, 2, 3, 3, 3, 3]
+    latencies, each = page.latest("measured", 0), [0, 1, 1, 2, 2, 2, 3, 3, 3, 3]
     assert latencies == [one for last in (77, 77, -5, 0, 77) for one in (*each, last)]
-    assert page.latest("measured", MEASURED, 54) == [77]
+    assert page.latest("measured", 54) == [77]
 
 
 @pytest.mark.parametrize("how", ["mode", "owner", "link", "file", "foreign page"])

@@ -74,6 +74,8 @@ RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three r
 TOPIC = 32 + 3 * RING  # and of the name
 TOPIC_BYTES = 256
 PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3  # the bytes of the file that are locked
+_RINGS = {"released": RELEASED, "bypassed": BYPASSED, "measured": MEASURED}
+"""Each has the name under which the numbers in it are counted."""
 _AT = {name: place for place, name in enumerate(FIELDS)}
 _SIZE = 8 * TOPIC + TOPIC_BYTES
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
@@ -171,10 +173,10 @@ class Page:
         """Write a number of a page that is only looked at."""
         os.pwrite(self._file, value.to_bytes(8, sys.byteorder, signed=True), 8 * _AT[field])
 
-    def latest(self, count: str, ring: int, since: int) -> list[int]:
+    def latest(self, ring: str, since: int) -> list[int]:
         """The numbers of a ring behind the first ``since``, as far as they are there."""
-        last = self[count]
-        return [self._numbers[ring + n % RING] for n in range(max(since, last - RING), last)]
+        last, place = self[ring], _RINGS[ring]
+        return [self._numbers[place + n % RING] for n in range(max(since, last - RING), last)]
 
     @property
     def topic(self) -> str:
@@ -213,20 +215,15 @@ class Page:
         answer = fcntl.fcntl(self._file, command, struct.pack(_FLOCK, kind, 0, byte, 1, 0))
         return int(struct.unpack(_FLOCK, answer)[0])
 
-    def note(self, key: int | None, *, bypassed: bool) -> None:
-        """A message has been dealt with, by the standby or by the shaping node."""
-        self.add(*(("bypassed", BYPASSED) if bypassed else ("released", RELEASED)), key or 0)
+    def add(self, ring: str, value: int) -> None:
+        """Put a number into a ring, and count it."""
+        number = self[ring]
+        self._numbers[_RINGS[ring] + number % RING] = value
+        self[ring] = number + 1
 
-    def add(self, count: str, ring: int, value: int) -> None:
-        """Put a number into the ring at a place, whose numbers are counted under a name."""
-        number = self[count]
-        self._numbers[ring + number % RING] = value
-        self[count] = number + 1
-
-    def noted(self, *, bypassed: bool) -> list[int]:
-        """The latest messages that one of the two has dealt with, in no order."""
-        ring = BYPASSED if bypassed else RELEASED
-        return self._numbers[ring : ring + RING].tolist()
+    def noted(self, ring: str) -> list[int]:
+        """The latest numbers of a ring, in no order."""
+        return self._numbers[_RINGS[ring] : _RINGS[ring] + RING].tolist()
 
     def close(self) -> None:
         """Give up the page, and with it whatever it has locked."""
@@ -297,7 +294,7 @@ class Turn:
             give_up = time.monotonic_ns() + GIVE_UP_NS
             while self.page.is_locked(PASSING) and time.monotonic_ns() < give_up:
                 time.sleep(0.0001)
-            self._bypassed = frozenset(self.page.noted(bypassed=True))
+            self._bypassed = frozenset(self.page.noted("bypassed"))
             if self._seen >= 0 and count - self._seen > RING:
                 self._oldest = min(self._bypassed)  # older ones were, too
             self._seen = count
@@ -309,7 +306,7 @@ class Turn:
 
     def done(self, key: int | None) -> None:
         """A message has been published or discarded."""
-        self.page.note(key, bypassed=False)
+        self.page.add("released", key or 0)
         self.page["until_ns"] = time.monotonic_ns()
         self.page["failed_starts"] = 0
         if not self.page.is_current:
@@ -317,8 +314,8 @@ class Turn:
                 left = self.page
                 self._open()
                 self._move_back = left["moved_from_ns"] != 0
-                for one in left.noted(bypassed=False):  # a standby that lags has to know them
-                    self.page.note(one, bypassed=False)
+                for one in left.noted("released"):  # a standby that lags has to know them
+                    self.page.add("released", one)
                 left.close()
 
     def moved(self) -> tuple[int, int] | None:
@@ -336,7 +333,7 @@ class Turn:
     def count(self, outcome: Outcome) -> None:
         """A message has been published or dropped: it counts, and its latency to its arrival."""
         message, release = outcome.message, outcome.release
-        self.page.add("measured", MEASURED, message.arrival_ns - release.origin_ns)
+        self.page.add("measured", message.arrival_ns - release.origin_ns)
         self.page[outcome.dropped or "published"] += 1
         self.page["lost_by_dds"] += message.lost or 0
         self.page["late"] += release.overrun is not None
@@ -357,7 +354,7 @@ class Turn:
         # A standby still deals with what came before this node's first message.
         if page["listening"] and key is not None and not self._gave_up:
             while page.is_locked(STANDING_BY) and time.monotonic_ns() < give_up:
-                if key == page["acknowledged"] or key in page.noted(bypassed=True):
+                if key == page["acknowledged"] or key in page.noted("bypassed"):
                     break
                 time.sleep(0.0002)
         return True
@@ -477,7 +474,7 @@ class Standby:
             self._gone("is late for its own release: it hangs, or was stopped")
             self.page.lock(PASSING)
             for waiting in self._pending:  # the node is there, and could go on at any time
-                self.page.note(waiting.about, bypassed=True)
+                self.page.add("bypassed", waiting.about)
             self._pass_on(len(self._pending), noted=True)
             self.page.unlock(PASSING)
         elif taken != self._stuck_at:
@@ -497,7 +494,7 @@ class Standby:
 
     def _forget(self) -> None:
         """Leave out what was dealt with, and what came before: order is not to be broken."""
-        known = {*self.page.noted(bypassed=False), *self.page.noted(bypassed=True)}
+        known = {*self.page.noted("released"), *self.page.noted("bypassed")}
         dealt_with = [place for place, one in enumerate(self._pending, 1) if one.about in known]
         for _ in range(max(dealt_with, default=0)):
             self._pending.popleft()
@@ -507,7 +504,7 @@ class Standby:
             waiting = self._pending.popleft()
             self._publish(waiting.payload, waiting.about or None, waiting.arrival_ns)
             if not noted:
-                self.page.note(waiting.about, bypassed=True)
+                self.page.add("bypassed", waiting.about)
 
     def _gone(self, why: str) -> None:
         if not self.page["bypassing_since_ns"]:

@@ -16,14 +16,7 @@ from typing import Literal, TypeAlias
 from pydantic import TypeAdapter
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import (
-    MEASURED,
-    MOVING,
-    STANDING_BY,
-    VERSION,
-    Page,
-    page_folders,
-)
+from chainshaper.gate.handover import MOVING, STANDING_BY, VERSION, Page, page_folders
 from chainshaper.linux.threads import innermost_id, parents, read_proc, status_field
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
@@ -177,7 +170,7 @@ class FollowedOutput:
             raise OperationError(
                 f"{self._page.path}: its gate cannot be followed: {error}; start this run again"
             ) from error
-        new = self._page.latest("measured", MEASURED, self._seen)
+        new = self._page.latest("measured", self._seen)
         self._seen = self._page["measured"]
         return new
 

@@ -292,7 +292,7 @@ class Shaping:
         if self._turn.was_bypassed(gone):
             overflowed.pop()
         else:
-            self._turn.page.note(gone, bypassed=False)
+            self._turn.page.add("released", gone or 0)
 
     def _look(self) -> None:
         """Take all that has come."""
