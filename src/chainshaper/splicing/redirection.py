@@ -77,18 +77,15 @@ class Redirect:
         return {key: one for key in keys if (one := getattr(self, key)) is not None}
 
     def see(
-        self,
-        rules: Sequence[str],
-        name: str | None,
-        namespace: str | None,
-        label: str,
-        action: Any = None,
+        self, rules: Sequence[str], label: str, action: Any = None, given: Sequence[str] = ("", "")
     ) -> list[tuple[int, str]]:
         """Rules to add to those of a process or component, each before the one of a place.
 
-        ``name`` and ``namespace`` are None where the executable decides; one that is given a name
-        only is taken to stand in no namespace.
+        Its name and namespace are those of its rules, or else ``given``, or else the executable
+        decides; one that is given a name only is taken to stand in no namespace.
         """
+        name = _of_rule(rules, "__node", "__name") or given[0] or None
+        namespace = _of_rule(rules, "__ns") or given[1] or None
         added: list[tuple[int, str]] = []
         label = f"{(namespace or '').rstrip('/')}/{name}" if name else f"an unnamed one ({label})"
         if label not in self.added:
@@ -204,8 +201,7 @@ def redirect_command(
             continue
         places = list(_places(parts))
         rules = [parts[place + 1] for place in places]
-        name = _of_rule(rules, "__node", "__name")
-        added = redirect.see(rules, name, _of_rule(rules, "__ns"), label, action)
+        added = redirect.see(rules, label, action)
         changed = changed or bool(added)
         for number, rule in reversed(added):
             if number < len(places):
@@ -231,9 +227,8 @@ def redirect_request(request: Any, redirects: Sequence[Redirect]) -> list[Redire
     found = []
     for redirect in redirects:
         rules = list(request.remap_rules)
-        name = _of_rule(rules, "__node", "__name") or request.node_name or None
-        namespace = _of_rule(rules, "__ns") or request.node_namespace or None
-        added = redirect.see(rules, name, namespace, request.plugin_name)
+        given = request.node_name, request.node_namespace
+        added = redirect.see(rules, request.plugin_name, given=given)
         for number, rule in reversed(added):
             rules.insert(number, rule)
         request.remap_rules = rules
