@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from bare_plans import bare_plan
 from gated import cpu_ns, groups_left, own_cgroup
 from known import known
 from processes import children_of, wait_for
@@ -20,14 +21,7 @@ from chainshaper.linux.runs import find_journals
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads, parents, start_of
 from chainshaper.planning import Plan, save_plan
-from chainshaper.planning.plan import (
-    ChainOfPlan,
-    Evidence,
-    Margin,
-    Prediction,
-    Server,
-    Thread,
-)
+from chainshaper.planning.plan import Server, Thread
 
 MS = 1_000_000
 CYCLE = 100 * MS
@@ -44,20 +38,7 @@ FREEZER = ("--backend", "freezer", "--phase", "0ms")
 
 
 def plan_for(*servers: Server) -> Plan:
-    return Plan(
-        chain=ChainOfPlan(period_ns=CYCLE),
-        evidence=Evidence(
-            samples=1000,
-            min_latency_ns=5 * MS,
-            mean_latency_ns=5 * MS,
-            max_latency_ns=5 * MS,
-        ),
-        margin=Margin(epsilon_ns=MS),
-        policy="server-per-chain",
-        cycle_ns=CYCLE,
-        servers=servers,
-        predicted=Prediction(mean_ns=CYCLE, max_ns=CYCLE, jitter_ns=MS),
-    )
+    return bare_plan(None, CYCLE, *servers)
 
 
 def server(name: str, node: str, *slots: tuple[int, int], core: int | None = None) -> Server:

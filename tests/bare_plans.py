@@ -8,7 +8,7 @@ MS = 1_000_000
 
 
 def bare_plan(
-    spec: str, cycle_ns: int, *servers: Server, output: str | None = None, **fields: Any
+    spec: str | None, cycle_ns: int, *servers: Server, output: str | None = None, **fields: Any
 ) -> Plan:
     """A plan that shapes nothing, unless ``fields`` say so."""
     return Plan(
