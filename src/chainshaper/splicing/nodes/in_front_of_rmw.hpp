@@ -25,8 +25,6 @@
 
 #define EXPORTED extern "C" __attribute__((visibility("default")))
 
-namespace {
-
 // What we need of rmw's structs.
 struct RmwNode {
   const char * implementation;
@@ -79,6 +77,23 @@ struct MessageInfo {
   std::uint64_t others[31];       // more than any version has
 };
 
+// Of the functions behind ours, those that are called before ours of that name, or without one.
+extern "C" {
+Allocator rcutils_get_default_allocator();
+const RmwPublisher * rcl_publisher_get_rmw_handle(const void * handle);
+const char * rmw_get_implementation_identifier();
+SubscriptionOptions rmw_get_default_subscription_options();
+int rmw_publish_serialized_message(const RmwPublisher * publisher, const Bytes * message,
+                                   void * allocation);
+int rmw_serialize(const void * message, const void * type_support, Bytes * bytes);
+void * rmw_create_subscription(const RmwNode * node, const void * type_support, const char * topic,
+                               const RmwQos * qos, const void * options);
+int rmw_take_serialized_message_with_info(const void * subscription, void * bytes, bool * taken,
+                                          MessageInfo * info, void * allocation);
+}
+
+namespace {
+
 template <typename... Values>
 void say(const char * format, Values... values) {
   const std::string line = std::string("[chainshaper] ") + format + "\n";
@@ -92,10 +107,11 @@ void * behind(const char * name) {
   return loaded == nullptr ? nullptr : dlsym(loaded, name);
 }
 
-// Calls a function of rmw, which is there: `usable` has looked, or its caller has linked to it.
-#define RMW(type, name) \
+// The function of that name behind ours, which is there: `usable` has looked, or its caller has
+// linked to it.
+#define RMW(name) \
   (*[] { \
-    static const auto found = reinterpret_cast<type>(behind(name)); \
+    static const auto found = reinterpret_cast<decltype(&name)>(behind(#name)); \
     return found; \
   }())
 
@@ -111,9 +127,8 @@ bool usable() {
     const auto is_one_of = [](const char * word, std::initializer_list<std::string> words) {
       return word != nullptr && std::find(words.begin(), words.end(), word) != words.end();
     };
-    const auto identify =
-        reinterpret_cast<const char * (*)()>(behind("rmw_get_implementation_identifier"));
-    const char * const rmw = identify == nullptr ? "no rmw" : identify();
+    const bool has_rmw = behind("rmw_get_implementation_identifier") != nullptr;
+    const char * const rmw = has_rmw ? RMW(rmw_get_implementation_identifier)() : "no rmw";
     bool all = is_one_of(distribution, {"humble", "jazzy", "kilted", "lyrical", "rolling"}) &&
                is_one_of(rmw, {"rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_fastrtps_dynamic_cpp",
                                "rmw_zenoh_cpp", "rmw_connextdds"});

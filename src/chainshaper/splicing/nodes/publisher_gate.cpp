@@ -49,12 +49,7 @@ void emit_write(const void * publisher, const void * message, std::int64_t stamp
 // A message as it is sent.
 class Serialized {
 public:
-  Serialized() {
-    using Get = Allocator (*)();
-    static const auto get =
-        reinterpret_cast<Get>(behind("rcutils_get_default_allocator"));
-    bytes.allocator = get();
-  }
+  Serialized() { bytes.allocator = RMW(rcutils_get_default_allocator)(); }
 
   Serialized(const Serialized &) = delete;
   Serialized & operator=(const Serialized &) = delete;
@@ -100,18 +95,14 @@ public:
     void * const library = dlopen("libstd_msgs__rosidl_typesupport_c.so", RTLD_LAZY);
     void * const get = library == nullptr ? nullptr : dlsym(library, support);
     if (get != nullptr) {
-      using Create = void * (*)(const RmwNode *, const void *, const char *, const RmwQos *,
-                                const SubscriptionOptions *);
       RmwQos qos{};
       qos.history = keep_last;
       qos.depth = 10;
       qos.reliability = is_humble() ? reliable : best_available_reliability;
       qos.durability = is_humble() ? volatile_durability : best_available_durability;
-      const auto options =
-          RMW(SubscriptionOptions(*)(), "rmw_get_default_subscription_options")();
+      const auto options = RMW(rmw_get_default_subscription_options)();
       const void * const type = reinterpret_cast<const void * (*)()>(get)();
-      subscription_ =
-          RMW(Create, "rmw_create_subscription")(node, type, topic.c_str(), &qos, &options);
+      subscription_ = RMW(rmw_create_subscription)(node, type, topic.c_str(), &qos, &options);
     }
     if (subscription_ == nullptr) say("modes on %s cannot be read", topic.c_str());
   }
@@ -119,8 +110,7 @@ public:
   // The modes that were announced since the last time, each with the time (CLOCK_MONOTONIC).
   template <typename Announced>
   void read(Announced announced) {
-    using Take = int (*)(const void *, Bytes *, bool *, MessageInfo *, void *);
-    const auto take = RMW(Take, "rmw_take_serialized_message_with_info");
+    const auto take = RMW(rmw_take_serialized_message_with_info);
     for (bool taken = subscription_ != nullptr; taken;) {
       Serialized text;
       MessageInfo info{};
@@ -316,12 +306,10 @@ private:
   }
 
   void publish(const Serialized & message) {
-    using Publish = int (*)(const RmwPublisher *, const Bytes *, void *);
     EMIT(rcl_publish, rcl_publisher_, &message.bytes);
     // Before Jazzy rmw has no trace point on the way of serialized messages.
     if (is_humble()) emit_write(publisher, &message.bytes, 0);
-    const int code =
-        RMW(Publish, "rmw_publish_serialized_message")(publisher, &message.bytes, nullptr);
+    const int code = RMW(rmw_publish_serialized_message)(publisher, &message.bytes, nullptr);
     if (code != 0 && !failed_) say("%s cannot be published: %d", settings_.output.c_str(), code);
     failed_ = code != 0;
   }
@@ -390,37 +378,30 @@ void shape(const RmwNode * node, const RmwPublisher * publisher, const void * ty
 EXPORTED RmwPublisher * rmw_create_publisher(const RmwNode * node, const void * type_support,
                                              const char * topic, const RmwQos * qos,
                                              const void * options) {
-  using Create = RmwPublisher * (*)(const RmwNode *, const void *, const char *, const RmwQos *,
-                                    const void *);
-  auto * const publisher =
-      RMW(Create, "rmw_create_publisher")(node, type_support, topic, qos, options);
+  auto * const publisher = RMW(rmw_create_publisher)(node, type_support, topic, qos, options);
   shape(node, publisher, type_support, qos == nullptr ? RmwQos{} : *qos);
   return publisher;
 }
 
 EXPORTED int rmw_destroy_publisher(RmwNode * node, RmwPublisher * publisher) {
-  using Destroy = int (*)(RmwNode *, RmwPublisher *);
   for (auto & one : outputs)
     if (Output * const output = one; output != nullptr && output->publisher == publisher) {
       one = nullptr;
       delete output;
     }
-  return RMW(Destroy, "rmw_destroy_publisher")(node, publisher);
+  return RMW(rmw_destroy_publisher)(node, publisher);
 }
 
 EXPORTED int rmw_publish(const RmwPublisher * publisher, const void * message, void * allocation) {
-  using Publish = int (*)(const RmwPublisher *, const void *, void *);
-  using Serialize = int (*)(const void *, const void *, Bytes *);
   if (Output * const output = output_of(publisher))
     return output->take(message, [&](Bytes & bytes) {
-      return RMW(Serialize, "rmw_serialize")(message, output->type_support(), &bytes);
+      return RMW(rmw_serialize)(message, output->type_support(), &bytes);
     });
-  return RMW(Publish, "rmw_publish")(publisher, message, allocation);
+  return RMW(rmw_publish)(publisher, message, allocation);
 }
 
 EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, const Bytes * message,
                                             void * allocation) {
-  using Publish = int (*)(const RmwPublisher *, const Bytes *, void *);
   if (Output * const output = output_of(publisher))
     return output->take(message, [&](Bytes & bytes) {
       bytes.buffer = static_cast<std::uint8_t *>(
@@ -430,17 +411,15 @@ EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, cons
       bytes.length = bytes.capacity = message->length;
       return 0;
     });
-  return RMW(Publish, "rmw_publish_serialized_message")(publisher, message, allocation);
+  return RMW(rmw_publish_serialized_message)(publisher, message, allocation);
 }
 
 // A loaned message leaves as it is: it cannot wait without a copy. rclcpp asks before it borrows one,
 // and where the answer is no it publishes from memory of its own, which is shaped like any other.
 EXPORTED bool rcl_publisher_can_loan_messages(const void * handle) {
-  using Publisher = const RmwPublisher * (*)(const void *);
-  using CanLoan = bool (*)(const void *);
   static std::atomic<bool> said;
-  if (!RMW(CanLoan, "rcl_publisher_can_loan_messages")(handle)) return false;
-  const auto * const publisher = RMW(Publisher, "rcl_publisher_get_rmw_handle")(handle);
+  if (!RMW(rcl_publisher_can_loan_messages)(handle)) return false;
+  const auto * const publisher = RMW(rcl_publisher_get_rmw_handle)(handle);
   if (output_of(publisher) == nullptr) return true;
   if (!said.exchange(true))
     say("%s: no messages are loaned: they cannot wait for their slot without a copy, so the node's own"
@@ -451,9 +430,8 @@ EXPORTED bool rcl_publisher_can_loan_messages(const void * handle) {
 
 EXPORTED int rmw_borrow_loaned_message(const RmwPublisher * publisher, const void * type_support,
                                        void ** message) {
-  using Borrow = int (*)(const RmwPublisher *, const void *, void **);
   if (output_of(publisher) != nullptr) return 3;  // RMW_RET_UNSUPPORTED
-  return RMW(Borrow, "rmw_borrow_loaned_message")(publisher, type_support, message);
+  return RMW(rmw_borrow_loaned_message)(publisher, type_support, message);
 }
 
 // Called by rcl for each publisher, behind rmw_create_publisher.

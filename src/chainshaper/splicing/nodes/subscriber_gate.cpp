@@ -65,10 +65,8 @@ void wait_for(const void * subscription, const bool * taken, const MessageInfo *
 EXPORTED void * rmw_create_subscription(const RmwNode * node, const void * type_support,
                                         const char * topic, const RmwQos * qos,
                                         const void * options) {
-  using Create = void * (*)(const RmwNode *, const void *, const char *, const RmwQos *,
-                            const void *);
   void * const subscription =
-      RMW(Create, "rmw_create_subscription")(node, type_support, topic, qos, options);
+      RMW(rmw_create_subscription)(node, type_support, topic, qos, options);
   remember(subscription, node, topic);
   return subscription;
 }
@@ -76,14 +74,13 @@ EXPORTED void * rmw_create_subscription(const RmwNode * node, const void * type_
 EXPORTED int rmw_destroy_subscription(RmwNode * node, void * subscription) {
   for (auto & one : deliveries)
     if (one.subscription == subscription) one.subscription = nullptr;
-  return RMW(int (*)(RmwNode *, void *), "rmw_destroy_subscription")(node, subscription);
+  return RMW(rmw_destroy_subscription)(node, subscription);
 }
 
-using TakeMessage = int (*)(const void *, void *, bool *, MessageInfo *, void *);
 #define TAKE(name) \
   EXPORTED int name(const void * subscription, void * message, bool * taken, MessageInfo * info, \
                     void * allocation) { \
-    const int code = RMW(TakeMessage, #name)(subscription, message, taken, info, allocation); \
+    const int code = RMW(name)(subscription, message, taken, info, allocation); \
     if (code == 0) wait_for(subscription, taken, info); \
     return code; \
   }
