@@ -1,6 +1,7 @@
 """`ros2 chain` is `chainshaper`: the same verbs, options, output and exit codes."""
 
 import argparse
+import re
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -87,9 +88,14 @@ def test_what_colcon_did_not_install_is_named(
     assert "needs the Python package typer: install" in capsys.readouterr().err
 
 
-def test_the_versions_agree() -> None:
-    version = ElementTree.parse(ROOT / "ros" / "package.xml").findtext("version")  # noqa: S314 - our own
-    assert f'version = "{version}"' in (ROOT / "pyproject.toml").read_text()
+def test_colcon_s_manifest_has_our_version_and_depends_on_what_we_use() -> None:
+    manifest = ElementTree.parse(ROOT / "ros" / "package.xml")  # noqa: S314 - our own
+    project = (ROOT / "pyproject.toml").read_text()
+    assert f'version = "{manifest.findtext("version")}"' in project
+    packages = [one.text or "" for one in manifest.findall("exec_depend")]
+    names = [name.removeprefix("python3-") for name in packages if name.startswith("python3-")]
+    assert names
+    assert [name for name in names if not re.search(rf'"(py)?{name}>=', project)] == []
 
 
 def test_colcon_would_install_everything(tmp_path: Path) -> None:
