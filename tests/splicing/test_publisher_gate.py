@@ -4,6 +4,7 @@
 """
 
 import os
+import re
 import shutil
 import subprocess
 import threading
@@ -259,30 +260,22 @@ def test_no_message_of_an_output_is_loaned_so_that_it_can_wait(run: Callable[...
 
 
 @pytest.mark.parametrize(
-    ("env", "said"),
+    ("changed", "said"),
     [
         ({"ROS_DISTRO": "zebra"}, "ROS 2 zebra with rmw_cyclonedds_cpp is not known"),
         ({"STAND_IN_FOR": "rmw_new"}, "ROS 2 jazzy with rmw_new is not known"),
         ({"CHAINSHAPER_GATES": "/nowhere"}, ""),
+        ({"change": ("anchor stamp", "anchor chain")}, "/t5 leaves at once: its gate in .*'chain'"),
+        ({"change": ("/node5", "/node6")}, ""),  # another node's gate
     ],
 )
 def test_what_it_cannot_shape_passes_at_once_and_it_says_so(
-    run: Callable[..., Run], env: dict[str, str], said: str
+    run: Callable[..., Run], changed: dict[str, Any], said: str
 ) -> None:
-    done = run({"/t5": SLOT}, [at(20 * MS)], **env)
+    done = run({"/t5": SLOT}, [at(20 * MS)], **changed)
     assert len(done.of("typed", "/t5")) == 1
     assert not done.written()
-    assert (said in done.errors) if said else not done.errors
-
-
-@pytest.mark.parametrize("change", [("anchor stamp", "anchor chain"), ("/node5", "/node6")])
-def test_a_wrong_gate_and_another_nodes_are_not_put_before_it(
-    run: Callable[..., Run], change: tuple[str, str]
-) -> None:
-    done = run({"/t5": SLOT}, [at(20 * MS)], change=change)
-    assert len(done.of("typed", "/t5")) == 1
-    wrong = "/t5 leaves at once: its gate in" in done.errors and "'chain'" in done.errors
-    assert wrong == (change[0] == "anchor stamp")
+    assert re.search(said, done.errors) if said else not done.errors
 
 
 def test_messages_that_wait_as_their_publisher_ends_are_counted(run: Callable[..., Run]) -> None:
