@@ -22,6 +22,7 @@ from chainshaper.workload.description import (
     CallbackDescription,
     GateDescription,
     NodeDescription,
+    node_name,
     origin_timer,
 )
 
@@ -42,7 +43,7 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
 
 
 def _refuse_strange_nodes(application: Application, joint: ApplicationPlan) -> None:
-    own = {"/" + name.strip("/") for name in application.nodes}
+    own = {*map(node_name, application.nodes)}
     planned = {thread.node for server in joint.servers for thread in server.threads}
     if strange := planned - own - {node.thread.node for node in joint.shaping_nodes}:
         raise InputError(
@@ -121,7 +122,7 @@ def _placed(application: Application, joint: ApplicationPlan) -> Application:
     best = min((server.priority for server in running), default=1)
     nodes = dict(application.nodes)
     for name, node in application.nodes.items():
-        if (server := server_of.get("/" + name.strip("/"))) is not None:
+        if (server := server_of.get(node_name(name))) is not None:
             own = application.scheduling_of(name)
             rank = max(1, own.priority - (server.priority - best))
             if (own.core, own.priority) != (server.core, rank):
@@ -171,7 +172,7 @@ def writers_of(application: Application) -> list[Writer]:
     """Who publishes what in a described application, and how."""
     return [
         Writer(
-            node="/" + name.strip("/"),
+            node=node_name(name),
             topic=topic,
             depth=application.topic(topic).depth,
             asynchronous=application.topic(topic).publication == "asynchronous",
