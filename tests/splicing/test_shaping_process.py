@@ -6,7 +6,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -193,7 +193,7 @@ def at_work(
     plan: Plan,
     folder: Path,
     publishers: dict[str, Any] | None = None,
-    change: dict[str, object] | None = None,
+    change: Mapping[str, object] | None = None,
     **more: Any,
 ) -> Iterator[NodeRun]:
     """The plan's node in Python, with its log in the folder, and parameters changed."""
