@@ -54,21 +54,20 @@ def walk(stream: list[tuple[int, Boundary]], until: int) -> dict[int, frozenset[
     return found
 
 
-def test_a_shared_boundary_closes_one_server_and_opens_the_other() -> None:
-    # R_m [0, 60), its output's server [60, 70): one instant, never both.
-    assert boundaries_of(100, (((0, 60),), ((60, 70),))) == (
-        Boundary(0, frozenset({0}), frozenset({0})),
-        Boundary(60, frozenset({1}), frozenset({1})),
-        Boundary(70, frozenset(), frozenset()),
-    )
-
-
-def test_a_slot_that_ends_with_the_cycle_goes_over_into_one_that_begins_it() -> None:
-    own = frozenset({0})
-    assert boundaries_of(100, (((0, 20), (80, 100)),)) == (
-        Boundary(0, own, own),
-        Boundary(20, frozenset(), frozenset()),
-        Boundary(80, own, own),
+@pytest.mark.parametrize(
+    ("slots", "opened"),
+    [
+        # R_m [0, 60), its output's server [60, 70): one instant, never both.
+        ((((0, 60),), ((60, 70),)), {0: {0}, 60: {1}, 70: set()}),
+        # A slot that ends with the cycle goes over into the one that begins it.
+        ((((0, 20), (80, 100)),), {0: {0}, 20: set(), 80: {0}}),
+        ((((0, 100),),), {0: {0}}),
+        (((),), {0: set()}),
+    ],
+)
+def test_the_boundaries_of_a_cycle(slots: Slots, opened: dict[int, set[int]]) -> None:
+    assert boundaries_of(100, slots) == tuple(
+        Boundary(at, frozenset(servers), frozenset(servers)) for at, servers in opened.items()
     )
 
 
@@ -79,14 +78,6 @@ def test_nobody_wakes_up_where_nothing_changes() -> None:
         *(1120, 1160),
         *(1220, 1260),
     ]
-
-
-def test_a_server_that_is_open_throughout_is_never_closed() -> None:
-    assert [b.open for b in boundaries_of(100, (((0, 100),),))] == [{0}]
-
-
-def test_a_server_without_slots_is_never_opened() -> None:
-    assert [b.open for b in boundaries_of(100, ((),))] == [frozenset()]
 
 
 @given(tables(), st.integers(-50, 50))
