@@ -376,17 +376,19 @@ def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:
     assert Scheduling(0, None).policy == os.SCHED_OTHER
 
 
+GATE = ShapingNode(
+    name="gate",
+    input="/out_tmp",
+    output="/out",
+    core=1,
+    fifo_priority=84,
+    spin_ns=0,
+    pause_ns=0,
+)
+
+
 def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() -> None:
-    node = ShapingNode(
-        name="gate",
-        input="/out_tmp",
-        output="/out",
-        core=1,
-        fifo_priority=84,
-        spin_ns=0,
-        pause_ns=0,
-        receivers=("/sink", "/a", "/absent"),
-    )
+    node = GATE.model_copy(update={"receivers": ("/sink", "/a", "/absent")})
     chain = _server("chain", EXECUTOR_A, priority=2)
     bare = _plan(chain, _server("output", node.thread, priority=1, start=1)).chains[0]
     plan = whole(revised(bare, shaping_node=node))
@@ -415,24 +417,15 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
         assert _by_tid(found)[300] == Scheduling(81, (core,))
         assert len(waiting_receivers(several, found)) == notes
         assert not waiting_receivers(several, left_by_back_end("scx", found))
-    alone = whole(revised(bare, shaping_node=node.model_copy(update={"receivers": ()})))
+    alone = whole(revised(bare, shaping_node=GATE))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
 
 
 def test_a_gate_in_a_container_is_known_by_its_threads_name() -> None:
     """Of a component, as of a library before rmw: the container's other threads stay its nodes'."""
-    gate = ShapingNode(
-        name="gate",
-        input="/out_tmp",
-        output="/out",
-        core=1,
-        fifo_priority=84,
-        spin_ns=0,
-        pause_ns=0,
-    )
     main, other = _node("/a", 100, "executor", "unknown")
     named = replace(other, thread=replace(other.thread, comm=gate_thread_name("gate")))
-    found = with_gates(Allocation((main, named), ()), [gate]).threads
+    found = with_gates(Allocation((main, named), ()), [GATE]).threads
     assert [(one.thread.tid, one.thread.role, one.nodes) for one in found] == [
         (100, "executor", ("/a",)),
         (101, "executor", ("/gate",)),
