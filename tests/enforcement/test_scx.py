@@ -7,12 +7,12 @@ import signal
 import struct
 import subprocess
 import threading
-import time
 from pathlib import Path
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from processes import wait_for
 
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.scx import libbpf
@@ -174,21 +174,15 @@ def test_a_thread_that_may_not_run_on_the_core_is_refused() -> None:
         process.wait()
 
 
-def _until(process: subprocess.Popen[bytes], wanted: str) -> None:
-    deadline = time.monotonic() + 30
-    while wanted not in (what_happened(process) or ""):
-        assert time.monotonic() < deadline, what_happened(process)
-        time.sleep(0.01)
-
-
 def test_a_kicker_that_stops_or_dies_is_noticed() -> None:
-    process = subprocess.Popen([shutil.which("sleep") or "sleep", "60"])
+    process = subprocess.Popen(["sleep", "60"])
+    stopped = f"was stopped by signal {int(signal.SIGSTOP)}"
     try:
         assert what_happened(process) is None
         process.send_signal(signal.SIGSTOP)
-        _until(process, f"was stopped by signal {int(signal.SIGSTOP)}")
+        wait_for(lambda: what_happened(process) == stopped, "it to be stopped")
         process.kill()
-        _until(process, "was killed by signal 9")
+        wait_for(lambda: what_happened(process) == "was killed by signal 9", "it to be killed")
     finally:
         process.kill()
         process.wait()
