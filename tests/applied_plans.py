@@ -4,10 +4,12 @@ import os
 import re
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 from bare_plans import bare_plan
@@ -15,6 +17,8 @@ from gated import cpu_ns, groups_left, own_cgroup
 from known import known
 from processes import children_of, wait_for
 
+from chainshaper.enforcement.undoing import RunState
+from chainshaper.flow.apply import apply_plan
 from chainshaper.linux import cgroups
 from chainshaper.linux.processes import descendants
 from chainshaper.linux.runs import find_journals
@@ -22,6 +26,7 @@ from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads, parents, start_of
 from chainshaper.planning import Plan, save_plan
 from chainshaper.planning.plan import Server, Thread
+from chainshaper.values.errors import ChainshaperError
 
 MS = 1_000_000
 CYCLE = 100 * MS
@@ -90,6 +95,41 @@ def applied(plan: Plan, folder: Path, *options: str) -> Iterator[subprocess.Pope
     with started(plan, folder, *options) as process:
         wait_until_in_force(process)
         yield process
+
+
+@contextmanager
+def applied_here(
+    plan: Plan, runs: Path, stop: threading.Event | None = None, **how: Any
+) -> Iterator[list[RunState]]:
+    """A plan in force by a thread of this process, with `fifo` unless ``how`` says else; what was
+    seen of its state.
+
+    Raises:
+        ChainshaperError: it does not come into force, or fails while it is.
+    """
+    states: list[RunState] = []
+    failures: list[ChainshaperError] = []
+    stop = stop or threading.Event()
+    options = {"back_end": "fifo", "stop": stop, "watch": states.append, "folder": runs, **how}
+
+    def run() -> None:
+        try:
+            apply_plan(plan, **options)
+        except ChainshaperError as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        wait_for(lambda: bool(states or failures), "the plan to come into force")
+        if not failures:
+            yield states
+    finally:
+        stop.set()
+        thread.join(30)
+        assert not thread.is_alive()
+    if failures:
+        raise failures[0]
 
 
 def wait_until_in_force(process: subprocess.Popen[str]) -> None:

@@ -4,7 +4,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +13,7 @@ from applied_plans import (
     FREEZER,
     MODULES,
     applied,
+    applied_here,
     ended,
     in_force,
     leftovers,
@@ -35,8 +35,6 @@ from processes import wait_for
 
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.guardian import GROUP
-from chainshaper.enforcement.undoing import RunState
-from chainshaper.flow.apply import apply_plan
 from chainshaper.linux import own_processes
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
 from chainshaper.linux.runs import find_journals
@@ -131,24 +129,15 @@ def test_a_strange_line_of_a_journal_is_named_and_all_else_undone(tmp_path: Path
 def test_a_full_disk_does_not_end_a_plan_in_force(full_disk: Path, tmp_path: Path) -> None:
     filling = full_disk / "filling"
     filling.unlink()
-    seen: list[RunState] = []
-    stop = threading.Event()
+    how = {"back_end": "freezer", "phase_ns": 0}
     with node_to_govern(tmp_path) as governed:
-        options = {"back_end": "freezer", "phase_ns": 0, "folder": full_disk, "stop": stop}
-        run = threading.Thread(
-            target=lambda: apply_plan(one_server_plan(), watch=seen.append, **options)  # type: ignore[arg-type]
-        )
-        run.start()
-        wait_for(lambda: bool(seen), "the plan to be in force")
-        with pytest.raises(OSError, match="No space left"):
-            filling.write_bytes(bytes(1_000_000))
-        looks = len(seen)
-        wait_for(lambda: len(seen) >= looks + 3, "the run to go on")
-        assert run.is_alive()
-        assert scheduling(governed.pid) != governed.scheduling
-        assert any("No space left" in note for note in seen[-1].notes)
-        stop.set()
-        run.join(timeout=30)
+        with applied_here(one_server_plan(), full_disk, **how) as seen:
+            with pytest.raises(OSError, match="No space left"):
+                filling.write_bytes(bytes(1_000_000))
+            looks = len(seen)
+            wait_for(lambda: len(seen) >= looks + 3, "the run to go on")
+            assert scheduling(governed.pid) != governed.scheduling
+            assert any("No space left" in note for note in seen[-1].notes)
         filling.unlink()
         assert list(full_disk.iterdir()) == []
         governed.check_as_before()

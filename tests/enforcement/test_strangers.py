@@ -4,28 +4,23 @@ import os
 import shutil
 import signal
 import subprocess
-import threading
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from applied_plans import needs_fifo, plan_for, running_node, server
+from applied_plans import applied_here, needs_fifo, plan_for, running_node, server
 from command_line import called, json_of, refused
 from known import known
 from processes import wait_for
 from strangers import NOBODY, named, needs_root, open_folder, strange
 
 from chainshaper import find_threads
-from chainshaper.enforcement.undoing import RunState
-from chainshaper.flow import apply as applying
 from chainshaper.linux.processes import read_process, run_users, user_of
 from chainshaper.linux.threads import has_ended, list_threads, start_of
 from chainshaper.planning import Plan, save_plan
 from chainshaper.sources import ros
 from chainshaper.sources.ros import environment_of, own_environment, start_with_rclpy
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError
 
 __all__ = ["open_folder"]
 pytestmark = needs_root
@@ -35,45 +30,6 @@ cat /proc/self/status > {ran}.partial
 ls -l /proc/self/fd >> {ran}.partial
 mv {ran}.partial {ran}
 """
-
-
-@contextmanager
-def applied(plan: Plan, folder: Path, **how: object) -> Iterator[Callable[[], RunState]]:
-    """The plan in force, in a folder of its own; what is given is the state that it is in.
-
-    Raises:
-        ChainshaperError: it does not come into force, or fails while it is.
-    """
-    states: list[RunState] = []
-    failures: list[ChainshaperError] = []
-    stop = threading.Event()
-
-    def run() -> None:
-        try:
-            applying.apply_plan(
-                plan,
-                back_end="fifo",
-                phase_ns=0,
-                stop=stop,
-                watch=states.append,
-                folder=folder / "runs",
-                **how,  # type: ignore[arg-type]
-            )
-        except ChainshaperError as error:
-            failures.append(error)
-
-    thread = threading.Thread(target=run)
-    thread.start()
-    try:
-        wait_for(lambda: bool(states or failures), "the plan to come into force")
-        if not failures:
-            yield lambda: states[-1]
-    finally:
-        stop.set()
-        thread.join(30)
-        assert not thread.is_alive()
-    if failures:
-        raise failures[0]
 
 
 def trap(folder: Path) -> tuple[dict[str, str], Path]:
@@ -108,12 +64,12 @@ def test_nothing_of_a_strangers_environment_runs_unless_its_user_is_named_and_th
         own_threads = [realtime(one.pid) for one in (others, gate)]
         with (
             pytest.raises(OperationError, match="left alone, since users run them whom this run"),
-            applied(plan, tmp_path),
+            applied_here(plan, tmp_path / "runs", phase_ns=0),
         ):
             pass
         assert not ran.exists()
         assert [realtime(one.pid) for one in (others, gate)] == own_threads == [[], []]
-        with applied(plan, tmp_path, users=["nobody"]):
+        with applied_here(plan, tmp_path / "runs", phase_ns=0, users=["nobody"]):
             wait_for(ran.exists, "what the nodes' user wants to be run")
             assert realtime(others.pid)
             assert realtime(gate.pid), "the shaping node has its server's priority, too"
@@ -138,22 +94,25 @@ def test_a_name_that_a_stranger_repeats_neither_blocks_nor_is_governed_ever(
         running_node("other", tmp_path / "other"),
         strange(named("origin", "other")) as stranger,
     ):
-        with running_node("origin", tmp_path / "origin") as node, applied(plan, tmp_path) as state:
+        with (
+            running_node("origin", tmp_path / "origin") as node,
+            applied_here(plan, tmp_path / "runs", phase_ns=0) as states,
+        ):
             wait_for(lambda: bool(realtime(node.pid)), "the plan's node to be governed")
-            (line,) = [note for note in state().notes if str(stranger.pid) in note]
+            (line,) = [note for note in states[-1].notes if str(stranger.pid) in note]
             assert "/origin, /other (process" in line
             assert "of nobody)" in line
             assert "\n" not in line
             node.send_signal(signal.SIGKILL)
             node.wait()
-            gone = state()
-            wait_for(lambda: not state().servers[0].threads, "the end of the node to be seen")
-            wait_for(lambda: state() is not gone, "another look")
+            gone = states[-1]
+            wait_for(lambda: not states[-1].servers[0].threads, "the end of the node to be seen")
+            wait_for(lambda: states[-1] is not gone, "another look")
             assert realtime(stranger.pid) == []
             (tmp_path / "origin").unlink()
             with running_node("origin", tmp_path / "origin") as again:
                 wait_for(lambda: bool(realtime(again.pid)), "the node to be taken in again")
-                assert [note for note in state().notes if str(stranger.pid) in note] == [line]
+                assert [note for note in states[-1].notes if str(stranger.pid) in note] == [line]
                 assert realtime(stranger.pid) == []
         assert realtime(stranger.pid) == []
 
