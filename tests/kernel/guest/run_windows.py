@@ -55,7 +55,6 @@ class Precision:
     leave: tuple[int, ...]
     unused: int
     outside: int
-    longest_outside: int
 
     def text(self) -> str:
         return (
@@ -74,13 +73,11 @@ def precision(windows: Intervals, slots: Intervals) -> Precision:
             continue
         enter.append(max(inside[0][0] - start, 0))
         leave.append(inside[-1][1] - end)
-    outside = [b - a - overlap([(a, b)], slots) for a, b in windows]
-    return Precision(tuple(enter), tuple(leave), unused, sum(outside), max(outside, default=0))
+    outside = length(windows) - overlap(windows, slots)
+    return Precision(tuple(enter), tuple(leave), unused, outside)
 
 
 def _spread(values: tuple[int, ...]) -> str:
-    if not values:
-        return "-"
     ordered = sorted(values)
     chosen = (ordered[0], ordered[len(ordered) // 2], ordered[-1])
     return "/".join(f"{value / 1e3:.1f}" for value in chosen)
