@@ -173,29 +173,12 @@ def test_journals_lie_where_they_vanish_with_the_boot(monkeypatch: pytest.Monkey
 MS = 1_000_000
 
 
-def _run(folder: Path, name: str, **facts: object) -> Journal:
+def _run(folder: Path, name: str, in_force_ns: int | None) -> Journal:
     """A run that governs this very process."""
     journal = open_journal(folder, name)
     server = ServerState("chain", 0, 1, ((0, 1),), (os.getpid(),), "freezer", ServerCounters())
-    state = RunState(
-        **{  # type: ignore[arg-type]
-            "run": name,
-            "owner": os.getpid(),
-            "plan": "plan.yaml",
-            "command": (),
-            "back_end": "freezer",
-            "reason": "",
-            "started_ns": 0,
-            "cycle_ns": 10,
-            "anchor_ns": 0,
-            "phase_spread_ns": None,
-            "drift_ns": None,
-            "servers": (server,),
-            "notes": (),
-            "failure": None,
-            **facts,
-        }
-    )
+    which = (name, os.getpid(), "plan.yaml", (), "freezer", "")
+    state = RunState(*which, 0, 10, servers=(server,), in_force_ns=in_force_ns)
     save_run_state(journal.path.parent, state)
     return journal
 
