@@ -13,7 +13,7 @@ def bare_plan(
     """A plan that shapes nothing, unless ``fields`` say so."""
     return Plan(
         chain=ChainOfPlan(spec=spec, output=output, period_ns=cycle_ns),
-        evidence=Evidence(samples=1, min_latency_ns=0, mean_latency_ns=1, max_latency_ns=1),
+        evidence=Evidence(samples=1000, min_latency_ns=0, mean_latency_ns=1, max_latency_ns=1),
         margin=Margin(epsilon_ns=0),
         cycle_ns=cycle_ns,
         servers=servers,
