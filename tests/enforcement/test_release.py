@@ -129,9 +129,9 @@ def test_a_strange_line_of_a_journal_is_named_and_all_else_undone(tmp_path: Path
 def test_a_full_disk_does_not_end_a_plan_in_force(full_disk: Path, tmp_path: Path) -> None:
     filling = full_disk / "filling"
     filling.unlink()
-    how = {"back_end": "freezer", "phase_ns": 0}
+    plan = one_server_plan()
     with node_to_govern(tmp_path) as governed:
-        with applied_here(one_server_plan(), full_disk, **how) as seen:
+        with applied_here(plan, full_disk, back_end="freezer", phase_ns=0) as seen:
             with pytest.raises(OSError, match="No space left"):
                 filling.write_bytes(bytes(1_000_000))
             looks = len(seen)
