@@ -88,21 +88,23 @@ def made_records() -> tuple[str, dict[int, list[EventRecord]]]:
 
 
 def read_records(folder: Path) -> tuple[str, dict[int, list[EventRecord]]]:
-    """Metadata and records per core of a real trace of one folder and one stream class."""
+    """Metadata and records per core of a real trace of one folder and one stream class.
+
+    Events with a field that no table has a column for are left out.
+    """
     trace = open_trace(folder)
     text, _ = read_metadata_text(trace.folders[0].path / "metadata")
-    names = {"pid": "vpid", "tid": "vtid"}
+    (stream,) = trace.folders[0].declared.streams.values()
+    fields = {e.name: e.fields.fields if e.fields else () for e in stream.events.values()}
+    names = {"pid": "vpid", "tid": "vtid", "procname": "procname"}  # as `ros2 trace` asks for
     records: dict[int, list[EventRecord]] = {}
-    for name, frame in read_events(trace, context=True).items():
+    for name, frame in read_events(trace).items():
         for row in frame.iter_rows(named=True):
-            context = {
-                names.get(column, column.removeprefix("context.")): row.pop(column)
-                for column in list(row)
-                if column in ("pid", "tid", "procname") or column.startswith("context.")
-            }
+            context = {own: row.pop(column) for column, own in names.items() if column in row}
             now, cpu = row.pop("time"), row.pop("cpu")
             payload = {column.removeprefix("payload."): value for column, value in row.items()}
-            records.setdefault(cpu, []).append(EventRecord(name, now, payload, context))
+            if len(payload) == len(fields[name]):
+                records.setdefault(cpu, []).append(EventRecord(name, now, payload, context))
     for found in records.values():
         found.sort(key=lambda record: record.time)
     return text, records

@@ -13,23 +13,20 @@ from typing import Any
 import bt2  # type: ignore[import-not-found]
 
 
-def plain(field: Any) -> Any:
-    """A bt2 field as plain Python; a variant as a mapping with its one option."""
-    kind = type(field).__name__
-    if "Structure" in kind:
-        return {name: plain(field[name]) for name in field}
-    if "Array" in kind:
-        return [plain(item) for item in field]
-    if "Variant" in kind:
-        names = list(field.cls) if hasattr(field, "cls") else list(field.field_class)
-        return {names[field.selected_option_index]: plain(field.selected_option)}
-    if "String" in kind:
-        return str(field)
-    return float(field) if "Real" in kind else int(field)
-
-
 def fields(of: Any) -> Any:
-    return plain(of) if of is not None else {}
+    """The numbers, texts and arrays of bytes of a bt2 structure: what a table has columns for."""
+    found: dict[str, Any] = {}
+    for name in of or ():
+        field, kind = of[name], type(of[name]).__name__
+        if "String" in kind:
+            found[name] = str(field)
+        elif "Integer" in kind or "Enumeration" in kind:
+            found[name] = int(field)
+        elif "Array" in kind:
+            element = field.cls.element_field_class
+            if getattr(element, "field_value_range", 0) == 8:
+                found[name] = [int(item) for item in field]
+    return found
 
 
 events, discarded, lost = [], 0, 0

@@ -55,12 +55,12 @@ def _events(number: int, fields: str) -> str:
 # Declarations, the fields of the event, its payload; what the message says, None for none.
 BOMBS = {
     "a sequence of texts of no bits": (
-        TEXT, "struct { u32 n; chr v[n][0]; }", struct.pack("<I", 60_000), "far more memory"),
+        TEXT, "struct { u32 n; chr v[n][0]; }", struct.pack("<I", 60_000), None),
     "sequences in sequences": (
         TEXT, "struct { u32 n; struct { struct { chr v[0]; } v[n]; } v[n]; }",
-        struct.pack("<I", 1000), "far more memory"),
+        struct.pack("<I", 1000), None),
     "arrays in arrays": (
-        TEXT, "struct { chr v[1000][1000][1000][0]; u8 x; }", b"\0", "far more memory"),
+        TEXT, "struct { chr v[1000][1000][1000][0]; u8 x; }", b"\0", None),
     "one byte an event": (
         TEXT, "struct { u8 t; }", b"\0", None),
     "many texts of no bits": (

@@ -29,7 +29,9 @@ def test_round_trip(tmp_path: Path, options: dict[str, Any]) -> None:
     expected: dict[str, list[Any]] = {}
     for event in make_trace(tmp_path, **options):
         who = {"time": event.time, "pid": event.context["vpid"], "tid": event.context["vtid"]}
-        expected.setdefault(event.name, []).append(lean({**who, **event.payload}))
+        row = {**who, **event.payload}
+        row.pop("subs", None)  # of 64 bits each: no table has a column for them
+        expected.setdefault(event.name, []).append(lean(row))
     frames = read_events(open_trace(tmp_path))
     rows = actual_rows({n: f.drop("cpu", "procname") for n, f in frames.items()})
     assert rows.keys() == expected.keys()

@@ -149,10 +149,9 @@ def store(column, width, row, value):
 
 
 @compiled(inline=True)
-def keep(op, value, rows):
+def keep(op, value, row):
     """Write a value to its slot's row, if it has a slot."""
     if get(op, tb.O_ADDRESS) != 0:
-        row = get(rows, get(op, tb.O_COUNTER))
         store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, value)
 
 
@@ -178,7 +177,7 @@ def advance_clock(state, value, size):
 
 
 @compiled()
-def run_number(machine, op, base, mapped, position, regs):
+def run_number(machine, op, base, mapped, position, regs, row):
     """Read an integer or a float's bits; the caller has checked the end."""
     size, flags = get(op, tb.O_SIZE), get(op, tb.O_FLAGS)
     value = bits_at(base, position, size, flags & 2, mapped)
@@ -188,13 +187,13 @@ def run_number(machine, op, base, mapped, position, regs):
     register = get(op, tb.O_REGISTER)
     if register >= 0:
         put(regs, register, np.int64(value))
-    keep(op, value, get(machine, tb.M_ROWS))
+    keep(op, value, row)
     if flags & 4:
         advance_clock(get(machine, tb.M_STATE), value, size)
 
 
 @compiled(inline=True)
-def run_text(machine, op, base, mapped, end, position, regs):
+def run_text(machine, op, base, mapped, end, position, regs, row):
     """Read a string or a text array; returns the position behind it or a failure."""
     at = position >> 3
     if get(op, tb.O_CODE) == tb.TEXT:
@@ -213,22 +212,20 @@ def run_text(machine, op, base, mapped, end, position, regs):
         code = intern(machine, base + at, length, digest, word)
         if code < 0:
             return np.int64(tb.FULL_DICTIONARY)
-        keep(op, np.uint64(code), get(machine, tb.M_ROWS))
+        keep(op, np.uint64(code), row)
     return following
 
 
 @compiled()
 def run_copy(op, base, position, count, rows):
-    """Copy ``count`` elements that lie alike in packet and slot; both ends are checked."""
-    width = get(op, tb.O_SIZE) >> 3
+    """Copy ``count`` bytes to their slot; both ends are checked."""
     source = base + (position >> 3)
-    target = get(op, tb.O_INNER_ADDRESS) + get(rows, get(op, tb.O_INNER)) * width
-    total = count * width
-    index = total * 0
-    while index + 8 <= total:
+    target = get(op, tb.O_INNER_ADDRESS) + get(rows, get(op, tb.O_INNER))
+    index = count * 0
+    while index + 8 <= count:
         store_long(target + index, load_word(source + index))
         index += 8
-    while index < total:
+    while index < count:
         store_byte(target + index, load_byte(source + index))
         index += 1
 
@@ -241,14 +238,14 @@ def choose(op, ranges, regs):
         tag = np.int64(np.uint64(tag) ^ (tb.U1 << np.uint64(63)))
     first = get(op, tb.O_COUNT)
     for index in range(first, first + get(op, tb.O_LEAST)):
-        row = ranges + 32 * index
+        row = ranges + 24 * index
         if get(row, 0) <= tag <= get(row, 1):
             return row
     return np.int64(-1)
 
 
 @compiled()
-def run_many(machine, op, base, end, position, regs, depth):
+def run_many(machine, op, base, end, position, regs, depth, row):
     """Run a SKIP_MANY or COPY, or begin a LOOP, whose turns go on the stack at ``depth``.
 
     Returns the position behind it or a failure.
@@ -263,16 +260,16 @@ def run_many(machine, op, base, end, position, regs, depth):
     state = get(machine, tb.M_STATE)
     if not afforded(state, count * get(op, tb.O_COST)):
         return np.int64(tb.OVER_BUDGET)
-    rows, inner = get(machine, tb.M_ROWS), get(op, tb.O_INNER)
-    if inner >= 0 and get(rows, inner) + count > get(get(machine, tb.M_CAPS), inner):
-        return np.int64(tb.FULL_TABLE)
-    keep(op, np.uint64(count), rows)
     if code == tb.LOOP:
         put(state, tb.X_STACK + depth, count)
         return position
     if code == tb.COPY:
-        run_copy(op, base, position, count, rows)
-    if inner >= 0:
+        rows, inner = get(machine, tb.M_ROWS), get(op, tb.O_INNER)
+        if get(rows, inner) + count > get(get(machine, tb.M_CAPS), inner):
+            return np.int64(tb.FULL_TABLE)
+        keep(op, np.uint64(count), row)
+        if get(op, tb.O_INNER_ADDRESS) != 0:
+            run_copy(op, base, position, count, rows)
         put(rows, inner, get(rows, inner) + count)
     return position + count * get(op, tb.O_SIZE)
 
@@ -330,13 +327,13 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
             if code == tb.MOVE and place + 8 <= mapped:
                 store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, load_word(base + place))
             elif code != tb.SKIP:
-                run_number(machine, op, base, mapped, start, regs)
+                run_number(machine, op, base, mapped, start, regs, row)
         elif code <= tb.CHARACTERS:
-            position = run_text(machine, op, base, mapped, end, position, regs)
+            position = run_text(machine, op, base, mapped, end, position, regs, row)
             if position < 0:
                 return position
         elif code <= tb.LOOP:
-            position = run_many(machine, op, base, end, position, regs, depth)
+            position = run_many(machine, op, base, end, position, regs, depth, row)
             if position < 0:
                 return position
             if code == tb.LOOP and get(state, tb.X_STACK + depth) == 0:
@@ -344,10 +341,6 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
             elif code == tb.LOOP:
                 depth += 1
         elif code == tb.AGAIN:
-            inner = get(op, tb.O_INNER)
-            if inner >= 0:
-                rows = get(machine, tb.M_ROWS)
-                put(rows, inner, get(rows, inner) + 1)
             left = get(state, tb.X_STACK + depth - 1) - 1
             put(state, tb.X_STACK + depth - 1, left)
             if left > 0:
@@ -358,7 +351,6 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
             chosen = choose(op, get(machine, tb.M_RANGES), regs)
             if chosen < 0:
                 return np.int64(tb.NO_OPTION)
-            keep(op, np.uint64(get(chosen, 3)), get(machine, tb.M_ROWS))
             following = ops + (get(chosen, 2) << 7)
         else:
             following = ops + (get(op, tb.O_TARGET) << 7)

@@ -6,9 +6,9 @@ cost of reading an event.
 
 `lay_out` turns the types of all events into operations. Runs of fixed size that are not asked for
 become one SKIP, so that an event that is not wanted costs one addition. Values go to *slots*, one
-flat array each. A slot belongs to a *level*: level 0 has one row per event, each array or sequence
-opens one with a row per element. Slots and levels are numbered in the order in which a column's
-type is walked, here and where columns are made of them.
+flat array each. A slot belongs to a *level*: level 0 has one row per event, each array of bytes
+opens one with a row per byte. Slots and levels are numbered in the order of the columns, here and
+where columns are made of them.
 """
 
 # ruff: noqa: PLR0917 - what is known of a trace on the way down its metadata
@@ -27,8 +27,8 @@ from chainshaper.sources.ctf import tsdl
 
 # fmt: off
 # A table's columns stand together, with what they hold behind them.
-# The machine. RANGES of variants' tags: low, high, operation to go on with, 1 + option. ROWS are
-# the row counters (COUNTERS of them), CAPS how far each may go, SAVED room for some. SLOTS is the
+# The machine. RANGES of variants' tags: low, high, operation to go on with. ROWS are the row
+# counters (COUNTERS of them), CAPS how far each may go, SAVED room for some. SLOTS is the
 # dictionary's hash table, int32, MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per
 # event class a count and BATCH pairs (address, row).
 (
@@ -93,20 +93,19 @@ A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
 (
     O_CODE,
     O_ALIGN,  # bits
-    O_SIZE,  # bits; of one element for SKIP_MANY and COPY
+    O_SIZE,  # bits; of one element for SKIP_MANY
     O_FLAGS,  # 1 signed, 2 big-endian, 4 advances the clock
     O_ADDRESS,  # where row 0 of the slot lies, 0 for no slot
     O_WIDTH,  # bytes per row of the slot
-    O_COUNTER,  # the level's row counter
     O_REGISTER,  # written by NUMBER, the length or tag for others; -1 for none
     O_COUNT,  # constant length; first range of SWITCH
     O_TARGET,  # operation to go on with
-    O_INNER,  # the element level's row counter, -1 where it is not wanted
+    O_INNER,  # the row counter of the level of bytes that COPY writes
     O_INNER_ADDRESS,  # where COPY writes
     O_LEAST,  # the least bits an element takes; number of ranges of SWITCH
     O_OFFSET,  # bytes from the aligned start of an event of constant layout
-    O_COST,  # of an element of SKIP_MANY, COPY and LOOP
-) = range(15)
+    O_COST,  # of an element of COPY and LOOP
+) = range(14)
 OPERATION_COLUMNS = 16
 
 SKIP, NUMBER, MOVE, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP = range(11)
@@ -172,11 +171,10 @@ class LayoutError(ValueError):
 
 
 class Slot(NamedTuple):
-    """A flat array: its level, its NumPy type code or TEXT_CODES, whether rows may be unwritten."""
+    """A flat array: its level, its NumPy type code or TEXT_CODES."""
 
     level: int
     kind: str
-    sparse: bool
 
     @property
     def dtype(self) -> np.dtype[Any]:
@@ -199,14 +197,13 @@ class Table:
 
 
 class Wanted(NamedTuple):
-    """Events that get a table, those of them without their procname, and whether with all context.
+    """Events that get a table, and those of them without their procname.
 
     pid and tid always are wanted.
     """
 
     names: frozenset[str] = frozenset()
     nameless: frozenset[str] = frozenset()
-    context: bool = False
 
 
 _Scope = tuple[str, tsdl.StructType | None, Container[str]]
@@ -310,14 +307,14 @@ _Frame = dict[str, "_Number | _Frame | None"]
 
 
 class _Place(NamedTuple):
-    """Where a type stands: the numbers around it, its level, and whether it gets a column."""
+    """Where a type stands: the numbers around it, and whether it gets a column."""
 
     frames: tuple[_Frame, ...]
-    level: int
     keep: bool
 
     def inside(self, frame: _Frame) -> _Place:
-        return self._replace(frames=(*self.frames, frame))
+        """In a structure, variant or array, whose members get no columns."""
+        return _Place((*self.frames, frame), keep=False)
 
 
 @dataclass
@@ -339,7 +336,6 @@ class _Writer:
     roots: dict[str, _Frame] = field(default_factory=dict)
     slots: list[Slot] = field(default_factory=list)
     levels: int = 1
-    sparse: bool = False
     start: int = field(default=0, init=False)
 
     def following(self, addresses: Sequence[tuple[int, int]] = (), fixed: bool = False) -> _Writer:
@@ -355,7 +351,7 @@ class _Writer:
             if kind is not None:
                 self._skip(kind.align, 0)
             for member in kind.fields if kind is not None else ():
-                place = _Place((frame,), 0, member.name in wanted)
+                place = _Place((frame,), member.name in wanted)
                 match member.type if self.fixed and member.name == "uuid" else None:
                     case tsdl.ArrayType(tsdl.IntegerType(8, 8), 16):
                         half = tsdl.IntegerType(64, 8, byte_order="le")
@@ -369,8 +365,7 @@ class _Writer:
     def count_from(self, counter: int) -> None:
         """Set the row counter of level 0."""
         for row in self.layout.operations[self.start :]:
-            row[O_COUNTER] += counter
-            row[O_INNER] += counter if row[O_INNER] >= 0 else 0
+            row[O_INNER] += counter if row[O_CODE] == COPY else 0
 
     def _type(self, name: str, kind: tsdl.Type, at: _Place) -> int:
         """Lay out a type; returns the least number of bits that it takes, alignment aside."""
@@ -393,10 +388,10 @@ class _Writer:
 
     def _number(self, name: str, kind: tsdl.IntegerType | tsdl.FloatType, at: _Place) -> int:
         big = self.big if kind.byte_order == "native" else kind.byte_order == "be"
-        code, register, clock = "f", -1, False
+        signed, register, clock = False, -1, False
         at.frames[-1][name] = None
         if isinstance(kind, tsdl.IntegerType):
-            code, clock = "i" if kind.signed else "u", kind.clock is not None
+            signed, clock = kind.signed, kind.clock is not None
             if self.fixed and name in REGISTERS and (len(at.frames) == 1 or name == "id"):
                 register = REGISTERS[name]
                 # The end of a packet is no instant that its events follow.
@@ -405,14 +400,14 @@ class _Writer:
                 register, self.registers = self.registers, self.registers + 1
             at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
         width = 1 << ((kind.size + 7 >> 3) - 1).bit_length()
-        place = self._slot(f"{code}{width}", at) if at.keep else {}
+        place = self._slot(f"{'i' if signed else 'u'}{width}", at)
         if not place and register < 0 and not clock:
             self._skip(kind.align, kind.size)
             return kind.size
-        flags = (code == "i") + 2 * big + 4 * clock
+        flags = signed + 2 * big + 4 * clock
         columns = {O_ALIGN: kind.align, O_SIZE: kind.size, O_FLAGS: flags, O_REGISTER: register}
         row = self._row(NUMBER, columns | place)
-        if at.level == 0 and _is_moved(row):
+        if _is_moved(row):
             row[O_CODE] = MOVE
         return kind.size
 
@@ -430,50 +425,51 @@ class _Writer:
             else:
                 self._skip(8, 8 * count)
             return 8 * count
-        columns |= self._slot("u4", at) if register >= 0 else {}
-        inner = self.levels
-        if at.keep:
-            self.levels += 1
-            columns[O_INNER] = inner
-        slots, loop, first = len(self.slots), self._row(LOOP, columns), len(rows)
-        least = self._type(f"{name}[]", kind.element, at.inside({})._replace(level=inner))
-        found = self.slots[slots:]
-        loop[O_COST] = sum(slot.dtype.itemsize for slot in found if slot.level == inner)
+        if at.keep and tsdl.is_bytes(kind):
+            return self._bytes(columns, at)
+        loop, first = self._row(LOOP, columns), len(rows)
+        least = self._type(f"{name}[]", kind.element, at.inside({}))
         only = rows[first] if len(rows) == first + 1 else loop
         even = only[O_CODE] == SKIP and only[O_SIZE] % only[O_ALIGN] == 0
-        if not found and even and only[O_SIZE] == 0:  # an array of empty structures
+        if even and only[O_SIZE] == 0:  # an array of empty structures
             del rows[first - 1 :]
             self._skip(tsdl.alignment(kind), 0)
-        elif even and register < 0 and not at.keep:
+        elif even and register < 0:
             del rows[first - 1 :]
             self._skip(max(tsdl.alignment(kind), only[O_ALIGN]), only[O_SIZE] * count)
         elif even and only[O_SIZE] > 0:
             loop[O_CODE], loop[O_SIZE] = SKIP_MANY, only[O_SIZE]
             del rows[first:]
-        elif only[O_CODE] == NUMBER and _is_moved(only) and only[O_SIZE] % only[O_ALIGN] == 0:
-            loop[O_CODE], loop[O_SIZE], loop[O_INNER_ADDRESS] = COPY, only[O_SIZE], only[O_ADDRESS]
-            del rows[first:]
         else:
-            self._row(AGAIN, {O_TARGET: first, O_INNER: loop[O_INNER]})
+            self._row(AGAIN, {O_TARGET: first})
             loop[O_TARGET], loop[O_LEAST] = len(rows), least
-            loop[O_COST] += self.layout.cost(first, len(rows))
+            loop[O_COST] = self.layout.cost(first, len(rows))
         return count * least
+
+    def _bytes(self, columns: dict[int, int], at: _Place) -> int:
+        """Lay out an array or sequence of bytes that gets a column, on a level of its own."""
+        if columns[O_REGISTER] >= 0:
+            columns |= self._slot("u4", at)
+        columns |= {O_SIZE: 8, O_COST: 1, O_INNER: self.levels}
+        place = self._slot("u1", at, self.levels)
+        self._row(COPY, {**columns, O_INNER_ADDRESS: place.get(O_ADDRESS, 0)})
+        self.levels += 1
+        return 8 * columns[O_COUNT]
 
     def _variant(self, name: str, kind: tsdl.VariantType, at: _Place) -> int:
         if kind.tag is None:
             raise LayoutError(f"variant {name!r} has no tag")
         rows, tag = self.layout.operations, self._referred(kind.tag, at)
-        columns = {O_REGISTER: tag.register, O_FLAGS: int(tag.signed), **self._slot("u2", at)}
+        columns = {O_REGISTER: tag.register, O_FLAGS: int(tag.signed)}
         switch = self._row(SWITCH, {**columns, O_COUNT: len(self.layout.ranges)})
         by_label, targets = self._ranges_by_label(tag), []
-        for number, option in enumerate(kind.options, start=1):
+        for option in kind.options:
             labels = dict.fromkeys((option.name, option.name.removeprefix("_")))
             ends = [pair for label in labels for pair in by_label.get(label, ())]
-            targets.append([[low, high, 0, number] for low, high in ends])
+            targets.append([[low, high, 0] for low, high in ends])
             self.layout.ranges += targets[-1]
         switch[O_LEAST] = sum(map(len, targets))
         self.layout.steps += switch[O_LEAST]
-        outer, self.sparse = self.sparse, True
         frame = at.frames[-1][name] = _Frame()
         jumps, least = [], []
         for option, ranges in zip(kind.options, targets, strict=True):
@@ -483,7 +479,6 @@ class _Writer:
             jumps.append(self._row(JUMP, {}))
         for jump in jumps:
             jump[O_TARGET] = len(rows)
-        self.sparse = outer
         return min(least, default=0)
 
     def _ranges_by_label(self, tag: _Number) -> dict[str, list[tuple[int, int]]]:
@@ -513,18 +508,18 @@ class _Writer:
                 return found
         raise LayoutError(f"length or tag {path!r} names no number that is read before it")
 
-    def _slot(self, kind: str, at: _Place) -> dict[int, int]:
+    def _slot(self, kind: str, at: _Place, level: int = 0) -> dict[int, int]:
         """Add a slot, if one is wanted: the columns of an operation that say where it lies."""
         if at.keep:
-            self.slots.append(Slot(at.level, kind, self.sparse))
+            self.slots.append(Slot(level, kind))
             if self.addresses:
                 address, width = self.addresses[len(self.slots) - 1]
-                return {O_ADDRESS: address, O_WIDTH: width, O_COUNTER: at.level}
+                return {O_ADDRESS: address, O_WIDTH: width}
         return {}
 
     def _row(self, code: int, columns: dict[int, int]) -> list[int]:
         row = [0] * OPERATION_COLUMNS
-        row[O_CODE], row[O_ALIGN], row[O_REGISTER], row[O_INNER] = code, 1, -1, -1
+        row[O_CODE], row[O_ALIGN], row[O_REGISTER] = code, 1, -1
         for column, value in columns.items():
             row[column] = value
         self.layout.operations.append(row)
@@ -624,38 +619,44 @@ def _columns(
     A kernel trace's pid and tid are of the initial namespace; user space traces have ``vpid`` and
     ``vtid`` of the process's only.
     """
-    contexts = {"stream.event.context": stream.event_context, "event.context": event.context}
-    if event.name not in asked.names:
-        return [(s, k, ()) for s, k in {**contexts, "event.fields": event.fields}.items()], []
-    members_of = {s: kind.fields if kind is not None else () for s, kind in contexts.items()}
-    present: dict[str, tuple[str, str]] = {}
-    for scope, members in members_of.items():
-        for member in members:
-            present.setdefault(tsdl.field_name(member.name), (scope, member.name))
-    standard: dict[tuple[str, str], str] = {}
-    for column in ("pid", "tid", *(["procname"] if event.name not in asked.nameless else [])):
-        names = (column, f"v{column}") if kernel else (f"v{column}", column)
-        found = next((present[name] for name in names if name in present), None)
-        if found is not None:
-            standard[found] = column
-    scopes: list[_Scope] = []
-    columns: list[tuple[str, tsdl.Type]] = []
-    for scope, members in members_of.items():
-        chosen = [m for m in members if asked.context or (scope, m.name) in standard]
-        scopes.append((scope, contexts[scope], {member.name for member in chosen}))
-        for member in chosen:
-            name = standard.get((scope, member.name), f"context.{tsdl.field_name(member.name)}")
-            columns.append((name, member.type))
-    members = event.fields.fields if event.fields is not None else ()
-    scopes.append(("event.fields", event.fields, {member.name for member in members}))
-    taken = {"time", "cpu", "pid", "tid", "procname", *(name for name, _ in columns)}
-    for member in members:
-        name = tsdl.field_name(member.name)
-        while name in taken:
-            name = f"payload.{name}"
-        taken.add(name)
-        columns.append((name, member.type))
-    return scopes, columns
+    scopes = {
+        "stream.event.context": stream.event_context,
+        "event.context": event.context,
+        "event.fields": event.fields,
+    }
+    members = {
+        scope: [one for one in kind.fields if _has_column(one.type)] if kind is not None else []
+        for scope, kind in scopes.items()
+    }
+    wanted: dict[str, dict[str, str]] = {scope: {} for scope in scopes}  # field → column
+    if event.name in asked.names:
+        present: dict[str, tuple[str, str]] = {}
+        for scope in ("stream.event.context", "event.context"):
+            for member in members[scope]:
+                present.setdefault(tsdl.field_name(member.name), (scope, member.name))
+        for column in ("pid", "tid", *(["procname"] if event.name not in asked.nameless else [])):
+            names = (column, f"v{column}") if kernel else (f"v{column}", column)
+            if found := next((present[name] for name in names if name in present), None):
+                wanted[found[0]][found[1]] = column
+        taken = {"time", "cpu", "pid", "tid", "procname"}
+        for member in members["event.fields"]:
+            name = tsdl.field_name(member.name)
+            while name in taken:
+                name = f"payload.{name}"
+            taken.add(name)
+            wanted["event.fields"][member.name] = name
+    columns = [
+        (wanted[scope][member.name], member.type)
+        for scope, own in members.items()
+        for member in own
+        if member.name in wanted[scope]
+    ]
+    return [(scope, kind, wanted[scope]) for scope, kind in scopes.items()], columns
+
+
+def _has_column(kind: tsdl.Type) -> bool:
+    """Whether a table can have such a field: a number, a text, or an array of bytes."""
+    return isinstance(kind, tsdl.IntegerType) or tsdl.is_text(kind) or tsdl.is_bytes(kind)
 
 
 def _id_table(layout: Layout, rows: dict[int, int]) -> list[int]:

@@ -74,7 +74,6 @@ def read_events(
     trace: CtfTrace,
     names: Collection[str] | None = None,
     *,
-    context: bool = False,
     nameless: Collection[str] = (),
     threads: int | None = None,
     progress: _Progress = lambda _: None,
@@ -91,18 +90,17 @@ def read_events(
     * ``procname``: Categorical, where recorded; not for the events that are ``nameless``, since
       reading it is most of the work for an event without other texts.
     * the payload under its own names without LTTng's leading underscore; a field called like
-      one of the above is ``payload.<name>``. Integers and floats keep their width and sign,
-      enumerations their integer; strings and text arrays are String (bytes that are not UTF-8
-      as ``\\xNN``); arrays are Array, sequences List, structures Struct, variants Struct with
-      all but the chosen option null.
-    * with ``context``, the other context fields as ``context.<name>``.
+      one of the above is ``payload.<name>``. Integers keep their width and sign, enumerations
+      their integer; strings and text arrays are String (bytes that are not UTF-8 as ``\\xNN``),
+      arrays and sequences of bytes List of UInt8. No event table has a field of another kind:
+      these are passed over.
 
     Events that cannot be read end their packet; the result's ``warnings`` say which and why.
     ``progress`` gets the share that is done, from 0 to 1.
     Raises `CtfError` where a file is gone or changes while it is read.
     """
     asked = frozenset(trace.event_names if names is None else names)
-    layout = lay_out(trace.folders, Wanted(asked, frozenset(nameless), context))
+    layout = lay_out(trace.folders, Wanted(asked, frozenset(nameless)))
     rows = {event.stream for event in layout.events if event.table is not None}
     used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, tb.P_STREAM].tolist())]
     borders = _span_borders(used, layout, threads or _cores())
@@ -327,9 +325,6 @@ class _Columns:
             part[: rows * kind.itemsize].view(kind)
             for part, (rows, kind) in zip(parts, wanted, strict=False)
         )
-        for slot, array in zip(table.slots, self.slots, strict=True):
-            if slot.sparse:
-                array[:] = 0
         cpu = self.cpu.ctypes.data if table.has_cpu else 0
         slots = [(array.ctypes.data, array.itemsize) for array in self.slots]
         layout.attach(table, self.time.ctypes.data, cpu, slots)
@@ -346,65 +341,25 @@ class _Columns:
 
     def frame(self, strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
         """The table's frame; texts are codes of ``strings``, procnames of ``categories``."""
-        self._slots, self._levels = iter(self.slots), iter(self.rows[1:])
-        rows = self.rows[0]
+        slots, rows = iter(self.slots), self.rows[0]
         found = {"time": pl.Series("time", self.time)}
         if self.table.has_cpu:
             found["cpu"] = pl.Series("cpu", self.cpu)
         for name, kind in self.table.columns:
-            texts = categories if name == "procname" else strings
-            column = self._column(name, kind, rows, texts)
-            if column is not None:
-                found[name] = column
+            if tsdl.is_text(kind):
+                texts = categories if name == "procname" else strings
+                found[name] = texts.gather(pl.Series(next(slots))).alias(name)
+            elif isinstance(kind, tsdl.ArrayType):
+                length = kind.length
+                lengths = np.full(rows, length) if isinstance(length, int) else next(slots)
+                found[name] = _lists(pl.Series(name, next(slots)), lengths)
+            else:
+                found[name] = pl.Series(name, next(slots))
         for name in ("cpu", "pid", "tid"):
             if name not in found:
                 found[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, rows)
         leading = [n for n in ("time", "cpu", "pid", "tid", "procname") if n in found]
         return pl.DataFrame([found[n] for n in dict.fromkeys([*leading, *found])])
-
-    def _column(
-        self,
-        name: str,
-        kind: tsdl.Type,
-        rows: int,
-        texts: pl.Series,
-        chosen: NDArray[np.bool_] | None = None,
-    ) -> pl.Series | None:
-        """One column, from the next slots and levels; None for a structure without fields.
-
-        Of a variant's option levels have the rows only that have ``chosen`` it.
-        """
-        match kind:
-            case tsdl.StringType() | tsdl.ArrayType() if tsdl.is_text(kind):
-                return texts.gather(pl.Series(next(self._slots))).alias(name)
-            case tsdl.ArrayType(element, count):
-                whole = isinstance(count, int)
-                lengths = np.zeros(rows, np.uint32) if whole else next(self._slots)
-                values = self._column(name, element, next(self._levels), texts)
-                if values is None or not count or isinstance(count, str):
-                    return None if values is None else _ragged(values, lengths)
-                deeper = values.dtype.shape if isinstance(values.dtype, pl.Array) else ()
-                there = rows if chosen is None else int(chosen.sum())
-                arrays = values.reshape((there, count, *deeper))
-                at = None if chosen is None else _where(chosen, np.cumsum(chosen) - 1)
-                return arrays if at is None else arrays.gather(at)
-            case tsdl.StructType(fields):
-                found = [
-                    self._column(tsdl.field_name(one.name), one.type, rows, texts, chosen)
-                    for one in fields
-                ]
-                columns = [column for column in found if column is not None]
-                return _struct(name, columns) if columns else None
-            case tsdl.VariantType(_, options):
-                tags, parts = next(self._slots), []
-                for number, option in enumerate(options, start=1):
-                    own, called = tags == number, tsdl.field_name(option.name)
-                    values = self._column(called, option.type, rows, texts, own)
-                    if values is not None:
-                        parts.append(values.gather(_where(own, np.arange(rows))))
-                nothing = pl.Series(name, [None], pl.Null).new_from_index(0, rows)
-                return _struct(name, parts) if parts else nothing
-        return pl.Series(name, next(self._slots))
 
 
 def _memory(size: int) -> NDArray[np.uint8]:
@@ -433,34 +388,10 @@ def _frames(columns: list[_Columns], texts: list[str], unsorted: bool) -> dict[s
     return frames
 
 
-def _where(chosen: NDArray[np.bool_], places: NDArray[np.int64]) -> pl.Series:
-    """Row numbers, null where a row has not ``chosen`` what is looked for."""
-    return pl.Series(places.astype(np.uint32)).set(pl.Series(~chosen), None)
-
-
-def _ragged(values: pl.Series, lengths: NDArray[Any]) -> pl.Series:
+def _lists(values: pl.Series, lengths: NDArray[Any]) -> pl.Series:
     """``values`` cut into lists of the given lengths, in order."""
-    full = np.flatnonzero(lengths)
-    if not len(full):
-        return pl.Series(values.name, [[]] * len(lengths), dtype=pl.List(values.dtype))
-    owner = pl.Series("owner", np.repeat(full, lengths[full])).set_sorted()
-    rows = pl.DataFrame([owner, values.alias("value")]).group_by("owner", maintain_order=True)
-    lists = rows.agg("value")["value"].alias(values.name)
-    if len(full) == len(lengths):
-        return lists
-    # Rows without an element point at an empty list behind the others.
-    empty = pl.Series(values.name, [[]], dtype=lists.dtype)
-    places = np.full(len(lengths), len(full), np.uint32)
-    places[full] = np.arange(len(full), dtype=np.uint32)
-    return pl.concat([lists, empty]).gather(pl.Series(places))
-
-
-def _struct(name: str, parts: list[pl.Series]) -> pl.Series:
-    """A column of structures; ``_a`` and ``a`` of one structure would both be shown as ``a``."""
-    found: dict[str, pl.Series] = {}
-    for part in parts:
-        own = part.name
-        while own in found:
-            own = "_" + own
-        found[own] = part.alias(own)
-    return pl.DataFrame(list(found.values())).to_struct(name)
+    rows = np.arange(len(lengths))
+    owned = pl.DataFrame([pl.Series("row", np.repeat(rows, lengths)), values])
+    lists = owned.group_by("row").agg(values.name)
+    every = pl.DataFrame({"row": rows}).join(lists, on="row", how="left", maintain_order="left")
+    return every[values.name].fill_null([])
