@@ -25,6 +25,8 @@ from chainshaper.values.compiled.memory import (
     trailing_zeros,
 )
 
+ZERO = np.int64(0)
+
 # Numba mixes int64 and uint64 into float64: every value below keeps to one of the two.
 
 
@@ -55,6 +57,28 @@ def digest_text(base, at, limit, mapped):
         digest ^= digest >> tb.U29
         place += 8
     return place - 8 - at + (trailing_zeros(zeros) >> 3), digest, word
+
+
+@compiled(inline=True)
+def digest_bytes(base, at, count, mapped):
+    """The same of so many bytes of any value."""
+    digest, word, place, limit = tb.FACTOR, tb.U0, at, at + count
+    while place < limit:
+        word = word_at(base, place, mapped)
+        if place + 8 > limit:
+            word &= (tb.U1 << np.uint64(8 * (limit - place))) - tb.U1
+        digest = (digest ^ word) * tb.FACTOR
+        digest ^= digest >> tb.U29
+        place += 8
+    return count, digest, word
+
+
+@compiled(inline=True)
+def digest_characters(op, base, at, count, mapped):
+    """The same of an array: a text, or bytes."""
+    if get(op, tb.O_FLAGS) != 0:
+        return digest_text(base, at, at + count, mapped)
+    return digest_bytes(base, at, count, mapped)
 
 
 @compiled(inline=True)
@@ -206,7 +230,7 @@ def run_text(machine, op, base, mapped, end, position, regs, row):
         count = get(op, tb.O_COUNT) if register < 0 else get(regs, register)
         if count < 0 or count > (end - position) >> 3:
             return np.int64(tb.BAD_LENGTH)
-        length, digest, word = digest_text(base, at, at + count, mapped)
+        length, digest, word = digest_characters(op, base, at, count, mapped)
         following = (at + count) << 3
     if get(op, tb.O_ADDRESS) != 0:
         code = intern(machine, base + at, length, digest, word)
@@ -214,20 +238,6 @@ def run_text(machine, op, base, mapped, end, position, regs, row):
             return np.int64(tb.FULL_DICTIONARY)
         keep(op, np.uint64(code), row)
     return following
-
-
-@compiled()
-def run_copy(op, base, position, count, rows):
-    """Copy ``count`` bytes to their slot; both ends are checked."""
-    source = base + (position >> 3)
-    target = get(op, tb.O_INNER_ADDRESS) + get(rows, get(op, tb.O_INNER))
-    index = count * 0
-    while index + 8 <= count:
-        store_long(target + index, load_word(source + index))
-        index += 8
-    while index < count:
-        store_byte(target + index, load_byte(source + index))
-        index += 1
 
 
 @compiled()
@@ -245,8 +255,8 @@ def choose(op, ranges, regs):
 
 
 @compiled()
-def run_many(machine, op, base, end, position, regs, depth, row):
-    """Run a SKIP_MANY or COPY, or begin a LOOP, whose turns go on the stack at ``depth``.
+def run_many(machine, op, end, position, regs, depth):
+    """Run a SKIP_MANY, or begin a LOOP, whose turns go on the stack at ``depth``.
 
     Returns the position behind it or a failure.
     """
@@ -263,14 +273,6 @@ def run_many(machine, op, base, end, position, regs, depth, row):
     if code == tb.LOOP:
         put(state, tb.X_STACK + depth, count)
         return position
-    if code == tb.COPY:
-        rows, inner = get(machine, tb.M_ROWS), get(op, tb.O_INNER)
-        if get(rows, inner) + count > get(get(machine, tb.M_CAPS), inner):
-            return np.int64(tb.FULL_TABLE)
-        keep(op, np.uint64(count), row)
-        if get(op, tb.O_INNER_ADDRESS) != 0:
-            run_copy(op, base, position, count, rows)
-        put(rows, inner, get(rows, inner) + count)
     return position + count * get(op, tb.O_SIZE)
 
 
@@ -291,7 +293,8 @@ def move_batch(machine, event, batch):
             length = get(op, tb.O_COUNT)
             for index in range(count):
                 place = get(batch, 2 * index + 1) + offset
-                found, digest, word = digest_text(place, np.int64(0), length, size - offset + 8)
+                mapped = size - offset + 8
+                found, digest, word = digest_characters(op, place, ZERO, length, mapped)
                 text = intern(machine, place, found, digest, word)
                 if text < 0:
                     return np.int64(tb.FULL_DICTIONARY)
@@ -333,7 +336,7 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
             if position < 0:
                 return position
         elif code <= tb.LOOP:
-            position = run_many(machine, op, base, end, position, regs, depth, row)
+            position = run_many(machine, op, end, position, regs, depth)
             if position < 0:
                 return position
             if code == tb.LOOP and get(state, tb.X_STACK + depth) == 0:

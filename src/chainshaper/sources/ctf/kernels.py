@@ -9,11 +9,10 @@ They run without Python's lock. `layout` says what they are given.
 import numpy as np
 
 from chainshaper.sources.ctf import layout as tb
-from chainshaper.sources.ctf.interpreter import advance_clock, afforded, execute, move_batch
+from chainshaper.sources.ctf.interpreter import ZERO, advance_clock, afforded, execute, move_batch
 from chainshaper.values.compiled.memory import compiled, get, load_word, put, store_long, store_word
 
 A_ALL = tb.A_ROW * tb.AHEAD
-ZERO = np.int64(0)
 
 
 @compiled(inline=True)
@@ -167,24 +166,17 @@ def step_over(machine, row, start, mapped, end, position, regs):
 
 
 @compiled()
-def copy_numbers(target, source, count):
-    """Copy ``count`` numbers from one table to another."""
-    for index in range(count):
-        put(target, index, get(source, index))
-
-
-@compiled()
 def walk_events(
     machine, regs, base, size, packets, first, last, counts, borders, border, spans, marks
 ):
     """Step through every event of the ``packets`` [first, last) of a file; the next border.
 
-    Advances ``counts`` per event class and the row counters per level. ``borders`` are ``spans``
+    Advances ``counts`` per event class and the tables' row counters. ``borders`` are ``spans``
     instants (ns, ascending), those before number ``border`` being done; for each, the row of
     ``marks`` gets the first event at or after it (packet, position, clock) and the row counters
     before it. An event that cannot be read ends its packet: END becomes that event's position.
     """
-    state, rows, saved = get(machine, tb.M_STATE), get(machine, tb.M_ROWS), get(machine, tb.M_SAVED)
+    state, rows = get(machine, tb.M_STATE), get(machine, tb.M_ROWS)
     events, counters = get(machine, tb.M_EVENTS), get(machine, tb.M_COUNTERS)
     for index in range(first, last):
         packet = packets + index * tb.P_ROW
@@ -203,25 +195,21 @@ def walk_events(
             before = get(state, tb.X_CLOCK)
             after, event = read_header(machine, stream, start, mapped, end, position, regs)
             time = nanoseconds(get(state, tb.X_CLOCK), frequency)
-            counter, levels, row = np.int64(-1), np.int64(0), events
+            row = events
             if after >= 0:
                 while border < spans and time >= get(borders, border):
                     mark = marks + 8 * border * (3 + counters)
                     put(mark, 0, index)
                     put(mark, 1, position)
                     put(mark, 2, before)
-                    copy_numbers(mark + 24, rows, counters)
+                    for counter in range(counters):
+                        put(mark, 3 + counter, get(rows, counter))
                     border += 1
                 row = events + event * tb.E_ROW
-                counter, levels = get(row, tb.E_COUNTER), get(row, tb.E_LEVELS)
-                if levels > 1:
-                    copy_numbers(saved, rows + 8 * counter, levels)
                 after = step_over(machine, row, start, mapped, end, after, regs)
                 if not afforded(state, get(row, tb.E_COST)):
                     after = np.int64(tb.OVER_BUDGET)
             if after < 0 or after == position:
-                if levels > 1:
-                    copy_numbers(rows + 8 * counter, saved, levels)
                 put(packet, tb.P_ERROR, min(after, np.int64(-1)))
                 put(packet, tb.P_ERROR_AT, position)
                 put(packet, tb.P_END, position)
@@ -231,8 +219,9 @@ def walk_events(
                 put(state, tb.X_UNSORTED, np.int64(1))
             put(state, tb.X_LATEST, time)
             put(counts, event, get(counts, event) + 1)
-            if counter >= 0:
-                put(rows, counter, get(rows, counter) + 1)
+            table = get(row, tb.E_COUNTER)
+            if table >= 0:
+                put(rows, table, get(rows, table) + 1)
             position = after
     return border
 
@@ -320,12 +309,9 @@ def read_ahead(machine, file, cursor, ahead, packets, regs):
 def write_apart(machine, event, file, cursor, packets, regs, row):
     """Write an event whose length is not known before, the last one that was read ahead.
 
-    Returns 0 or a failure, after which it is undone.
+    Returns 0 or a failure, after which the cursor is as it was.
     """
-    state, levels = get(machine, tb.M_STATE), get(event, tb.E_LEVELS)
-    counters = get(machine, tb.M_ROWS) + 8 * get(event, tb.E_COUNTER)
-    if levels > 1:
-        copy_numbers(get(machine, tb.M_SAVED), counters, levels)
+    state = get(machine, tb.M_STATE)
     packet = packets + get(cursor, tb.C_PACKET) * tb.P_ROW
     at = get(packet, tb.P_BYTE)
     put(state, tb.X_CLOCK, get(cursor, tb.C_CLOCK))
@@ -333,8 +319,6 @@ def write_apart(machine, event, file, cursor, packets, regs, row):
     position = get(cursor, tb.C_POSITION)
     position = execute(machine, event, tb.E_FILL, base, mapped, end, position, regs, row)
     if position < 0:
-        if levels > 1:
-            copy_numbers(counters, get(machine, tb.M_SAVED), levels)
         return position
     put(cursor, tb.C_POSITION, position)
     put(cursor, tb.C_CLOCK, get(state, tb.X_CLOCK))

@@ -5,10 +5,9 @@ the addresses of the others: Numba counts references to arrays at every call, at
 cost of reading an event.
 
 `lay_out` turns the types of all events into operations. Runs of fixed size that are not asked for
-become one SKIP, so that an event that is not wanted costs one addition. Values go to *slots*, one
-flat array each. A slot belongs to a *level*: level 0 has one row per event, each array of bytes
-opens one with a row per byte. Slots and levels are numbered in the order of the columns, here and
-where columns are made of them.
+become one SKIP, so that an event that is not wanted costs one addition. Values of a column go to
+one flat array, its *slot*, with a row per event: integers as they are, texts and bytes as their
+code in a dictionary of all that are different.
 """
 
 # ruff: noqa: PLR0917 - what is known of a trace on the way down its metadata
@@ -28,13 +27,13 @@ from chainshaper.sources.ctf import tsdl
 # fmt: off
 # A table's columns stand together, with what they hold behind them.
 # The machine. RANGES of variants' tags: low, high, operation to go on with. ROWS are the row
-# counters (COUNTERS of them), CAPS how far each may go, SAVED room for some. SLOTS is the
-# dictionary's hash table, int32, MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per
-# event class a count and BATCH pairs (address, row).
+# counters of the tables (COUNTERS of them), CAPS how far each may go. SLOTS is the dictionary's
+# hash table, int32, MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per event class a
+# count and BATCH pairs (address, row).
 (
-    M_OPS, M_RANGES, M_STATE, M_ROWS, M_CAPS, M_SAVED, M_SLOTS, M_MASK, M_ENTRIES, M_ROOM,
+    M_OPS, M_RANGES, M_STATE, M_ROWS, M_CAPS, M_SLOTS, M_MASK, M_ENTRIES, M_ROOM,
     M_STREAMS, M_EVENTS, M_IDS, M_COUNTERS, M_BATCHES, MACHINE_WORDS,
-) = range(16)
+) = range(15)
 
 BATCH = 128
 AHEAD = 64
@@ -65,13 +64,13 @@ STATE_WORDS = X_STACK + 16
 ) = range(21)
 
 # Event classes of all stream classes: operations (first, end) that WALK over context and payload,
-# and that FILL columns; ALIGN and SIZE where the former is one constant step, else 0; the row
-# COUNTER of level 0, -1 where the event is not wanted; addresses of row 0 of TIME and CPU (or 0);
+# and that FILL columns; ALIGN and SIZE where the former is one constant step, else 0; the COUNTER
+# of its table's rows, -1 where the event is not wanted; addresses of row 0 of TIME and CPU (or 0);
 # CONSTANT 1 where every event is laid out alike, SIZE bits of it.
 (
-    E_WALK, E_WALK_STOP, E_ALIGN, E_SIZE, E_FILL, E_FILL_STOP, E_COUNTER, E_LEVELS,
+    E_WALK, E_WALK_STOP, E_ALIGN, E_SIZE, E_FILL, E_FILL_STOP, E_COUNTER,
     E_TIME, E_CPU, E_CONSTANT, E_COST, EVENT_COLUMNS,
-) = range(13)
+) = range(12)
 
 # Stream files, for one span of time: its first packet and the position in it, -1 for the packet's
 # first event; where it ends, LAST_POSITION -1 for before the packet's first event.
@@ -94,21 +93,19 @@ A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
     O_CODE,
     O_ALIGN,  # bits
     O_SIZE,  # bits; of one element for SKIP_MANY
-    O_FLAGS,  # 1 signed, 2 big-endian, 4 advances the clock
+    O_FLAGS,  # 1 signed, 2 big-endian, 4 advances the clock; 1 for CHARACTERS that end at a NUL
     O_ADDRESS,  # where row 0 of the slot lies, 0 for no slot
     O_WIDTH,  # bytes per row of the slot
     O_REGISTER,  # written by NUMBER, the length or tag for others; -1 for none
     O_COUNT,  # constant length; first range of SWITCH
     O_TARGET,  # operation to go on with
-    O_INNER,  # the row counter of the level of bytes that COPY writes
-    O_INNER_ADDRESS,  # where COPY writes
     O_LEAST,  # the least bits an element takes; number of ranges of SWITCH
     O_OFFSET,  # bytes from the aligned start of an event of constant layout
-    O_COST,  # of an element of COPY and LOOP
-) = range(14)
+    O_COST,  # of an element of LOOP
+) = range(12)
 OPERATION_COLUMNS = 16
 
-SKIP, NUMBER, MOVE, TEXT, CHARACTERS, SKIP_MANY, COPY, LOOP, AGAIN, SWITCH, JUMP = range(11)
+SKIP, NUMBER, MOVE, TEXT, CHARACTERS, SKIP_MANY, LOOP, AGAIN, SWITCH, JUMP = range(10)
 """In groups that run alike. MOVE: a NUMBER of 8, 4, 2 or 1 bytes as they lie in the packet."""
 
 # Bytes per row.
@@ -162,38 +159,34 @@ _MOST_STEPS = 200_000
 # More bits than any packet has: sizes beyond are all the same and must not overflow int64.
 _ENDLESS_BITS = 1 << 56
 _DENSE_IDS = 4096
-TEXT_CODES = "text"
-"""The kind of a slot that has codes of strings (uint32)."""
 
 
 class LayoutError(ValueError):
     """Types that cannot be laid out: an unresolved length or tag, too deep a nesting."""
 
 
-class Slot(NamedTuple):
-    """A flat array: its level, its NumPy type code or TEXT_CODES."""
-
-    level: int
-    kind: str
-
-    @property
-    def dtype(self) -> np.dtype[Any]:
-        return np.dtype("u4" if self.kind == TEXT_CODES else self.kind)
-
-
 @dataclass(frozen=True)
 class Table:
     """Where the events of one name and one shape go: ``time``, ``cpu`` where known, ``columns``.
 
-    ``counter`` is the row counter of level 0 and ``levels`` how many belong to the table.
+    ``counter`` is the number of its row counter.
     """
 
     name: str
     columns: tuple[tuple[str, tsdl.Type], ...]
-    slots: tuple[Slot, ...]
-    levels: int
     has_cpu: bool
     counter: int = field(compare=False)
+
+    def slot_types(self) -> list[np.dtype[Any]]:
+        """What each column's slot has: integers, or codes in the dictionary."""
+        return [_slot_type(kind) for _, kind in self.columns]
+
+
+def _slot_type(kind: tsdl.Type) -> np.dtype[Any]:
+    if not isinstance(kind, tsdl.IntegerType):
+        return np.dtype("u4")
+    width = 1 << ((kind.size + 7 >> 3) - 1).bit_length()
+    return np.dtype(f"{'i' if kind.signed else 'u'}{width}")
 
 
 class Wanted(NamedTuple):
@@ -236,7 +229,6 @@ class Layout:
     folders: list[tuple[int, int]] = field(default_factory=list)
     tables: dict[Table, list[Event]] = field(default_factory=dict)
     ids: list[int] = field(default_factory=list)
-    counters: int = 0
     registers: int = len(REGISTERS)
     steps: int = 0
     labels: dict[int, dict[str, list[tuple[int, int]]]] = field(default_factory=dict)
@@ -253,10 +245,10 @@ class Layout:
     def attach(self, table: Table, time: int, cpu: int, slots: Sequence[tuple[int, int]]) -> None:
         """Give a table's event classes what writes to its columns, whose addresses these are."""
         self._arrays, self.steps = {}, 0
+        writing = [{O_ADDRESS: address, O_WIDTH: width} for address, width in slots]
         for event in self.tables[table]:
-            row, writer = event.row, event.header.following(slots)
+            row, writer = event.row, event.header.following(writing)
             start, stop = row[E_FILL], row[E_FILL_STOP] = writer.run(event.scopes)
-            writer.count_from(table.counter)
             row[E_TIME], row[E_CPU] = time, cpu
             constant = row[E_ALIGN] >= 8 and row[E_SIZE] > 0
             row[E_CONSTANT] = int(constant and self._note_offsets(start, stop))
@@ -307,51 +299,50 @@ _Frame = dict[str, "_Number | _Frame | None"]
 
 
 class _Place(NamedTuple):
-    """Where a type stands: the numbers around it, and whether it gets a column."""
+    """Where a type stands: the numbers around it, and its slot if it gets a column."""
 
     frames: tuple[_Frame, ...]
-    keep: bool
+    slot: dict[int, int]
 
     def inside(self, frame: _Frame) -> _Place:
         """In a structure, variant or array, whose members get no columns."""
-        return _Place((*self.frames, frame), keep=False)
+        return _Place((*self.frames, frame), {})
 
 
 @dataclass
 class _Writer:
     """Writes the operations of types that follow each other.
 
-    ``addresses`` are those of the slots, and their bytes per row; without them rows are only
-    counted. ``roots`` maps a dynamic scope (``stream.event.context``, …) to the numbers read there
-    so far; a number whose name is ``referenced`` gets a register, ``registers`` the next one. In
-    headers (``fixed``) the numbers of REGISTERS have those.
+    ``slots`` are the columns of operations that write to one each; without them events are only
+    stepped over. ``roots`` maps a dynamic scope (``stream.event.context``, …) to the numbers read
+    there so far; a number whose name is ``referenced`` gets a register, ``registers`` the next one.
+    In headers (``fixed``) the numbers of REGISTERS have those.
     """
 
     layout: Layout
     big: bool
     referenced: frozenset[str]
     fixed: bool = True
-    addresses: Sequence[tuple[int, int]] = ()
+    slots: Sequence[dict[int, int]] = ()
     registers: int = len(REGISTERS)
     roots: dict[str, _Frame] = field(default_factory=dict)
-    slots: list[Slot] = field(default_factory=list)
-    levels: int = 1
     start: int = field(default=0, init=False)
 
-    def following(self, addresses: Sequence[tuple[int, int]] = (), fixed: bool = False) -> _Writer:
+    def following(self, slots: Sequence[dict[int, int]] = (), fixed: bool = False) -> _Writer:
         """A writer for what follows in one of several places."""
         roots = dict(self.roots)
-        return replace(self, roots=roots, slots=[], levels=1, addresses=addresses, fixed=fixed)
+        return replace(self, roots=roots, slots=slots, fixed=fixed)
 
     def run(self, scopes: Sequence[_Scope]) -> tuple[int, int]:
         """Lay out scopes: their first operation and the one after the last."""
         self.start = len(self.layout.operations)
+        slots = iter(self.slots)
         for scope, kind, wanted in scopes:
             frame = self.roots[scope] = _Frame()
             if kind is not None:
                 self._skip(kind.align, 0)
             for member in kind.fields if kind is not None else ():
-                place = _Place((frame,), member.name in wanted)
+                place = _Place((frame,), next(slots, {}) if member.name in wanted else {})
                 match member.type if self.fixed and member.name == "uuid" else None:
                     case tsdl.ArrayType(tsdl.IntegerType(8, 8), 16):
                         half = tsdl.IntegerType(64, 8, byte_order="le")
@@ -362,11 +353,6 @@ class _Writer:
         self.layout.registers = max(self.layout.registers, self.registers)
         return self.start, len(self.layout.operations)
 
-    def count_from(self, counter: int) -> None:
-        """Set the row counter of level 0."""
-        for row in self.layout.operations[self.start :]:
-            row[O_INNER] += counter if row[O_CODE] == COPY else 0
-
     def _type(self, name: str, kind: tsdl.Type, at: _Place) -> int:
         """Lay out a type; returns the least number of bits that it takes, alignment aside."""
         self.layout.steps += 1
@@ -374,7 +360,7 @@ class _Writer:
             raise LayoutError(f"{name}: types nested too deeply")
         match kind:
             case tsdl.StringType():
-                self._row(TEXT, {O_ALIGN: 8, **self._slot(TEXT_CODES, at)})
+                self._row(TEXT, {O_ALIGN: 8, **at.slot})
                 return 8
             case tsdl.StructType():
                 frame = at.frames[-1][name] = _Frame()
@@ -399,14 +385,12 @@ class _Writer:
             elif name in self.referenced:
                 register, self.registers = self.registers, self.registers + 1
             at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
-        width = 1 << ((kind.size + 7 >> 3) - 1).bit_length()
-        place = self._slot(f"{'i' if signed else 'u'}{width}", at)
-        if not place and register < 0 and not clock:
+        if not at.slot and register < 0 and not clock:
             self._skip(kind.align, kind.size)
             return kind.size
         flags = signed + 2 * big + 4 * clock
         columns = {O_ALIGN: kind.align, O_SIZE: kind.size, O_FLAGS: flags, O_REGISTER: register}
-        row = self._row(NUMBER, columns | place)
+        row = self._row(NUMBER, columns | at.slot)
         if _is_moved(row):
             row[O_CODE] = MOVE
         return kind.size
@@ -418,15 +402,9 @@ class _Writer:
         else:
             register = self._referred(kind.length, at).register
         columns = {O_ALIGN: tsdl.alignment(kind), O_REGISTER: register, O_COUNT: count}
-        if tsdl.is_text(kind):
-            place = self._slot(TEXT_CODES, at)
-            if place or register >= 0:
-                self._row(CHARACTERS if place else SKIP_MANY, {**columns, O_SIZE: 8, **place})
-            else:
-                self._skip(8, 8 * count)
+        if at.slot:
+            self._row(CHARACTERS, {**columns, **at.slot, O_FLAGS: int(tsdl.is_text(kind))})
             return 8 * count
-        if at.keep and tsdl.is_bytes(kind):
-            return self._bytes(columns, at)
         loop, first = self._row(LOOP, columns), len(rows)
         least = self._type(f"{name}[]", kind.element, at.inside({}))
         only = rows[first] if len(rows) == first + 1 else loop
@@ -445,16 +423,6 @@ class _Writer:
             loop[O_TARGET], loop[O_LEAST] = len(rows), least
             loop[O_COST] = self.layout.cost(first, len(rows))
         return count * least
-
-    def _bytes(self, columns: dict[int, int], at: _Place) -> int:
-        """Lay out an array or sequence of bytes that gets a column, on a level of its own."""
-        if columns[O_REGISTER] >= 0:
-            columns |= self._slot("u4", at)
-        columns |= {O_SIZE: 8, O_COST: 1, O_INNER: self.levels}
-        place = self._slot("u1", at, self.levels)
-        self._row(COPY, {**columns, O_INNER_ADDRESS: place.get(O_ADDRESS, 0)})
-        self.levels += 1
-        return 8 * columns[O_COUNT]
 
     def _variant(self, name: str, kind: tsdl.VariantType, at: _Place) -> int:
         if kind.tag is None:
@@ -507,15 +475,6 @@ class _Writer:
             if isinstance(found, _Number):
                 return found
         raise LayoutError(f"length or tag {path!r} names no number that is read before it")
-
-    def _slot(self, kind: str, at: _Place, level: int = 0) -> dict[int, int]:
-        """Add a slot, if one is wanted: the columns of an operation that say where it lies."""
-        if at.keep:
-            self.slots.append(Slot(level, kind))
-            if self.addresses:
-                address, width = self.addresses[len(self.slots) - 1]
-                return {O_ADDRESS: address, O_WIDTH: width}
-        return {}
 
     def _row(self, code: int, columns: dict[int, int]) -> list[int]:
         row = [0] * OPERATION_COLUMNS
@@ -592,15 +551,14 @@ def _add_event(
     start, stop = row[E_WALK], row[E_WALK_STOP] = writer.run(scopes)
     row[E_COUNTER], row[E_COST] = -1, layout.cost(start, stop)
     if name in wanted.names:
-        has_cpu, slots = bool(stream[S_KNOWN] >> R_CPU & 1), tuple(writer.slots)
-        table = Table(name, tuple(columns), slots, writer.levels, has_cpu, layout.counters)
+        has_cpu = bool(stream[S_KNOWN] >> R_CPU & 1)
+        table = Table(name, tuple(columns), has_cpu, len(layout.tables))
         if table in layout.tables:
             table = layout.tables[table][0].table or table
         else:
-            layout.tables[table], layout.counters = [], layout.counters + table.levels
-        writer.count_from(table.counter)
-        row[E_COUNTER], row[E_LEVELS] = table.counter, table.levels
-        row[E_COST] += 8 + 4 * has_cpu + sum(s.dtype.itemsize for s in slots if s.level == 0)
+            layout.tables[table] = []
+        row[E_COUNTER] = table.counter
+        row[E_COST] += 8 + 4 * has_cpu + sum(one.itemsize for one in table.slot_types())
     if start == stop:
         row[E_ALIGN] = 1
     elif stop == start + 1 and layout.operations[start][O_CODE] == SKIP:
@@ -656,7 +614,10 @@ def _columns(
 
 def _has_column(kind: tsdl.Type) -> bool:
     """Whether a table can have such a field: a number, a text, or an array of bytes."""
-    return isinstance(kind, tsdl.IntegerType) or tsdl.is_text(kind) or tsdl.is_bytes(kind)
+    match kind:
+        case tsdl.IntegerType() | tsdl.StringType() | tsdl.ArrayType(tsdl.IntegerType(8, 8)):
+            return True
+    return False
 
 
 def _id_table(layout: Layout, rows: dict[int, int]) -> list[int]:

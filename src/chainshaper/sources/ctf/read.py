@@ -105,8 +105,10 @@ def read_events(
     used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, tb.P_STREAM].tolist())]
     borders = _span_borders(used, layout, threads or _cores())
     files = _walked(used, layout, borders, threads, lambda share: progress(share / 3))
-    total = sum((file.reached[-1] for file in files), np.zeros(max(layout.counters, 1), np.int64))
-    columns = [_Columns(layout, table, total) for table in layout.tables]
+    columns = [
+        _Columns(layout, table, sum(int(file.reached[-1][table.counter]) for file in files))
+        for table in layout.tables
+    ]
     texts = _filled(
         files, layout, len(borders) + 1, columns, threads, lambda n: progress((1 + 2 * n) / 3)
     )
@@ -233,8 +235,8 @@ def _filled(
     columns: list["_Columns"],
     threads: int | None,
     progress: _Progress,
-) -> list[str]:
-    """Pass 2 over all spans; returns the strings that text slots then have codes of."""
+) -> list[bytes]:
+    """Pass 2 over all spans; returns the texts and bytes that slots then have codes of."""
     if not files:
         return []
     packets = np.concatenate([file.packets for file in files])
@@ -248,7 +250,7 @@ def _filled(
                 for table in columns:
                     table.recode(before, after, np.array(own, np.uint32))
             progress((span + 1) / spans)
-    return [string.decode(errors="backslashreplace") for string in codes]
+    return list(codes)
 
 
 def _fill(span: int, files: list[_File], packets: NDArray[np.int64], layout: Layout) -> list[bytes]:
@@ -305,25 +307,24 @@ def _span_files(span: int, files: list[_File]) -> NDArray[np.int64]:
 
 
 class _Columns:
-    """The arrays of one table: time, cpu (or None) and its slots; ``rows`` of each level.
+    """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its slots.
 
     They are parts of one piece of memory, large enough for huge pages: page faults would else be a
     third of all work.
     """
 
-    def __init__(self, layout: Layout, table: Table, total: NDArray[np.int64]) -> None:
-        self.table = table
-        self.rows: list[int] = total[table.counter : table.counter + table.levels].tolist()
-        wanted: list[tuple[int, np.dtype[Any]]] = [(self.rows[0], np.dtype("i8"))]
-        wanted.append((self.rows[0] * table.has_cpu, np.dtype("i4")))
-        wanted += [(self.rows[slot.level], slot.dtype) for slot in table.slots]
+    def __init__(self, layout: Layout, table: Table, rows: int) -> None:
+        self.table, self.rows = table, rows
+        wanted: list[tuple[int, np.dtype[Any]]] = [(rows, np.dtype("i8"))]
+        wanted.append((rows * table.has_cpu, np.dtype("i4")))
+        wanted += [(rows, kind) for kind in table.slot_types()]
         # Columns side by side must not begin alike in their pages, or they would compete for
         # the same few lines of the processor's cache.
-        sizes = [-(-rows * kind.itemsize // 4096) * 4096 + 320 for rows, kind in wanted]
+        sizes = [-(-count * kind.itemsize // 4096) * 4096 + 320 for count, kind in wanted]
         parts = np.split(_memory(sum(sizes)), np.cumsum(sizes))
         self.time, self.cpu, *self.slots = (
-            part[: rows * kind.itemsize].view(kind)
-            for part, (rows, kind) in zip(parts, wanted, strict=False)
+            part[: count * kind.itemsize].view(kind)
+            for part, (count, kind) in zip(parts, wanted, strict=False)
         )
         cpu = self.cpu.ctypes.data if table.has_cpu else 0
         slots = [(array.ctypes.data, array.itemsize) for array in self.slots]
@@ -333,31 +334,29 @@ class _Columns:
         self, before: NDArray[np.int64], after: NDArray[np.int64], codes: NDArray[np.uint32]
     ) -> None:
         """Replace one span's own codes of strings by those of the whole."""
-        for slot, array in zip(self.table.slots, self.slots, strict=True):
-            if slot.kind == tb.TEXT_CODES:
-                counter = self.table.counter + slot.level
-                part = array[before[counter] : after[counter]]
-                part[:] = codes[part]
+        span = slice(before[self.table.counter], after[self.table.counter])
+        for (_, kind), array in zip(self.table.columns, self.slots, strict=True):
+            if not isinstance(kind, tsdl.IntegerType):
+                array[span] = codes[array[span]]
 
-    def frame(self, strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
-        """The table's frame; texts are codes of ``strings``, procnames of ``categories``."""
-        slots, rows = iter(self.slots), self.rows[0]
+    def frame(self, known: list[bytes], strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
+        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts."""
         found = {"time": pl.Series("time", self.time)}
         if self.table.has_cpu:
             found["cpu"] = pl.Series("cpu", self.cpu)
-        for name, kind in self.table.columns:
+        for (name, kind), slot in zip(self.table.columns, self.slots, strict=True):
             if tsdl.is_text(kind):
                 texts = categories if name == "procname" else strings
-                found[name] = texts.gather(pl.Series(next(slots))).alias(name)
+                found[name] = texts.gather(pl.Series(slot)).alias(name)
             elif isinstance(kind, tsdl.ArrayType):
-                length = kind.length
-                lengths = np.full(rows, length) if isinstance(length, int) else next(slots)
-                found[name] = _lists(pl.Series(name, next(slots)), lengths)
+                codes, places = np.unique(slot, return_inverse=True)
+                lists = [list(known[code]) for code in codes]
+                found[name] = pl.Series(name, lists, pl.List(pl.UInt8)).gather(places)
             else:
-                found[name] = pl.Series(name, next(slots))
+                found[name] = pl.Series(name, slot)
         for name in ("cpu", "pid", "tid"):
             if name not in found:
-                found[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, rows)
+                found[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, self.rows)
         leading = [n for n in ("time", "cpu", "pid", "tid", "procname") if n in found]
         return pl.DataFrame([found[n] for n in dict.fromkeys([*leading, *found])])
 
@@ -371,14 +370,15 @@ def _memory(size: int) -> NDArray[np.uint8]:
     return memory[first : first + size]
 
 
-def _frames(columns: list[_Columns], texts: list[str], unsorted: bool) -> dict[str, pl.DataFrame]:
+def _frames(columns: list[_Columns], known: list[bytes], unsorted: bool) -> dict[str, pl.DataFrame]:
+    texts = [text.decode(errors="backslashreplace") for text in known]
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
     parts: dict[str, list[pl.DataFrame]] = {}
     while columns:
         # Arrays are let go one table at a time: Polars has copies of its own.
         table = columns.pop(0)
-        parts.setdefault(table.table.name, []).append(table.frame(strings, categories))
+        parts.setdefault(table.table.name, []).append(table.frame(known, strings, categories))
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):
         frame = pl.concat(parts[name], how="diagonal_relaxed", rechunk=True)
@@ -386,12 +386,3 @@ def _frames(columns: list[_Columns], texts: list[str], unsorted: bool) -> dict[s
             frame = frame.sort("time", maintain_order=True)
         frames[name] = frame.with_columns(pl.col("time").set_sorted())
     return frames
-
-
-def _lists(values: pl.Series, lengths: NDArray[Any]) -> pl.Series:
-    """``values`` cut into lists of the given lengths, in order."""
-    rows = np.arange(len(lengths))
-    owned = pl.DataFrame([pl.Series("row", np.repeat(rows, lengths)), values])
-    lists = owned.group_by("row").agg(values.name)
-    every = pl.DataFrame({"row": rows}).join(lists, on="row", how="left", maintain_order="left")
-    return every[values.name].fill_null([])

@@ -170,7 +170,7 @@ class Scratch:
     """The tables that kernels work with in one thread, and the ``address`` of that of addresses."""
 
     def __init__(self, layout: Layout, files: int = 1) -> None:
-        counters = max(layout.counters, 1)
+        counters = max(len(layout.tables), 1)
         self.state = np.zeros(tb.STATE_WORDS, np.int64)
         self.state[tb.X_BUDGET] = 1 << 62
         self.rows = np.zeros(counters, np.int64)
@@ -181,7 +181,6 @@ class Scratch:
             tb.M_STATE: self.state,
             tb.M_ROWS: self.rows,
             tb.M_CAPS: self.caps,
-            tb.M_SAVED: np.zeros(counters, np.int64),
             tb.M_BATCHES: np.zeros((len(layout.events), 1 + 2 * tb.BATCH), np.int64),
         }
         self._words = np.zeros(tb.MACHINE_WORDS, np.int64)

@@ -190,14 +190,6 @@ def is_text(kind: Type) -> bool:
     return False
 
 
-def is_bytes(kind: Type) -> bool:
-    """Whether values are arrays of bytes that are no texts."""
-    match kind:
-        case ArrayType(IntegerType(8, 8, encoded=False)):
-            return True
-    return False
-
-
 # Tokens
 
 
