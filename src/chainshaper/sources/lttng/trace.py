@@ -13,7 +13,6 @@ application's start again when tracing begins; ``init_timestamp`` says when they
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -58,8 +57,13 @@ def open_lttng_trace(
     """
     progress = progress or (lambda _, __: None)
     progress(0.0, "opening the trace (the first time on a machine, its decoder is compiled)")
-    with _as_our_errors():
+    try:
         trace = open_trace(*paths)
+    except PermissionError as error:
+        remedy = "copy the trace, or run as its owner"
+        raise InputError(f"{error.filename}: no permission to read it: {remedy}") from error
+    except OSError as error:
+        raise OperationError(f"the trace cannot be read: {error}") from error
     first = trace.folders[0]
     for folder in trace.folders[1:]:
         if None not in (clocks := {first.clock.uuid, folder.clock.uuid}) and len(clocks) == 2:
@@ -83,18 +87,6 @@ def open_lttng_trace(
         notes=(*trace.warnings, *tables.notes()),
     )
     return Recording(Path(paths[0]), info, tables)
-
-
-@contextmanager
-def _as_our_errors() -> Iterator[None]:
-    """What the operating system says about files becomes an error of the project."""
-    try:
-        yield
-    except PermissionError as error:
-        remedy = "copy the trace, or run as its owner"
-        raise InputError(f"{error.filename}: no permission to read it: {remedy}") from error
-    except OSError as error:
-        raise OperationError(f"the trace cannot be read: {error}") from error
 
 
 def _fact(environment: Mapping[str, object], name: str) -> str:
@@ -205,13 +197,12 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         first, nameless = not self.counts, not self._names
         for place, (host, trace) in enumerate(self._hosts.items()):
             self._report(place, 0.0)
-            with _as_our_errors():
-                found = read_events(
-                    trace,
-                    wanted,
-                    nameless=[full for full in wanted if table_name(full) not in CREATION],
-                    progress=lambda share, place=place: self._report(place, share),  # type: ignore[misc]
-                )
+            found = read_events(
+                trace,
+                wanted,
+                nameless=[full for full in wanted if table_name(full) not in CREATION],
+                progress=lambda share, place=place: self._report(place, share),  # type: ignore[misc]
+            )
             if first:
                 self._take_stock(host, trace, found)
             if nameless:
@@ -236,8 +227,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
     def _take_stock(self, host: str, trace: CtfTrace, found: Events) -> None:
         """Count all events, also of unwanted streams; move numbers that another host has, too."""
-        with _as_our_errors():
-            others, unread = count_events(replace(trace, streams=found.unread))
+        others, unread = count_events(replace(trace, streams=found.unread))
         for name, count in found.counts.items():
             self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
         self.warnings += found.warnings + unread
@@ -254,8 +244,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         names = _process_names(found)
         if not names and not any(name in self for name in CREATION):
             ran = [full for name in _WHO_RUNS for full in self._sources.get(name, ())]
-            with _as_our_errors():
-                names = _process_names(read_events(trace, ran))
+            names = _process_names(read_events(trace, ran))
         self._names |= {pid + self._moved[host]: name for pid, name in names.items()}
 
 
