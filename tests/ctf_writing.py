@@ -4,8 +4,8 @@
     packet = encode_packet(parse_tsdl(text), [EventRecord("e", 0, {"n": 1})], {"cpu_id": 0, …})
     write_trace(folder, text, {"channel_0": [packet]})
 
-babeltrace2 reads the result. Values are plain Python: int, float, str, list for arrays and
-sequences, mapping (by the names that users see) for structures, (option, value) for variants.
+babeltrace2 reads the result. Values are plain Python: int, str, list for arrays and sequences,
+mapping (by the names that users see) for structures, (option, value) for variants.
 """
 
 import re
@@ -23,7 +23,6 @@ from chainshaper.sources.ctf.trace import METADATA_MAGIC
 from chainshaper.sources.ctf.tsdl import (
     ArrayType,
     Field,
-    FloatType,
     IntegerType,
     StringType,
     StructType,
@@ -94,9 +93,6 @@ class _Bits:
         around |= (value & (1 << size) - 1) << (8 * count - shift - size if big else shift)
         self.data[first:] = around.to_bytes(count, order)
 
-    def is_big(self, kind: IntegerType | FloatType) -> bool:
-        return self.big if kind.byte_order == "native" else kind.byte_order == "be"
-
     def raw(self, data: bytes) -> None:
         """Write bytes at the next whole byte."""
         self.align(8)
@@ -107,10 +103,6 @@ class _Bits:
 def _encode(bits: _Bits, kind: Type, value: Any, name: str = "", depth: int = 0) -> None:
     """Append ``value`` as ``kind``; raises ValueError or KeyError where it does not fit."""
     match kind:
-        case FloatType(size=size):
-            packed = struct.pack("<d" if size == 64 else "<f", value)
-            bits.align(kind.align)
-            bits.integer(int.from_bytes(packed, "little"), size, bits.is_big(kind))
         case StringType():
             bits.raw((value.encode() if isinstance(value, str) else value) + b"\0")
         case StructType():
@@ -126,8 +118,6 @@ def _encode(bits: _Bits, kind: Type, value: Any, name: str = "", depth: int = 0)
         case ArrayType():
             _encode_array(bits, kind, value, depth)
         case IntegerType():
-            if isinstance(value, str):
-                value = next(m.low for m in kind.mappings if m.label == value)
             bits.align(kind.align)
             stamp = kind.clock is not None or (depth == 1 and name in bits.stamps)
             if stamp and kind.size == 64:
@@ -136,7 +126,8 @@ def _encode(bits: _Bits, kind: Type, value: Any, name: str = "", depth: int = 0)
                 bits.names[name] = bits.position
             if kind.clock is not None:
                 value &= (1 << kind.size) - 1
-            bits.integer(value, kind.size, bits.is_big(kind))
+            big = bits.big if kind.byte_order == "native" else kind.byte_order == "be"
+            bits.integer(value, kind.size, big)
 
 
 def _encode_array(bits: _Bits, kind: ArrayType, value: Any, depth: int) -> None:

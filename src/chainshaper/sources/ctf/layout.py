@@ -559,9 +559,7 @@ def _add_event(
             layout.tables[table] = []
         row[E_COUNTER] = table.counter
         row[E_COST] += 8 + 4 * has_cpu + sum(one.itemsize for one in table.slot_types())
-    if start == stop:
-        row[E_ALIGN] = 1
-    elif stop == start + 1 and layout.operations[start][O_CODE] == SKIP:
+    if stop == start + 1 and layout.operations[start][O_CODE] == SKIP:
         row[E_ALIGN], row[E_SIZE] = layout.operations[start][O_ALIGN : O_SIZE + 1]
     layout.events.append(Event(name, row, table, len(layout.streams), header, scopes))
     if table is not None:
