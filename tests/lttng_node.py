@@ -1,7 +1,7 @@
 """A program with LTTng trace points of the provider `ros2`, for what needs a real LTTng.
 
-The provider is generated from the events that a real ROS 2 Jazzy emits (rclcpp 28.1.6), with their
-real fields; `sources/chain_node.c` emits them as its nodes would.
+`sources/chain_node.c` emits events as the nodes of ROS 2 Jazzy do (rclcpp 28.1.6); the provider
+declares them with the fields of our event tables, whose names and types are `tracetools`'.
 """
 
 import atexit
@@ -10,37 +10,16 @@ import re
 import shutil
 import subprocess
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
+import polars as pl
 import pytest
+
+from chainshaper.values import events
 
 LTTNG = ("--source", "lttng")
 """The program emits its events to LTTng itself: no library in front of libtracetools sees them."""
-
-EVENTS = """
-callback_end: callback: uint64
-callback_start: callback: uint64; is_intra_process: int32
-rcl_init: context_handle: uint64; version: string
-rcl_node_init: node_handle: uint64; rmw_handle: uint64; node_name: string; namespace: string
-rcl_publish: publisher_handle: uint64; message: uint64
-rcl_publisher_init: publisher_handle: uint64; node_handle: uint64; rmw_publisher_handle: uint64; \
-topic_name: string; queue_depth: uint64
-rcl_subscription_init: subscription_handle: uint64; node_handle: uint64; \
-rmw_subscription_handle: uint64; topic_name: string; queue_depth: uint64
-rcl_take: message: uint64
-rcl_timer_init: timer_handle: uint64; period: int64
-rclcpp_callback_register: callback: uint64; symbol: string
-rclcpp_publish: message: uint64
-rclcpp_subscription_callback_added: subscription: uint64; callback: uint64
-rclcpp_subscription_init: subscription_handle: uint64; subscription: uint64
-rclcpp_take: message: uint64
-rclcpp_timer_callback_added: timer_handle: uint64; callback: uint64
-rclcpp_timer_link_node: timer_handle: uint64; node_handle: uint64
-rmw_publish: rmw_publisher_handle: uint64; message: uint64; timestamp: int64
-rmw_publisher_init: rmw_publisher_handle: uint64; gid: uint8[24]
-rmw_subscription_init: rmw_subscription_handle: uint64; gid: uint8[24]
-rmw_take: rmw_subscription_handle: uint64; message: uint64; source_timestamp: int64; taken: int32
-"""
 
 _HEADER = """
 #undef TRACEPOINT_PROVIDER
@@ -77,31 +56,30 @@ def _built() -> Path | str:
     """Build the program once; its path, or what the compiler said."""
     folder = Path(tempfile.mkdtemp(prefix="chain-node-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    events = "\n".join(_event(line) for line in EVENTS.split("\n") if line)
-    (folder / "ros2_provider.h").write_text(_HEADER.format(events=events))
     source = Path(__file__).parent / "sources" / "chain_node.c"
+    emitted = sorted(set(re.findall(r"tracepoint\(ros2, (\w+)", source.read_text())))
+    declared = "\n".join(_event(name, events.FIELDS[name]) for name in emitted)
+    (folder / "ros2_provider.h").write_text(_HEADER.format(events=declared))
     libraries = ["-llttng-ust", "-ldl", "-lpthread"]
     command = ["gcc", "-O1", f"-I{folder}", "-o", f"{folder / 'chain_node'}", str(source)]
     built = subprocess.run([*command, *libraries], capture_output=True, text=True, check=False)
     return folder / "chain_node" if built.returncode == 0 else built.stderr.strip()
 
 
-def _event(line: str) -> str:
-    """``name: field: type; …`` as LTTng's macro wants it."""
-    name, _, rest = line.partition(": ")
+def _event(name: str, columns: Mapping[str, pl.DataType]) -> str:
+    """An event as LTTng's macro wants it."""
     arguments, fields = [], []
-    for field, kind in (re.split(": ", one) for one in rest.split("; ")):
-        array = re.fullmatch(r"(\w+)\[(\d+)\]", kind)
-        if array:
-            arguments.append(f"const {array[1]}_t *, {field}_")
-            fields.append(f"ctf_array({array[1]}_t, {field}, {field}_, {array[2]})")
-        elif kind == "string":
+    for field, kind in columns.items():
+        if isinstance(kind, pl.List):
+            arguments.append(f"const uint8_t *, {field}_")
+            fields.append(f"ctf_array(uint8_t, {field}, {field}_, 24)")
+        elif isinstance(kind, pl.String):
             arguments.append(f"const char *, {field}_")
             fields.append(f"ctf_string({field}, {field}_)")
         else:
-            arguments.append(f"{kind}_t, {field}_")
-            macro = "ctf_integer_hex" if kind == "uint64" else "ctf_integer"
-            fields.append(f"{macro}({kind}_t, {field}, {field}_)")
+            arguments.append(f"{str(kind).lower()}_t, {field}_")
+            macro = "ctf_integer_hex" if kind == pl.UInt64() else "ctf_integer"
+            fields.append(f"{macro}({str(kind).lower()}_t, {field}, {field}_)")
     given, declared = ", ".join(arguments), " ".join(fields)
     return f"TRACEPOINT_EVENT(ros2, {name}, TP_ARGS({given}), TP_FIELDS({declared}))"
 
