@@ -358,16 +358,10 @@ def test_threads_of_a_container_are_not_the_kernels_of_the_same_numbers(tmp_path
 def test_services_and_their_clients(tmp_path: Path) -> None:
     """A client asks twice; the server's callback runs twice. The client's own is not traced."""
     story = Story()
-    server, client = story.node("/server", 10), story.node("/client", 11)
-    story.event("rcl_service_init", 1, 10, service_handle=50, node_handle=server.handle,
-                rmw_service_handle=51, service_name="/add")  # fmt: skip
-    story.event("rclcpp_service_callback_added", 2, 10, service_handle=50, callback=52)
-    story.event("rclcpp_callback_register", 3, 10, callback=52, symbol="Server::add()")
-    story.event("rcl_client_init", 4, 11, client_handle=60, node_handle=client.handle,
-                rmw_client_handle=61, service_name="/add")  # fmt: skip
+    server = story.service(story.node("/server", 10), "/add")
+    story.client(story.node("/client", 11), "/add")
     for now in (1000, 2000):
-        story.event("callback_start", now, 10, callback=52, is_intra_process=0)
-        story.event("callback_end", now + 70, 10, callback=52)
+        story.runs(server, now, now + 70)
     trace = written(tmp_path / "trace", story)
     (row,) = json_of("callbacks", trace)
     assert (row["node"], row["kind"], row["topic"]) == ("/server", "service", "/add")
