@@ -563,7 +563,8 @@ def test_without_a_library_lttng_records_and_says_why(
 
 
 def test_wrong_use_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    attached = called("record", "--source", "preload", "-o", tmp_path / "r", "--pid", "1")
+    attach = ("--pid", str(os.getpid()))  # not 1, whose descendants are all that runs here
+    attached = called("record", "--source", "preload", "-o", tmp_path / "r", *attach)
     assert attached.code == 1
     assert "no process of these users runs with the library in front" in attached.err
     assert "attach with `--source ebpf`" in attached.err
