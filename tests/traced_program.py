@@ -6,7 +6,7 @@ import os
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -131,6 +131,41 @@ def traced(tracer: Tracer, run: Callable[[], list[list[str]]] = list) -> Traced:
     finally:
         tracer.remove()
     return Traced(*tracer.recording(), printed)
+
+
+def traced_everything(tracer: Tracer, cycles: int) -> tuple[Traced, dict[str, list[list[str]]]]:
+    """`every` of two versions, as on a machine with two distributions, and a chain: one recording.
+
+    And what the former printed, by version.
+    """
+    programs = {"8.2.3": built(), "4.1.1": built("-DHUMBLE", version="4.1.1")}
+    printed = {}
+
+    def run_all() -> list[list[str]]:
+        printed.update({version: one.run("every") for version, one in programs.items()})
+        return programs["8.2.3"].run("chain", str(cycles))
+
+    with pytest.MonkeyPatch.context() as patch:
+        prefixes = (str(one.prefix) for one in programs.values())
+        patch.setenv("AMENT_PREFIX_PATH", ":".join(prefixes))
+        return traced(tracer, run_all), printed
+
+
+def assert_everything(
+    run: Traced, printed: Mapping[str, list[list[str]]], left_out: Collection[str] = ()
+) -> None:
+    """Every argument of every function arrived as it was passed, but of events ``left_out``.
+
+    So what the tracers say of events (arguments, texts, gids) is what the functions have.
+    """
+    assert run.info.lost == {"lost_events": 0}
+    assert run.info.distribution == "jazzy"
+    for version, rows in printed.items():
+        pid = int(rows[0][1])
+        own = of_process(run.tables, pid)
+        assert set(left_out) <= {row[0] for row in rows}
+        assert_same(own, [row for row in rows if row[0] not in left_out], version)
+        assert own["rcl_take"].item(0, "tid") != pid
 
 
 def assert_same(tables: Mapping[str, pl.DataFrame], printed: list[list[str]], version: str) -> None:

@@ -17,12 +17,13 @@ from strangers import NOBODY, named, open_folder, strange
 from traced_program import (
     Program,
     Traced,
-    assert_same,
+    assert_everything,
     build,
     built,
     of_process,
     skip_without_bpftrace,
     traced,
+    traced_everything,
 )
 
 from chainshaper.analysis.flow import DataFlow, data_flow
@@ -68,36 +69,15 @@ def set_up(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> N
 
 @pytest.fixture(scope="module")
 def everything(tmp_path_factory: pytest.TempPathFactory) -> tuple[Traced, dict[str, Any]]:
-    """`every` of two versions, as on a machine with two distributions, and a chain: one recording.
-
-    And what the former printed, by version.
-    """
     skip_without_bpftrace()
-    program, humble = built(), built("-DHUMBLE", version="4.1.1")
-    printed = {}
-
-    def run_all() -> list[list[str]]:
-        for version, one in (("8.2.3", program), ("4.1.1", humble)):
-            printed[version] = one.run("every")
-        return program.run("chain", str(CYCLES))
-
-    tracer = EbpfTracer(tmp_path_factory.mktemp("trace"), program.command("every"), ())
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("AMENT_PREFIX_PATH", f"{program.prefix}:{humble.prefix}")
-        return traced(tracer, run_all), printed
+    tracer = EbpfTracer(tmp_path_factory.mktemp("trace"), ["command"], ())
+    return traced_everything(tracer, CYCLES)
 
 
 def test_every_argument_of_every_function_arrives_as_it_was_passed(
     everything: tuple[Traced, dict[str, Any]],
 ) -> None:
-    run, printed = everything
-    assert run.info.lost == {"lost_events": 0}
-    assert run.info.distribution == "jazzy"
-    for version, rows in printed.items():
-        pid = int(rows[0][1])
-        own = of_process(run.tables, pid)
-        assert_same(own, rows, version)
-        assert own["rcl_take"].item(0, "tid") != pid
+    assert_everything(*everything)
 
 
 def test_execution_times_are_the_threads_own_cpu_time(

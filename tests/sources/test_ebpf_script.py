@@ -59,17 +59,6 @@ def test_bpftrace_accepts_the_script_of_a_distribution_that_is_not_traced_here(
     assert run.returncode == 0, run.stderr[-2000:]
 
 
-def test_arguments_are_the_columns_but_for_what_no_function_is_given() -> None:
-    assert [a.column for a in point("rcl_init").arguments] == ["context_handle"]
-    assert [(a.column, a.place) for a in point("rclcpp_publish").arguments] == [("message", 1)]
-    old, new = point("rmw_publish", "7.1.0"), point("rmw_publish", "8.2.3")
-    assert [a.column for a in old.arguments] == ["message"]
-    assert [a.column for a in new.arguments] == ["rmw_publisher_handle", "message", "timestamp"]
-    for event in ("callback_start", "rclcpp_ring_buffer_enqueue", "rmw_take"):
-        assert [a.column for a in point(event).arguments] == list(events.FIELDS[event])
-        assert point(event).arguments[-1].kind == "flag"
-
-
 def test_only_exported_functions_get_a_probe() -> None:
     few = TracingLibrary(Path("/lib.so"), frozenset({"ros_trace_callback_end", "other"}), None)
     points = trace_points([few])

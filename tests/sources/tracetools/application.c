@@ -107,6 +107,8 @@ static void call_every(void) {
     CALL(rclcpp_timer_callback_added, "hh", HANDLE, HANDLE);
     CALL(rclcpp_timer_link_node, "hh", HANDLE, HANDLE);
     CALL(rclcpp_callback_register, "hs", HANDLE, "void (*)(std::shared_ptr<Message>)");
+    CALL(rcl_lifecycle_state_machine_init, "hh", HANDLE, HANDLE);
+    CALL(rcl_lifecycle_transition, "hss", HANDLE, "inactive", "active");
     CALL(callback_start, "hb", HANDLE, true);
     CALL(callback_end, "h", HANDLE);
     CALL(rclcpp_executor_get_next_ready, "");
