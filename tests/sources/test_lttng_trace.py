@@ -242,21 +242,25 @@ def test_another_providers_events_of_the_same_name_are_not_ours(tmp_path: Path) 
 
 
 @pytest.mark.parametrize(
-    ("field", "damaged"),
-    [("topic_name", "x64"), ("publisher_handle", "string"), ("node_handle", "u32[]")],
+    ("event", "field", "damaged"),
+    [
+        ("rcl_publisher_init", "topic_name", "x64"),
+        ("rcl_publisher_init", "publisher_handle", "string"),
+        ("rcl_publisher_init", "node_handle", "u32[]"),
+        ("rmw_publisher_init", "gid", "u32[]"),
+    ],
 )
 def test_fields_of_another_kind_are_said_to_be_unknown(
-    field: str, damaged: str, tmp_path: Path
+    event: str, field: str, damaged: str, tmp_path: Path
 ) -> None:
-    kinds = {"publisher_handle": "x64", "node_handle": "x64", "rmw_publisher_handle": "x64",
-             "topic_name": "string", "queue_depth": "u64"} | {field: damaged}  # fmt: skip
-    values: dict[str, Any] = {"x64": 7, "u64": 7, "string": "seven", "u32[]": [7]}
+    kinds = dict.fromkeys(events.FIELDS[event], "x64") | {"topic_name": "string", field: damaged}
+    values: dict[str, Any] = {"x64": 7, "string": "seven", "u32[]": [7]}
     payload = {name: values[kind] for name, kind in kinds.items()}
     payload[f"_{field}_length"] = 1
-    one_event(tmp_path / "trace", "ros2:rcl_publisher_init", kinds, payload)
+    one_event(tmp_path / "trace", f"ros2:{event}", kinds, payload)
     said = called("graph", tmp_path / "trace")
     assert said.code == 0
-    assert f"rcl_publisher_init has no usable field {field}" in said.err
+    assert f"{event} has no usable field {field}" in said.err
 
 
 def test_events_of_nobody_knows_which_thread_are_counted_and_left_out(tmp_path: Path) -> None:

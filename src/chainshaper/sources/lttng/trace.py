@@ -308,7 +308,7 @@ def _decoded_type(declared: ctf.Type | None) -> pl.DataType | None:
     match declared:
         case ctf.IntegerType():
             return pl.Int64()
-        case ctf.ArrayType(ctf.IntegerType()):
+        case ctf.ArrayType(ctf.IntegerType(8, 8)):
             return pl.String() if ctf.is_text(declared) else pl.List(pl.Int64())
         case ctf.StringType():
             return pl.String()
