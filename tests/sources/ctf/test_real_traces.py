@@ -1,4 +1,4 @@
-"""Every event and field of real ROS 2 traces, against babeltrace2."""
+"""Every event of real ROS 2 traces, and every field that has a column, against babeltrace2."""
 
 import json
 

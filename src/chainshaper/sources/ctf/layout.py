@@ -295,7 +295,7 @@ class _Number(NamedTuple):
     mappings: tuple[tsdl.EnumMapping, ...]
 
 
-_Frame = dict[str, "_Number | _Frame | None"]
+_Frame = dict[str, "_Number | _Frame"]
 
 
 class _Place(NamedTuple):
@@ -359,6 +359,9 @@ class _Writer:
         if len(at.frames) > _DEEPEST or self.layout.steps > _MOST_STEPS:
             raise LayoutError(f"{name}: types nested too deeply")
         match kind:
+            case tsdl.FloatType():
+                self._skip(kind.align, kind.size)
+                return kind.size
             case tsdl.StringType():
                 self._row(TEXT, {O_ALIGN: 8, **at.slot})
                 return 8
@@ -372,23 +375,20 @@ class _Writer:
                 return self._variant(name, kind, at)
         return self._number(name, kind, at)
 
-    def _number(self, name: str, kind: tsdl.IntegerType | tsdl.FloatType, at: _Place) -> int:
+    def _number(self, name: str, kind: tsdl.IntegerType, at: _Place) -> int:
         big = self.big if kind.byte_order == "native" else kind.byte_order == "be"
-        signed, register, clock = False, -1, False
-        at.frames[-1][name] = None
-        if isinstance(kind, tsdl.IntegerType):
-            signed, clock = kind.signed, kind.clock is not None
-            if self.fixed and name in REGISTERS and (len(at.frames) == 1 or name == "id"):
-                register = REGISTERS[name]
-                # The end of a packet is no instant that its events follow.
-                clock = clock and register != R_END
-            elif name in self.referenced:
-                register, self.registers = self.registers, self.registers + 1
-            at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
+        register, clock = -1, kind.clock is not None
+        if self.fixed and name in REGISTERS and (len(at.frames) == 1 or name == "id"):
+            register = REGISTERS[name]
+            # The end of a packet is no instant that its events follow.
+            clock = clock and register != R_END
+        elif name in self.referenced:
+            register, self.registers = self.registers, self.registers + 1
+        at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
         if not at.slot and register < 0 and not clock:
             self._skip(kind.align, kind.size)
             return kind.size
-        flags = signed + 2 * big + 4 * clock
+        flags = kind.signed + 2 * big + 4 * clock
         columns = {O_ALIGN: kind.align, O_SIZE: kind.size, O_FLAGS: flags, O_REGISTER: register}
         row = self._row(NUMBER, columns | at.slot)
         if _is_moved(row):

@@ -63,7 +63,6 @@ class FloatType:
 
     size: int
     align: int
-    byte_order: ByteOrder = "native"
 
 
 @dataclass(frozen=True, slots=True)
@@ -333,9 +332,8 @@ def _float_type(values: Attributes, offset: int) -> FloatType:
     if (exponent, mantissa) not in ((8, 24), (11, 53)):
         given = f"floating point of {exponent} + {mantissa} bits"
         raise TsdlError(offset, f"{given}; IEEE 32 or 64 supported")
-    align = _alignment(_number(values, "align", 8), offset)
-    order = _one_of(_ORDERS, values, "byte_order", "native")
-    return FloatType(exponent + mantissa, align, order)
+    _one_of(_ORDERS, values, "byte_order", "native")
+    return FloatType(exponent + mantissa, _alignment(_number(values, "align", 8), offset))
 
 
 # Grammar
