@@ -18,12 +18,6 @@ if TYPE_CHECKING:
 LINE_EVERY = 10
 
 
-def recording_of(plan: "cs.ApplicationPlan") -> Path | None:
-    """The recording that a plan was made from, where it is still there."""
-    named = plan.chains[0].evidence.recording
-    return Path(named) if named and Path(named).is_dir() else None
-
-
 def threads(
     where: str | None = opt.argument(
         "[PID|PLAN]",
@@ -41,14 +35,10 @@ def threads(
     """Show the threads of running nodes: executors, DDS threads, publishers; class and cores."""
     from chainshaper.reporting.overviews import threads_json, threads_table
 
-    place: int | cs.ApplicationPlan | None = None
-    if where is not None and where.isdecimal():
-        place = int(where)
-    elif where is not None:
-        place = cs.load_application_plan(where)
-        recording = recording or recording_of(place)
-    recorded = None if recording is None else cs.open_source(recording)
-    found = cs.find_threads(place, recorded, users=user or ())
+    pid = int(where) if where is not None and where.isdecimal() else None
+    plan = None if where is None or pid is not None else cs.load_application_plan(where)
+    known = opt.recording_of(recording, plan)
+    found = cs.find_threads(plan if pid is None else pid, known, users=user or ())
     if out.present(json, threads_json(found), threads_table(found)):
         out.notes(found.notes)
 
@@ -94,7 +84,7 @@ def apply(
     planned = cs.load_application_plan(plan)
     opt.refuse_bound_alone(max_latency, adapt)
     how: dict[str, Any] = {
-        "recording": None if recording is None else cs.open_source(recording),
+        "recording": opt.recording_of(recording),
         "phase_ns": phase,
         "users": user or (),
     }

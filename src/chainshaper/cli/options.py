@@ -284,6 +284,16 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
         return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")
 
 
+def recording_of(
+    named: Path | None, plan: "cs.ApplicationPlan | None" = None
+) -> "cs.Recording | None":
+    """The recording that an option names, or else the plan's own, where that is still there."""
+    own = None if plan is None else plan.chains[0].evidence.recording
+    if named is None and own and Path(own).is_dir():
+        named = Path(own)
+    return None if named is None else cs.open_source(named)
+
+
 def refuse_bound_alone(max_latency_ns: int | None, adapt: bool) -> None:
     """Refuse a bound for slots that stay where they are. Raises InputError."""
     if max_latency_ns is not None and not adapt:

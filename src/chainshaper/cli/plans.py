@@ -8,7 +8,6 @@ from typing import Any
 import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
-from chainshaper.cli.applying import recording_of
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Fallback, NodeKind
@@ -324,7 +323,7 @@ def splice(
             raise InputError(
                 "give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
             )
-        known = _opened(recording)
+        known = opt.recording_of(recording)
         splicing = cs.splice_throttlers(throttled_inputs(throttle), recording=known, **common)
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
@@ -332,7 +331,7 @@ def splice(
         planned = cs.load_application_plan(plan)
         out.warn(planned, node)
         common |= {"message_type": message_type, "fallback": fallback}
-        known = _opened(recording or recording_of(planned))
+        known = opt.recording_of(recording, planned)
         splicing = cs.splice_launch_files(planned, recording=known, **common)
     setup = build_package(splicing.folder / NODES) if build and not dry_run else None
     if json:
@@ -358,10 +357,6 @@ def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":
         with wrong_values_refused(cs.ThrottledInput):
             parsed.append(cs.ThrottledInput.model_validate(values))
     return parsed
-
-
-def _opened(recording: Path | None) -> "cs.Recording | None":
-    return None if recording is None else cs.open_source(recording)
 
 
 def _show_splicing(

@@ -510,7 +510,7 @@ def profile(
         request = cs.PlanRequest(cores=(core,))
     cores = check_profiling(request.cores)
     names = [f"/{name.strip('/')}" for name in node or ()]
-    earlier = None if like is None else cs.open_source(like)
+    earlier = opt.recording_of(like)
     if len(cores) > 1 and not (earlier and chains):
         raise InputError(
             "--cores are distributed by what chains do at the same time: name these with --chain,"
