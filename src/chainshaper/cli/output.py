@@ -42,17 +42,20 @@ def show_line(text: str | Path) -> None:
         sys.stdout.write(shown(str(text), but="\n") + "\n")
 
 
-def print_json(value: Any) -> None:
-    """One JSON document on stdout; the one control character that JSON leaves alone is escaped."""
+def print_json(value: Any, *, indent: int | None = 2) -> None:
+    """One JSON document on stdout, out at once; without an indent it is a line.
+
+    The one control character that JSON leaves alone is escaped.
+    """
     with _written():
-        sys.stdout.write(json.dumps(value, indent=2).replace("\x7f", "\\u007f") + "\n")
+        sys.stdout.write(json.dumps(value, indent=indent).replace("\x7f", "\\u007f") + "\n")
 
 
 def present(as_json: bool, value: Any, *tables: "RenderableType") -> bool:
     """A value as JSON, or the same as tables; whether it was the tables."""
     if as_json:
         print_json(value)
-    else:
+    elif tables:
         show(*tables)
     return not as_json
 
@@ -221,9 +224,3 @@ def live() -> "Iterator[Callable[[Sequence[RenderableType]], None]]":
 
     with Live(auto_refresh=False) as place:
         yield lambda tables: place.update(Group(*tables), refresh=True)
-
-
-def print_json_line(value: Any) -> None:
-    """One JSON document on a line of its own, out at once."""
-    with _written():
-        sys.stdout.write(json.dumps(value).replace("\x7f", "\\u007f") + "\n")

@@ -297,9 +297,7 @@ def splice(
 
     if undo:
         cs.undo_splice(output)
-        if json:
-            out.print_json({"removed": str(output)})
-        else:
+        if out.present(json, {"removed": str(output)}):
             out.show_line(f"{output} is removed")
         return
     if build and node == "python":
@@ -334,10 +332,8 @@ def splice(
         known = opt.recording_of(recording, planned)
         splicing = cs.splice_launch_files(planned, recording=known, **common)
     setup = build_package(splicing.folder / NODES) if build and not dry_run else None
-    if json:
-        out.print_json(_splicing_json(splicing, setup))
-        return
-    _show_splicing(splicing, arguments, setup, dry_run=dry_run)
+    if out.present(json, _splicing_json(splicing, setup)):
+        _show_splicing(splicing, arguments, setup, dry_run=dry_run)
 
 
 def throttled_inputs(inputs: Sequence[str]) -> "list[cs.ThrottledInput]":

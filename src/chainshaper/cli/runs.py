@@ -244,17 +244,14 @@ def _record_and_show(
         )
     recording = recorded.recording
     count = int(cs.event_counts(recording)["count"].sum())
-    if json:
-        out.print_json(
-            {
-                "recording": str(recording.path),
-                "events": count,
-                "lost": recording.info.lost,
-                "exit_code": recorded.exit_code,
-                "notes": list(recording.info.notes),
-            }
-        )
-    else:
+    values = {
+        "recording": str(recording.path),
+        "events": count,
+        "lost": recording.info.lost,
+        "exit_code": recorded.exit_code,
+        "notes": list(recording.info.notes),
+    }
+    if out.present(json, values):
         out.show_line(recording.path)
     out.notes((*recording.info.notes, f"{count} events; {out.lost_events(recording)}"))
     if recorded.exit_code:
@@ -369,9 +366,9 @@ def watch(
                 next_look += (1 + late // every) * every  # none is made up for
                 export(seen := watched.look())
                 publish(seen)
-                broken = judged(seen)
+                broken = [one.text for one in judged(seen)]
                 if json:
-                    out.print_json_line(seen.as_json() | {"broken": [one.text for one in broken]})
+                    out.print_json(seen.as_json() | {"broken": broken}, indent=None)
                 else:
                     show(watch_tables(seen))
     if started is not None and started.returncode and not stop.is_set():
