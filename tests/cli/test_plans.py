@@ -155,7 +155,7 @@ def test_auto_shows_the_curve_and_says_why_it_stops(common: Words, file: Path) -
         ("--policy server-per-callback", "needs the chain's callbacks"),
         ("--epsilon 1ms --overrun-probability 1e-6", "either given or covers a share"),
         ("--sink /a../b", "give a recording for several"),
-        ("--period 0ms", "write a period longer than 0 ms"),
+        ("--period 0ms", "0ms is no time: write more than 0"),
         ("--skip 1s --percentile 99", "0 latencies are too few to plan with"),
     ],
 )

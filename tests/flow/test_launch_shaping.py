@@ -6,7 +6,7 @@ The flow itself needs ROS 2 and minutes; every step of it is tested where it is 
 from pathlib import Path
 
 import pytest
-from command_line import refused
+from command_line import called, refused
 
 from chainshaper import shape_launch
 from chainshaper.values.errors import InputError, PlatformError
@@ -51,6 +51,7 @@ def test_what_cannot_be_shaped_is_refused_before_anything_is_launched(
         "--mode-profile city=before": "goes with --modes",
     }.items():
         assert reason in refused(2, "shape", *words.split(), *launch)
+    assert "0ms is no time: write more than 0" in called("shape", "--period", "0ms", *launch).err
     assert not (tmp_path / "out").exists()
 
 

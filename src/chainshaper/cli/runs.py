@@ -557,7 +557,9 @@ def shape(
         "A throttler before an input of NODE that is not quite periodic, from the first recording"
         " on (may be repeated).",
     ),
-    period: int | None = opt.option("--period DURATION", "Period of a chain that no timer starts."),
+    period: int | None = opt.option(
+        "--period DURATION>0", "Period of a chain that no timer starts."
+    ),
     duration: int | None = opt.option(
         "--duration DURATION", "How long to measure, before and after. Default: 60s."
     ),
