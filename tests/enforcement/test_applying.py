@@ -110,12 +110,16 @@ def test_a_command_is_started_governed_and_ended(tmp_path: Path) -> None:
     assert json.loads(stdout)["command"] == command, "what the command says goes elsewhere"
 
 
+KILLED = ("sh", "-c", "kill -9 $$")
+
+
 def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     save_plan(one_server_plan(), path)
-    ended = chainshaper("apply", path, *FIFO, "--", "false")
-    assert ended.code == 1
-    assert "ended with code 1 before all nodes" in ended.err
+    for command, how in (("false",), "ended with code 1"), (KILLED, "was killed by SIGKILL"):
+        ended = chainshaper("apply", path, *FIFO, "--", *command)
+        assert ended.code == 1
+        assert f"the command {how} before all nodes" in ended.err
     shaped = plan_shaping(
         np.array([8, 12]) * 1_000_000,
         50_000_000,

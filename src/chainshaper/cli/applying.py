@@ -79,6 +79,7 @@ def apply(
 
     Whatever ends it, everything is as it was before.
     """
+    from chainshaper.linux.own_processes import end_in_words
     from chainshaper.reporting.overviews import servers_table
 
     planned = cs.load_application_plan(plan)
@@ -110,7 +111,7 @@ def apply(
     out.present(json, asdict(done.state) | {"exit_code": done.exit_code}, servers_table(done.state))
     out.notes(done.state.notes)
     if done.exit_code and not stop.is_set():
-        raise OperationError(f"the command ended with code {done.exit_code}")
+        raise OperationError(f"the command {end_in_words(done.exit_code)}")
 
 
 def _show_changes(

@@ -36,7 +36,7 @@ from chainshaper.flow import threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
 from chainshaper.flow.threads import LEAD_NS
-from chainshaper.linux.own_processes import end_command, start_command
+from chainshaper.linux.own_processes import end_command, end_in_words, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
@@ -245,8 +245,8 @@ class _Run:
                     ) from None
                 if self.command_ended and self.command is not None:
                     raise OperationError(
-                        f"the command ended with code {self.command.returncode} before all nodes "
-                        f"of the plan were running: {named or 'all'} were not"
+                        f"the command {end_in_words(self.command.returncode)} before all nodes of"
+                        f" the plan were running: {named or 'all'} were not"
                     ) from None
                 if waited >= wait_ns:
                     raise
