@@ -6,10 +6,12 @@ import subprocess
 from collections.abc import Generator, Iterator
 from pathlib import Path
 from typing import TypeVar
+from unittest import mock
 
 import pytest
 from calm_runs import calm_run
 from hypothesis import settings
+from ros2 import ros2_environment
 from small_chain import EXECUTOR_CORE, small_chain, small_chain_plan, small_chain_text
 
 from chainshaper import run_application, shape_application, simulate
@@ -138,6 +140,13 @@ def simulated_shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Re
     """The same as ``shaped``, simulated."""
     folder = tmp_path_factory.mktemp("simulated_shaped")
     return simulate(small_chain(folder), folder / "after", plan, cycles=CYCLES)
+
+
+@pytest.fixture
+def in_ros2() -> Iterator[None]:
+    """What a test starts is started in the environment of ROS 2."""
+    with mock.patch.dict(os.environ, ros2_environment()):
+        yield
 
 
 @pytest.fixture

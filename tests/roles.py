@@ -12,18 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from ros2 import ros2_environment
 
-__all__ = ["printed", "role", "ros2_alone"]
-
-
-def ros2_alone() -> dict[str, str]:
-    """The environment of ROS 2, without what others publish on the network."""
-    return {**ros2_environment(), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
+__all__ = ["printed", "role"]
 
 
 @functools.cache
 def role() -> Path:
     """The program; `role ROLE [NUMBER]` plays one."""
-    environment = ros2_alone()
+    environment = ros2_environment()
     folder = Path(tempfile.mkdtemp(prefix="roles-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     source = Path(__file__).with_name("roles")

@@ -9,11 +9,14 @@ import pytest
 
 
 def ros2_environment() -> dict[str, str]:
-    """The environment of ROS 2; without one the test is skipped, with the reason."""
+    """The environment of ROS 2, without what others publish on the network.
+
+    Without ROS 2 the test is skipped, with the reason.
+    """
     environment = _environment()
     if environment is None:
         pytest.skip("no ROS 2: source its setup.bash, or name it in ROS2_SETUP")
-    return dict(environment)
+    return {**environment, "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
 
 
 @functools.cache

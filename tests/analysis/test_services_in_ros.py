@@ -1,11 +1,14 @@
 """Services and an action of C++ nodes, recorded by the library in front: what the nodes print."""
 
+import os
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from command_line import called, json_of
-from roles import printed, role, ros2_alone
+from roles import printed, role
+from ros2 import ros2_environment
 
 import chainshaper as cs
 
@@ -27,9 +30,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
         f'"{role()}" {" ".join(words)} > "{folder}/{name}" &' for name, words in NODES.items()
     ]
     script = "\n".join(["trap 'kill $(jobs -p)' INT TERM", *starts, "wait", "wait"])
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ros2_alone().items():
-            patch.setenv(name, value)
+    with mock.patch.dict(os.environ, ros2_environment()):
         made = called(
             *("record", "--source", "preload", "-o", folder / "recording"),
             *("--duration", f"{SECONDS}s", "--", "bash", "-c", script),
@@ -102,13 +103,11 @@ def test_the_commands_show_services_and_clients(recording: Path) -> None:
 @pytest.mark.ros2
 @pytest.mark.timeout(300)
 def test_lttng_has_no_calls_before_kilted_and_latency_says_so(tmp_path: Path) -> None:
-    environment = ros2_alone()
+    environment = ros2_environment()
     if environment["ROS_DISTRO"] not in ("humble", "jazzy"):
         return  # tracetools has trace points for calls
     script = f'"{role()}" server & "{role()}" client 50 & sleep 5; kill %1 %2; wait'
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in environment.items():
-            patch.setenv(name, value)
+    with mock.patch.dict(os.environ, environment):
         folder = tmp_path / "lttng"
         made = called("record", "--source", "lttng", "-o", folder, "--", "bash", "-mc", script)
     assert made.code == 0, made.err

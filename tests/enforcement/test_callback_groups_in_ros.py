@@ -51,12 +51,11 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.usefixtures("in_ros2")
 def test_one_callback_group_is_gated_and_the_other_runs_on(
     program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    environment = {**ros2_environment(), "ROS_DOMAIN_ID": "97"}
-    for name, value in environment.items():
-        monkeypatch.setenv(name, value)
+    monkeypatch.setenv("ROS_DOMAIN_ID", "97")
     command = (str(program), "--ros-args", "-r", "__node:=groups")
     recording, path = tmp_path / "rec", tmp_path / "plan.yaml"
     finished = called("record", "-o", recording, "--duration", "3s", "--", *command)

@@ -7,19 +7,15 @@ import figure_8
 import numpy as np
 import pytest
 from on_ros import MIDDLEWARES, ros_in_turns
-from ros2 import ros2_environment
 
 from chainshaper.linux.scheduling import may_use_fifo
 
 
 @pytest.mark.ros2
+@pytest.mark.usefixtures("in_ros2")
 @pytest.mark.timeout(600)
 @pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
-def test_what_was_profiled_and_what_was_shaped_take_turns(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in ros2_environment().items():
-        monkeypatch.setenv(name, value)
+def test_what_was_profiled_and_what_was_shaped_take_turns(tmp_path: Path) -> None:
     before, (node, *_) = dict(os.environ), figure_8.shapings()
     runs = ros_in_turns([node], cycles=60, folder=tmp_path, blocks=2)
     assert dict(os.environ) == before

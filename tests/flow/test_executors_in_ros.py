@@ -82,12 +82,10 @@ def ran(program: Path, tmp_path: Path) -> Ran:
         launch = tmp_path / "robot.launch.py"
         launch.write_text(LAUNCH.replace("{nodes!r}", repr(nodes)))
         folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / f"{tmp_path.name}-{verb}"
-        known = {"ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
-        known["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         command = [sys.executable, "-m", "chainshaper", verb, "-o", str(folder), *options, "--json"]
         run = subprocess.run(
             [*command, "--", "ros2", "launch", str(launch)],
-            env={**ros2_environment(), **known},
+            env={**ros2_environment(), "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)},
             capture_output=True,
             text=True,
             check=False,

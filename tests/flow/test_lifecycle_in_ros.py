@@ -1,12 +1,16 @@
 """A lifecycle node that is shaped: cycles without it count apart, and nothing is late after."""
 
+import os
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from unittest import mock
 
 import polars as pl
 import pytest
 from command_line import called, json_of
-from roles import role, ros2_alone
+from roles import role
+from ros2 import ros2_environment
 
 import chainshaper as cs
 
@@ -24,16 +28,14 @@ wait
 
 
 @pytest.fixture(scope="module")
-def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What was recorded of the launch file, unshaped."""
+def before(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """What was recorded of the launch file, unshaped; what is started has its environment."""
     folder = tmp_path_factory.mktemp("lifecycle") / "before"
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {**ros2_alone(), "ROLE": str(role()), "PERIOD": "100"}.items():
-            patch.setenv(name, value)
+    with mock.patch.dict(os.environ, {**ros2_environment(), "ROLE": str(role()), "PERIOD": "100"}):
         words = ("record", "--source", "preload", "-o", folder, "--duration", "8s", "--")
         made = called(*words, "ros2", "launch", LAUNCH)
-    assert made.code == 0, made.err
-    return folder
+        assert made.code == 0, made.err
+        yield folder
 
 
 @pytest.mark.ros2
@@ -47,14 +49,8 @@ def before(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
 )
 def test_a_node_that_is_made_inactive_is_shaped_again_when_it_is_active(
-    before: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    where: str,
-    changes: str,
+    before: Path, tmp_path: Path, where: str, changes: str
 ) -> None:
-    for name, value in {**ros2_alone(), "ROLE": str(role()), "PERIOD": "100"}.items():
-        monkeypatch.setenv(name, value)
     plan, spliced, after = (tmp_path / name for name in ("plan.yaml", "spliced", "after"))
     publication = ("--publication", "in-process") if where == "in-process" else ()
     # The slot lies in the middle of the cycle, whatever else the machine did meanwhile.

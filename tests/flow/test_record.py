@@ -14,7 +14,6 @@ import pytest
 from command_line import Running, called, chainshaper, json_of, refused
 from lttng_node import LTTNG, chain_command, required_node
 from processes import wait_for
-from ros2 import ros2_environment
 
 from chainshaper import open_recording
 from chainshaper.flow import record
@@ -263,12 +262,8 @@ def test_a_full_disk_is_named(node: Path, full_disk: Path) -> None:
 
 
 @pytest.mark.ros2
-def test_real_nodes_are_recorded_with_types_and_qos(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name, value in ros2_environment().items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+@pytest.mark.usefixtures("in_ros2")
+def test_real_nodes_are_recorded_with_types_and_qos(tmp_path: Path) -> None:
     package = ["ros2", "pkg", "prefix", "demo_nodes_cpp"]
     if subprocess.run(package, capture_output=True, check=False).returncode:
         pytest.skip("the package demo_nodes_cpp is not installed in this ROS 2")

@@ -140,7 +140,6 @@ def attempt(program: Path, tmp_path: Path) -> Callable[..., Attempt]:
     def attempt(nodes: list[str], verb: str, name: str, *words: str, **variables: str) -> Attempt:
         known = {"MODES": "", "ASYNCHRONOUS": "{}", "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
         environment = {**ros2_environment(), **known, **variables}
-        environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
         folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / name
         file, text = tmp_path / "robot.launch.py", LAUNCH.replace("{nodes!r}", repr(nodes))
         file.write_text(text.replace("{program!r}", repr(str(program))))

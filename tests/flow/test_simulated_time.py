@@ -9,7 +9,7 @@ import pytest
 from applied_plans import node_command
 from command_line import called
 from processes import wait_for
-from roles import role, ros2_alone
+from roles import role
 from story import OFFSET, Story
 
 from chainshaper.flow.plan import profile_chains
@@ -107,6 +107,7 @@ wait; wait
 
 
 @pytest.mark.ros2
+@pytest.mark.usefixtures("in_ros2")
 @pytest.mark.timeout(300)
 @pytest.mark.parametrize(
     ("percent", "simulated", "said"),
@@ -120,13 +121,10 @@ wait; wait
 def test_a_replayed_clock_is_seen_in_ros(
     tmp_path: Path, percent: int, simulated: str, said: str
 ) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in ros2_alone().items():
-            patch.setenv(name, value)
-        made = called(
-            *("record", "--source", "preload", "-o", tmp_path / "recording", "--duration", "12s"),
-            *("--", "bash", "-c", NODES, role(), str(percent), simulated),
-        )
+    made = called(
+        *("record", "--source", "preload", "-o", tmp_path / "recording", "--duration", "12s"),
+        *("--", "bash", "-c", NODES, role(), str(percent), simulated),
+    )
     assert made.code == 0, made.err
     planned = called("plan", tmp_path / "recording", "--chain", "/source../t2")
     assert planned.code == 2

@@ -8,19 +8,15 @@ from pathlib import Path
 
 import pytest
 from command_line import called, json_of
-from ros2 import ros2_environment
 from traced_program import skip_without_bpftrace
 
 PACKAGE = "demo_nodes_cpp"
 
 
 @pytest.fixture
-def nodes(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
+def nodes(in_ros2: None) -> Iterator[list[int]]:
     """Processes of a talker and a listener."""
     skip_without_bpftrace()
-    for name, value in ros2_environment().items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     package = ["ros2", "pkg", "prefix", PACKAGE]
     found = subprocess.run(package, capture_output=True, text=True, check=False)
     if found.returncode:

@@ -14,7 +14,6 @@ import polars as pl
 import pytest
 from command_line import called, json_of
 from containers import in_container
-from ros2 import ros2_environment
 from small_chain import small_chain
 
 import chainshaper as cs
@@ -27,17 +26,14 @@ LENGTHS = {"gid": 16}  # LTTng has what follows the gid as well
 
 
 @pytest.fixture
-def launch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def launch(in_ros2: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The command that launches a generated package of C++ nodes."""
-    for name, value in ros2_environment().items():
-        monkeypatch.setenv(name, value)
-    monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
     workspace = tmp_path / "ws"
     (workspace / "src").mkdir(parents=True)
     cs.generate_package(small_chain(tmp_path), workspace / "src/small")
     build = ["colcon", "build", "--merge-install", "--packages-select", "small"]
     subprocess.run(build, cwd=workspace, check=True, capture_output=True)
-    prefixes = f"{workspace}/install:{ros2_environment()['AMENT_PREFIX_PATH']}"
+    prefixes = f"{workspace}/install:{os.environ['AMENT_PREFIX_PATH']}"
     monkeypatch.setenv("AMENT_PREFIX_PATH", prefixes)
     return ["ros2", "launch", "small", "small.launch.py"]
 

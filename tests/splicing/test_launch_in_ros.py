@@ -34,8 +34,7 @@ ADDED = ("/chainshaper_pose", "/chainshaper_pose_standby")
 def environment() -> dict[str, str]:
     found = ros2_environment()
     found["AMENT_PREFIX_PATH"] = f"{PACKAGES}{os.pathsep}{found.get('AMENT_PREFIX_PATH', '')}"
-    found |= {"ROS_DOMAIN_ID": "94", "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    return found
+    return found | {"ROS_DOMAIN_ID": "94"}
 
 
 @pytest.fixture(scope="module")

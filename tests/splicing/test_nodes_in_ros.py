@@ -1,6 +1,7 @@
 """The shaping node and the throttler in a real ROS 2 environment, all three kinds."""
 
 import json
+import os
 import shutil
 import signal
 import subprocess
@@ -10,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import polars as pl
 import pytest
@@ -42,10 +44,7 @@ COUNT = 30
 @pytest.fixture(autouse=True, scope="module")
 def in_ros_environment() -> Iterator[None]:
     """Everything that is started here is started in a ROS 2 environment."""
-    with pytest.MonkeyPatch.context() as monkeypatch:
-        for name, value in ros2_environment().items():
-            monkeypatch.setenv(name, value)
-        monkeypatch.setenv("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+    with mock.patch.dict(os.environ, ros2_environment()):
         yield
 
 

@@ -71,7 +71,6 @@ def plan() -> Plan:
 @pytest.fixture(params=["python", "cpp"])
 def launched(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Launched]:
     environment = {**ros2_environment(), "ROS_DOMAIN_ID": DOMAIN, "CHAINSHAPER_TEST": str(tmp_path)}
-    environment["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     kind: NodeKind = request.param
     if kind == "cpp" and shutil.which("colcon", path=environment["PATH"]) is None:
         pytest.skip("colcon is not on the PATH, so no package can be built")
