@@ -18,7 +18,7 @@ from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, cast
 from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
@@ -403,17 +403,6 @@ def chain_phases(
     return [known[k] if k in known else phases[one] for k, one in enumerate(wanted)]
 
 
-class CarriedOut(NamedTuple):
-    """A plan as it is carried out, from when on its cycles count (CLOCK_MONOTONIC, modulo the
-    hyper-period); and, where these were measured, its timers and how long before slots they expire.
-    """
-
-    plan: ApplicationPlan
-    anchor_ns: int
-    waits_ns: list[int]
-    phases: list[Phase]
-
-
 def carried_out(
     plan: ApplicationPlan,
     found: Allocation,
@@ -422,22 +411,26 @@ def carried_out(
     gated: bool = True,
     progress: Callable[[float], None] = lambda _: None,
     known: Mapping[int, Phase] = MappingProxyType({}),
-) -> CarriedOut:
+) -> tuple[ApplicationPlan, int, list[int], list[Phase]]:
     """A plan on what runs, whose first timer expires at ``phase_ns`` (None: all are measured that
     are not ``known``, see :func:`chain_phases`).
+
+    Returns the plan as it is carried out, from when on its cycles count (CLOCK_MONOTONIC, modulo
+    the hyper-period); and, where its timers were measured, how long before slots they expire, and
+    where.
 
     Raises OperationError: a chain has no regular beginning, or as :func:`placed`.
     """
     if phase_ns is not None:
         anchor_ns = phase_ns + LEAD_NS - plan.chains[0].offset_ns
-        return CarriedOut(plan, anchor_ns % plan.cycle_ns, [], [])
+        return plan, anchor_ns % plan.cycle_ns, [], []
     phases = chain_phases(plan, found, progress, known)
     plan, anchor_ns = placed(plan, phases, gated=gated)
     waits_ns = [
         (anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
         for chain, phase in zip(plan.chains, phases, strict=True)
     ]
-    return CarriedOut(plan, anchor_ns, waits_ns, phases)
+    return plan, anchor_ns, waits_ns, phases
 
 
 def placed(
