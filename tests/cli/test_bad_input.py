@@ -176,7 +176,7 @@ def test_without_the_privilege_it_runs_with_what_it_may(
         ("record -o OUT", "no command given"),
         ("record -o OUT --pid 1 -- true", "a COMMAND is started, --pid attaches"),
         ("profile -o OUT", "no command given"),
-        ("profile -o OUT --chain /a../b -- true", "an earlier recording knows"),
+        ("profile -o OUT --chain /a../b -- true", "knows: name it with --like"),
         ("shape APP -o OUT", "a described application is shaped with its plan"),
         ("export REC -o OUT", "add --perfetto"),
         ("release nothing", "no run 'nothing': "),

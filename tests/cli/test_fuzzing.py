@@ -23,12 +23,10 @@ from command_line import called
 from ctf_writing import write_lttng_trace
 from small_chain import small_chain_text
 
-from chainshaper import simulate
 from chainshaper.planning import Plan, dump_plan, plan_shaping
 from chainshaper.planning.plan import revised
 from chainshaper.planning.plan_file import plans_as_text
 from chainshaper.values.recording import Recording
-from chainshaper.workload.description import load_application
 
 CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "25"))
 FIRST = int(os.environ.get("CHAINSHAPER_FUZZ_FIRST", "0"))
@@ -52,15 +50,6 @@ DTYPES = (
     pl.String, pl.Float64, pl.Int8, pl.UInt8, pl.Int64, pl.UInt64, pl.Boolean, pl.Datetime("ns"),
     pl.List(pl.Int64), pl.Null, pl.Categorical, pl.Binary, pl.Decimal(20, 2), pl.Duration("ns"),
 )  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    """A short simulated run of the small chain."""
-    folder = tmp_path_factory.mktemp("fuzzing")
-    (folder / "application.yaml").write_text(small_chain_text())
-    application = load_application(folder / "application.yaml")
-    return simulate(application, folder / "recording", cycles=20)
 
 
 def _looked_at(chance: random.Random, source: Path) -> Arguments:
@@ -269,13 +258,13 @@ def _case(kind: str, number: int, folder: Path) -> Iterator[Path]:
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: str(kind.__name__))
 def test_whatever_is_damaged_there_is_a_result_or_one_message(
-    kind: Callable[..., Arguments], tmp_path: Path, recording: Recording, plan: Plan
+    kind: Callable[..., Arguments], tmp_path: Path, simulated: Recording, plan: Plan
 ) -> None:
     before, codes = _peak(), set()
     for number in range(FIRST, FIRST + CASES):
         with _case(kind.__name__, number, tmp_path / str(number)) as folder:
             chance = random.Random(f"{kind.__name__} {number}")
-            arguments = kind(chance, folder, recording, *([plan] if kind is plans else []))
+            arguments = kind(chance, folder, simulated, *([plan] if kind is plans else []))
             started = time.monotonic()
             finished = called(*arguments)
             assert time.monotonic() - started < SECONDS, arguments

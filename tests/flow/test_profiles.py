@@ -126,10 +126,7 @@ def test_a_publication_takes_until_its_callback_ends_or_publishes_again_or_all_h
     recording = Recording(Path("story"), info, story.tables())
     (profile,) = profile_chains(recording, ["/out"])
     assert profile.longest_publication_ns == 60, "of 40, 50 and 60 ns"
-    stall = {"time": 3110, "cpu": 1, "duration": 20}
-    types = {**events.COMMON_COLUMNS, **events.FIELDS["machine_stall"]}
-    stalled = {**story.tables(), "machine_stall": pl.DataFrame([stall], schema_overrides=types)}
-    (profile,) = profile_chains(replace(recording, events=stalled), ["/out"])
+    (profile,) = profile_chains(_stalled(recording, 3110, lasting=20), ["/out"])
     assert profile.longest_publication_ns == 50, "a stall is no part of it"
 
 
@@ -226,17 +223,16 @@ def test_asynchronous_publication_gates_the_last_nodes_thread() -> None:
     assert plan.predicted.max_ns == 501 * MS
 
 
-def _stalled(*times_ms: int) -> Recording:
-    recording = _recorded()
+def _stalled(recording: Recording, *times: int, lasting: int = 5 * MS) -> Recording:
     stalls = pl.DataFrame(
-        [{"time": time * MS, "cpu": 1, "duration": 5 * MS} for time in times_ms],
+        [{"time": time, "cpu": 1, "duration": lasting} for time in times],
         schema_overrides={**events.COMMON_COLUMNS, **events.FIELDS["machine_stall"]},
     )
-    return Recording(recording.path, recording.info, {**recording.events, "machine_stall": stalls})
+    return replace(recording, events={**recording.events, "machine_stall": stalls})
 
 
 def test_stalled_cycles_are_left_out() -> None:
-    (profile,) = profile_chains(_stalled(1050), [CHAIN])
+    (profile,) = profile_chains(_stalled(_recorded(), 1050 * MS), [CHAIN])
     assert profile.disturbed == 1
     assert profile.latencies_ns.max() == 95 * MS - 1
     assert profile.callbacks[-1].max_response_ns == 50 * MS
@@ -244,7 +240,7 @@ def test_stalled_cycles_are_left_out() -> None:
 
 @pytest.mark.parametrize("stalls", [2, 3])
 def test_where_no_cycle_is_undisturbed_all_of_them_are_planned_from(stalls: int) -> None:
-    recording = _stalled(*(1050 + 100 * number for number in range(stalls)))
+    recording = _stalled(_recorded(), *((1050 + 100 * number) * MS for number in range(stalls)))
     plan = plan_recording(recording, CHAIN)
     assert plan.evidence.all_disturbed
     assert (plan.evidence.samples, plan.evidence.disturbed) == (3, stalls)

@@ -181,9 +181,7 @@ def test_what_is_wrong_is_said_before_anything_starts(
     (tmp_path / "mine").write_text("mine")
     ebpf = ("--source", "ebpf")
     for arguments, words in (
-        (("-o", path), "no command given"),
         (("-o", path, "--", "no_such", "launch"), "no_such: no such command"),
-        (("-o", path, *ebpf, "--pid", "1", *program), "give one of them"),
         (("-o", path, *ebpf, "--buffer", "8", *program), "--buffer is about LTTng's buffers"),
         (("-o", tmp_path / "mine", *program), "exists already and is not overwritten"),
     ):
