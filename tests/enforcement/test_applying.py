@@ -116,8 +116,8 @@ KILLED = ("sh", "-c", "kill -9 $$")
 def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
     save_plan(one_server_plan(), path)
-    for command, how in (("false",), "ended with code 1"), (KILLED, "was killed by SIGKILL"):
-        ended = chainshaper("apply", path, *FIFO, "--", *command)
+    for words, how in (("false",), "ended with code 1"), (KILLED, "was killed by SIGKILL"):
+        ended = chainshaper("apply", path, *FIFO, "--", *words)
         assert ended.code == 1
         assert f"the command {how} before all nodes" in ended.err
     shaped = plan_shaping(
