@@ -37,7 +37,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import polars as pl
@@ -60,10 +59,10 @@ from results import (
     Line,
     Run,
     Value,
-    drawn_again,
     earlier_lines,
     earlier_runs,
     figure,
+    figures_of,
     save,
     value_text,
 )
@@ -236,20 +235,9 @@ def value_of(what: str, latency_ns: NDArray[np.int64]) -> Value:
 
 def lines_of_run(run: Run) -> Iterator[Line]:
     """The figures of one run, of undisturbed cycles and of all that came to an end."""
-
-    def calm(what: str, latency: NDArray[np.int64], disturbed: NDArray[np.bool_]) -> Value:
-        return value_of(what, latency[(latency >= 0) & ~disturbed])
-
-    def every(what: str, latency: NDArray[np.int64], _: NDArray[np.bool_]) -> Value:
-        return value_of(what, latency[latency >= 0])
-
-    of: Callable[[str, NDArray[np.int64], NDArray[np.bool_]], Value]
     for what in WHATS:
-        values, intervals = dict[str, Any](), dict[str, tuple[float, float]]()
-        for column, of in (("ros", calm), ("ros_all", every)):
-            values[column] = of(what, run.latency_ns, run.disturbed)
-            if again := drawn_again(run, partial(of, what)):
-                intervals[column] = again
+        of = partial(value_of, what)
+        values, intervals = figures_of(run, of, of)
         yield Line(f"{run.name}: {what}", "ms", None, None, None, **values, intervals=intervals)
 
 

@@ -41,10 +41,10 @@ __all__ = [
     "Run",
     "Value",
     "cell",
-    "drawn_again",
     "earlier_lines",
     "earlier_runs",
     "figure",
+    "figures_of",
     "lines_of",
     "save",
     "value_text",
@@ -56,6 +56,7 @@ RESULTS = HERE / "results"
 PICTURES = HERE / "pictures"
 
 Value: TypeAlias = float | str | None
+Figure: TypeAlias = Callable[[NDArray[np.int64]], Value]
 Column: TypeAlias = Literal["simulated", "live", "ros", "fast"]
 """Where a run's latencies come from; the last two are ROS 2 on Cyclone DDS, and on Fast DDS."""
 
@@ -161,14 +162,12 @@ def figure(what: str, latency_ns: NDArray[np.int64], late_from_ns: float = np.in
     return float(in_time.max() if what == "maximum" else in_time.mean())
 
 
-def drawn_again(
-    run: Run, of: Callable[[NDArray[np.int64], NDArray[np.bool_]], Value]
-) -> tuple[float, float] | None:
+def drawn_again(run: Run, of: Figure, counted: NDArray[np.bool_]) -> tuple[float, float] | None:
     """Between which values 95 % of a run's figure lie, when its cycles are drawn again.
 
     Stretches of ten consecutive cycles are drawn with replacement, as many of every block as it
     has: what belongs together in time stays together (moving-block bootstrap, Künsch 1989). ``of``
-    gets latencies and which of them are disturbed. Of a maximum it shows how much hangs on few
+    gets the latencies of those that are ``counted``. Of a maximum it shows how much hangs on few
     cycles, not how much larger another run's may be.
     """
     random, drawn = np.random.default_rng(1), list[NDArray[np.int64]]()
@@ -178,12 +177,30 @@ def drawn_again(
         starts = random.integers(0, own.size - length + 1, (RESAMPLES, -(-own.size // length)))
         places = (starts[:, :, None] + np.arange(length)).reshape(RESAMPLES, -1)[:, : own.size]
         drawn.append(own[places])
-    again = (of(run.latency_ns[row], run.disturbed[row]) for row in np.concatenate(drawn, axis=1))
+    again = (of(run.latency_ns[row[counted[row]]]) for row in np.concatenate(drawn, axis=1))
     values = [value for value in again if isinstance(value, float | int)]
     if not values:
         return None
     low, high = np.percentile(values, [2.5, 97.5])
     return float(low), float(high)
+
+
+def figures_of(
+    run: Run, calm: Figure, every: Figure
+) -> tuple[dict[str, Any], dict[str, tuple[float, float]]]:
+    """A figure of the undisturbed cycles, and one of all that came to an end, by a line's columns.
+
+    And the intervals of those that were measured.
+    """
+    values, intervals = dict[str, Any](), dict[str, tuple[float, float]]()
+    ended = run.latency_ns >= 0
+    for suffix, of, counted in (("", calm, ended & ~run.disturbed), ("_all", every, ended)):
+        column = run.column + suffix
+        values[column] = of(run.latency_ns[counted])
+        again = None if run.column == "simulated" else drawn_again(run, of, counted)
+        if again is not None:
+            intervals[column] = again
+    return values, intervals
 
 
 def lines_of(
@@ -206,25 +223,16 @@ def lines_of(
     limits = late_from_ns if isinstance(late_from_ns, Mapping) else {}
     anywhere = late_from_ns if isinstance(late_from_ns, int) else np.inf
 
-    def calm(
-        what: str, limit: float, latency: NDArray[np.int64], disturbed: NDArray[np.bool_]
-    ) -> Value:
-        return figure(what, latency[(latency >= 0) & ~disturbed], limit)
-
-    def every(what: str, limit: float, latency: NDArray[np.int64], _: NDArray[np.bool_]) -> Value:
-        return figure(what, latency[latency >= 0], limit if what == "late" else np.inf)
-
     def line(what: str, value: Value) -> Line:
         values: dict[str, Any] = dict.fromkeys(("simulated", "live"))
         intervals: dict[str, tuple[float, float]] = {}
+        of_all = partial(figure, what)
         for column, run in found.items():
             limit = limits.get(column, anywhere)
-            for name_of, judge in ((column, calm), (f"{column}_all", every)):
-                of = partial(judge, what, limit)
-                values[name_of] = of(run.latency_ns, run.disturbed)
-                again = None if column == "simulated" else drawn_again(run, of)
-                if again is not None:
-                    intervals[name_of] = again
+            in_time = partial(figure, what, late_from_ns=limit)
+            found_of_run = figures_of(run, in_time, in_time if what == "late" else of_all)
+            values |= found_of_run[0]
+            intervals |= found_of_run[1]
         unit = "cycles" if what == "late" else "ms"
         values |= {"intervals": intervals, "no_evidence": no_evidence or {}}
         return Line(f"{name}: {what}", unit, value, why=why, **values)
