@@ -107,13 +107,17 @@ def test_a_child_that_is_silent_is_not_waited_for_for_ever(nursery: Nursery, bod
         nursery.start(body).hear(within_s=0.5)
 
 
-def test_a_child_that_babbles_or_is_cut_off_is_not_believed(nursery: Nursery) -> None:
+def test_a_child_that_babbles_or_is_cut_off_is_not_believed(
+    nursery: Nursery, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("chainshaper.workload.launcher.DYING_S", 0.1)  # these two run on
     for body in ("babbles", "counts"):
         child = nursery.start(body)
         said = "sends something that is not part of the protocol"
         with pytest.raises(OperationError, match=said):
             child.hear()
         assert first_casualty([child]) is None
+    monkeypatch.undo()
     child = nursery.start("cut_off")
     with pytest.raises(OperationError, match="ended with code 0 before the run was over"):
         child.hear_bytes(child.hear()["bytes"])

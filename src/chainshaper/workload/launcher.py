@@ -30,6 +30,9 @@ from chainshaper.values.errors import OperationError
 ENOUGH = signal.SIGUSR1
 """Has a child end its run early, and send what it recorded."""
 
+DYING_S = 2.0
+"""A process that has closed its pipe ends by then, or talks nonsense."""
+
 WORKER_NAME = "executor"
 """The name of a node's threads that execute beside its main one."""
 
@@ -99,7 +102,7 @@ class Child:
     def obituary(self) -> str:
         """One sentence about how it died, with the last line of its error output."""
         try:
-            code = self.process.wait(timeout=2)
+            code = self.process.wait(timeout=DYING_S)
         except subprocess.TimeoutExpired:
             return f"{self.name} (pid {self.pid}) sends something that is not part of the protocol"
         self.errors.seek(0)
