@@ -1,15 +1,15 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
-.PHONY: demo test test-untimed test-timed test-daemons test-kernel lint benchmark experiments docs clean
+.PHONY: demo test test-untimed test-timed test-tracers test-kernel lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
-# Tests that need the machine's cores for themselves, and beside them those that talk to LTTng's
-# daemon, all others (tests/conftest.py), and what looks at the code.
+# Tests that need the machine's cores for themselves, and beside them those that run a tracer of the
+# whole machine, all others (tests/conftest.py), and what looks at the code.
 test: .venv/.ready-dev
 	scripts/test-tools
-	$(MAKE) --jobs=4 --output-sync=line lint test-untimed test-timed test-daemons
+	$(MAKE) --jobs=4 --output-sync=line lint test-untimed test-timed test-tracers
 
 # What fails beside the others is named, and tried once more when those are through; what fails again
 # has failed.
@@ -19,13 +19,13 @@ tried = run='.venv/bin/python -m pytest -m "$(1)" -o cache_dir=.pytest_cache/$(2
 	echo "tried once more, alone:"; eval "$$run --last-failed --last-failed-no-failures none"
 
 test-untimed: .venv/.ready-dev
-	@$(call tried,not timed and not daemons,untimed)
+	@$(call tried,not timed and not tracers,untimed)
 
 test-timed: .venv/.ready-dev
 	@$(call tried,timed,timed)
 
-test-daemons: .venv/.ready-dev
-	@$(call tried,daemons,daemons)
+test-tracers: .venv/.ready-dev
+	@$(call tried,tracers and not timed,tracers)
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.

@@ -56,9 +56,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         file = item.path.relative_to(Path(__file__).parent).with_suffix("")
         timed = file.parent.as_posix() in TIMED and file.as_posix() not in TIMELESS
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
-        # One session daemon at a time, but no core for itself: they have a process of their own.
-        daemons = item.get_closest_marker("daemons") and not item.get_closest_marker("ros2")
-        if not daemons and (timed or live or item.get_closest_marker("ros2")):
+        # One tracer at a time, but no core for itself: they have a process of their own.
+        tracers = item.get_closest_marker("tracers") and not item.get_closest_marker("ros2")
+        if not tracers and (timed or live or item.get_closest_marker("ros2")):
             item.add_marker("timed")
 
 

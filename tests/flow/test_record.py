@@ -21,7 +21,7 @@ from chainshaper.values.errors import OperationError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-pytestmark = pytest.mark.daemons
+pytestmark = pytest.mark.tracers
 
 CYCLES = 30
 

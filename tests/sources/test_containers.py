@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 
+import pytest
 from command_line import called, json_of
 from containers import contained, in_container, needs_namespaces
 from known import known
@@ -81,6 +82,7 @@ def test_a_command_that_starts_a_container_is_recorded(tmp_path: Path) -> None:
     assert set(started["pid"]) == set(started["tid"].unique()) or (started["tid"] > NEXT_HOST).all()
 
 
+@pytest.mark.tracers
 def test_two_containers_are_recorded_by_ebpf(tmp_path: Path) -> None:
     skip_without_bpftrace()
     command = built().command("chain", "400", "--ros-args", "-r", "__node:=both")

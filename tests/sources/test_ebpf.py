@@ -35,6 +35,8 @@ from chainshaper.values.recording import EndpointInfo, open_recording
 
 __all__ = ["open_folder"]
 
+pytestmark = pytest.mark.tracers  # each has the kernel compile and check its programs
+
 CYCLES, PERIOD_NS = 20, 50_000_000
 TOPICS = ("/ebpf1", "/ebpf2")
 

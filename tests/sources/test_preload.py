@@ -505,8 +505,7 @@ def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> N
     assert json_of("latency", tmp_path / "rec", "--chain", "/ebpf1../ebpf2", "--json")["count"] >= 5
 
 
-@pytest.mark.timed  # other tests' daemons of LTTng come and go beside it
-@pytest.mark.daemons
+@pytest.mark.tracers  # other tests' daemons of LTTng come and go beside it
 def test_without_a_library_lttng_records_and_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
