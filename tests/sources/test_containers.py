@@ -13,7 +13,7 @@ from traced_program import built, skip_without_bpftrace
 import chainshaper as cs
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process, user_of
-from chainshaper.sources.preload import build_library
+from chainshaper.sources.preload import installed_library
 from chainshaper.sources.system import NEXT_HOST
 
 pytestmark = needs_namespaces
@@ -55,7 +55,7 @@ def _assert_apart(recording: Path, pids: set[int]) -> None:
 
 def test_two_containers_are_recorded_by_the_library_in_front(tmp_path: Path) -> None:
     """In one of them root is another user than here."""
-    environment = {"LD_PRELOAD": str(build_library(tmp_path))}
+    environment = {"LD_PRELOAD": str(installed_library())}
     command = built().command("chain", "60", "--ros-args")
     with ExitStack() as both:
         inside = [_running(both, command, environment, user=user) for user in (False, True)]

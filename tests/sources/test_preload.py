@@ -39,6 +39,7 @@ from chainshaper.sources.preload import (
     build_library,
     event_names,
     in_cache,
+    installed_library,
     preloading,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -316,11 +317,11 @@ def test_what_comes_faster_than_it_is_read_is_counted(tmp_path: Path) -> None:
 
 
 @contextmanager
-def memory_behind(program: str, folder: Path) -> Iterator[Path]:
+def memory_behind(program: str) -> Iterator[Path]:
     """The file of the memory of a process that has run a program, and waits until the end."""
     with subprocess.Popen(
         [sys.executable, "-c", f"{CALLER}{program}\nprint(os.getpid(), flush=True)\ninput()"],
-        env={**os.environ, "LD_PRELOAD": str(build_library(folder))},
+        env={**os.environ, "LD_PRELOAD": str(installed_library())},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,
@@ -333,9 +334,9 @@ def memory_behind(program: str, folder: Path) -> Iterator[Path]:
         process.communicate("\n")
 
 
-def test_a_ring_that_runs_over_has_the_newest_and_counts_the_others(tmp_path: Path) -> None:
+def test_a_ring_that_runs_over_has_the_newest_and_counts_the_others() -> None:
     """Read once, behind ten rings' worth of events: a reader that was not scheduled meanwhile."""
-    with memory_behind(f"for n in range(10 * {RING} + 7): take(n)", tmp_path) as file:
+    with memory_behind(f"for n in range(10 * {RING} + 7): take(n)") as file:
         with file.open("rb") as opened:
             memory = TracedProcess(opened.fileno())
         (records,) = memory.new_records()
@@ -482,7 +483,7 @@ def test_the_command_records_and_the_chain_is_measured(tmp_path: Path) -> None:
 
 def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> None:
     """Objects of before are known, events of before are not: the run lasts longer than its part."""
-    environment = {**os.environ, "LD_PRELOAD": str(build_library(tmp_path))}
+    environment = {**os.environ, "LD_PRELOAD": str(installed_library())}
     words = built().command("chain", "40")
     with (
         subprocess.Popen(words, env=environment, stdout=subprocess.PIPE) as process,
@@ -556,9 +557,9 @@ def test_an_environment_with_other_libraries_in_front_has_them_still(
     assert given.keys() == {"LD_PRELOAD", VARIABLE}
 
 
-def test_a_ring_whose_count_is_damaged_costs_no_other(tmp_path: Path) -> None:
+def test_a_ring_whose_count_is_damaged_costs_no_other() -> None:
     """A node may write where it should not: what its memory says then is no count of events."""
-    with memory_behind("take(1)", tmp_path) as path, path.open("r+b") as file:
+    with memory_behind("take(1)") as path, path.open("r+b") as file:
         memory = TracedProcess(file.fileno())
         counts = [(1 << 63) + 5, 1]
         for count in counts:

@@ -35,7 +35,7 @@ from chainshaper.cli import runs
 from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
-from chainshaper.sources.preload import VARIABLE, PreloadTracer, build_library, event_names
+from chainshaper.sources.preload import VARIABLE, PreloadTracer, event_names, installed_library
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
@@ -48,9 +48,9 @@ LONGEST_NS = SECOND // 5
 
 
 @contextmanager
-def running(folder: Path, cycles: int, **environment: str) -> "Iterator[subprocess.Popen[str]]":
+def running(cycles: int, **environment: str) -> "Iterator[subprocess.Popen[str]]":
     """The application, with the library in front; its chain begins when this is entered."""
-    variables = {**os.environ, "LD_PRELOAD": str(build_library(folder)), **environment}
+    variables = {**os.environ, "LD_PRELOAD": str(installed_library()), **environment}
     with subprocess.Popen(
         built().command("chain", str(cycles), "wait"),
         env=variables,
@@ -92,7 +92,7 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     """Attached in the middle, two at a time: cycle by cycle what the whole recording has."""
     (tmp_path / "trace").mkdir()
     tracer = PreloadTracer(tmp_path / "trace", ["command"], ())
-    with running(tmp_path, 80, **{VARIABLE: tracer.start()[VARIABLE]}) as process:
+    with running(80, **{VARIABLE: tracer.start()[VARIABLE]}) as process:
         time.sleep(0.5)
         watch, other = own_watch(callbacks=True), own_watch()
         seen = watched(watch, 2.0)
@@ -139,7 +139,7 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
     with pytest.raises(OperationError, match="no event has been seen"):
         watch.save(tmp_path / "nothing")
     for _ in range(2):
-        with running(tmp_path, 1000):
+        with running(1000):
             watch._searched_ns = 0
             seen = watched(watch, 1.0)[-1]
             assert len(watch.processes) >= 1
@@ -152,11 +152,9 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
     assert not watch.processes
 
 
-def test_a_look_that_comes_late_counts_all_cycles(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_look_that_comes_late_counts_all_cycles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(watch_module, "RECORDER_NS", SECOND // 10)
-    with running(tmp_path, 1000):
+    with running(1000):
         watch = own_watch()
         before = watched(watch, 0.5)[-1].chains[0].counted["complete"]
         until = time.monotonic() + 1
@@ -170,7 +168,7 @@ def test_a_look_that_comes_late_counts_all_cycles(
 def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> None:
     """The plan is made from the last seconds, which the flight recorder has, for a cycle that
     outputs cannot hold."""
-    with running(tmp_path, 400):
+    with running(400):
         watch = own_watch()
         watched(watch, 1.5)
         recording = watch.save(tmp_path / "flight", reasons=["too slow"])
@@ -220,9 +218,9 @@ def test_shares_are_of_outputs_within_slots() -> None:
     assert chain.shares() == ((2 / 8, 1 / 8), 1 / 8)
 
 
-def test_a_node_that_dies_in_a_callback_leaves_a_cycle_that_is_incomplete(tmp_path: Path) -> None:
+def test_a_node_that_dies_in_a_callback_leaves_a_cycle_that_is_incomplete() -> None:
     watch = own_watch()
-    with running(tmp_path, 1000) as process:
+    with running(1000) as process:
         seen = watched(watch, 1.0)[-1].chains[0]
         (memory,) = (one for pid, one in watch.processes.items() if pid == process.pid)
         start = event_names().index("callback_start") + 3  # numbers begin with 3
@@ -246,7 +244,7 @@ def test_a_node_that_dies_in_a_callback_leaves_a_cycle_that_is_incomplete(tmp_pa
 def test_a_full_disk_stops_neither_the_watch_nor_loses_what_it_has(
     tmp_path: Path, full_disk: Path
 ) -> None:
-    with running(tmp_path, 200):
+    with running(200):
         watch = own_watch()
         watched(watch, 1.0)
         with pytest.raises(OperationError, match=r"cannot be written: .*No space left"):
@@ -291,7 +289,7 @@ def test_a_clock_that_is_set_spoils_no_figure(
     shifted = lambda: real() - (60_000_000 if time.monotonic_ns() > at else 0)  # noqa: E731
     monkeypatch.setattr(watch_module, "clock_offset", shifted)
     program = built("-DHUMBLE", version=version) if version == "4.1.1" else built()
-    watch, libraries = own_watch(), f"{build_library(tmp_path)}:{tmp_path / 'clock.so'}"
+    watch, libraries = own_watch(), f"{installed_library()}:{tmp_path / 'clock.so'}"
     variables = {**os.environ, "LD_PRELOAD": libraries, "STEP_AT": str(at)}
     process = subprocess.Popen(
         program.command("chain", "60"), env=variables, stdout=subprocess.PIPE, text=True
@@ -333,7 +331,7 @@ def test_memory_does_not_grow(tmp_path: Path) -> None:
 
 
 def test_the_command_shows_and_streams(tmp_path: Path) -> None:
-    with running(tmp_path, 400) as process:
+    with running(400) as process:
         words = [sys.executable, "-m", "chainshaper", "watch", "--chain", CHAIN, "--longest"]
         words += ["200ms", "--every", "500ms"]
         streaming = subprocess.Popen(
@@ -382,7 +380,7 @@ def test_the_python_example_of_the_documentation_records_again_and_again(tmp_pat
     for wanted, shorter in (("/t1../t5", CHAIN), ("80_000_000", "1"), ("600", "40")):
         assert wanted in example
         example = example.replace(wanted, shorter)
-    with running(tmp_path, 1000):
+    with running(1000):
         words = [sys.executable, "-c", example]
         run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
@@ -395,7 +393,7 @@ def test_the_flight_recorder_takes_the_next_free_name(
     """Several watch in a folder, or Ctrl-\\ comes in the second in which a limit breaks."""
     now = datetime(2026, 1, 2, 3, 4, 5)
     monkeypatch.setattr(runs, "datetime", SimpleNamespace(now=lambda: now))
-    with running(tmp_path, 200):
+    with running(200):
         watch = own_watch()
         watched(watch, 0.5)
         for _ in range(3):
