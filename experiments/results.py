@@ -136,11 +136,6 @@ class Run:
         return self.latency_ns[(self.latency_ns >= 0) & ~self.disturbed]
 
     @property
-    def complete_ns(self) -> NDArray[np.int64]:
-        """The latencies of all cycles that came to an end."""
-        return self.latency_ns[self.latency_ns >= 0]
-
-    @property
     def blocks(self) -> NDArray[np.int64]:
         """The block of each cycle; one where none took turns."""
         return np.zeros(self.latency_ns.size, np.int64) if self.block is None else self.block
