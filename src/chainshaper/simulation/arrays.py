@@ -338,14 +338,13 @@ def build_machine(
     plan: ApplicationPlan | None,
     timing: Timing,
     *,
-    events: bool,
     switches: bool,
     latencies: int,
 ) -> Machine:
     """The array of a system before anything has happened.
 
-    ``events`` and ``switches`` say what is logged, ``latencies`` for how many recorded instances of
-    the chain the latency is noted.
+    ``latencies`` is for how many recorded instances of the chain the latency is noted; where it is
+    for none, events are logged, with ``switches`` those of threads as well.
     """
     rows = Rows([0] * X.COLUMNS)
     streams = Streams(system.application.seed, rows)
@@ -362,7 +361,7 @@ def build_machine(
     waiting = histories + sum(system.depth(topic or "") for topic in synchronised)
     unsent = sum(system.depth(publisher.topic) for publisher in system.publishers)
     pool = POOL + waiting + unsent + at.RESERVE
-    entries = LOG_ENTRIES if events else 0
+    entries = 0 if latencies else LOG_ENTRIES
     logs = rows.add(len(at.LOG_FIELDS), A.COLUMNS)
     first_message = streams.settle(len(rows))
     heap = first_message + pool * M.COLUMNS
@@ -385,7 +384,7 @@ def build_machine(
         X.STOP: timing.stop_ns,
         X.LAST_TIMER: timing.last_timer_ns,
         X.RECORD_FROM: timing.record_from_ns,
-        X.LOGGING: events,
+        X.LOGGING: not latencies,
         X.SWITCHES: switches,
         X.SWITCH_COST: described.context_switch_ns,
         X.PREEMPTION_COST: described.preemption_ns,

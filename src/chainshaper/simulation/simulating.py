@@ -7,7 +7,7 @@ cycles. What publishing costs is not in them: a callback computes before it publ
 """
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -53,8 +53,6 @@ LONGEST_NS = 1 << 62
 MOST = 100_000
 """Enough samples for any distribution."""
 
-Progress = Callable[[float, str], None]
-
 
 def simulate(
     application: Application,
@@ -65,7 +63,7 @@ def simulate(
     seed: int | None = None,
     switches: bool = False,
     command: Sequence[str] = (),
-    progress: Progress | None = None,
+    progress: live.Progress | None = None,
 ) -> Recording:
     """Simulate ``cycles`` periods of an application's chain and record its events.
 
@@ -81,7 +79,7 @@ def simulate(
     output = refuse_existing(output)
     joint = None if plan is None else whole(plan)
     application, timing = _checked(application, joint, cycles, seed)
-    system, machine = _built(application, joint, timing, events=True, switches=switches)
+    system, machine = _built(application, joint, timing, switches=switches)
     info = RecordingInfo(
         source="simulated",
         host="simulation",  # thread ids say nothing about any real machine
@@ -106,7 +104,7 @@ def simulate_latencies(
     *,
     cycles: int = 320,
     seed: int | None = None,
-    progress: Progress | None = None,
+    progress: live.Progress | None = None,
 ) -> Int64s:
     """The end-to-end latencies of an application's chain, by simulation (ns).
 
@@ -161,19 +159,15 @@ def _built(
     plan: ApplicationPlan | None,
     timing: live.Timing,
     *,
-    events: bool = False,
     switches: bool = False,
     latencies: int = 0,
 ) -> tuple[System, Machine]:
     in_force = None if plan is None else open_until_done(plan)
-    system = build_system(application, in_force, follow_chain=not events)
-    machine = build_machine(
-        system, in_force, timing, events=events, switches=switches, latencies=latencies
-    )
-    return system, machine
+    system = build_system(application, in_force, follow_chain=latencies > 0)
+    return system, build_machine(system, in_force, timing, switches=switches, latencies=latencies)
 
 
-def _runs(machine: Machine, progress: Progress | None = None) -> Iterator[int]:
+def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[int]:
     """Run to the end; why the engine stopped, each time that it did."""
     m = machine.array
     while (reason := _run_engine(m.ctypes.data)) != at.OVER:
@@ -191,7 +185,7 @@ def _runs(machine: Machine, progress: Progress | None = None) -> Iterator[int]:
 
 
 def _event_tables(
-    system: System, machine: Machine, progress: Progress | None
+    system: System, machine: Machine, progress: live.Progress | None
 ) -> Iterator[dict[str, pl.DataFrame]]:
     """The event tables part by part as the log fills up, the objects' first."""
     objects, handles = _create_objects(system)
