@@ -172,7 +172,8 @@ class Executor:
                 while self._snapshot:
                     entity = self._snapshot.popleft()
                     if entity.group not in self._busy:
-                        now = self._chosen(entity.handle)
+                        now = monotonic_ns()
+                        self._execute(now, entity.handle)
                         if isinstance(entity, Timer):
                             entity.call(now)
                         if entity.group is not None:
@@ -199,12 +200,6 @@ class Executor:
         ready: list[Entity] = [timer for timer in self.timers if timer.due_ns <= now]
         ready += [one for one in self.subscriptions if one.subscription.ready()]
         self._snapshot.extend(one for one in ready if one.group not in self._busy)
-
-    def _chosen(self, handle: int) -> int:
-        """Record that a timer or subscription is executed next; when that is (ns)."""
-        now = monotonic_ns()
-        self._execute(now, handle)
-        return now
 
     def record_take(self, rmw_handle: int, message: Message) -> None:
         """Record that a message was taken for the callback that starts next."""
