@@ -5,8 +5,8 @@
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
-# Tests that need the machine's cores for themselves, and beside them those that run a tracer of the
-# whole machine, all others (tests/conftest.py), and what looks at the code.
+# Tests that need the machine's cores for themselves, and beside them those that trace real
+# processes, all others (tests/conftest.py), and what looks at the code.
 test: .venv/.ready-dev
 	scripts/test-tools
 	$(MAKE) --jobs=4 --output-sync=line lint test-untimed test-timed test-tracers

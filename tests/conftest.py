@@ -41,7 +41,6 @@ TIMELESS |= {
     "verify/test_slowdowns",
     "verify/test_budgets",
     "verify/test_predictions",
-    "verify/test_watch",
     "workload/test_ros_package",
 }
 LIVE_RUNS = {"unshaped", "shaped"}
@@ -56,7 +55,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         file = item.path.relative_to(Path(__file__).parent).with_suffix("")
         timed = file.parent.as_posix() in TIMED and file.as_posix() not in TIMELESS
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
-        # One tracer at a time, but no core for itself: they have a process of their own.
+        # One tracer at a time, but no core for itself: they mostly wait, in a process of their own.
         tracers = item.get_closest_marker("tracers") and not item.get_closest_marker("ros2")
         if not tracers and (timed or live or item.get_closest_marker("ros2")):
             item.add_marker("timed")

@@ -16,7 +16,7 @@ from chainshaper.linux.processes import Process, user_of
 from chainshaper.sources.preload import installed_library
 from chainshaper.sources.system import NEXT_HOST
 
-pytestmark = needs_namespaces
+pytestmark = [needs_namespaces, pytest.mark.tracers]
 
 
 def _running(
@@ -82,7 +82,6 @@ def test_a_command_that_starts_a_container_is_recorded(tmp_path: Path) -> None:
     assert set(started["pid"]) == set(started["tid"].unique()) or (started["tid"] > NEXT_HOST).all()
 
 
-@pytest.mark.tracers
 def test_two_containers_are_recorded_by_ebpf(tmp_path: Path) -> None:
     skip_without_bpftrace()
     command = built().command("chain", "400", "--ros-args", "-r", "__node:=both")

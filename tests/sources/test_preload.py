@@ -44,6 +44,8 @@ from chainshaper.sources.preload import (
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
+pytestmark = pytest.mark.tracers
+
 RING, RINGS = 1 << 14, 64
 ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 CYCLES, PERIOD_NS = 20, 50_000_000
@@ -506,7 +508,6 @@ def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> N
     assert json_of("latency", tmp_path / "rec", "--chain", "/ebpf1../ebpf2", "--json")["count"] >= 5
 
 
-@pytest.mark.tracers  # other tests' daemons of LTTng come and go beside it
 def test_without_a_library_lttng_records_and_says_why(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
