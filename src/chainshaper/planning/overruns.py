@@ -69,11 +69,9 @@ class Expected(NamedTuple):
 
 def expected(plan: Plan) -> Expected | None:
     """What a plan's outputs will look like; None where no slots give them their places."""
-    slots, shares = publish_slots(plan), plan.predicted.shares
-    if plan.policy == "one-long-slot" or not 0 < len(slots) == len(shares):
+    leave, shares = tuple(start for start, _ in slots_of_latency(plan)), plan.predicted.shares
+    if plan.policy == "one-long-slot" or not 0 < len(leave) == len(shares):
         return None
-    delay = cycles_until_output(plan) * plan.cycle_ns
-    leave = tuple(delay + start for start, _ in slots)
     apart = STOPPED_THREAD_NS if any(publisher_servers(plan)) else GATE_NS
     mean = round(sum(share * start for share, start in zip(shares, leave, strict=True)))
     return Expected(leave, mean, leave[-1] + apart, leave[-1] - leave[0] + apart)
@@ -357,8 +355,8 @@ def _about_bands(plan: Plan) -> Iterator[str]:
 
 def _leaves_at(plan: Plan) -> int:
     """When outputs leave, from the start of their chain on, if they come in time."""
-    slots, delay = publish_slots(plan), cycles_until_output(plan) * plan.cycle_ns
-    return delay + slots[-1][0] if slots else plan.evidence.max_latency_ns + plan.margin.epsilon_ns
+    slots = slots_of_latency(plan)
+    return slots[-1][0] if slots else plan.evidence.max_latency_ns + plan.margin.epsilon_ns
 
 
 def _about_late_outputs(plan: Plan) -> Iterator[str]:
