@@ -467,6 +467,18 @@ def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> No
     assert wanted[203] == Scheduling(None, (0,)), "it would be outranked on core 1"
 
 
+def test_what_fast_dds_sends_late_is_sent_by_a_thread_that_lets_others_run() -> None:
+    """Above its siblings on a core, it would spin for ever for a lock that they want to release."""
+    plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
+    resending = _node("/b", 200, "executor", "dds", "dds")
+    resending[1] = replace(resending[1], thread=replace(resending[1].thread, kind="resend"))
+    wanted = _by_tid(
+        plan_scheduling(plan, _allocation(_node("/a", 100, "executor"), resending), (0, 1))
+    )
+    assert wanted[201] == Scheduling(0, (0,))
+    assert wanted[202] == Scheduling(90, (0,))
+
+
 def test_several_threads_of_a_server_take_turns_but_the_chain_begins_at_once() -> None:
     plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
     allocation = _allocation(_node("/a", 100, "executor", "executor"), _node("/b", 200, "executor"))

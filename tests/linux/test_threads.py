@@ -34,7 +34,8 @@ from chainshaper.values.errors import OperationError, PlatformError
 KINDS: dict[DdsKind, tuple[str, ...]] = {
     "receive": ("recv", "recvUC", "recvMC", "dds.udp.7410", "dds.shm.7413", "dds.tcp.5100"),
     "delivery": ("dq.user", "dq.camera"),
-    "transmit": ("xmit.user", "sendq", "dds.asyn.0.0"),
+    "transmit": ("xmit.user", "sendq"),
+    "resend": ("dds.asyn.0.0",),
     "event": ("tev", "dds.ev.0"),
     "discovery": ("dq.builtins", "dds.ds_ev.0", "dds.tls.replies"),
     "lease": ("lease",),

@@ -17,6 +17,9 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   or, of several chains, whose servers keep that core busy, on the first core without servers;
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
   the writer's lock, and above them would never let them release it;
+* the thread by which Fast DDS sends what synchronous writers could not (`dds.asyn.N.0`) has the
+  fair class, on the cores of DDS threads: it spins while another thread has or wants a writer's
+  lock (`FlowControllerImpl::run`), and above that thread, on its core, would do so for ever;
 * what a plan has in a best-effort server comes behind all these, on the server's core, under the
   fair class (SCHED_OTHER). All others are left alone.
 """
@@ -550,10 +553,14 @@ def _beside(
 ) -> WantedScheduling | None:
     """What a thread in no server shall get, in a process that has one in a server.
 
-    DDS threads stand above all servers; where no core is left to them they stay where they are.
+    DDS threads stand above all servers, but for the one that spins on the locks of others; where no
+    core is left to them they stay where they are.
     Others, of no class of their own, leave the core of a publisher, which would outrank them.
     """
     thread = one.thread
+    if thread.kind == "resend":
+        reason = "spins on its siblings' locks, and has nothing to do as a rule"
+        return WantedScheduling(one, Scheduling(0, cores or None), None, reason)
     if thread.role == "dds":
         receives = thread.kind == "receive"
         allowed = cores[:1] if receives and receives_output else cores

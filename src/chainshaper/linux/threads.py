@@ -48,7 +48,7 @@ _DDS_NAMES: tuple[tuple[str, DdsKind], ...] = (  # the first that matches a whol
     (r"fsm", "connection"),
     (r"debmon|threadmon", "housekeeping"),
     # Fast DDS; per participant, port or reader.
-    (r"dds\.asyn\.\d+\.0", "transmit"),  # repeats what synchronous writers have sent
+    (r"dds\.asyn\.\d+\.0", "resend"),  # what synchronous writers could not send
     (r"dds\.asyn\..*", "asynchronous publisher"),
     (r"dds\.tcp_(accept|keep)", "connection"),
     (r"dds\.shm\.wdog", "housekeeping"),
