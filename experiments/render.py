@@ -113,7 +113,8 @@ def _answers(found: Mapping[str, dict[str, Any]]) -> dict[str, object]:
     return {
         "reproduced": f"The paper states {said} numbers. Of those that ours are evidence for,"
         f" {counts['simulated']} simulated values are near, {counts['live']} live ones"
-        f" ({counts['live_all']} over all cycles) and {counts['ros_all']} on ROS 2 (all cycles).",
+        f" ({counts['live_all']} over all cycles), {counts['ros_all']} on ROS 2 with Cyclone DDS"
+        f" and {counts['fast_all']} with Fast DDS (all cycles).",
         "late": " and ".join(
             f"{late} of {outputs} {where}"
             for where, columns in (("live", ("live",)), ("on ROS 2", ROS))
