@@ -225,9 +225,9 @@ def lines_of(
         for column, run in found.items():
             limit = limits.get(column, anywhere)
             in_time = partial(figure, what, late_from_ns=limit)
-            found_of_run = figures_of(run, in_time, in_time if what == "late" else of_all)
-            values |= found_of_run[0]
-            intervals |= found_of_run[1]
+            own, between = figures_of(run, in_time, in_time if what == "late" else of_all)
+            values |= own
+            intervals |= between
         unit = "cycles" if what == "late" else "ms"
         values |= {"intervals": intervals, "no_evidence": no_evidence or {}}
         return Line(f"{name}: {what}", unit, value, why=why, **values)

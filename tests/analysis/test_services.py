@@ -204,11 +204,11 @@ def test_services_that_every_node_has_are_no_messages() -> None:
 def action(story: Story) -> tuple[Callback, Callback, Callback]:
     """/asker (1) has a goal worked at by /worker (2): its goals, their server, its timer."""
     asker, worker = story.node("/asker", 1), story.node("/worker", 2)
-    goals = story.client(asker, "/work/_action/send_goal", 9)
-    server = story.service(worker, "/work/_action/send_goal", callbackless=True)
+    goals = story.client(asker, "/dock/_action/send_goal", 9)
+    server = story.service(worker, "/dock/_action/send_goal", callbackless=True)
     timer = story.timer(asker)
-    feedback = story.publisher(worker, "/work/_action/feedback")
-    reader = story.subscription(asker, "/work/_action/feedback", callbackless=True)
+    feedback = story.publisher(worker, "/dock/_action/feedback")
+    reader = story.subscription(asker, "/dock/_action/feedback", callbackless=True)
     progress = story.publisher(asker, "/progress")
     for number, start in enumerate((100, 200), 1):
         story.start(timer, start)
@@ -229,9 +229,9 @@ def test_feedback_is_followed_and_a_goal_leads_to_its_first_one() -> None:
     story = Story()
     action(story)
     flow = data_flow(story.tables())
-    every = spans(flow, "/work/_action/feedback../progress")
+    every = spans(flow, "/dock/_action/feedback../progress")
     assert every == [(sent, sent + 7) for sent in (120, 140, 220, 240)]
-    assert spans(flow, "/asker../work/_action/feedback../progress") == [(100, 127), (200, 227)]
+    assert spans(flow, "/asker../dock/_action/feedback../progress") == [(100, 127), (200, 227)]
     assert not any("callback events" in note for note in flow.notes)
     shown = flow.objects.callbacks.filter(pl.col("kind") == "service")
-    assert shown["topic"].to_list() == ["/work/_action/send_goal"]
+    assert shown["topic"].to_list() == ["/dock/_action/send_goal"]
