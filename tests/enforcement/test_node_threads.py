@@ -459,8 +459,8 @@ def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> No
         _node("/c", 300, "executor"),
     )
     wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
-    assert wanted[100] == Scheduling(85, (1,), takes_turns=True), "it begins the chain"
-    assert wanted[200] == Scheduling(84, (1,), takes_turns=True)
+    assert wanted[100] == Scheduling(85, (1,)), "it begins the chain"
+    assert wanted[200] == Scheduling(84, (1,))
     assert wanted[201] == Scheduling(83, (1,)), "not 87, which its server would have"
     assert wanted[300] == Scheduling(81, (1,)), "the next server stays below it"
     assert wanted[202] == Scheduling(90, (0,))
@@ -479,10 +479,10 @@ def test_what_fast_dds_sends_late_is_sent_by_a_thread_that_lets_others_run() -> 
     assert wanted[202] == Scheduling(90, (0,))
 
 
-def test_several_threads_of_a_server_take_turns_but_the_chain_begins_at_once() -> None:
+def test_threads_of_a_server_come_first_come_first_served_but_the_chain_begins_at_once() -> None:
     plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
     allocation = _allocation(_node("/a", 100, "executor", "executor"), _node("/b", 200, "executor"))
-    first, following = (Scheduling(priority, (1,), takes_turns=True) for priority in (88, 87))
+    first, following = (Scheduling(priority, (1,)) for priority in (88, 87))
     wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
     assert wanted == {100: first, 101: first, 200: following}
 

@@ -10,7 +10,9 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   not wait for what it is delivered to. Those that receive stand above the others; where the output
   is received, they have the first of these cores. Zenoh's router is treated alike;
 * servers stand below 88 in the order of their own priority, smaller first; several threads of one
-  server share a priority under SCHED_RR, so that they take turns;
+  server share a priority under SCHED_FIFO, so that they come first, come first served, as they were
+  profiled: a turn of SCHED_RR is counted over all callbacks of a thread, and would end within one,
+  which then waits for the whole callback of another;
 * the thread that begins a chain stands one above the others of its server, if there are any: the
   chain begins as its timer expires, also where another of them runs a callback then;
 * who receives what a shaping node publishes stands below all servers, on the shaping node's core,
@@ -519,7 +521,7 @@ def scheduling_around(
         several = len(members[server.name]) > 1
         begins = one.thread.role == "executor" and not set(first).isdisjoint(one.nodes)
         above = several and begins and not take_turns
-        return Scheduling(ranks[server.priority] + above, (server.core,), take_turns or several)
+        return Scheduling(ranks[server.priority] + above, (server.core,), take_turns)
 
     own = [
         WantedScheduling(

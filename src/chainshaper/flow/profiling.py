@@ -8,7 +8,6 @@ their DDS threads above them on the others. Threads that appear later get theirs
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -93,9 +92,8 @@ def profiling_condition(
         around = scheduling_around(
             *(at_home, servers.values(), found, available_cores()), clear=clear, first=first
         )
-        # One after the other, as under SCHED_FIFO in the paper: no turns.
         new = [
-            (one.thread.thread, replace(one.wanted, takes_turns=False))
+            (one.thread.thread, one.wanted)
             for one in around
             if one.thread.thread.identity not in done
         ]
