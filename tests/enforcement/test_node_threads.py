@@ -303,7 +303,7 @@ def test_servers_stand_below_dds_in_the_order_of_their_priority() -> None:
     )
     assert _by_tid(plan_scheduling(plan, allocation, (0, 1))) == {
         200: Scheduling(87, (1,)),
-        100: Scheduling(84, (1,)),
+        100: Scheduling(85, (1,)),
         101: Scheduling(90, (0,)),
         201: Scheduling(90, (0,)),
         # Best effort, unknown threads and other processes are left alone.
@@ -398,8 +398,8 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     wanted = plan_scheduling(plan, allocation, (0, 1))
     assert _by_tid(wanted) == {
         100: Scheduling(87, (1,)),
-        200: Scheduling(84, (1,)),  # in the chain, and so not below it
-        300: Scheduling(81, (1,)),
+        200: Scheduling(85, (1,)),  # in the chain, and so not below it
+        300: Scheduling(83, (1,)),
         301: Scheduling(91, (0,)),  # waited for, so above other DDS threads
     }
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
@@ -408,13 +408,13 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     (gate_thread,) = (one.wanted for one in wanted if one.thread.thread.tid == 100)
     free = _by_tid(left_by_back_end("scx", wanted, plan.free_threads))
     assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
-    assert more_cores[300] == Scheduling(81, (1,)), "it rests while one chain's output is received"
+    assert more_cores[300] == Scheduling(83, (1,)), "it rests while one chain's output is received"
     other = _server("other", PlannedThread(node="/b"), core=2, priority=2)
     several = ApplicationPlan(chains=(plan.chains[0], _plan(other).chains[0]))
     both = _allocation(gate, _node("/a", 200, "executor"), _node("/b", 400, "executor"), sink)
     for cores, core, notes in (((0, 1, 2), 0, 0), ((1, 2), 1, 1)):
         found = plan_scheduling(several, both, cores)
-        assert _by_tid(found)[300] == Scheduling(81, (core,))
+        assert _by_tid(found)[300] == Scheduling(83, (core,))
         assert len(waiting_receivers(several, found)) == notes
         assert not waiting_receivers(several, left_by_back_end("scx", found))
     alone = whole(revised(bare, shaping_node=GATE))
@@ -459,10 +459,10 @@ def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> No
         _node("/c", 300, "executor"),
     )
     wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
-    assert wanted[100] == Scheduling(85, (1,)), "it begins the chain"
+    assert wanted[100] == Scheduling(85, (1,)), "it comes first in its server"
     assert wanted[200] == Scheduling(84, (1,))
     assert wanted[201] == Scheduling(83, (1,)), "not 87, which its server would have"
-    assert wanted[300] == Scheduling(81, (1,)), "the next server stays below it"
+    assert wanted[300] == Scheduling(82, (1,)), "the next server stays below it"
     assert wanted[202] == Scheduling(90, (0,))
     assert wanted[203] == Scheduling(None, (0,)), "it would be outranked on core 1"
 
@@ -479,12 +479,16 @@ def test_what_fast_dds_sends_late_is_sent_by_a_thread_that_lets_others_run() -> 
     assert wanted[202] == Scheduling(90, (0,))
 
 
-def test_threads_of_a_server_come_first_come_first_served_but_the_chain_begins_at_once() -> None:
-    plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
-    allocation = _allocation(_node("/a", 100, "executor", "executor"), _node("/b", 200, "executor"))
-    first, following = (Scheduling(priority, (1,)) for priority in (88, 87))
+def test_threads_of_a_server_stand_in_the_plans_order_those_of_a_node_together() -> None:
+    plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B, PlannedThread(node="/c")))
+    allocation = _allocation(
+        _node("/c", 300, "executor"),
+        _node("/b", 200, "executor"),
+        _node("/a", 100, "executor", "executor"),
+    )
     wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
-    assert wanted == {100: first, 101: first, 200: following}
+    order = {100: 87, 101: 87, 200: 86, 300: 85}
+    assert wanted == {tid: Scheduling(priority, (1,)) for tid, priority in order.items()}
 
 
 def test_a_publisher_on_a_core_of_its_own_has_its_servers_priority() -> None:
@@ -543,9 +547,15 @@ def test_nodes_that_share_an_executor_are_one_thread_of_one_server() -> None:
 
 
 def test_more_priorities_than_there_are_are_refused() -> None:
-    assert min(server_priorities(range(1, 30)).values()) == 3
-    with pytest.raises(InputError, match="30 different server priorities do not fit below 90"):
-        server_priorities(range(1, 31))
+    """Between 87 and 2, with one below each server's for a publisher."""
+    assert server_priorities({2: 1, 1: 2}) == {1: (87, 86), 2: (84,)}
+    assert server_priorities(dict.fromkeys(range(1, 44), 1))[43] == (3,)
+    assert server_priorities({1: 1, 2: 200})[2] == tuple(range(85, 2, -1)), "the last share one"
+    many = server_priorities(dict.fromkeys(range(20), 3))
+    assert {len(own) for own in many.values()} == {3}
+    assert {len(own) for own in server_priorities(dict.fromkeys(range(30), 3)).values()} == {1}
+    with pytest.raises(InputError, match="44 different server priorities do not fit below 90"):
+        server_priorities(dict.fromkeys(range(1, 45), 1))
 
 
 @st.composite

@@ -467,7 +467,8 @@ def profile(
     ),
     node: list[str] | None = opt.option(
         "--node NAME",
-        "A node that gets the priority (may be repeated). Default: the chain's, or all.",
+        "A node that gets the priority (may be repeated, the most urgent first). Default: the "
+        "chain's, or all, at one priority.",
     ),
     core: int | None = opt.option(
         "--core",
@@ -524,9 +525,7 @@ def profile(
         source=source,
         duration_ns=duration,
         chain=chains[0] if chains else None,
-        scheduling=cs.profiling_condition(
-            core_of, core_of or cores[0], like=earlier, chains=chains
-        ),
+        scheduling=cs.profiling_condition(core_of, core_of or cores[0], like=earlier),
         watch_stalls=True,
     )
 

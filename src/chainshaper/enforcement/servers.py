@@ -3,7 +3,7 @@
 A **table** has servers with slots that repeat every cycle (paper, section 2.2.1); threads are
 assigned to them by their ids. Between slots a server's threads do not run at all (``fifo``
 excepted, which isolates only); where servers overlap on a core, the better priority runs, a smaller
-number; threads of one server come first come, first served (``scx``, ``litmus``: they take turns);
+number; of one server's threads the first is the most urgent (``scx``, ``litmus``: they take turns);
 threads of no server run when no server's wants to.
 """
 

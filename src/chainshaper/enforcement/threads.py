@@ -9,12 +9,14 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
 * DDS threads stand above all servers, on other cores where there are any: what they deliver must
   not wait for what it is delivered to. Those that receive stand above the others; where the output
   is received, they have the first of these cores. Zenoh's router is treated alike;
-* servers stand below 88 in the order of their own priority, smaller first; several threads of one
-  server share a priority under SCHED_FIFO, so that they come first, come first served, as they were
-  profiled: a turn of SCHED_RR is counted over all callbacks of a thread, and would end within one,
-  which then waits for the whole callback of another;
-* the thread that begins a chain stands one above the others of its server, if there are any: the
-  chain begins as its timer expires, also where another of them runs a callback then;
+* servers stand below 88 in the order of their own priority, smaller first;
+* threads of one server stand in the order in which the plan names their nodes
+  (:func:`~chainshaper.planning.plan.most_urgent_first`). At one priority, callbacks that become
+  ready at once would run in the order in which DDS happens to deliver, another one after each
+  start, and what was profiled would say little of what follows. Where priorities are too few for
+  all, the last of a server share one. Turns (SCHED_RR) are counted over all callbacks of a thread
+  and end within one, which then waits for the whole callback of another: there are none, unless the
+  plan wants them;
 * who receives what a shaping node publishes stands below all servers, on the shaping node's core,
   or, of several chains, whose servers keep that core busy, on the first core without servers;
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
@@ -56,7 +58,7 @@ IN_ORDER = "its executors are known by the order in which it started its threads
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
-_STEP = 3  # room for a publisher below the better server's threads, and a thread that begins above
+_BELOW = 1  # room for a publisher below a server's threads
 _RECEIVES = "receives the output"
 _MOST_NAMED = 5
 _COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
@@ -415,13 +417,23 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
     return own
 
 
-def server_priorities(priorities: Iterable[int]) -> dict[int, int]:
-    """The real-time priority for each server priority: 87, 84, … Raises InputError: too many."""
-    ranks = sorted(set(priorities))
-    if _BEST_SERVER_PRIORITY - _STEP * (len(ranks) - 1) <= 1:
-        many = f"{len(ranks)} different server priorities do not fit below {DDS_PRIORITY}"
+def server_priorities(sizes: Mapping[int, int]) -> dict[int, tuple[int, ...]]:
+    """The real-time priorities of each server priority, 87, 86, … for as many nodes as its largest
+    server has (``sizes``); fewer, where those of all do not fit. Raises InputError: too many.
+    """
+    room = _BEST_SERVER_PRIORITY - 1 - _BELOW * len(sizes)
+    if room < len(sizes):
+        many = f"{len(sizes)} different server priorities do not fit below {DDS_PRIORITY}"
         raise InputError(f"{many}: give servers that never overlap the same one")
-    return {rank: _BEST_SERVER_PRIORITY - _STEP * place for place, rank in enumerate(ranks)}
+    most = max(sizes.values(), default=1)
+    while sum(min(size, most) for size in sizes.values()) > room:
+        most -= 1
+    found, best = dict[int, tuple[int, ...]](), _BEST_SERVER_PRIORITY
+    for rank in sorted(sizes):
+        lowest = best - min(sizes[rank], most) + 1
+        found[rank] = tuple(range(best, lowest - 1, -1))
+        best = lowest - 1 - _BELOW
+    return found
 
 
 def plan_scheduling(
@@ -433,24 +445,16 @@ def plan_scheduling(
     :func:`server_members` and :func:`scheduling_around`.
     """
     members = server_members(plan, allocation)
-    planned = {one.thread.identity for group in members.values() for one in group}
-    below = min(server_priorities(_ranked(plan.servers)).values()) - _STEP
     cores = {receiver: node.core for node in plan.shaping_nodes for receiver in node.receivers}
     free = set(available_cores) - {server.core for server in plan.servers}
     if free and len(plan.chains) > 1:
         cores = dict.fromkeys(cores, min(free))
-    receiving = [
-        WantedScheduling(one, Scheduling(max(1, below), (core,)), None, _RECEIVES)
-        for one in allocation.threads
-        if one.thread.role == "executor" and one.thread.identity not in planned
-        for core in [cores[node] for node in one.nodes if node in cores][:1]
-    ]
     return scheduling_around(
         *(members, plan.servers, allocation, available_cores),
-        receiving=receiving,
+        order=[planned.node for server in plan.servers for planned in server.threads],
+        receivers=cores,
         take_turns=plan.takes_turns,
         clear={node.core for node in plan.shaping_nodes},
-        first={begins.node for chain in plan.chains if (begins := first_planned(chain))},
     )
 
 
@@ -487,41 +491,46 @@ def closed_before(chain: Plan) -> int | None:
     return None if is_always_open else chain.cycle_ns - slots[-1][1]
 
 
-def _ranked(servers: Iterable[Server | ReservationServer]) -> list[int]:
-    """The priorities that stand for real-time ones."""
-    return [one.priority for one in servers if not getattr(one, "best_effort", False)]
-
-
 def scheduling_around(
     members: Mapping[str, Sequence[NodeThread]],
     servers: Collection[Server | ReservationServer],
     allocation: Allocation,
     available_cores: Sequence[int],
     *,
-    receiving: Sequence[WantedScheduling] = (),
+    order: Sequence[str] = (),
+    receivers: Mapping[str, int] = MappingProxyType({}),
     take_turns: bool = False,
     clear: Collection[int] = (),
-    first: Collection[str] = (),
 ) -> tuple[WantedScheduling, ...]:
     """What the threads of servers, and the others of their processes, shall get.
 
-    ``members`` are by server's name. ``receiving`` is what threads that receive an output shall
-    get, whose processes are treated alike; with ``take_turns``, servers of one priority share it by
-    turns. DDS threads leave the cores of all servers or, where these are all that there are, those
-    to be ``clear``. The nodes that begin a chain are ``first``.
+    ``members`` are by server's name, and within a server in the ``order`` of their nodes, the most
+    urgent first; others come behind these, and share a priority. ``receivers`` are nodes that
+    receive an output, and the core for that: the processes of their executors, which stand below
+    all servers, are treated alike. With ``take_turns``, servers of one priority share it by turns.
+    DDS threads leave the cores of all servers or, where these are all that there are, those to be
+    ``clear``.
 
     Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
     InputError: see :func:`server_priorities`.
     """
-    ranks = server_priorities(_ranked(servers))
+    places = {node: place for place, node in reversed([*enumerate(order)])}
+
+    def place_of(one: NodeThread) -> int:
+        known = (places[node] for node in one.nodes if node in places)
+        return 0 if take_turns else min(known, default=len(order))
+
+    taken = {name: sorted({place_of(one) for one in own}) for name, own in members.items()}
+    sizes: dict[int, int] = {}
+    for its in (one for one in servers if not getattr(one, "best_effort", False)):
+        sizes[its.priority] = max(1, sizes.get(its.priority, 0), len(taken[its.name]))
+    priorities = server_priorities(sizes)
 
     def wanted_in(server: Server | ReservationServer, one: NodeThread) -> Scheduling:
         if getattr(server, "best_effort", False):
             return Scheduling(0, (server.core,))
-        several = len(members[server.name]) > 1
-        begins = one.thread.role == "executor" and not set(first).isdisjoint(one.nodes)
-        above = several and begins and not take_turns
-        return Scheduling(ranks[server.priority] + above, (server.core,), take_turns)
+        own, place = priorities[server.priority], taken[server.name].index(place_of(one))
+        return Scheduling(own[min(place, len(own) - 1)], (server.core,), take_turns)
 
     own = [
         WantedScheduling(
@@ -530,15 +539,23 @@ def scheduling_around(
         for its in sorted(servers, key=lambda one: one.priority)
         for member in members[its.name]
     ]
-    planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
+    planned = {one.thread.thread.identity for one in own}
+    below = max(1, min(map(min, priorities.values()), default=DDS_PRIORITY) - 1 - _BELOW)
+    receiving = [
+        WantedScheduling(one, Scheduling(below, (core,)), None, _RECEIVES)
+        for one in allocation.threads
+        if one.thread.role == "executor" and one.thread.identity not in planned
+        for core in [receivers[node] for node in one.nodes if node in receivers][:1]
+    ]
+    planned |= {one.thread.thread.identity for one in receiving}
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
-    receivers = {one.thread.thread.pid for one in receiving}
-    concerned = set(planned.values())
+    receiving_pids = {one.thread.thread.pid for one in receiving}
+    concerned = receiving_pids | {one.thread.thread.pid for one in own}
     if any(one.thread.pid in concerned and is_of_zenoh(one.thread) for one in allocation.threads):
         concerned |= {one.thread.pid for one in allocation.threads if set(one.nodes) & ROUTERS}
     beside = (
-        _beside(one, own, free_cores, one.thread.pid in receivers)
+        _beside(one, own, free_cores, one.thread.pid in receiving_pids)
         for one in allocation.threads
         if one.thread.pid in concerned and one.thread.identity not in planned
     )

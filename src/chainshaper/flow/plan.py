@@ -26,6 +26,7 @@ from chainshaper.analysis.latency import Executor
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.margins import read_latencies
+from chainshaper.planning.plan import most_urgent_first
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.splicing.application import splice_application
@@ -134,7 +135,7 @@ def _profile_of(
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
     period = _period(analysis, period_ns)
     simulated = _simulated(flow, analysis)
-    nodes = dict.fromkeys(stage.node for stage in stages)
+    nodes = taking_part(graph, chain, stages)
     running, named, cores, priority = _executors(recording, flow, graph, stages)
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
     instances = _instances_apart_from(flow, disturbed)
@@ -314,6 +315,12 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
         )
         for members, topic in order
     ]
+
+
+def taking_part(graph: ApplicationGraph, chain: Chain, stages: Sequence[_Stage]) -> tuple[str, ...]:
+    """The nodes of a chain, and of the branches that it waits for, the most urgent first."""
+    along = (graph.callbacks[number].node for number in chain.callbacks)
+    return most_urgent_first(along, (stage.node for stage in stages))
 
 
 def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> frozenset[str]:

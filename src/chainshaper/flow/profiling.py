@@ -16,14 +16,13 @@ from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.threads import Allocation, NodeThread, allocate, scheduling_around
-from chainshaper.flow.plan import graph_stages, profile_chains
+from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together
-from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording
@@ -38,32 +37,28 @@ def profiling_condition(
     core: int | Mapping[str, int] | None = None,
     folder: Path | None = None,
     like: Recording | None = None,
-    chains: Sequence[str] = (),
     *,
     before: Mapping[str, int] = MappingProxyType({}),
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
-    ``core`` is where the executors run (default: the last that we may use), or the core of each of
-    ``nodes``, ``before`` how many stages of a pipeline are more urgent there, as a plan has it.
-    ``folder`` is where journals are (default: `/run/chainshaper`). An earlier recording that this
-    one is ``like`` says which components a container has, and which executors several threads;
-    ``chains`` in it begin as a plan has them begin.
+    The first of ``nodes`` are the most urgent, as in a plan; all, where none is named, have one
+    priority. ``core`` is where the executors run (default: the last that we may use), or the core
+    of each of ``nodes``, ``before`` how many stages of a pipeline are more urgent there, as a plan
+    has it. ``folder`` is where journals are (default: `/run/chainshaper`). An earlier recording
+    that this one is ``like`` says which components a container has, and which executors several
+    threads.
 
-    Raises InputError: no such chain. PlatformError: no such core, or SCHED_FIFO is not permitted.
-    OperationError: `apply` governs one of the nodes, or the core; a node does not appear; not all
-    could be changed or put back.
+    Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
+    governs one of the nodes, or the core; a node does not appear; not all could be changed or put
+    back.
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
     cores = check_profiling([core] if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     homes = {(core, before.get(node, 0)) for node, core in core_of.items()} or {(cores[0], 0)}
     servers = {(c, k): ReservationServer(f"core {c}, {k}", c, 1 + k, ()) for c, k in homes}
     recorded = recorded_processes(like)[0] if like is not None else ()
-    first: set[str] = set()
-    if like is not None and chains:
-        graph = _graph(like)
-        first = {graph.callbacks[find_chain(graph, one).callbacks[0]].node for one in chains}
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
     appeared = False
 
@@ -90,7 +85,7 @@ def profiling_condition(
             at_home[server.name].append(one)
         clear = cores[:1] if len(cores) > 1 else ()  # the plan's, whose output it has mostly
         around = scheduling_around(
-            *(at_home, servers.values(), found, available_cores()), clear=clear, first=first
+            *(at_home, servers.values(), found, available_cores()), order=[*nodes], clear=clear
         )
         new = [
             (one.thread.thread, one.wanted)
@@ -122,14 +117,10 @@ def check_profiling(cores: Sequence[int] | None) -> Sequence[int]:
 
 
 def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
-    """The nodes of recorded chains, and of the branches that they wait for."""
-    graph = _graph(recording)
-    stages = (graph_stages(graph, find_chain(graph, chain)) for chain in chains)
-    return tuple(dict.fromkeys(stage.node for one in stages for stage in one))
-
-
-def _graph(recording: Recording) -> ApplicationGraph:
-    return graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
+    """The nodes of recorded chains, each in order, then those of the branches that it waits for."""
+    graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
+    found = ((one, graph_stages(graph, one)) for one in (find_chain(graph, c) for c in chains))
+    return tuple(dict.fromkeys(node for own in found for node in taking_part(graph, *own)))
 
 
 def profiled_cores(
@@ -151,7 +142,8 @@ def profiled_cores(
         if len(chains) > 1 or len(request.cores or ()) > 1:
             raise
         return (), dict.fromkeys(chain_nodes(recording, *chains), cores[0])
-    return seen, cores_for(seen, cores, request, worth)
+    core_of = cores_for(seen, cores, request, worth)
+    return seen, {node: core_of[node] for one in seen for node in one.core_of}
 
 
 def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[int]]:

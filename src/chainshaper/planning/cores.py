@@ -3,9 +3,10 @@
 The paper takes the assignment as given (sections 5.1 and 5.4). Executors gain from a core of their
 own where branches of a graph run at the same time, or slots of different chains would collide.
 
-An assignment is judged by playing out one cycle of each graph: a callback starts when all that it
-waits for is done and its core is free, and is not pre-empted, as under SCHED_FIFO at one priority.
-What counts, in this order:
+An assignment is judged by playing out one cycle of each graph: of the callbacks for which all is
+done that they wait for, the most urgent executor's runs on each core, in the order of
+:mod:`chainshaper.enforcement.threads`: chains first, then the branches that they wait for. What
+counts, in this order:
 
 1. by how much chains that share a core do not fit: slots as long as the longest execution must
    both fit into the greatest common divisor of their periods
@@ -36,7 +37,7 @@ _Cost: TypeAlias = Callable[[_Assignment], tuple[float, float, int]]
 
 
 class _Callback(NamedTuple):
-    executor: int
+    executor: int  # the most urgent is 0
     mean_ns: int
     longest_ns: int
     after: tuple[int, ...]
@@ -57,7 +58,8 @@ def assign_cores(
     the share ``worth`` off the latencies. The nodes of one process move as one. A slot is
     ``margin_ns`` longer than the longest execution.
     """
-    nodes = dict.fromkeys(callback.node for one in profiles for callback in one.callbacks)
+    own = ((*one.core_of, *(callback.node for callback in one.callbacks)) for one in profiles)
+    nodes = dict.fromkeys(node for ordered in own for node in ordered)
     hosts = {node: min(group) for one in profiles for group in one.together for node in group}
     executors = list(dict.fromkeys(hosts.get(node, node) for node in nodes))
     executor_of = {node: executors.index(hosts.get(node, node)) for node in nodes}
@@ -150,19 +152,24 @@ def _cost(
 
 def _played_out(graph: _Graph, assignment: _Assignment, lasting: Sequence[int]) -> list[int]:
     """When each callback of a cycle is done."""
-    done: dict[int, int] = {}
-    free: dict[int, int] = {}
+    left, done, now = [*lasting], dict[int, int](), 0
 
-    def start_of(place: int) -> tuple[int, int, int]:
-        one = graph.callbacks[place]
-        ready = max((done[before] for before in one.after), default=0)
-        return max(ready, free.get(assignment[one.executor], 0)), ready, place
+    def urgency_of(place: int) -> tuple[int, bool, int]:
+        return graph.callbacks[place].executor, left[place] == lasting[place], place
 
-    while len(done) < len(lasting):
-        start, _, place = min(
-            start_of(place)
+    while len(done) < len(left):
+        ready = [
+            place
             for place, one in enumerate(graph.callbacks)
             if place not in done and all(before in done for before in one.after)
-        )
-        done[place] = free[assignment[graph.callbacks[place].executor]] = start + lasting[place]
-    return [done[place] for place in range(len(lasting))]
+        ]
+        running: dict[int, int] = {}  # on each core
+        for place in sorted(ready, key=urgency_of):
+            running.setdefault(assignment[graph.callbacks[place].executor], place)
+        step = min(left[place] for place in running.values())
+        now += step
+        for place in running.values():
+            left[place] -= step
+            if not left[place]:
+                done[place] = now
+    return [done[place] for place in range(len(left))]

@@ -37,7 +37,8 @@ _SECTION_COMMENTS = {
     "shaping_thread": "shaping nodes' threads run in their servers' slots only; free: their gates"
     " alone time them",
     "equal_priorities": "servers of one core and priority take turns; apart: they never overlap",
-    "servers": "a thread runs only in its server's slots; a smaller priority is better",
+    "servers": "a thread runs only in its server's slots; a smaller priority is better, and of\n"
+    "# its threads the first is the most urgent",
     "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
     "adaptation": "how slots follow the latencies (apply --adapt): later when so many times the"

@@ -30,6 +30,7 @@ from chainshaper.planning.plan import (
     Slot,
     Thread,
     below_executors,
+    most_urgent_first,
     output_server,
     publish_slots,
     publisher_servers,
@@ -70,8 +71,8 @@ def plan_shaping(
     same cycle (eq. 3) and on the same core, at the better priority.
 
     ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process) unless
-    the wishes say otherwise; Δ is 1 ms. ``nodes`` are those whose executors run the chain,
-    ``fifo_priority`` and ``receivers`` for the shaping node.
+    the wishes say otherwise; Δ is 1 ms. ``nodes`` are those whose executors run the chain, in its
+    order, ``fifo_priority`` and ``receivers`` for the shaping node.
     ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` and
     :class:`~chainshaper.planning.plan.Evidence`, and single
     :class:`~chainshaper.values.plan_choices.Wishes`. OperationError: L̄ + ε + Δ does not fit.
@@ -94,7 +95,7 @@ def plan_shaping(
     with wrong_values_refused(Plan):
         chain = ChainOfPlan(period_ns=period_ns, **of_chain)
         node, gated = _gate(chain, wishes, core, fifo_priority, receivers)
-        threads = tuple(Thread(node=name) for name in nodes)
+        threads = tuple(Thread(node=name) for name in most_urgent_first(nodes))
         running = Server(
             name="chain", core=core, priority=CHAIN_PRIORITY, slots=((0, start),), threads=threads
         )
@@ -198,7 +199,8 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
     ``core_of`` names the core of every node that takes part, also on branches that the chain waits
-    for; its first is that whose timer begins the cycle. Raises InputError: a node is missing.
+    for, the most urgent first: it is that whose timer begins the cycle. Raises InputError: a node
+    is missing.
     """
     chain, others = _chain_and_others(plan)
     if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:

@@ -429,14 +429,14 @@ def _fill_cores(
         own = [] if plan is None else [server for server in plan.servers if server.core == core]
         used = [server for server in own if server in system.servers.values()]
         ranked = sorted(used, key=lambda server: server.priority)
+        turns = plan is not None and plan.takes_turns
+        # A server's threads in its order, as the priorities of SCHED_FIFO have them.
+        urgent = [(s.priority, "" if turns else one.node) for s in ranked for one in s.threads]
         for number, server in system.servers.items():
             if server in ranked:
-                bit = ranked.index(server)
-                rows[threads[number] + T.SERVER] = bit
-                rows[threads[number] + T.RANK] = bit - len(ranked)
-                if plan is not None and plan.takes_turns:
-                    equal = [one.priority for one in ranked].index(server.priority)
-                    rows[threads[number] + T.RANK] = equal - len(ranked)
+                rows[threads[number] + T.SERVER] = ranked.index(server)
+                its = (server.priority, "" if turns else system.threads[number].node)
+                rows[threads[number] + T.RANK] = urgent.index(its) - len(urgent)
                 if server.best_effort:  # under the fair class, behind all real-time threads
                     rows[threads[number] + T.RANK] = BEST_EFFORT
         mine = [thread for thread in threads if rows[thread + T.CORE] == place]
