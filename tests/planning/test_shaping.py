@@ -16,8 +16,8 @@ from chainshaper.planning.plan import (
     Plan,
     Thread,
     band_predictions,
-    publish_slots,
     most_urgent_first,
+    publish_slots,
     publishing_servers,
     server_of,
 )
