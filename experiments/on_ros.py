@@ -197,7 +197,7 @@ def _unshaped(one: Shaping, own: Path, output: Path, words: Sequence[str], cycle
         output,
         words,
         duration_ns=one.lasting_ns(cycles),
-        scheduling=profiling_condition(cores, cores, like=first),
+        scheduling=profiling_condition(cores, cores, like=first, policy=one.request.policy),
         chain=one.chains[0],
         watch_stalls=True,
     )

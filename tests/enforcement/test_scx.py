@@ -7,6 +7,7 @@ import signal
 import struct
 import subprocess
 import threading
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -276,6 +277,24 @@ def test_servers_of_a_core_stand_best_first_and_equals_in_the_order_of_the_table
     assert [names[number] for number in numbers[:count]] == ["a", "b", "c", "worst"]
     assert not any(numbers[count:])
     assert struct.unpack_from("<II", packed[1]) == (1, ids["x"])
+
+
+def test_the_more_urgent_of_a_servers_threads_are_in_a_better_server_of_their_own() -> None:
+    two = replace(server("two", 0, 2), places=2)
+    apart = scx.with_places_apart(table(two, server("best", 0, 1), server("equal", 1, 2)))
+    assert [(one.name, one.priority) for one in apart.servers] == [
+        ("two", 2),
+        ("two\0001", 3),
+        ("best", 1),
+        ("equal", 2),
+    ]
+    assert {one.slots for one in apart.servers} == {two.slots}
+    many = [replace(server(f"s{k}", 0, k), places=5) for k in range(1, 10)]
+    apart = scx.with_places_apart(table(*many))
+    check_table(apart)
+    assert len(apart.servers) == 27, "three places each: with a fourth, the core would have 36"
+    counted = [ServerCounters(9, 1, 500, 2), ServerCounters(9, 1, 500, 8)]
+    assert scx.in_all_places(counted) == ServerCounters(9, 1, 500, 9)
 
 
 def test_a_server_keeps_its_id_when_the_table_changes_until_they_run_out() -> None:

@@ -67,7 +67,7 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> _Run:
     return run
 
 
-def servers(assign: Callable[[int, str], None], arm: Callable[[int], None]) -> Any:
+def servers(assign: Callable[[int, str, int], None], arm: Callable[[int], None]) -> Any:
     counters: dict[str, ServerCounters] = {}
     return SimpleNamespace(assign=assign, arm=arm, counters=lambda: counters, failure=lambda: None)
 
@@ -78,7 +78,7 @@ def test_a_thread_that_cannot_be_put_into_its_server_is_named_and_ends_no_plan(
 ) -> None:
     """As in a container that began later, whose cgroups are not to be seen."""
 
-    def assign(tid: int, _: str) -> None:
+    def assign(tid: int, _: str, __: int) -> None:
         raise error(f"thread {tid} is in the cgroup /../x")
 
     monkeypatch.setattr(run, "find", lambda: found(8))
@@ -94,7 +94,7 @@ def test_slots_count_from_the_new_timer_of_a_first_node_that_is_started_again(
     """It expires at 61 ms instead of 5: they had stayed at 7, and nobody had looked any more."""
     done: list[tuple[str, int]] = []
     here = servers(
-        lambda tid, _: done.append(("assigned", tid)), lambda at: done.append(("armed", at))
+        lambda tid, _, __: done.append(("assigned", tid)), lambda at: done.append(("armed", at))
     )
     monkeypatch.setattr(applying, "_LOOK_S", 0.001)
     monkeypatch.setattr(applying, "put_back", lambda *_: None)
@@ -126,7 +126,7 @@ def test_a_first_node_that_is_started_again_without_a_timer_yet_is_looked_at_aga
 ) -> None:
     """It runs freely until then: in its server it would begin with the slot, wherever that is."""
     assigned: list[int] = []
-    here = servers(lambda tid, _: assigned.append(tid), lambda _: None)
+    here = servers(lambda tid, _, __: assigned.append(tid), lambda _: None)
     monkeypatch.setattr(run, "find", lambda: found(8))
 
     def measure(*_: Any, **__: Any) -> Phase:

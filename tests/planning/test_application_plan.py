@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper import load_application_plan, save_application_plan, save_plan
+from chainshaper.flow.threads import server_table
 from chainshaper.planning.application_plan import ApplicationPlan, combined, plan_of_chain, whole
-from chainshaper.planning.plan import Plan, Server, Slot, Thread
+from chainshaper.planning.plan import Plan, Server, Slot, Thread, revised
 from chainshaper.planning.plan_file import plan_in, plan_values, plans_as_text
 from chainshaper.values.errors import InputError
 
@@ -122,6 +123,19 @@ def test_a_plan_is_written_with_each_server_once_and_read_again(
     assert [one.name for one in three.servers] == ["chain", "out_a", "out_b", "chain_2"]
     assert plan_of_chain(three, "/b") == three.chains[1]
     assert plan_of_chain(three, "/nowhere") is None
+
+
+def test_threads_have_the_plans_order_unless_single_callbacks_were_measured(
+    three: ApplicationPlan,
+) -> None:
+    assert three.most_urgent_first == ("/first", "/second", "/gate_a", "/gate_b", "/third")
+    assert [one.places for one in server_table(three).servers] == [2, 1, 1, 1]
+    alone = three.chains[0]
+    single = combined([revised(alone, policy="let-per-callback")])
+    assert single.most_urgent_first == ("/first",)
+    assert [one.places for one in server_table(single).servers] == [2, 1], "the others share one"
+    turns = combined([revised(alone, equal_priorities="round-robin")])
+    assert turns.most_urgent_first == ()
 
 
 def test_plans_of_one_chain_are_read_and_written_as_ever(

@@ -11,7 +11,6 @@ import pytest
 from chainshaper import load_application
 from chainshaper.planning import CallbackTimes, Profile, cores
 from chainshaper.planning.cores import assign_cores
-from chainshaper.planning.plan import most_urgent_first
 
 MS = 1_000_000
 DAG = Path(__file__).parents[2] / "experiments" / "dag.yaml"
@@ -65,14 +64,14 @@ def test_what_runs_one_after_the_other_stays_on_one_core() -> None:
 def test_one_cycle_is_played_out_by_hand_the_more_urgent_first() -> None:
     """The chain a, b, c, whose branch x has begun when c is ready; y is of x's executor."""
     work = [("a", 10, ()), ("b", 5, (0,)), ("x", 30, (0,)), ("x", 1, (1,)), ("c", 10, (1, 2, 3))]
-    chain = replace(_work(*work), core_of=dict.fromkeys(most_urgent_first("abc", "abxc"), 0))
-    (graph,) = cores._graphs([chain], {"a": 0, "c": 1, "b": 2, "x": 3})
+    chain = replace(_work(*work), core_of=dict.fromkeys("abcx", 0))
+    (graph,) = cores._graphs([chain], {"a": 0, "b": 1, "c": 2, "x": 3})
     for b_at, done in ((0, [10, 15, 45, 46, 56]), (1, [10, 15, 40, 41, 51])):
-        played = cores._played_out(graph, (0, 0, b_at, 0), [one.mean_ns for one in graph.callbacks])
+        played = cores._played_out(graph, (0, b_at, 0, 0), [one.mean_ns for one in graph.callbacks])
         assert played == [ms * MS for ms in done]
     at_once = [("a", 10, ()), ("b", 20, (0,)), ("x", 30, (0,)), ("c", 5, (1,))]
-    (graph,) = cores._graphs([_work(*at_once)], {"a": 0, "c": 1, "b": 2, "x": 3})
-    played = cores._played_out(graph, (0, 0, 1, 0), [one.mean_ns for one in graph.callbacks])
+    (graph,) = cores._graphs([_work(*at_once)], {"a": 0, "b": 1, "c": 2, "x": 3})
+    played = cores._played_out(graph, (0, 1, 0, 0), [one.mean_ns for one in graph.callbacks])
     assert played == [10 * MS, 30 * MS, 45 * MS, 35 * MS], "c interrupts x from 30 to 35 ms"
 
 

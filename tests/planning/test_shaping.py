@@ -16,7 +16,6 @@ from chainshaper.planning.plan import (
     Plan,
     Thread,
     band_predictions,
-    most_urgent_first,
     publish_slots,
     publishing_servers,
     server_of,
@@ -72,14 +71,6 @@ def test_asynchronous_publication_gates_the_publishers_thread() -> None:
     assert _plan(publication="asynchronous") == bare, "eq. 2 and eq. 4: the same slots"
 
 
-def test_the_beginning_is_the_most_urgent_then_what_is_near_the_output_then_branches() -> None:
-    assert most_urgent_first([]) == ()
-    assert most_urgent_first(["/a", "/b", "/a", "/c"]) == ("/a", "/c", "/b")
-    assert most_urgent_first(["/a", "/b"], ["/a", "/d", "/e", "/b"]) == ("/a", "/b", "/e", "/d")
-    chain, _ = _plan(nodes=["/a", "/b", "/a", "/c"]).servers
-    assert [thread.node for thread in chain.threads] == ["/a", "/c", "/b"]
-
-
 def test_the_last_nanosecond_fits_and_the_next_does_not() -> None:
     assert publish_slots(_plan(period_ns=62 * MS)) == ((61 * MS, 62 * MS),)
     with pytest.raises(OperationError, match=r"cycle of 61\.999999 ms: 1 ns too long") as caught:
@@ -98,6 +89,7 @@ def test_the_last_nanosecond_fits_and_the_next_does_not() -> None:
         ({"period_ns": 0}, "longer than 0 ms"),
         ({"output": "t5"}, "output: 't5' is not a full ROS 2 name"),
         ({"output": "/t5", "fifo_priority": 99}, "fifo_priority: 99 should be less than"),
+        ({"nodes": ["/a", "/a"]}, r"servers\[0\]\.threads\[1\]: .* already"),
     ],
 )
 def test_values_no_plan_may_have_are_refused(wrong: dict[str, Any], words: str) -> None:

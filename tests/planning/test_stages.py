@@ -168,7 +168,7 @@ def test_a_pipeline_by_hand(tmp_path: Path) -> None:
     assert [s.core for s in plan.servers] == [1, 0, 0], "the first stage stays on its core"
     assert [[t.node for t in s.threads] for s in plan.servers[:2]] == [
         ["/n1", "/n2"],
-        ["/n4", "/n3"],  # what was begun earlier ends earlier
+        ["/n3", "/n4"],
     ]
     assert (plan.predicted.mean_ns, plan.predicted.jitter_ns) == (162 * MS, MS)
     assert cycles_until_output(plan) == 1

@@ -525,7 +525,9 @@ def profile(
         source=source,
         duration_ns=duration,
         chain=chains[0] if chains else None,
-        scheduling=cs.profiling_condition(core_of, core_of or cores[0], like=earlier),
+        scheduling=cs.profiling_condition(
+            core_of, core_of or cores[0], like=earlier, policy=request.policy
+        ),
         watch_stalls=True,
     )
 

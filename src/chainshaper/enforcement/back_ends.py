@@ -101,7 +101,7 @@ class Fifo(BackEnd):
         super().__init__(table)
         self._journal = journal
 
-    def assign(self, tid: int, server: str) -> None:  # noqa: ARG002 - it has its priority
+    def assign(self, tid: int, server: str, place: int = 0) -> None:  # noqa: ARG002 - by priority
         server_named(self._table, server)
 
     def arm(self, anchor_ns: int) -> None:  # noqa: ARG002 - priorities know no cycle

@@ -252,7 +252,7 @@ class Freezer(BackEnd):
             self._end()
             raise
 
-    def assign(self, tid: int, server: str) -> None:
+    def assign(self, tid: int, server: str, place: int = 0) -> None:  # noqa: ARG002 - by priority
         """See :meth:`BackEnd.assign`. While armed, a thread whose server is closed stops at once.
 
         Raises OperationError: it belongs to another run, or the servers are no longer in force.

@@ -83,7 +83,7 @@ class Litmus(BackEnd):
         self._ids: dict[str, int] = {}
         self._generation = 0
 
-    def assign(self, tid: int, server: str) -> None:
+    def assign(self, tid: int, server: str, place: int = 0) -> None:  # noqa: ARG002 - turns
         self._members[tid] = server_named(self._table, server)
         if self._ids:
             self._attach(tid)

@@ -3,12 +3,12 @@
 A **table** has servers with slots that repeat every cycle (paper, section 2.2.1); threads are
 assigned to them by their ids. Between slots a server's threads do not run at all (``fifo``
 excepted, which isolates only); where servers overlap on a core, the better priority runs, a smaller
-number; of one server's threads the first is the most urgent (``scx``, ``litmus``: they take turns);
-threads of no server run when no server's wants to.
+number; of one server's threads those of the first place are the most urgent (``litmus``: they take
+turns); threads of no server run when no server's wants to.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from chainshaper.values.errors import InputError
 
@@ -16,13 +16,15 @@ from chainshaper.values.errors import InputError
 @dataclass(frozen=True)
 class ReservationServer:
     """A plan's server without its nodes, which processes read that have Python alone: half-open
-    slots in ns after the start of a cycle, ascending, on one core.
+    slots in ns after the start of a cycle, ascending, on one core; and how many ``places`` its
+    threads have, the first the most urgent.
     """
 
     name: str
     core: int
     priority: int
     slots: tuple[tuple[int, int], ...]
+    places: int = field(default=1, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -68,8 +70,9 @@ class BackEnd(ABC):
         self._since_ns: int | None = None
 
     @abstractmethod
-    def assign(self, tid: int, server: str) -> None:
-        """Put a thread into a server; before ``arm`` it goes on running freely.
+    def assign(self, tid: int, server: str, place: int = 0) -> None:
+        """Put a thread into a server; before ``arm`` it goes on running freely. Its place there is
+        for back ends that choose between a server's threads themselves.
 
         One that has ended is passed over: threads come and go. Raises InputError: no such server.
         """

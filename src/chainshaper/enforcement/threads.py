@@ -10,13 +10,15 @@ On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DES
   not wait for what it is delivered to. Those that receive stand above the others; where the output
   is received, they have the first of these cores. Zenoh's router is treated alike;
 * servers stand below 88 in the order of their own priority, smaller first;
-* threads of one server stand in the order in which the plan names their nodes
-  (:func:`~chainshaper.planning.plan.most_urgent_first`). At one priority, callbacks that become
+* threads of one server stand in the order in which the plan names their nodes: the chain's from its
+  beginning on, then those of branches that it waits for. At one priority, callbacks that become
   ready at once would run in the order in which DDS happens to deliver, another one after each
   start, and what was profiled would say little of what follows. Where priorities are too few for
-  all, the last of a server share one. Turns (SCHED_RR) are counted over all callbacks of a thread
-  and end within one, which then waits for the whole callback of another: there are none, unless the
-  plan wants them;
+  all, the last of a server share one. Where slots are made of what single callbacks took, all but
+  the first share one, as they did while that was measured
+  (:attr:`~chainshaper.planning.application_plan.ApplicationPlan.most_urgent_first`). Turns
+  (SCHED_RR) are counted over all callbacks of a thread and end within one, which then waits for the
+  whole callback of another: there are none, unless the plan wants them;
 * who receives what a shaping node publishes stands below all servers, on the shaping node's core,
   or, of several chains, whose servers keep that core busy, on the first core without servers;
 * an asynchronous publisher stands below every other thread of its process on its core: it spins on
@@ -451,7 +453,7 @@ def plan_scheduling(
         cores = dict.fromkeys(cores, min(free))
     return scheduling_around(
         *(members, plan.servers, allocation, available_cores),
-        order=[planned.node for server in plan.servers for planned in server.threads],
+        order=plan.most_urgent_first,
         receivers=cores,
         take_turns=plan.takes_turns,
         clear={node.core for node in plan.shaping_nodes},
@@ -491,6 +493,11 @@ def closed_before(chain: Plan) -> int | None:
     return None if is_always_open else chain.cycle_ns - slots[-1][1]
 
 
+def place_of(one: NodeThread, order: Sequence[str]) -> int:
+    """Where a thread stands in an order of nodes: with the first of its own, or behind all."""
+    return min((order.index(node) for node in one.nodes if node in order), default=len(order))
+
+
 def scheduling_around(
     members: Mapping[str, Sequence[NodeThread]],
     servers: Collection[Server | ReservationServer],
@@ -514,13 +521,7 @@ def scheduling_around(
     Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
     InputError: see :func:`server_priorities`.
     """
-    places = {node: place for place, node in reversed([*enumerate(order)])}
-
-    def place_of(one: NodeThread) -> int:
-        known = (places[node] for node in one.nodes if node in places)
-        return 0 if take_turns else min(known, default=len(order))
-
-    taken = {name: sorted({place_of(one) for one in own}) for name, own in members.items()}
+    taken = {name: sorted({place_of(one, order) for one in own}) for name, own in members.items()}
     sizes: dict[int, int] = {}
     for its in (one for one in servers if not getattr(one, "best_effort", False)):
         sizes[its.priority] = max(1, sizes.get(its.priority, 0), len(taken[its.name]))
@@ -529,7 +530,7 @@ def scheduling_around(
     def wanted_in(server: Server | ReservationServer, one: NodeThread) -> Scheduling:
         if getattr(server, "best_effort", False):
             return Scheduling(0, (server.core,))
-        own, place = priorities[server.priority], taken[server.name].index(place_of(one))
+        own, place = priorities[server.priority], taken[server.name].index(place_of(one, order))
         return Scheduling(own[min(place, len(own) - 1)], (server.core,), take_turns)
 
     own = [

@@ -286,9 +286,10 @@ class _Run:
             progress(share, "measuring where in a cycle the chain begins")
 
         gated = gates(self.choice.name)
-        self.given, self.anchor_ns, self.waits_ns, phases = threads.carried_out(
+        carried = threads.carried_out(
             self.given, self.found, phase_ns, gated=gated, progress=measured
         )
+        self.given, self.anchor_ns, self.waits_ns, phases = carried
         self.note(
             *(
                 f"the beginning of {chain_name(chain)} varies by {duration_text(phase.spread_ns)}"
@@ -307,6 +308,7 @@ class _Run:
         servers = (
             ServerState(
                 *(one.name, one.core, one.priority, one.slots, ()),
+                places=threads.places_in(one, self.plan.most_urgent_first),
                 kept_by=kept_by.get(one.name, "gate"),
                 counters=_NOTHING,
             )
@@ -399,11 +401,13 @@ class _Run:
         themselves = {thread.node for thread in self.plan.free_threads}
         already = {one.name: one.threads for one in self.state.servers}
         members = allocation.server_members(self.plan, self.found)
+        urgency = self.plan.most_urgent_first
+        order = {one.name: threads.order_in(one, urgency) for one in self.plan.servers}
         for name, one in ((name, one) for name, group in members.items() for one in group):
             self.go_on()
             if one.thread.tid not in already[name] and themselves.isdisjoint(one.nodes):
                 with self.arming:
-                    servers.assign(one.thread.tid, name)
+                    servers.assign(one.thread.tid, name, allocation.place_of(one, order[name]))
         tids = {name: tuple(one.thread.tid for one in group) for name, group in members.items()}
         self.show_servers(threads=tids)
 
@@ -576,14 +580,15 @@ class _Run:
                 if place not in again
             }
             gated = gates(self.choice.name)
-            given, anchor_ns, waits_ns, _ = threads.carried_out(
+            carried = threads.carried_out(
                 *(self.given, self.found, None),
                 gated=gated,
                 progress=lambda _: self.go_on(),
                 known=known,
             )
+            anchor_ns, waits_ns = carried.anchor_ns, carried.waits_ns
             with self.arming:
-                plan = open_until_done(with_slots_moved(given, self.moved_ns), waits_ns)
+                plan = open_until_done(with_slots_moved(carried.plan, self.moved_ns), waits_ns)
                 table = threads.server_table(plan)
                 if isinstance(servers, Freezer):
                     servers.change(table, anchor_ns)
@@ -594,7 +599,7 @@ class _Run:
                     )
                 else:
                     servers.arm(anchor_ns)
-                self.given, self.plan = given, plan
+                self.given, self.plan = carried.plan, plan
                 self.anchor_ns, self.waits_ns = anchor_ns, waits_ns
             self.save_plan()
             self.show(anchor_ns=anchor_ns)

@@ -172,7 +172,10 @@ def shape_launch(
         own = [wanted[place] for place in places]
         cores = {node: core_of[node] for node in chain_nodes(first, *own)}
         condition = profiling_condition(
-            *(cores, cores), like=first, before=stages_before(seen, request)
+            *(cores, cores),
+            like=first,
+            before=stages_before(seen, request),
+            policy=request.policy,
         )
         before = record(
             *("before" if number == 1 else f"before_{number}", shaped, duration_ns),

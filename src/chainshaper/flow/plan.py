@@ -26,7 +26,6 @@ from chainshaper.analysis.latency import Executor
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.margins import read_latencies
-from chainshaper.planning.plan import most_urgent_first
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.splicing.application import splice_application
@@ -318,9 +317,11 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
 
 
 def taking_part(graph: ApplicationGraph, chain: Chain, stages: Sequence[_Stage]) -> tuple[str, ...]:
-    """The nodes of a chain, and of the branches that it waits for, the most urgent first."""
+    """The nodes of a chain in its order, then those of the branches that it waits for in theirs:
+    so urgent they are (:mod:`chainshaper.enforcement.threads`).
+    """
     along = (graph.callbacks[number].node for number in chain.callbacks)
-    return most_urgent_first(along, (stage.node for stage in stages))
+    return tuple(dict.fromkeys((*along, *(stage.node for stage in stages))))
 
 
 def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> frozenset[str]:

@@ -20,11 +20,13 @@ from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
+from chainshaper.planning.plan import PER_CALLBACK
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.plan_choices import Policy
 from chainshaper.values.recording import Recording
 
 START_NS = 30_000_000_000  # so long the nodes have to appear
@@ -39,22 +41,24 @@ def profiling_condition(
     like: Recording | None = None,
     *,
     before: Mapping[str, int] = MappingProxyType({}),
+    policy: Policy = "shaped",
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
 
     It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
-    The first of ``nodes`` are the most urgent, as in a plan; all, where none is named, have one
-    priority. ``core`` is where the executors run (default: the last that we may use), or the core
-    of each of ``nodes``, ``before`` how many stages of a pipeline are more urgent there, as a plan
-    has it. ``folder`` is where journals are (default: `/run/chainshaper`). An earlier recording
-    that this one is ``like`` says which components a container has, and which executors several
-    threads.
+    The first of ``nodes`` are the most urgent, as in a plan of this ``policy``; all, where none is
+    named, have one priority. ``core`` is where the executors run (default: the last that we may
+    use), or the core of each of ``nodes``, ``before`` how many stages of a pipeline are more urgent
+    there, as a plan has it. ``folder`` is where journals are (default: `/run/chainshaper`). An
+    earlier recording that this one is ``like`` says which components a container has, and which
+    executors several threads.
 
     Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
     governs one of the nodes, or the core; a node does not appear; not all could be changed or put
     back.
     """
     wanted, core_of = frozenset(nodes), core if isinstance(core, Mapping) else {}
+    order = tuple(nodes)[: 1 if policy in PER_CALLBACK else None]
     cores = check_profiling([core] if isinstance(core, int) else [*dict.fromkeys(core_of.values())])
     homes = {(core, before.get(node, 0)) for node, core in core_of.items()} or {(cores[0], 0)}
     servers = {(c, k): ReservationServer(f"core {c}, {k}", c, 1 + k, ()) for c, k in homes}
@@ -85,7 +89,7 @@ def profiling_condition(
             at_home[server.name].append(one)
         clear = cores[:1] if len(cores) > 1 else ()  # the plan's, whose output it has mostly
         around = scheduling_around(
-            *(at_home, servers.values(), found, available_cores()), order=[*nodes], clear=clear
+            *(at_home, servers.values(), found, available_cores()), order=order, clear=clear
         )
         new = [
             (one.thread.thread, one.wanted)

@@ -18,7 +18,7 @@ from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, NamedTuple, cast
 from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
@@ -308,7 +308,7 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
     if plan.takes_turns and back_end == "scx":
         raise InputError(
             "equal_priorities: round-robin, but under the back end scx turns are those of one"
-            " server's threads, and servers of one priority run in the plan's order: choose"
+            " node's threads, and servers of one priority run in the plan's order: choose"
             " another (--backend freezer)"
         )
 
@@ -357,13 +357,30 @@ def server_table(plan: ApplicationPlan) -> ServerTable:
             "the plan's servers name no threads of the application, so there is nothing to apply: "
             "plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
         )
-    return table_of(plan.cycle_ns, servers)
+    return table_of(plan.cycle_ns, servers, plan.most_urgent_first)
 
 
-def table_of(cycle_ns: int, servers: Iterable[Server]) -> ServerTable:
-    """Servers of a plan without their nodes."""
-    bare = (ReservationServer(one.name, one.core, one.priority, one.slots) for one in servers)
+def table_of(cycle_ns: int, servers: Iterable[Server], order: Sequence[str] = ()) -> ServerTable:
+    """Servers of a plan without their nodes, whose threads are in this order."""
+    bare = (
+        ReservationServer(
+            *(one.name, one.core, one.priority, one.slots), places=places_in(one, order)
+        )
+        for one in servers
+    )
     return ServerTable(cycle_ns, tuple(bare))
+
+
+def order_in(server: Server, order: Sequence[str]) -> list[str]:
+    """The nodes of a server that are in the order, in that."""
+    own = {thread.node for thread in server.threads}
+    return [node for node in order if node in own]
+
+
+def places_in(server: Server, order: Sequence[str]) -> int:
+    """How many places threads of a server have: one for each node in the order, one for others."""
+    nodes, ordered = {thread.node for thread in server.threads}, order_in(server, order)
+    return max(1, len(ordered) + (len(ordered) < len(nodes)))
 
 
 def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
@@ -403,6 +420,17 @@ def chain_phases(
     return [known[k] if k in known else phases[one] for k, one in enumerate(wanted)]
 
 
+class CarriedOut(NamedTuple):
+    """A plan as it is carried out, and from when on its cycles count (CLOCK_MONOTONIC, modulo the
+    hyper-period). Where timers were measured: how long before slots they expire, and where.
+    """
+
+    plan: ApplicationPlan
+    anchor_ns: int
+    waits_ns: list[int]
+    phases: list[Phase]
+
+
 def carried_out(
     plan: ApplicationPlan,
     found: Allocation,
@@ -411,26 +439,22 @@ def carried_out(
     gated: bool = True,
     progress: Callable[[float], None] = lambda _: None,
     known: Mapping[int, Phase] = MappingProxyType({}),
-) -> tuple[ApplicationPlan, int, list[int], list[Phase]]:
+) -> CarriedOut:
     """A plan on what runs, whose first timer expires at ``phase_ns`` (None: all are measured that
     are not ``known``, see :func:`chain_phases`).
-
-    Returns the plan as it is carried out, from when on its cycles count (CLOCK_MONOTONIC, modulo
-    the hyper-period); and, where its timers were measured, how long before slots they expire, and
-    where.
 
     Raises OperationError: a chain has no regular beginning, or as :func:`placed`.
     """
     if phase_ns is not None:
         anchor_ns = phase_ns + LEAD_NS - plan.chains[0].offset_ns
-        return plan, anchor_ns % plan.cycle_ns, [], []
+        return CarriedOut(plan, anchor_ns % plan.cycle_ns, [], [])
     phases = chain_phases(plan, found, progress, known)
     plan, anchor_ns = placed(plan, phases, gated=gated)
     waits_ns = [
         (anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
         for chain, phase in zip(plan.chains, phases, strict=True)
     ]
-    return plan, anchor_ns, waits_ns, phases
+    return CarriedOut(plan, anchor_ns, waits_ns, phases)
 
 
 def placed(

@@ -22,6 +22,7 @@ from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
 from chainshaper.planning.overruns import slots_without, united, with_output_moved
 from chainshaper.planning.plan import (
+    PER_CALLBACK,
     Plan,
     Server,
     ShapingNode,
@@ -138,6 +139,19 @@ class ApplicationPlan(Part):
     def takes_turns(self) -> bool:
         """Whether threads of all servers of one priority take turns."""
         return any(chain.equal_priorities == "round-robin" for chain in self.chains)
+
+    @property
+    def most_urgent_first(self) -> tuple[str, ...]:
+        """The nodes that have an order among the threads of their server, which is the plan's.
+
+        None has where they take turns, and only that which begins the chain where slots are made of
+        what single callbacks took: one that is interrupted by another takes longer.
+        """
+        found: dict[str, None] = {}
+        for chain in () if self.takes_turns else self.chains:
+            nodes = [thread.node for server in chain.servers for thread in server.threads]
+            found |= dict.fromkeys(nodes[:1] if chain.policy in PER_CALLBACK else nodes)
+        return tuple(found)
 
     @property
     def free_threads(self) -> set[Thread]:

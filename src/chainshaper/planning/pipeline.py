@@ -34,16 +34,7 @@ from itertools import accumulate, count, pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.plan import (
-    Plan,
-    Prediction,
-    Server,
-    Slot,
-    Thread,
-    most_urgent_first,
-    publish_slots,
-    revised,
-)
+from chainshaper.planning.plan import Plan, Prediction, Server, Slot, Thread, publish_slots, revised
 from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
@@ -239,7 +230,7 @@ def pipelined(
     opens = stages[-1].closes_ns
     if opens % cycle + length > cycle:  # a publish slot does not wrap
         opens = -(-opens // cycle) * cycle
-    done, urgent = opens + length, most_urgent_first(nodes)
+    done = opens + length
     with wrong_values_refused(Plan):
         servers = tuple(
             Server(
@@ -248,7 +239,7 @@ def pipelined(
                 priority=CHAIN_PRIORITY + cores[: stage.place].count(cores[stage.place]),
                 slots=in_cycle(stage.opens_ns, stage.closes_ns, cycle),
                 threads=tuple(
-                    Thread(node=n) for n in urgent if n in nodes[stage.first : stage.end]
+                    Thread(node=n) for n in dict.fromkeys(nodes[stage.first : stage.end])
                 ),
             )
             for number, stage in enumerate(stages, start=1)

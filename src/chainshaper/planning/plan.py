@@ -155,8 +155,8 @@ class Thread(Part):
 
 class Server(Part):
     """A table-driven reservation server (section 2.2.1): its threads run in its slots only, the
-    first the most urgent (:func:`most_urgent_first`). A smaller ``priority`` is better, as in
-    LITMUS^RT. One for ``best_effort`` (R_m' and R_int of the
+    first the most urgent (:attr:`.ApplicationPlan.most_urgent_first`). A smaller ``priority`` is
+    better, as in LITMUS^RT. One for ``best_effort`` (R_m' and R_int of the
     paper, sections 3.1 and 5.1) runs only what is left of its core by all others.
     """
 
@@ -580,20 +580,6 @@ def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Sl
         for slot in server.slots
         if any(max(slot[0], earliest, start) < min(slot[1], end) for start, end in other.slots)
     ]
-
-
-def most_urgent_first(chain: Iterable[str], branches: Iterable[str] = ()) -> tuple[str, ...]:
-    """The nodes of a chain, and of the branches that it waits for, as they stand in a server.
-
-    First the one that begins the chain, so that it does so on time; then, of the chain and behind
-    it of the branches, those nearer the output, so that what was begun earlier ends earlier.
-
-    >>> most_urgent_first(["/a", "/b", "/c"], ["/a", "/d", "/b", "/c"])
-    ('/a', '/c', '/b', '/d')
-    """
-    along = [*dict.fromkeys(chain)]
-    beside = [node for node in dict.fromkeys(branches) if node not in along]
-    return (*along[:1], *reversed(along[1:]), *reversed(beside))
 
 
 def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:

@@ -427,7 +427,7 @@ def _shaped(
         spec=profile.spec,
         output=profile.topics[-1] if profile.topics else None,
         publisher=last,
-        nodes=profile.nodes,
+        nodes=tuple(dict.fromkeys(profile.nodes)),
         core=profile.core_of.get(last or "", DEFAULT_CORE),
         overrun=request.overrun or ("wait" if bound else "publish"),
         fifo_priority=profile.fifo_priority,

@@ -30,7 +30,6 @@ from chainshaper.planning.plan import (
     Slot,
     Thread,
     below_executors,
-    most_urgent_first,
     output_server,
     publish_slots,
     publisher_servers,
@@ -71,8 +70,8 @@ def plan_shaping(
     same cycle (eq. 3) and on the same core, at the better priority.
 
     ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process) unless
-    the wishes say otherwise; Δ is 1 ms. ``nodes`` are those whose executors run the chain, in its
-    order, ``fifo_priority`` and ``receivers`` for the shaping node.
+    the wishes say otherwise; Δ is 1 ms. ``nodes`` are those whose executors run the chain,
+    ``fifo_priority`` and ``receivers`` for the shaping node.
     ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` and
     :class:`~chainshaper.planning.plan.Evidence`, and single
     :class:`~chainshaper.values.plan_choices.Wishes`. OperationError: L̄ + ε + Δ does not fit.
@@ -95,7 +94,7 @@ def plan_shaping(
     with wrong_values_refused(Plan):
         chain = ChainOfPlan(period_ns=period_ns, **of_chain)
         node, gated = _gate(chain, wishes, core, fifo_priority, receivers)
-        threads = tuple(Thread(node=name) for name in most_urgent_first(nodes))
+        threads = tuple(Thread(node=name) for name in nodes)
         running = Server(
             name="chain", core=core, priority=CHAIN_PRIORITY, slots=((0, start),), threads=threads
         )

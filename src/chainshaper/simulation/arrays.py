@@ -429,16 +429,24 @@ def _fill_cores(
         own = [] if plan is None else [server for server in plan.servers if server.core == core]
         used = [server for server in own if server in system.servers.values()]
         ranked = sorted(used, key=lambda server: server.priority)
-        turns = plan is not None and plan.takes_turns
-        # A server's threads in its order, as the priorities of SCHED_FIFO have them.
-        urgent = [(s.priority, "" if turns else one.node) for s in ranked for one in s.threads]
-        for number, server in system.servers.items():
-            if server in ranked:
-                rows[threads[number] + T.SERVER] = ranked.index(server)
-                its = (server.priority, "" if turns else system.threads[number].node)
-                rows[threads[number] + T.RANK] = urgent.index(its) - len(urgent)
-                if server.best_effort:  # under the fair class, behind all real-time threads
-                    rows[threads[number] + T.RANK] = BEST_EFFORT
+        order = () if plan is None else plan.most_urgent_first
+        places = {node: place for place, node in enumerate(order)}
+        takes_turns = plan is not None and plan.takes_turns
+        governed = {
+            number: (
+                server.priority if takes_turns else ranked.index(server),
+                places.get(system.threads[number].node, len(order)),
+            )
+            for number, server in system.servers.items()
+            if server in ranked
+        }
+        urgent = sorted(set(governed.values()))
+        for number, urgency in governed.items():
+            server = system.servers[number]
+            rows[threads[number] + T.SERVER] = ranked.index(server)
+            rows[threads[number] + T.RANK] = urgent.index(urgency) - len(urgent)
+            if server.best_effort:  # under the fair class, behind all real-time threads
+                rows[threads[number] + T.RANK] = BEST_EFFORT
         mine = [thread for thread in threads if rows[thread + T.CORE] == place]
         rows[place + C.FIRST], rows[place + C.END] = rows.put(mine)
         rows[place + C.RUNNING], rows[place + C.LAST] = NONE, NONE

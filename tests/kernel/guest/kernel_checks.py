@@ -8,7 +8,7 @@ is as fast as its instructions are few, and nothing else runs.
 import os
 import signal
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from statistics import median
 
@@ -43,6 +43,8 @@ from scenes import (
     wait,
     wait_for_phase,
 )
+
+from chainshaper.enforcement.servers import ServerTable
 
 RUN_MS = 1200
 SLOT = 10 * MS
@@ -90,15 +92,30 @@ def a_thread_alone_on_its_core_keeps_its_slots() -> str:
 
 
 def a_worse_server_gets_nothing_while_a_better_one_has_work() -> str:
-    """A job of 4 ms, released at 12 ms, over a server that has [5, 25)."""
-    low = server("low", 5, 25, priority=2)
+    """A server that has [5, 25) beside that of the job."""
+    return _a_job_goes_first(table(A, server("low", 5, 25, priority=2)), ("A", 0), ("low", 0), 5)
+
+
+def of_a_servers_threads_the_one_in_the_first_place_runs_whenever_it_wants_to() -> str:
+    """Both are in the server [10, 25)."""
+    both = replace(server("both", 10, 25), places=2)
+    return _a_job_goes_first(table(both), ("both", 0), ("both", 1), 10)
+
+
+def _a_job_goes_first(
+    servers: ServerTable, home: tuple[str, int], rivals: tuple[str, int], from_ms: int
+) -> str:
+    """A job of 4 ms, released at 12 ms, over a rival that may run from ``from_ms`` to 25 ms."""
     with scene() as s:
         job = s.spinner("job", job=(0, CYCLE, 12 * MS, 4 * MS))
         rival, hog = s.spinner("rival"), s.spinner("hog")
-        loader = s.loader(table(A, low), {"A": [job], "low": [rival]})
+        loader = s.loader(servers)
+        loader.ask("assign", job.tid, *home)
+        loader.ask("assign", rival.tid, *rivals)
         start = loader.arm()
         wait(RUN_MS)
         end = time.monotonic_ns()
+        counted = loader.ask("counters")[rivals[0]]
         jobs, others = cut(job.windows(), start, end), cut(rival.windows(), start, end)
         best_effort = cut(hog.windows(), start, end)
     pending = slots_between(((12 * MS, 16 * MS),), CYCLE, 0, start, end)[1:-1]
@@ -106,15 +123,17 @@ def a_worse_server_gets_nothing_while_a_better_one_has_work() -> str:
     # A wake-up may come 50 us late: the kernel's timer slack for threads that are not real-time.
     assert used > 0.97 * length(pending), f"jobs got {used} of {length(pending)} ns"
     taken = overlap(others, [(a + MS // 10, b - MS // 10) for a, b in pending])
-    assert taken == 0, f"the worse server took {taken} ns"
-    rest = slots_between(((5 * MS, 12 * MS), (17 * MS, 25 * MS)), CYCLE, 0, start, end)[2:-2]
-    assert overlap(others, rest) > 0.99 * length(rest), "the worse server did not get the rest"
-    both = slots_between(((5 * MS, 25 * MS),), CYCLE, 0, start, end)[1:-1]
+    assert taken == 0, f"the rival took {taken} ns"
+    left = ((from_ms * MS, 12 * MS), (17 * MS, 25 * MS))
+    rest = slots_between(left, CYCLE, 0, start, end)[2:-2]
+    assert overlap(others, rest) > 0.99 * length(rest), "the rival did not get the rest"
+    both = slots_between(((from_ms * MS, 25 * MS),), CYCLE, 0, start, end)[1:-1]
     assert overlap(best_effort, both) < length(both) / 200
+    assert abs(counted["overruns"] - counted["slots"]) <= 1, "the rival never has enough"
     return f"{len(pending)} jobs, {used / len(pending) / MS:.2f} of 4 ms at once, rival 0"
 
 
-def threads_of_one_server_take_turns() -> str:
+def threads_of_one_place_take_turns() -> str:
     """Three of them, in 20 ms per cycle."""
     with scene() as s:
         threads = [s.spinner(f"t{i}") for i in range(3)]
@@ -371,7 +390,8 @@ VIRTUAL_TIME = (
     a_thread_keeps_its_slots_beside_best_effort,
     a_thread_alone_on_its_core_keeps_its_slots,
     a_worse_server_gets_nothing_while_a_better_one_has_work,
-    threads_of_one_server_take_turns,
+    of_a_servers_threads_the_one_in_the_first_place_runs_whenever_it_wants_to,
+    threads_of_one_place_take_turns,
     moving_the_cycles_lets_nobody_slip_between,
     two_servers_exchange_their_slots_at_one_instant,
     a_thread_assigned_while_running_is_governed_at_once,

@@ -16,8 +16,7 @@ from chainshaper.values.errors import ChainshaperError
 
 def table_of(text: dict[str, Any]) -> ServerTable:
     servers = tuple(
-        ReservationServer(s["name"], s["core"], s["priority"], tuple(map(tuple, s["slots"])))
-        for s in text["servers"]
+        ReservationServer(**{**s, "slots": tuple(map(tuple, s["slots"]))}) for s in text["servers"]
     )
     return ServerTable(text["cycle_ns"], servers)
 

@@ -24,7 +24,8 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from chainshaper.enforcement.scx.libbpf import (
@@ -135,15 +136,12 @@ def _lacking_privileges() -> list[str]:
 
 def check_table(table: ServerTable) -> None:
     """Refuse a table that the policy cannot hold. Raises InputError: a limit is exceeded."""
-    crowds = [("", len(table.servers), MAX_SERVERS - 1)]
-    for core, count in Counter(server.core for server in table.servers).items():
-        crowds.append((f" on core {core}", count, MAX_SERVERS_PER_CORE))
-    for where, count, most in crowds:
-        if count > most:
-            raise InputError(
-                f"{count} servers{where} are more than the {most} that back end scx can have; join"
-                " servers that share slots"
-            )
+    if too_many := _too_many(table):
+        where, count, most = too_many[0]
+        raise InputError(
+            f"{count} servers{where} are more than the {most} that back end scx can have; join"
+            " servers that share slots"
+        )
     for server in table.servers:
         name, slots = f"server {server.name}", len(server.slots)
         if server.core >= MAX_CORES:
@@ -151,6 +149,39 @@ def check_table(table: ServerTable) -> None:
             raise InputError(f"{name} is on core {server.core}; {known}")
         if not 1 <= slots <= MAX_SLOTS:
             raise InputError(f"{name} has {slots} slots; back end scx takes 1 to {MAX_SLOTS}")
+
+
+def _too_many(table: ServerTable) -> list[tuple[str, int, int]]:
+    """Where there are how many servers, and how many there may be."""
+    crowds = [("", len(table.servers), MAX_SERVERS - 1)]
+    for core, count in Counter(server.core for server in table.servers).items():
+        crowds.append((f" on core {core}", count, MAX_SERVERS_PER_CORE))
+    return [crowd for crowd in crowds if crowd[1] > crowd[2]]
+
+
+def with_places_apart(table: ServerTable) -> ServerTable:
+    """The table with a server for each place, in the order of priorities and places: so the policy
+    runs the most urgent of a server's threads. Where these would be more servers than the policy
+    can hold, the last places of each are one.
+    """
+    most = max((server.places for server in table.servers), default=1)
+    while most > 1 and _too_many(_apart(table, most)):
+        most -= 1
+    return _apart(table, most)
+
+
+def _apart(table: ServerTable, most: int) -> ServerTable:
+    places = [(one, k) for one in table.servers for k in range(min(one.places, most))]
+    ranks = sorted({(one.priority, k) for one, k in places})
+    apart = (
+        replace(one, name=_of_place(one.name, k), priority=1 + ranks.index((one.priority, k)))
+        for one, k in places
+    )
+    return replace(table, servers=tuple(apart))
+
+
+def _of_place(server: str, place: int) -> str:
+    return f"{server}\0{place}" if place else server
 
 
 def number_servers(table: ServerTable, known: Mapping[str, int]) -> dict[str, int]:
@@ -198,6 +229,13 @@ def unpack_counters(value: bytes) -> ServerCounters:
     return ServerCounters(slots, late, longest, overruns)
 
 
+def in_all_places(counters: Sequence[ServerCounters]) -> ServerCounters:
+    """What a server has done, from what it has in each place: all have the same slots."""
+    first = counters[0]
+    overruns = min(first.slots or 0, sum(one.overruns or 0 for one in counters))
+    return replace(first, overruns=overruns)
+
+
 def unpack_exit(value: bytes) -> str | None:
     """The element of map `ended`: why the kernel ended the policy, None if it has not."""
     kind, _, _, *texts = EXIT.unpack(value)
@@ -226,7 +264,8 @@ class ScxServers(BackEnd):
 
     def __init__(self, table: ServerTable) -> None:
         super().__init__(table)
-        self._ids = number_servers(table, {})
+        self._apart = with_places_apart(table)
+        self._ids = number_servers(self._apart, {})
         self._members: dict[int, tuple[int, int]] = {}  # tid -> (thread descriptor, server id)
         self._has_timer = not is_realtime_kernel()
         self._core_count = min(os.sysconf("SC_NPROCESSORS_CONF"), MAX_CORES)
@@ -239,7 +278,7 @@ class ScxServers(BackEnd):
         self._last_counters: dict[str, ServerCounters] = {}
         self._lock = threading.RLock()
 
-    def assign(self, tid: int, server: str) -> None:
+    def assign(self, tid: int, server: str, place: int = 0) -> None:
         """See :meth:`BackEnd.assign`; refused where it is real-time, or may not use the core."""
         core = server_named(self._table, server).core
         with self._lock:
@@ -249,7 +288,9 @@ class ScxServers(BackEnd):
                 return
             if tid in self._members:
                 os.close(self._members.pop(tid)[0])
-            self._members[tid] = (descriptor, self._ids[server])
+            places = [_of_place(server, k) for k in range(place + 1)]
+            its = [one.name for one in self._apart.servers if one.name in places][-1]
+            self._members[tid] = (descriptor, self._ids[its])
             if self._policy is not None:
                 self._hand_over(self._policy, tid)
                 ProgramRun(self._policy.program_descriptor("table_decide"), WAKE.size)()
@@ -268,16 +309,17 @@ class ScxServers(BackEnd):
         _check(table)
         with self._lock:
             self._check_in_use()
-            self._ids = number_servers(table, self._ids)
+            apart = with_places_apart(table)
+            self._ids = number_servers(apart, self._ids)
             cores = sorted({s.core for s in (*self._table.servers, *table.servers)})
             if self._policy is None:
                 self._policy = self._begin(cores)
             self._start_kickers(self._policy, cores)
-            instant = self._put_in_force(self._policy, table, cores, anchor_ns)
+            instant = self._put_in_force(self._policy, apart, cores, anchor_ns)
             while (left := instant - time.monotonic_ns()) > 0:
                 time.sleep(left / 1e9)
-            self._table, self._since_ns = table, instant
-            present = {self._ids[server.name] for server in table.servers}
+            self._table, self._apart, self._since_ns = table, apart, instant
+            present = {self._ids[server.name] for server in apart.servers}
             for tid, (descriptor, number) in tuple(self._members.items()):
                 if number not in present:
                     delete_element(self._policy.map_descriptor("assignments"), descriptor)
@@ -287,14 +329,17 @@ class ScxServers(BackEnd):
     def counters(self) -> dict[str, ServerCounters]:
         """See :meth:`BackEnd.counters`; after :meth:`release`, the last ones.
 
-        A slot counts as opened with the core's first decision inside it.
+        A slot counts as opened with the core's first decision inside it, and once as overrun, by
+        however many threads.
         """
         with self._lock:
             if self._policy is not None:
                 counters = self._policy.map_descriptor("counters")
+                of: dict[str, list[ServerCounters]] = {}
                 for name, number in self._ids.items():
                     value = look_up_element(counters, number, COUNTERS.size)
-                    self._last_counters[name] = unpack_counters(value)
+                    of.setdefault(name.partition("\0")[0], []).append(unpack_counters(value))
+                self._last_counters = {name: in_all_places(own) for name, own in of.items()}
             none = ServerCounters(0, 0, 0, 0)
             return {s.name: self._last_counters.get(s.name, none) for s in self._table.servers}
 
