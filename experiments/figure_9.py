@@ -57,8 +57,8 @@ NOTES = (
     "The command distributes the callbacks over both cores itself, so that on one core several can"
     " be ready at once. Until 2026-11-26 those of a server had one priority: they ran in the order"
     " in which DDS delivered, another one after each start, and turns of SCHED_RR ended within"
-    " them. Over Fast DDS 9 of 100 outputs were late then, and of three sinks 20, 4 and 3. Now a server's"
-    " threads have an order, the same while they are profiled."
+    " them. Over Fast DDS 9 of 100 outputs were late then, and of three sinks 20, 4 and 3. Now a"
+    " server's threads have an order, the same while they are profiled."
 )
 
 WHY_SINK = "not in the paper, which says that it can be done"
