@@ -66,7 +66,7 @@ def test_every_call_is_followed_to_the_client_that_made_it(recording: Path, node
 @pytest.mark.timeout(300)
 def test_an_actions_feedback_and_result_are_followed(recording: Path) -> None:
     source, folder = cs.open_source(recording), recording.parent
-    feedback = cs.analyse_latency(source, "/work/_action/feedback../progress")
+    feedback = cs.analyse_latency(source, "/errand/_action/feedback../progress")
     assert not feedback.incomplete
     found = feedback.traversals.select("start", "end").to_numpy()
     assert len(found) > 30
@@ -75,8 +75,8 @@ def test_an_actions_feedback_and_result_are_followed(recording: Path) -> None:
         assert (truth[: len(found), 0] <= found[:, place]).all()
         assert (found[:-1, place] <= truth[1 : len(found), 0]).all()
     for spec, parts in (
-        ("/asker../work/_action/send_goal../work/_action/feedback../progress", 1),
-        ("/asker../work/_action/get_result../finished", 3),
+        ("/asker../errand/_action/send_goal../errand/_action/feedback../progress", 1),
+        ("/asker../errand/_action/get_result../finished", 3),
     ):
         analysis = cs.analyse_latency(source, spec)
         assert sum(analysis.incomplete.values()) <= 1

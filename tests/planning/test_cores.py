@@ -62,7 +62,7 @@ def test_what_runs_one_after_the_other_stays_on_one_core() -> None:
 
 
 def test_one_cycle_is_played_out_by_hand_the_more_urgent_first() -> None:
-    """The chain a, b, c, whose branch x has begun when c is ready; y is of x's executor."""
+    """The chain a, b, c, and beside b the executor x with two callbacks, one after the other."""
     work = [("a", 10, ()), ("b", 5, (0,)), ("x", 30, (0,)), ("x", 1, (1,)), ("c", 10, (1, 2, 3))]
     chain = replace(_work(*work), core_of=dict.fromkeys("abcx", 0))
     (graph,) = cores._graphs([chain], {"a": 0, "b": 1, "c": 2, "x": 3})

@@ -3,9 +3,9 @@
 //
 //   client PERIOD_MS   timer -> request to /add -> its response -> /sum; prints `cycle BEGAN SENT`
 //   server             /add, which takes 2 to 5 ms
-//   asker PERIOD_MS    timer -> goal of /work; feedback -> /progress, result -> /finished; prints
+//   asker PERIOD_MS    timer -> goal of /errand; feedback -> /progress, result -> /finished; prints
 //                      `goal TIME`, `progress SENT`, `finished SENT`
-//   worker             /work: three times feedback, 20 ms apart, from a thread of the goal; prints
+//   worker             /errand: three times feedback, 20 ms apart, from a thread of the goal; prints
 //                      `feedback TIME`
 //   source PERIOD_MS   a timer of the node's clock -> /t1, stamped by that clock
 //   managed            a lifecycle node: /t1 -> /t2 of a lifecycle publisher, after 1 to 6 ms
@@ -84,7 +84,7 @@ rclcpp::Node::SharedPtr server(const char *) {
 
 rclcpp::Node::SharedPtr asker(const char * number) {
   auto node = std::make_shared<rclcpp::Node>("asker");
-  auto client = rclcpp_action::create_client<Work>(node, "/work");
+  auto client = rclcpp_action::create_client<Work>(node, "/errand");
   auto progress = node->create_publisher<Header>("/progress", 10);
   auto finished = node->create_publisher<Header>("/finished", 10);
   static auto timer = node->create_wall_timer(milliseconds(number), [=] {
@@ -110,7 +110,7 @@ rclcpp::Node::SharedPtr worker(const char *) {
   auto node = std::make_shared<rclcpp::Node>("worker");
   using Goal = rclcpp_action::ServerGoalHandle<Work>;
   static auto server = rclcpp_action::create_server<Work>(
-      node, "/work",
+      node, "/errand",
       [](auto, auto) { return rclcpp_action::GoalResponse::ACCEPT_AND_EXECUTE; },
       [](auto) { return rclcpp_action::CancelResponse::ACCEPT; },
       [](const std::shared_ptr<Goal> goal) {

@@ -540,19 +540,19 @@ def scheduling_around(
         for its in sorted(servers, key=lambda one: one.priority)
         for member in members[its.name]
     ]
-    planned = {one.thread.thread.identity for one in own}
+    in_servers = {one.thread.thread.identity for one in own}
     below = max(1, min(map(min, priorities.values()), default=DDS_PRIORITY) - 1 - _BELOW)
     receiving = [
         WantedScheduling(one, Scheduling(below, (core,)), None, _RECEIVES)
         for one in allocation.threads
-        if one.thread.role == "executor" and one.thread.identity not in planned
+        if one.thread.role == "executor" and one.thread.identity not in in_servers
         for core in [receivers[node] for node in one.nodes if node in receivers][:1]
     ]
-    planned |= {one.thread.thread.identity for one in receiving}
+    planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
     free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
     receiving_pids = {one.thread.thread.pid for one in receiving}
-    concerned = receiving_pids | {one.thread.thread.pid for one in own}
+    concerned = set(planned.values())
     if any(one.thread.pid in concerned and is_of_zenoh(one.thread) for one in allocation.threads):
         concerned |= {one.thread.pid for one in allocation.threads if set(one.nodes) & ROUTERS}
     beside = (

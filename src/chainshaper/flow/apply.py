@@ -286,10 +286,9 @@ class _Run:
             progress(share, "measuring where in a cycle the chain begins")
 
         gated = gates(self.choice.name)
-        carried = threads.carried_out(
+        self.given, self.anchor_ns, self.waits_ns, phases = threads.carried_out(
             self.given, self.found, phase_ns, gated=gated, progress=measured
         )
-        self.given, self.anchor_ns, self.waits_ns, phases = carried
         self.note(
             *(
                 f"the beginning of {chain_name(chain)} varies by {duration_text(phase.spread_ns)}"

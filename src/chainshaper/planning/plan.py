@@ -156,8 +156,8 @@ class Thread(Part):
 class Server(Part):
     """A table-driven reservation server (section 2.2.1): its threads run in its slots only, the
     first the most urgent (:attr:`.ApplicationPlan.most_urgent_first`). A smaller ``priority`` is
-    better, as in LITMUS^RT. One for ``best_effort`` (R_m' and R_int of the
-    paper, sections 3.1 and 5.1) runs only what is left of its core by all others.
+    better, as in LITMUS^RT. One for ``best_effort`` (R_m' and R_int of the paper, sections 3.1 and
+    5.1) runs only what is left of its core by all others.
     """
 
     name: Annotated[str, Field(min_length=1)]

@@ -422,6 +422,8 @@ def _fill_cores(
 ) -> None:
     """The cores, and the core, rank and server of each thread."""
     cores, threads = areas
+    order, takes_turns = ((), False) if plan is None else (plan.most_urgent_first, plan.takes_turns)
+    places = {node: place for place, node in enumerate(order)}
     for thread, info in zip(threads, system.threads, strict=True):
         rows[thread + T.CORE] = cores[system.cores.index(info.cores[0])]
         rows[thread + T.RANK] = BEST_EFFORT - info.priority
@@ -429,9 +431,6 @@ def _fill_cores(
         own = [] if plan is None else [server for server in plan.servers if server.core == core]
         used = [server for server in own if server in system.servers.values()]
         ranked = sorted(used, key=lambda server: server.priority)
-        order = () if plan is None else plan.most_urgent_first
-        places = {node: place for place, node in enumerate(order)}
-        takes_turns = plan is not None and plan.takes_turns
         governed = {
             number: (
                 server.priority if takes_turns else ranked.index(server),

@@ -264,8 +264,7 @@ class ScxServers(BackEnd):
 
     def __init__(self, table: ServerTable) -> None:
         super().__init__(table)
-        self._apart = with_places_apart(table)
-        self._ids = number_servers(self._apart, {})
+        self._ids = number_servers(with_places_apart(table), {})
         self._members: dict[int, tuple[int, int]] = {}  # tid -> (thread descriptor, server id)
         self._has_timer = not is_realtime_kernel()
         self._core_count = min(os.sysconf("SC_NPROCESSORS_CONF"), MAX_CORES)
@@ -289,7 +288,8 @@ class ScxServers(BackEnd):
             if tid in self._members:
                 os.close(self._members.pop(tid)[0])
             places = [_of_place(server, k) for k in range(place + 1)]
-            its = [one.name for one in self._apart.servers if one.name in places][-1]
+            apart = with_places_apart(self._table)
+            its = [one.name for one in apart.servers if one.name in places][-1]
             self._members[tid] = (descriptor, self._ids[its])
             if self._policy is not None:
                 self._hand_over(self._policy, tid)
@@ -318,7 +318,7 @@ class ScxServers(BackEnd):
             instant = self._put_in_force(self._policy, apart, cores, anchor_ns)
             while (left := instant - time.monotonic_ns()) > 0:
                 time.sleep(left / 1e9)
-            self._table, self._apart, self._since_ns = table, apart, instant
+            self._table, self._since_ns = table, instant
             present = {self._ids[server.name] for server in apart.servers}
             for tid, (descriptor, number) in tuple(self._members.items()):
                 if number not in present:
