@@ -36,7 +36,7 @@ from chainshaper.flow.record import record_command
 from chainshaper.linux.processes import run_users
 from chainshaper.planning import PlanRequest, load_application_plan
 from chainshaper.splicing.spliced_launch import parse_launch_command
-from chainshaper.values.errors import OperationError
+from chainshaper.values.errors import ChainshaperError, OperationError
 from chainshaper.workload.description import Application, origin_timer
 
 __all__ = ["MIDDLEWARES", "Shaping", "record_shaped", "ros_in_turns", "ros_runs"]
@@ -96,8 +96,10 @@ def ros_in_turns(
 ) -> list[Run]:
     """Shape the applications over every middleware that is installed; all runs, in turns.
 
-    Recordings that are in ``folder`` already are used, and not measured again.
-    Raises: as :func:`chainshaper.shape_launch`; OperationError: a package cannot be built.
+    Recordings that are in ``folder`` already are used, and not measured again. What the command
+    refuses or cannot do is printed, and has no shaped runs.
+    Raises: as :func:`chainshaper.flow.record.record_command`; OperationError: a package cannot be
+        built.
     """
     runs: list[Run] = []
     for one in shapings:
@@ -153,23 +155,11 @@ def _over(
 ) -> list[Run]:
     """The one command for each shaping, and the runs that take turns."""
     folder.mkdir(parents=True, exist_ok=True)
-    for one in shapings:
-        own = output_of(folder, one.name)
-        if not (own / "comparison.json").exists():  # which is written last
-            print(f"{column}, {one.name}: chainshaper shape", flush=True)
-            shutil.rmtree(own, ignore_errors=True)
-            shape_launch(
-                one.launch,
-                own,
-                chain=one.chains[0],
-                sinks=one.chains[1:],
-                request=one.request,
-                duration_ns=one.lasting_ns(cycles),
-            )
+    made = [_shape(column, one, output_of(folder, one.name), cycles) for one in shapings]
     turns = [
         (one, name, chain, runs is one.shaped)
-        for one in shapings
-        for runs in (one.unshaped, one.shaped)
+        for one, its_shaped in zip(shapings, made, strict=True)
+        for runs in (one.unshaped, one.shaped if its_shaped else {})
         for name, chain in runs.items()
     ]
     in_a_block = -(-cycles // blocks)
@@ -186,6 +176,27 @@ def _over(
         return first_cycles(run, in_a_block), output
 
     return [joined(*one) for one in taking_turns(len(turns), blocks, measure)]
+
+
+def _shape(column: Column, one: Shaping, own: Path, cycles: int) -> bool:
+    """Whether the one command shapes it, or did before."""
+    if (own / "comparison.json").exists():  # which is written last
+        return True
+    print(f"{column}, {one.name}: chainshaper shape", flush=True)
+    shutil.rmtree(own, ignore_errors=True)
+    try:
+        shape_launch(
+            one.launch,
+            own,
+            chain=one.chains[0],
+            sinks=one.chains[1:],
+            request=one.request,
+            duration_ns=one.lasting_ns(cycles),
+        )
+    except ChainshaperError as error:
+        print(f"{column}, {one.name}: not shaped: {error}", flush=True)
+        return False
+    return True
 
 
 def _unshaped(one: Shaping, own: Path, output: Path, words: Sequence[str], cycles: int) -> None:
