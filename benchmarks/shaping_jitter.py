@@ -20,7 +20,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from chainshaper.flow.demo import run_demo
+from chainshaper.flow.described import run_demo
 from chainshaper.values.durations import milliseconds
 from chainshaper.verify.measure import Measurement
 

@@ -100,7 +100,7 @@ ROWS = {
         PlanRequest(policy="server-per-callback", epsilon_ns=LIVE_MARGIN_OF_A_CALLBACK_NS),
         "the localizer's slot opens at 47 ms, live where the plan puts it, then comes its"
         " execution time; on ROS 2 no callback has a margin, and over Fast DDS the slots would take"
-        " 101 of 100 ms, so that no row was measured; " + WHY_LATE,
+        " 101 of 100 ms, so that nothing was shaped; " + WHY_LATE,
     ),
     "1 server per chain": Row(
         *(64.2, 84.4, 51.6, "2 server per chain"),

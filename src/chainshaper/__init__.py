@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from chainshaper.enforcement.undoing import end_run as end_run
     from chainshaper.enforcement.undoing import find_runs as find_runs
     from chainshaper.flow.apply import apply_plan as apply_plan
+    from chainshaper.flow.described import shape_application as shape_application
     from chainshaper.flow.doctor import examine_machine as examine_machine
     from chainshaper.flow.exploration import convert_recording as convert_recording
     from chainshaper.flow.exploration import describe_application as describe_application
@@ -46,7 +47,6 @@ if TYPE_CHECKING:
     from chainshaper.flow.launch_splicing import splice_throttlers as splice_throttlers
     from chainshaper.flow.plan import plan_recording as plan_recording
     from chainshaper.flow.plan import profile_chains as profile_chains
-    from chainshaper.flow.plan import shape_application as shape_application
     from chainshaper.flow.profiling import profiling_condition as profiling_condition
     from chainshaper.flow.record import Recorded as Recorded
     from chainshaper.flow.record import record_command as record_command

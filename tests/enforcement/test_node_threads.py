@@ -409,6 +409,12 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     free = _by_tid(left_by_back_end("scx", wanted, plan.free_threads))
     assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
     assert more_cores[300] == Scheduling(83, (1,)), "it rests while one chain's output is received"
+    for own_cores, stays in (((0,), True), ((0, 1), False)):
+        by_hand = replace(sink[0], thread=replace(sink[0].thread, priority=30, cores=own_cores))
+        placed = _allocation(gate, _node("/a", 200, "executor"), [by_hand, receiving])
+        scheduled = _by_tid(plan_scheduling(plan, placed, (0, 1)))
+        assert scheduled.get(300) == (None if stays else Scheduling(83, (1,)))
+        assert scheduled[301] == Scheduling(91, (0,))
     other = _server("other", PlannedThread(node="/b"), core=2, priority=2)
     several = ApplicationPlan(chains=(plan.chains[0], _plan(other).chains[0]))
     both = _allocation(gate, _node("/a", 200, "executor"), _node("/b", 400, "executor"), sink)

@@ -3,6 +3,7 @@
 //
 //   executing LOG EXECUTOR line|join PERIOD_MS LEAST_MS MOST_MS compute|sleep
 //   executing LOG EXECUTOR sink
+//   executing LOG EXECUTOR known   (exit code 1: this rclcpp has no such executor)
 //
 // line: a timer → /begun → /worked → /done; the second callback is in a reentrant group, the others
 // in one of their own; the last works for a tenth of the time. join: the timer publishes /left and /right, and the callback that gets the
@@ -10,8 +11,10 @@
 #include <sys/syscall.h>
 #include <unistd.h>
 
+#include <cstdlib>
 #include <ctime>
 #include <fstream>
+#include <iostream>
 #include <memory>
 #include <mutex>
 #include <random>
@@ -23,6 +26,10 @@
 #include "geometry_msgs/msg/point_stamped.hpp"
 #include "rclcpp/experimental/executors/events_executor/events_executor.hpp"
 #include "rclcpp/rclcpp.hpp"
+#include "rclcpp/version.h"
+#if RCLCPP_VERSION_GTE(32, 0, 0)  // Lyrical
+#include "rclcpp/executors/events_cbg_executor/events_cbg_executor.hpp"
+#endif
 
 using Message = geometry_msgs::msg::PointStamped;
 using Group = rclcpp::CallbackGroup::SharedPtr;
@@ -139,14 +146,24 @@ class Worker : public rclcpp::Node {
 
 std::unique_ptr<rclcpp::Executor> executor_of(const std::string& name) {
   if (name == "multi") return std::make_unique<rclcpp::executors::MultiThreadedExecutor>(rclcpp::ExecutorOptions{}, 4);
+#if RCLCPP_VERSION_GTE(32, 0, 0)
+  if (name == "cbg") return std::make_unique<rclcpp::executors::EventsCBGExecutor>(rclcpp::ExecutorOptions{}, 3);
+#else
   if (name == "static") return std::make_unique<rclcpp::executors::StaticSingleThreadedExecutor>();
+#endif
   if (name == "events") return std::make_unique<EventsExecutor>();
   if (name == "events-timers") return std::make_unique<EventsExecutor>(std::make_unique<SimpleEventsQueue>(), true);
-  return std::make_unique<rclcpp::executors::SingleThreadedExecutor>();
+  if (name == "single") return std::make_unique<rclcpp::executors::SingleThreadedExecutor>();
+  std::cerr << "this rclcpp has no executor " << name << std::endl;
+  std::exit(1);
 }
 
 int main(int argc, char** argv) {
   const auto words = rclcpp::init_and_remove_ros_arguments(argc, argv);
+  if (words[3] == "known") {
+    if (words[2] != "groups") executor_of(words[2]);
+    return 0;
+  }
   Notes notes{words[1]};
   const auto node = std::make_shared<Worker>(words, notes);
   std::vector<std::unique_ptr<rclcpp::Executor>> executors;

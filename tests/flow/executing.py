@@ -1,4 +1,7 @@
-"""The process of executing.cpp with rclpy: LOG single|multi line PERIOD_MS LEAST_MS MOST_MS HOW."""
+"""The process of executing.cpp with rclpy:
+
+LOG single|multi|events line PERIOD_MS LEAST_MS MOST_MS compute|sleep
+"""
 
 import random
 import sys
@@ -10,7 +13,12 @@ from pathlib import Path
 import rclpy
 from geometry_msgs.msg import PointStamped
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import (
+    Executor,
+    ExternalShutdownException,
+    MultiThreadedExecutor,
+    SingleThreadedExecutor,
+)
 from rclpy.node import Node
 
 
@@ -51,11 +59,19 @@ class Worker(Node):  # type: ignore[misc]
         self.notes.append((name, *at, time.monotonic_ns()))
 
 
+def executor_of(name: str) -> Executor:
+    if name == "events":  # Kilted and later
+        from rclpy.experimental import EventsExecutor
+
+        return EventsExecutor()
+    return MultiThreadedExecutor(4) if name == "multi" else SingleThreadedExecutor()
+
+
 def main() -> None:
     rclpy.init()
     words = rclpy.utilities.remove_ros_args(sys.argv)
     node = Worker(words)
-    executor = MultiThreadedExecutor(4) if words[2] == "multi" else SingleThreadedExecutor()
+    executor = executor_of(words[2])
     executor.add_node(node)
     with suppress(KeyboardInterrupt, ExternalShutdownException):
         executor.spin()

@@ -64,12 +64,25 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "executing"
 
 
+def refuse_missing(program: Path, language: str, executor: str) -> None:
+    """Skip a test of an executor that this distribution has not."""
+    module = "experimental" if executor == "events" else "executors"  # Kilted and later
+    words = {
+        "C++": [str(program), "/dev/null", executor, "known"],
+        "Python": ["python3", "-c", f"import rclpy.{module}"],
+    }[language]
+    run = subprocess.run(["env", *words], env=ros2_environment(), capture_output=True, check=False)
+    if run.returncode:
+        pytest.skip(f"this distribution has no executor {executor} of {language}")
+
+
 Ran: TypeAlias = Callable[..., tuple[Path, Any]]
 
 
 @pytest.fixture
 def ran(program: Path, tmp_path: Path) -> Ran:
     def ran(verb: str, language: str, words: str, *options: str) -> tuple[Path, Any]:
+        refuse_missing(program, language, words.split(maxsplit=1)[0])
         worker = tmp_path / "worker"
         worker.unlink(missing_ok=True)
         worker.write_text(f'#!/bin/sh\nexec python3 "{HERE / "executing.py"}" "$@"\n')
@@ -161,17 +174,21 @@ OUTPUTS = ("last", "left", "right")
         ("C++", "static preload", [1]),
         ("C++", "events preload", [2]),
         ("C++", "events-timers preload", [1, 1]),
+        ("C++", "cbg preload", [3]),
+        ("C++", "cbg lttng", [3]),
         ("C++", "groups preload", [1, 1, 1]),
         ("Python", "single preload", [1]),
         ("Python", "single lttng", [1]),
         ("Python", "multi preload", [5]),
+        ("Python", "events preload", [1]),
+        ("Python", "events lttng", [1]),
     ],
 )
 def test_traversals_and_threads_are_what_the_callbacks_say(
     ran: Ran, tmp_path: Path, language: str, executor_and_source: str, threads: list[int]
 ) -> None:
     executor, source = executor_and_source.split()
-    several = executor == "multi"
+    several = executor in {"multi", "cbg"}
     words = f"{executor} line 60 {30 if several else 5} {150 if several else 30} sleep"
     folder, _ = ran("record", language, words, "--source", source, "--duration", "8s")
     recording, names = open_recording(folder), ("timer", "work", "last")
@@ -200,7 +217,10 @@ def test_sets_that_several_threads_complete(ran: Ran, tmp_path: Path, first: str
 @pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
 @pytest.mark.parametrize(
     ("language", "executor", "threads"),
-    [("C++", "multi", 4), ("C++", "static", 1), ("C++", "events", 2), ("Python", "multi", 5)],
+    [
+        *(("C++", "multi", 4), ("C++", "static", 1), ("C++", "events", 2), ("C++", "cbg", 3)),
+        *(("Python", "multi", 5), ("Python", "events", 1)),
+    ],
 )
 def test_one_command_shapes_a_chain_on_this_executor(
     ran: Ran, tmp_path: Path, language: str, executor: str, threads: int

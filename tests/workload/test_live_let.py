@@ -7,7 +7,7 @@ import pytest
 from small_chain import DDS_CORE, EXECUTOR_CORE, PERIOD_NS, small_chain
 
 from chainshaper import plan_recording, run_application, simulate
-from chainshaper.flow.plan import shape_application
+from chainshaper.flow.described import shape_application
 from chainshaper.planning import PlanRequest
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML

@@ -70,7 +70,7 @@ def demo(
     Runs the paper's synthetic chain as real processes over real DDS topics, for about a minute and
     a half. Needs no ROS 2.
     """
-    from chainshaper.flow.demo import run_demo
+    from chainshaper.flow.described import run_demo
     from chainshaper.reporting.latency import comparison_json
     from chainshaper.reporting.overviews import callback_table, plan_table
 
@@ -103,7 +103,7 @@ def init(
 
     Edit its nodes, callbacks and execution times; `chainshaper run` and `simulate` take it.
     """
-    from chainshaper.flow.demo import synthetic_chain
+    from chainshaper.flow.described import synthetic_chain
     from chainshaper.values.files import new_file, write_whole
 
     write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])

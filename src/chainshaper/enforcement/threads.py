@@ -514,9 +514,10 @@ def scheduling_around(
     ``members`` are by server's name, and within a server in the ``order`` of their nodes, the most
     urgent first; others come behind these, and share a priority. ``receivers`` are nodes that
     receive an output, and the core for that: the processes of their executors, which stand below
-    all servers, are treated alike. With ``take_turns``, servers of one priority share it by turns.
-    DDS threads leave the cores of all servers or, where these are all that there are, those to be
-    ``clear``.
+    all servers, are treated alike. An executor that is real-time already, on cores of no server,
+    stays as it is: its other callbacks were placed there, too. With ``take_turns``, servers of one
+    priority share it by turns. DDS threads leave the cores of all servers or, where these are all
+    that there are, those to be ``clear``.
 
     Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
     InputError: see :func:`server_priorities`.
@@ -548,11 +549,13 @@ def scheduling_around(
         if one.thread.role == "executor" and one.thread.identity not in in_servers
         for core in [receivers[node] for node in one.nodes if node in receivers][:1]
     ]
-    planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
-    free_cores = tuple(sorted(set(available_cores) - {server.core for server in servers}))
-    free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
     receiving_pids = {one.thread.thread.pid for one in receiving}
-    concerned = set(planned.values())
+    busy = {server.core for server in servers}
+    receiving = [one for one in receiving if not _placed_already(one, busy)]
+    planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
+    free_cores = tuple(sorted(set(available_cores) - busy))
+    free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
+    concerned = set(planned.values()) | receiving_pids
     if any(one.thread.pid in concerned and is_of_zenoh(one.thread) for one in allocation.threads):
         concerned |= {one.thread.pid for one in allocation.threads if set(one.nodes) & ROUTERS}
     beside = (
@@ -566,6 +569,12 @@ def scheduling_around(
     return tuple(
         _below(one, wanted) if one.thread.thread.role == "publisher" else one for one in wanted
     )
+
+
+def _placed_already(one: WantedScheduling, busy: set[int]) -> bool:
+    """Whether a thread has a real-time priority, not the one that we would give, on other cores."""
+    thread = one.thread.thread
+    return thread.priority not in (0, one.wanted.priority) and busy.isdisjoint(thread.cores)
 
 
 def _beside(

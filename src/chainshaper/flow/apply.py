@@ -27,7 +27,7 @@ from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.freezer import Freezer, groups_of, run_of
-from chainshaper.enforcement.guardian import Guardians, put_back, run_claimed
+from chainshaper.enforcement.guardian import Guardians, put_back
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters
 from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
@@ -40,7 +40,6 @@ from chainshaper.linux.own_processes import end_command, end_in_words, start_com
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
-from chainshaper.linux.threads import list_threads
 from chainshaper.planning.application_plan import (
     ApplicationPlan,
     open_until_done,
@@ -49,14 +48,13 @@ from chainshaper.planning.application_plan import (
 )
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
-from chainshaper.planning.plan import Plan, Server, Thread, shaping_nodes
+from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, OperationError
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
-    from chainshaper.workload.live import Enforcement, StartedNodes
 
 
 START_NS = 30_000_000_000  # for a command to start all nodes of the plan
@@ -650,88 +648,3 @@ class _Run:
         if self.command is not None:
             end_command(self.command)
         put_back(self.journal, self.guardians, problems)
-
-
-def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
-    """The servers without which a plan does not work, and whom they have to gate: asynchronous
-    publishers, and the stages of a pipeline, which would run beside the instance before.
-    """
-    gates = {node.thread for node in plan.shaping_nodes}
-    pipelines = [chain for chain in plan.chains if chain.policy == "pipelined"]
-    staged = {one for chain in pipelines for server in chain.servers for one in server.threads}
-    return [
-        (server, own)
-        for server in open_until_done(plan).servers
-        if gates.isdisjoint(server.threads)
-        if (own := [one for one in server.threads if one.role == "publisher" or one in staged])
-    ]
-
-
-@contextlib.contextmanager
-def threads_gated(plan: ApplicationPlan, nodes: "StartedNodes") -> Iterator[None]:
-    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only (paper,
-    section 3.2.1, design 1).
-
-    Raises PlatformError: threads cannot be frozen here. OperationError: another run governs one of
-    the cores or nodes, a node has no such thread, or the servers failed meanwhile.
-    """
-    choice = choose_back_end("freezer")  # the others want threads of the fair class
-    planned = gated_threads(plan)
-    table = threads.table_of(plan.cycle_ns, (server for server, _ in planned))
-    cores = {server.core for server, _ in planned}
-    with run_claimed(cores, {one.node for _, own in planned for one in own}) as journal:
-        servers = make_back_end(choice.name, table, journal)
-        try:
-            for server, one in ((server, one) for server, own in planned for one in own):
-                for tid in _threads_of(one, nodes):
-                    servers.assign(tid, server.name)
-            servers.arm(nodes.start_ns if plan.moves_timers else nodes.anchor_ns)
-            yield
-            failure = servers.failure()
-        finally:
-            servers.release()
-    if failure is not None:
-        raise OperationError(f"the servers failed while the application ran: {failure}")
-
-
-@contextlib.contextmanager
-def slots_followed(
-    plan: ApplicationPlan,
-    reaches_ns: Mapping[int, tuple[int, int]],
-    enforcement: "Enforcement | None",
-    nodes: "StartedNodes",
-) -> Iterator[None]:
-    """Inside, slots of the live workload's gates follow its latencies, within their reach, beside
-    ``enforcement``. Raises what that does; OperationError: one does not follow to the end.
-    """
-    anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
-
-    def from_when(chain: Plan, _: int) -> int:
-        since = time.monotonic_ns() + 2 * chain.cycle_ns
-        return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
-
-    with contextlib.ExitStack() as until:
-        if enforcement is not None:
-            until.enter_context(enforcement(nodes))
-        followers = []
-        for place, reach_ns in reaches_ns.items():
-            chain, pids = plan.chains[place], nodes.pids.values()
-            followers.append(SlotFollower(chain, pids, reach_ns, partial(from_when, chain)))
-            until.callback(followers[-1].end)
-        yield
-    for follower in followers:
-        if follower.failure is not None:
-            raise follower.failure
-
-
-def _threads_of(wanted: Thread, nodes: "StartedNodes") -> list[int]:
-    pid = nodes.pids.get(wanted.node)
-    found = [t.tid for t in list_threads(pid) if t.role == wanted.role] if pid is not None else []
-    if not found and wanted.role == "executor":
-        raise OperationError(f"{wanted.node} of the plan is no node of the application")
-    if not found:
-        raise OperationError(
-            f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
-            "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
-        )
-    return found

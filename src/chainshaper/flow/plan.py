@@ -24,11 +24,8 @@ from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.margins import read_latencies
-from chainshaper.planning.plan_file import plan_values
 from chainshaper.planning.request import DEFAULT_CORE
-from chainshaper.splicing.application import splice_application
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import duration_text
@@ -37,7 +34,7 @@ from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import chain_of, longest_stall, opened
 from chainshaper.workload.description import Application, node_name
-from chainshaper.workload.live import Enforcement, Progress, run_application, timing_of
+from chainshaper.workload.live import timing_of
 
 DEFAULT_PRIORITY = 80
 _STANDARD = PlanRequest()
@@ -556,48 +553,3 @@ def plan_recording(
     wanted = (chain, *sinks)
     profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
     return plan_chain(profile, request, further)
-
-
-def shape_application(
-    application: Application,
-    plan: Plan | ApplicationPlan,
-    output: str | Path,
-    *,
-    cycles: int = 320,
-    realtime: bool | None = None,
-    enforcement: Enforcement | None = None,
-    adapt: bool = False,
-    max_latency_ns: int | None = None,
-    command: Sequence[str] = (),
-    progress: Progress = lambda *_: None,
-) -> Recording:
-    """Splice the plan's shaping nodes into an application, run it and record it.
-
-    ``enforcement`` puts the plan's servers in force while it runs; without, the thread of an
-    asynchronous publisher and the stages of a pipeline are gated. With ``adapt`` slots follow the
-    latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
-
-    Raises InputError: the plan does not fit the application, or no slot can follow; PlatformError:
-    threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
-    """
-    joint = whole(plan)
-    if enforcement is None:
-        from chainshaper.flow.apply import gated_threads, threads_gated
-
-        enforcement = partial(threads_gated, joint) if gated_threads(joint) else None
-    if adapt:
-        from chainshaper.flow.apply import slots_followed
-        from chainshaper.flow.threads import followed_chains
-
-        joint, reaches_ns, _ = followed_chains(joint, "fifo", max_latency_ns)
-        enforcement = partial(slots_followed, joint, reaches_ns, enforcement)
-    return run_application(
-        splice_application(application, joint),
-        output,
-        cycles=cycles,
-        realtime=realtime,
-        plan=plan_values(joint),
-        enforcement=enforcement,
-        command=command,
-        progress=progress,
-    )

@@ -1,0 +1,239 @@
+"""A described application, live: shaped by a plan, and the demonstration, which is the whole flow.
+
+The demonstration leaves everything in one folder:
+
+DIR/application.yaml        what ran
+DIR/before, DIR/after       the recordings of the unshaped and of the shaped run
+DIR/plan.yaml               what was planned from the former
+DIR/latency.png, …          latency of every cycle, and their distributions with the publish slot
+DIR/comparison.json         every figure of the printed table
+"""
+
+import contextlib
+import shutil
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import polars as pl
+
+from chainshaper.analysis import callback_statistics, data_flow
+from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
+from chainshaper.enforcement.guardian import run_claimed
+from chainshaper.flow.drift import SlotFollower
+from chainshaper.flow.plan import plan_recording
+from chainshaper.flow.threads import followed_chains, table_of
+from chainshaper.linux.threads import list_threads
+from chainshaper.planning import Plan, PlanRequest, save_plan
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
+from chainshaper.planning.plan import Server, Thread
+from chainshaper.planning.plan_file import plan_values
+from chainshaper.reporting.figures import write_comparison
+from chainshaper.splicing.application import splice_application
+from chainshaper.values.errors import OperationError
+from chainshaper.values.recording import Recording, refuse_existing
+from chainshaper.verify.measure import Comparison, compare_recordings
+from chainshaper.workload.description import Application, load_application
+from chainshaper.workload.live import Enforcement, Progress, StartedNodes, run_application
+
+_STANDARD = PlanRequest()
+
+
+def shape_application(
+    application: Application,
+    plan: Plan | ApplicationPlan,
+    output: str | Path,
+    *,
+    cycles: int = 320,
+    realtime: bool | None = None,
+    enforcement: Enforcement | None = None,
+    adapt: bool = False,
+    max_latency_ns: int | None = None,
+    command: Sequence[str] = (),
+    progress: Progress = lambda *_: None,
+) -> Recording:
+    """Splice the plan's shaping nodes into an application, run it and record it.
+
+    ``enforcement`` puts the plan's servers in force while it runs; without, the thread of an
+    asynchronous publisher and the stages of a pipeline are gated. With ``adapt`` slots follow the
+    latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
+
+    Raises InputError: the plan does not fit the application, or no slot can follow; PlatformError:
+    threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
+    """
+    joint = whole(plan)
+    if enforcement is None:
+        enforcement = partial(threads_gated, joint) if gated_threads(joint) else None
+    if adapt:
+        joint, reaches_ns, _ = followed_chains(joint, "fifo", max_latency_ns)
+        enforcement = partial(slots_followed, joint, reaches_ns, enforcement)
+    return run_application(
+        splice_application(application, joint),
+        output,
+        cycles=cycles,
+        realtime=realtime,
+        plan=plan_values(joint),
+        enforcement=enforcement,
+        command=command,
+        progress=progress,
+    )
+
+
+def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
+    """The servers without which a plan does not work, and whom they have to gate: asynchronous
+    publishers, and the stages of a pipeline, which would run beside the instance before.
+    """
+    gates = {node.thread for node in plan.shaping_nodes}
+    pipelines = [chain for chain in plan.chains if chain.policy == "pipelined"]
+    staged = {one for chain in pipelines for server in chain.servers for one in server.threads}
+    return [
+        (server, own)
+        for server in open_until_done(plan).servers
+        if gates.isdisjoint(server.threads)
+        if (own := [one for one in server.threads if one.role == "publisher" or one in staged])
+    ]
+
+
+@contextlib.contextmanager
+def threads_gated(plan: ApplicationPlan, nodes: StartedNodes) -> Iterator[None]:
+    """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only (paper,
+    section 3.2.1, design 1).
+
+    Raises PlatformError: threads cannot be frozen here. OperationError: another run governs one of
+    the cores or nodes, a node has no such thread, or the servers failed meanwhile.
+    """
+    choice = choose_back_end("freezer")  # the others want threads of the fair class
+    planned = gated_threads(plan)
+    table = table_of(plan.cycle_ns, (server for server, _ in planned))
+    cores = {server.core for server, _ in planned}
+    with run_claimed(cores, {one.node for _, own in planned for one in own}) as journal:
+        servers = make_back_end(choice.name, table, journal)
+        try:
+            for server, one in ((server, one) for server, own in planned for one in own):
+                for tid in _threads_of(one, nodes):
+                    servers.assign(tid, server.name)
+            servers.arm(nodes.start_ns if plan.moves_timers else nodes.anchor_ns)
+            yield
+            failure = servers.failure()
+        finally:
+            servers.release()
+    if failure is not None:
+        raise OperationError(f"the servers failed while the application ran: {failure}")
+
+
+@contextlib.contextmanager
+def slots_followed(
+    plan: ApplicationPlan,
+    reaches_ns: Mapping[int, tuple[int, int]],
+    enforcement: Enforcement | None,
+    nodes: StartedNodes,
+) -> Iterator[None]:
+    """Inside, slots of the live workload's gates follow its latencies, within their reach, beside
+    ``enforcement``. Raises what that does; OperationError: one does not follow to the end.
+    """
+    anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
+
+    def from_when(chain: Plan, _: int) -> int:
+        since = time.monotonic_ns() + 2 * chain.cycle_ns
+        return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
+
+    with contextlib.ExitStack() as until:
+        if enforcement is not None:
+            until.enter_context(enforcement(nodes))
+        followers = []
+        for place, reach_ns in reaches_ns.items():
+            chain, pids = plan.chains[place], nodes.pids.values()
+            followers.append(SlotFollower(chain, pids, reach_ns, partial(from_when, chain)))
+            until.callback(followers[-1].end)
+        yield
+    for follower in followers:
+        if follower.failure is not None:
+            raise follower.failure
+
+
+def _threads_of(wanted: Thread, nodes: StartedNodes) -> list[int]:
+    pid = nodes.pids.get(wanted.node)
+    found = [t.tid for t in list_threads(pid) if t.role == wanted.role] if pid is not None else []
+    if not found and wanted.role == "executor":
+        raise OperationError(f"{wanted.node} of the plan is no node of the application")
+    if not found:
+        raise OperationError(
+            f"{wanted.node} has no thread that publishes for it: let it publish asynchronously "
+            "(`publication: asynchronous` under `topics`), or plan with --publication synchronous"
+        )
+    return found
+
+
+@dataclass(frozen=True)
+class DemoResult:
+    """What the demonstration found; all of it can be recomputed from ``folder``."""
+
+    folder: Path
+    callbacks: pl.DataFrame
+    plan: Plan
+    comparison: Comparison
+    notes: tuple[str, ...]
+
+
+def synthetic_chain() -> Path:
+    """The description of the paper's synthetic chain (section 2.5)."""
+    return Path(str(resources.files("chainshaper") / "examples" / "synthetic_chain.yaml"))
+
+
+def run_demo(
+    folder: str | Path,
+    *,
+    application: str | Path | None = None,
+    cycles: int = 320,
+    request: PlanRequest = _STANDARD,
+    realtime: bool | None = None,
+    command: Sequence[str] = (),
+    planned: Callable[[Plan], None] = lambda _: None,
+    progress: Progress = lambda *_: None,
+) -> DemoResult:
+    """Run an application, plan, shape, run again and compare.
+
+    Raises InputError: ``folder`` exists and is not empty, or the application is not right.
+    PlatformError, OperationError: a step failed; complete recordings stay, without one nothing.
+    """
+    folder = refuse_existing(folder)
+    path = synthetic_chain() if application is None else Path(application)
+    description = load_application(path)
+    how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, "command": command}
+
+    def part(start: float, title: str) -> Progress:
+        return lambda done, what: progress(start + 0.48 * done, f"{title}, {what}")
+
+    made, copy = not folder.exists(), folder / "application.yaml"
+    report = part(0.0, "unshaped run")
+    try:
+        folder.mkdir(exist_ok=True)
+        shutil.copyfile(path, copy)
+        before = run_application(description, folder / "before", progress=report, **how)
+    except OSError as error:
+        raise OperationError(f"{folder}: cannot be written: {error}") from error
+    finally:
+        if not (folder / "before").exists():  # nothing came to stand beside it
+            copy.unlink(missing_ok=True)
+            if made and folder.exists():
+                folder.rmdir()
+    progress(0.48, "planning")
+    plan = plan_recording(before, request=request)
+    save_plan(plan, folder / "plan.yaml")
+    planned(plan)
+    report = part(0.5, "shaped run")
+    after = shape_application(description, plan, folder / "after", progress=report, **how)
+    progress(0.98, "comparing")
+    comparison = compare_recordings([before, after])
+    write_comparison(comparison, folder)
+    return DemoResult(
+        folder=folder,
+        callbacks=callback_statistics(data_flow(before.events, before.info.clock_offset_ns)),
+        plan=plan,
+        comparison=comparison,
+        notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes])),
+    )
