@@ -30,6 +30,10 @@ class ExternalShutdownException(Exception):  # noqa: N818 - upstream's name
     """The process is to stop."""
 
 
+def get_rmw_implementation_identifier() -> str:
+    return os.environ.get("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
+
+
 class QoSHistoryPolicy(IntEnum):
     SYSTEM_DEFAULT, KEEP_LAST, KEEP_ALL, UNKNOWN = range(4)
 
@@ -291,7 +295,7 @@ class Node:
 
 for _name in (
     *("rclpy." + part for part in ("clock", "executors", "node", "parameter", "qos")),
-    *("rclpy.subscription", "rcl_interfaces", "rcl_interfaces.msg"),
+    *("rclpy.subscription", "rclpy.utilities", "rcl_interfaces", "rcl_interfaces.msg"),
     *("std_msgs", "std_msgs.msg", "sensor_msgs", "sensor_msgs.msg"),
     *("diagnostic_msgs", "diagnostic_msgs.msg"),
 ):

@@ -117,6 +117,24 @@ def test_the_parameters_say_what_the_plan_says(
     assert parameters_of(elsewhere)["handover"] != same["handover"]
 
 
+@pytest.mark.parametrize(
+    ("humble", "rmw", "cleared"),
+    [("1", "rmw_fastrtps_cpp", 0), ("", "rmw_fastrtps_cpp", 1), ("1", "rmw_cyclonedds_cpp", 1)],
+)
+def test_a_core_is_cleared_for_delivering_threads_that_have_names(
+    tmp_path: Path, plan: Plan, humble: str, rmw: str, cleared: int
+) -> None:
+    """Others have no priority there, and would wait too."""
+    process = write_shaping_process(plan, known(plan.shaping_node), "python", tmp_path)
+    parameters_of(process, server_cores=[100_000])
+    environment = {"STAND_IN_HUMBLE": humble, "RMW_IMPLEMENTATION": rmw}
+    with running_node(process, tmp_path, environment=environment) as run:
+        pid = run.process.pid
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        commands = [Path(f"/proc/{child}/cmdline").read_text() for child in children]
+    assert sum("def _clear(" in command for command in commands) == cleared
+
+
 def test_every_parameter_is_documented() -> None:
     text = (Path(__file__).parents[2] / "docs" / "shaping_node.md").read_text()
     throttled = {"inputs", "outputs", "period_ns"}
@@ -244,7 +262,7 @@ def test_messages_leave_unchanged_inside_their_slot(tmp_path: Path, plan: Plan) 
 def test_every_release_is_rehearsed_twice_where_there_is_time(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    parts = ("clock", "executors", "node", "parameter", "qos", "subscription")
+    parts = ("clock", "executors", "node", "parameter", "qos", "subscription", "utilities")
     messages = ("rcl_interfaces", "rcl_interfaces.msg", "std_msgs", "std_msgs.msg")
     for module in ("rclpy", *(f"rclpy.{part}" for part in parts), *messages):
         monkeypatch.setitem(sys.modules, module, MagicMock())

@@ -33,6 +33,7 @@ from rclpy.qos import (
     QoSReliabilityPolicy,
 )
 from rclpy.subscription import Subscription
+from rclpy.utilities import get_rmw_implementation_identifier
 
 from chainshaper.gate.clear_core import started_beside
 from chainshaper.gate.decision import DEPTH, LOG_COLUMNS, READER_DEPTH, NodeParameters, Outcome
@@ -48,6 +49,11 @@ def parameters_of(node: Node) -> NodeParameters:
         for name, usual in vars(NodeParameters()).items()
     }
     return NodeParameters(**known)
+
+
+def threads_have_names() -> bool:
+    """Whether `apply` knows the threads that deliver. Fast DDS names them from 2.13 on (Jazzy)."""
+    return not (HUMBLE and get_rmw_implementation_identifier().startswith("rmw_fastrtps"))
 
 
 def wait(seconds: float) -> None:

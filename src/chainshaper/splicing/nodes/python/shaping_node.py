@@ -33,6 +33,7 @@ from chainshaper.splicing.nodes.python.node import (
     room_of,
     run,
     take_event,
+    threads_have_names,
     wait,
     wait_for_publisher,
 )
@@ -144,8 +145,9 @@ class Shaping:
         self._log = GateLog(node)
         self._pause_ns = parameters.pause_ns
         # DDS threads deliver the output on the first core that is ours to use and has no server;
-        # where the plan leaves receivers alone it does not name its servers' cores.
-        taken = set(parameters.server_cores)
+        # where the plan leaves receivers alone it does not name its servers' cores. Threads without
+        # names have no priority there, and would wait until it is clear no more.
+        taken = set(parameters.server_cores) if threads_have_names() else None
         core = min(os.sched_getaffinity(0) - taken, default=None) if taken else None
         self._readiness = Readiness(node, core, self._pause_ns)
         parameters.gate()  # one that makes no sense is refused before its input is there

@@ -16,6 +16,7 @@
 #include "chainshaper_shaping/handover.hpp"
 #include "chainshaper_shaping/readiness.hpp"
 #include "rcl/subscription.h"
+#include "rmw/rmw.h"
 #include "std_msgs/msg/string.hpp"
 
 #if __has_include("message.hpp")
@@ -148,8 +149,13 @@ namespace {
 
 using namespace chainshaper;  // NOLINT
 
-// Where DDS threads deliver the output: the first core that is ours to use and has no server.
+// Where DDS threads deliver the output: the first core that is ours to use and has no server. Those
+// of Fast DDS on Humble have no names, so no priority, and would wait while the core is cleared.
 Maybe delivery_core(const std::vector<std::int64_t> & taken) {
+#if !RCLCPP_VERSION_GTE(17, 0, 0)  // Humble
+  if (std::strncmp(rmw_get_implementation_identifier(), "rmw_fastrtps", 12) == 0)
+    return std::nullopt;
+#endif
   cpu_set_t ours;
   if (taken.empty() || sched_getaffinity(0, sizeof(ours), &ours) != 0) return std::nullopt;
   for (std::int64_t core = 0; core < CPU_SETSIZE; ++core)
