@@ -2,14 +2,18 @@
 
 import os
 import shlex
+import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 
 import pytest
 from actors import acting
 from hypothesis import given
 from hypothesis import strategies as st
 from known import known
+from processes import wait_for
 
 from chainshaper.linux.processes import (
     descendants,
@@ -169,6 +173,36 @@ def test_middleware_that_is_known_in_part_is_named(
         process = known(read_process(actor.pid))
     assert middleware_limit(replace(process, participates=True)) == limit
     assert process.participates is (limit != "unnamed" and bool(names))
+
+
+def test_threads_of_fast_dds_that_have_no_names_are_known_by_what_they_wait_for(
+    tmp_path: Path,
+) -> None:
+    """Those that receive, and none of the program's own that waits for a datagram too."""
+    source, library = Path(__file__).with_name("unnamed_receivers.cpp"), tmp_path / "libfastrtps.so"
+    build = [known(shutil.which("g++")), "-std=c++17", "-O1", "-fPIC", str(source)]
+    subprocess.run([*build, "-DLIBRARY", "-shared", "-o", str(library)], check=True)
+    program = [*build, str(library), f"-Wl,-rpath,{tmp_path}", "-o", str(tmp_path / "program")]
+    subprocess.run(program, check=True)
+    with NamedTemporaryFile(dir="/dev/shm", prefix="fastrtps_port") as port:
+        port.write(bytes(4096))
+        port.flush()
+        child = subprocess.Popen([tmp_path / "program", port.name], stdout=subprocess.PIPE)
+        try:
+            said = dict(known(child.stdout).readline().split() for _ in range(4))
+            receiving = {int(said[b"datagrams"]), int(said[b"port"])}
+            wait_for(lambda: _receiving(child.pid) == receiving, "its threads to wait")
+            process = known(read_process(child.pid))
+        finally:
+            child.kill()
+            child.communicate()
+    assert process.participates
+    assert middleware_limit(process) == "unnamed"
+
+
+def _receiving(pid: int) -> set[int]:
+    threads = known(read_process(pid)).threads
+    return {one.tid for one in threads if (one.role, one.kind) == ("dds", "receive")}
 
 
 def test_a_forked_helper_takes_no_part_whatever_its_command_line_says(tmp_path: Path) -> None:

@@ -23,6 +23,7 @@ from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, dat
 from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
+from chainshaper.linux.threads import dds_kind
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.margins import read_latencies
 from chainshaper.planning.request import DEFAULT_CORE
@@ -498,11 +499,13 @@ def _writer(recording: Recording, flow: DataFlow, node: str, topic: str) -> dict
     depths = created.join(writers, on=["pid", "publisher_handle"])["queue_depth"]
     threads = recording.info.threads
     pids = {thread.pid for thread in threads if thread.node == node}
-    roles = {thread.role for thread in threads if thread.pid in pids}
+    own_threads = [thread for thread in threads if thread.pid in pids]
+    roles = {thread.role for thread in own_threads}
+    have_names = any(dds_kind(thread.comm) is not None for thread in own_threads)
     sends_itself = False if recording.info.rmw == "rmw_cyclonedds_cpp" else None
     return {
         "longest_publication_ns": _longest_calm(flow, sent),
-        "asynchronous": "publisher" in roles if "dds" in roles else sends_itself,
+        "asynchronous": "publisher" in roles if have_names else sends_itself,
         "intra_process": True if handed.height else None,
         "output_depth": depths.filter(depths > 0).min(),
     }

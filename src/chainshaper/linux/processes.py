@@ -22,12 +22,14 @@ from pathlib import PurePath
 
 from chainshaper.linux.threads import (
     Thread,
+    dds_kind,
     innermost_id,
     is_of_zenoh,
     list_threads,
     parents,
     read_proc,
     status_field,
+    with_unnamed_receivers,
 )
 from chainshaper.values.errors import InputError
 
@@ -39,8 +41,9 @@ _RULE = re.compile(
 _WITH_VALUE = frozenset(
     ("-p", "--param", "--params-file", "--log-level", "--log-config-file", "--log-file-name")
 ) | frozenset(("-e", "--enclave"))
+_FAST_DDS = b"/libfastrtps.so"
 _LIBRARIES_WITHOUT_NAMED_THREADS = (
-    b"/libfastrtps.so",
+    _FAST_DDS,
     b"/libfastdds.so",
     b"/libnddscore.so",
     b"/libgurumdds.so",
@@ -56,8 +59,9 @@ MIDDLEWARE_LIMITS = {
     "connext": f"RTI Connext: its {_FROM_SOURCES.format('manual')}",
     "iceoryx": f"Cyclone DDS with iceoryx: its {_FROM_SOURCES.format('sources')}; the thread that"
     " delivers has no name, and stays as it is",
-    "unnamed": "the middleware's threads have no names (Fast DDS before 2.13, GurumDDS): those that"
-    " deliver stay as they are, and may wait for a chain on the same core",
+    "unnamed": "the middleware's threads have no names (Fast DDS before 2.13, GurumDDS): Fast DDS's"
+    " that receive are known by what they wait for; others stay as they are, and may wait for a"
+    " chain on the same core",
 }
 """What is limited on a middleware, in a line; what is not here was run."""
 
@@ -161,7 +165,7 @@ def read_process(pid: int) -> Process | None:
             if not command:
                 return None
             status = read_proc("status", folder)
-            threads = list_threads(pid)
+            participates, threads = _participation(pid, list_threads(pid))
             # It is the same process still, and the same user's: its id is no other's by now.
             if not threads or user_in(folder) != user:
                 return None
@@ -172,7 +176,7 @@ def read_process(pid: int) -> Process | None:
         parent=status_field(status, "PPid")[0],
         command=tuple(command.rstrip(b"\0").decode(errors="replace").split("\0")),
         inner_pid=innermost_id(status) or pid,
-        participates=_participates(pid, threads),
+        participates=participates,
         threads=threads,
         user=user,
     )
@@ -192,14 +196,17 @@ def find_applications(processes: Iterable[Process]) -> tuple[Process, ...]:
     return tuple(one for one in processes if one.participates or takes_ros_arguments(one.command))
 
 
-def _participates(pid: int, threads: tuple[Thread, ...]) -> bool:
+def _participation(pid: int, threads: tuple[Thread, ...]) -> tuple[bool, tuple[Thread, ...]]:
+    """Whether a process takes part in DDS, and its threads with what they do there."""
     if any(thread.kind in ("receive", "event") for thread in threads):
-        return True
+        return True, threads
     if len(threads) > 1:
         with suppress(OSError):  # another user's: its threads' names are all there is to see
             mapped = read_proc(f"/proc/{pid}/maps")
-            return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS)
-    return False
+            if _FAST_DDS in mapped:
+                threads = with_unnamed_receivers(threads, mapped)
+            return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS), threads
+    return False, threads
 
 
 def middleware_limit(process: Process) -> str | None:
@@ -211,7 +218,7 @@ def middleware_limit(process: Process) -> str | None:
         return "zenoh"
     if any(one.comm == _OF_ICEORYX for one in others):
         return "iceoryx"
-    named = {one.comm[:3] for one in others if one.kind is not None}
+    named = {one.comm[:3] for one in others if dds_kind(one.comm) is not None}
     if named & {"rCo", "rTr"}:
         return "connext"
     return None if named else "unnamed"
