@@ -8,13 +8,22 @@ from typing import Any
 import numpy as np
 import polars as pl
 import pytest
+from known import known
 from reference_traces import DATA
 from story import OFFSET, Callback, Publisher, Story
 
 from chainshaper.flow.plan import plan_recording, profile_chains
-from chainshaper.planning import Plan, PlanRequest, Profile, band_choice, plan_chain, plan_warnings
+from chainshaper.planning import (
+    CallbackTimes,
+    Plan,
+    PlanRequest,
+    Profile,
+    band_choice,
+    plan_chain,
+    plan_warnings,
+)
 from chainshaper.planning.margins import late_share
-from chainshaper.planning.profile import deciding_cycles
+from chainshaper.planning.profile import deciding_cycles, other_beginnings
 from chainshaper.planning.request import on_cores
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
@@ -371,6 +380,21 @@ def test_few_cycles_that_decide_are_named_and_how_to_leave_them_out(
     assert plan.servers[0].slots[0][1] < 32 * MS
     assert plan.evidence.max_of_all_ns == 130 * MS, "what is late stays known"
     assert late_share(profile.every, 32 * MS) == plan.margin.overrun_probability
+
+
+def test_who_begins_what_the_chain_waits_for_is_named() -> None:
+    """Front and rear each have a timer; the fusion waits for both."""
+    sequence = (("/front", (), "/a"), ("/rear", (), "/b"), ("/fusion", (0, 1), "/c"))
+    times = tuple(
+        CallbackTimes(node, 1, MS, MS, MS, after, topic) for node, after, topic in sequence
+    )
+    names: dict[str, Any] = {"nodes": ("/front", "/fusion"), "topics": ("/a", "/c")}
+    profile = Profile(np.array([10, 11]) * MS, 100 * MS, spec="/a../c", callbacks=times, **names)
+    said = known(other_beginnings(profile))
+    assert said.startswith("/a../c waits for what /rear begins, at another time beside /front")
+    alone = (times[0], replace(times[2], after=(0,)))
+    assert other_beginnings(replace(profile, callbacks=alone)) is None
+    assert other_beginnings(Profile(np.array([10, 11]) * MS, 100 * MS)) is None
 
 
 def test_many_long_cycles_are_no_outliers() -> None:

@@ -45,6 +45,7 @@ from chainshaper.planning import (
     save_application_plan,
 )
 from chainshaper.planning.application_plan import whole
+from chainshaper.planning.profile import other_beginnings
 from chainshaper.planning.request import (
     refuse_contradictions,
     refuse_entangled,
@@ -260,9 +261,11 @@ def _planned(
     """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
     if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
+    doubts = [*filter(None, map(other_beginnings, profiles[:chains]))]
     if chains > 1:
-        return plan_application(profiles, request)
-    return whole(plan_chain(profiles[0], request, profiles[1:])), []
+        plan, remarks = plan_application(profiles, request)
+        return plan, remarks + doubts
+    return whole(plan_chain(profiles[0], request, profiles[1:])), doubts
 
 
 def _chosen(first: Recording, choose: Choose | None) -> str:

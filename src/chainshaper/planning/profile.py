@@ -159,6 +159,21 @@ def up_to(profile: Profile, percentile: float) -> Profile:
     return replace(profile.chosen(latencies <= np.sort(latencies)[fit - 1]), of_modes=of_modes)
 
 
+def other_beginnings(profile: Profile) -> str | None:
+    """Who begins, beside the chain's first callback, what the chain waits for, if anybody does."""
+    first = (*profile.nodes[:1], *profile.topics[:1])
+    begin = dict.fromkeys(one.node for one in profile.callbacks if not one.after)
+    own = {one.node for one in profile.callbacks if (one.node, one.publishes) == first}
+    if not own or not (others := [node for node in begin if node not in own]):
+        return None
+    return (
+        f"{profile.name} waits for what {' and '.join(others)} begin{'s' * (len(others) == 1)}, at"
+        f" another time beside {profile.nodes[0]} after every start of the application unless they"
+        " are started together, and its latency is another then: measure it after other starts too,"
+        " or let slots follow (--adapt)"
+    )
+
+
 def deciding_cycles(profile: Profile) -> str | None:
     """Which few cycles decide the longest latency, the likely cause, and what leaves them out.
 
