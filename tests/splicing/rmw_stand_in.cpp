@@ -223,8 +223,9 @@ const void * rosidl_typesupport_c__get_message_type_support_handle__std_msgs__ms
 
 #define TRACED(name) \
   extern "C" void ros_trace_##name(std::uintptr_t a, std::uintptr_t b, std::uintptr_t c) { \
-    line("trace " #name " %llx %llx %lld\n", static_cast<unsigned long long>(a), \
-         static_cast<unsigned long long>(b), static_cast<long long>(c)); \
+    line("trace " #name " %llx %llx %lld %lld\n", static_cast<unsigned long long>(a), \
+         static_cast<unsigned long long>(b), static_cast<long long>(c), \
+         static_cast<long long>(now(CLOCK_REALTIME))); \
   }
 TRACED(rcl_node_init)
 TRACED(rcl_subscription_init)

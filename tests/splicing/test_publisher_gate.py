@@ -243,6 +243,20 @@ def test_tracers_see_a_node_behind_the_publisher_which_waits_for_nothing(
     ]
 
 
+def test_on_humble_a_message_is_stamped_behind_the_event_of_its_publication(
+    run: Callable[..., Run],
+) -> None:
+    """Its publication is the last one before its stamp: events of publications have none there."""
+    times = [n * 100 * MS + 20 * MS for n in range(4)]
+    lines = [at(ns, stamp=ns - 20 * MS) for ns in times]
+    done = run({"/t5": SLOT}, lines, ROS_DISTRO="humble")
+    of_input = done.of("trace", "rmw_publish")[::2]  # each waits for its slot, and goes on then
+    stamps = [row["source_timestamp"] for row in done.logs["/t5"]]
+    assert len(of_input) == 4
+    for event, stamp in zip(of_input, stamps, strict=True):
+        assert 0 < stamp - int(event[5]) < 20 * MS
+
+
 def test_a_message_that_is_serialized_already_waits_like_any_other(run: Callable[..., Run]) -> None:
     done = run({"/t5": SLOT}, [at(20 * MS, stamp=0, what="serialized"), at(30 * MS, stamp=0)])
     assert done.written() == [0, 1]

@@ -184,8 +184,11 @@ public:
   template <typename Fill>
   int take(const void * ros_message, Fill fill) {
     auto message = std::make_unique<Serialized>();
+    // Where the event has no stamp, a message's publication is the last one before its stamp.
+    const bool first = is_humble();
+    if (first) emit_write(&rmw_input_, ros_message, 0);
     message->stamp = next_stamp();
-    emit_write(&rmw_input_, ros_message, message->stamp);
+    if (!first) emit_write(&rmw_input_, ros_message, message->stamp);
     if (const int failed = fill(message->bytes)) return failed;
     Serialized * const own = message.release();
     own->next = arrived_.load(std::memory_order_relaxed);
