@@ -24,12 +24,15 @@ def spans(trace: ReferenceTrace, tables: EventTables, chain: str) -> list[Any]:
     ]
 
 
+@pytest.mark.parametrize("earlier_ns", [50, -1000])
 @pytest.mark.parametrize(("name", "chain"), CHAINS)
-def test_as_humble_without_handles_and_timestamps(name: str, chain: str) -> None:
-    """Humble's `rmw_publish` comes just before the message gets its timestamp."""
+def test_as_humble_without_handles_and_timestamps(name: str, chain: str, earlier_ns: int) -> None:
+    """Humble's `rmw_publish` comes just before the message gets its timestamp, by clocks whose
+    distance is known to a microsecond or so.
+    """
     trace = reference_trace(name)
     published = trace.tables["rmw_publish"]
-    before = published["timestamp"] - trace.clock_offset_ns - 50
+    before = published["timestamp"] - trace.clock_offset_ns - earlier_ns
     humble = published.drop("timestamp", "rmw_publisher_handle").with_columns(time=before)
     found = spans(trace, {**trace.tables, "rmw_publish": humble.sort("time")}, chain)
     truth = trace.truth["chain"]["start_and_end_ns"]

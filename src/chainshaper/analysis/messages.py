@@ -43,6 +43,8 @@ _CALLS = {"rmw_send_request": "client", "rmw_take_request": "service"}
 _CALLS |= {"rmw_send_response": "service", "rmw_take_response": "client"}
 _CALL_BITS = 40
 _GID = 16  # bytes that mean anything
+_CLOCKS_AGREE = 2_000
+"""So far apart (ns) the clocks of events and stamps may be; no writer publishes twice meanwhile."""
 
 
 def service_calls(
@@ -274,7 +276,9 @@ def link_takes(
     stampless = published.filter(pl.col("source_timestamp").is_null() & ~through_buffer)
     if stampless.height:
         stampless = stampless.select("topic", guess="publication", published="time")
-        rows = linked.with_columns(sent=pl.col("source_timestamp") - clock_offset_ns)
+        rows = linked.with_columns(
+            sent=pl.col("source_timestamp") - clock_offset_ns + _CLOCKS_AGREE
+        )
         rows = latest_before(rows, stampless, ["topic"], "sent", "published")
         # A subscription gets a message once: a second take of it read one whose events were lost.
         again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
