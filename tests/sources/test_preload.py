@@ -276,6 +276,13 @@ int rmw_take_response(const void *c, struct info *info, void *r, bool *taken)
     info->sent = 5678, info->number = 43, *taken = true;
     return 0;
 }
+void ros_trace_rmw_take(const void *s, const void *m, int64_t sent, bool taken);
+int rmw_take_with_info(const void *s, void *message, bool *taken, int64_t *info, void *allocation)
+{
+    *info = 77, *taken = message != 0;
+    if (s == (void *)1) ros_trace_rmw_take(s, message, *info, *taken);
+    return s == (void *)3;
+}
 """
 """An rmw that stands behind the library: what fails, and what takes nothing, is no call."""
 CALLS = """
@@ -290,13 +297,24 @@ assert number.value == 41 and taken.value
 """
 
 
-def test_calls_of_services_are_seen_between_rcl_and_rmw(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def rmw(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "rmw.c").write_text(RMW)
     library = tmp_path / "librmw.so"
     subprocess.run(["cc", "-shared", "-fPIC", "-o", library, tmp_path / "rmw.c"], check=True)
     monkeypatch.setenv("LD_PRELOAD", str(library))
+
+
+@pytest.mark.usefixtures("rmw")
+def test_what_rmw_takes_without_an_event_is_recorded_nevertheless(tmp_path: Path) -> None:
+    """And what has its event is recorded once."""
+    tables = traced(tracer_of(tmp_path), lambda: python(TAKES)).tables
+    taken = tables["rmw_take"].select("rmw_subscription_handle", "message", "source_timestamp")
+    assert taken.rows() == [(1, 9, 77), (2, 9, 77), (2, 9, 77)]
+
+
+@pytest.mark.usefixtures("rmw")
+def test_calls_of_services_are_seen_between_rcl_and_rmw(tmp_path: Path) -> None:
     tables = traced(tracer_of(tmp_path), lambda: python(CALLS)).tables
     seen = {name: tables[name].drop("time", "pid", "tid", "cpu").rows() for name in SERVICE_CALLS}
     gid = [7] * 16
@@ -306,6 +324,15 @@ def test_calls_of_services_are_seen_between_rcl_and_rmw(
         "rmw_send_response": [(4, 5, gid, 42)],
         "rmw_take_response": [(1, 6, 43, 5678)],
     }
+
+
+TAKES = """
+address, taken, info = ctypes.c_void_p, ctypes.c_bool(), ctypes.create_string_buffer(40)
+for subscription, message in ((1, 9), (2, 9), (2, 0), (2, 9), (3, 9)):
+    library.rmw_take_with_info(
+        address(subscription), address(message), ctypes.byref(taken), info, None
+    )
+"""
 
 
 def test_what_comes_faster_than_it_is_read_is_counted(tmp_path: Path) -> None:

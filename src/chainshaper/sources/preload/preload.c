@@ -87,6 +87,7 @@ static __thread struct {
   struct rseq_area *rseq;             // NULL: a switch cannot be noticed
   uint64_t used, used_at, last_used;  // CPU time as read, when that was, and as last written
   bool calls_timer;
+  uint16_t latest;  // event
 } own;
 
 static inline uint64_t now(clockid_t clock) {
@@ -422,7 +423,8 @@ typedef bool (*question)(void);
   bool ros_trace_enabled_##name(void) { return true; }
 
 #define EVENT(name, count, timed) \
-  HOOK(name, write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), timed))
+  HOOK(name, own.latest = number_##name; \
+       write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), timed))
 #define CREATION(name, texts, gid) \
   HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
 #define CALL(name)
@@ -476,6 +478,18 @@ int rmw_send_response(const void *service, struct request_id *id, void *response
   }
 TAKE(rmw_take_request)
 TAKE(rmw_take_response)
+
+// From Lyrical on rmw_fastrtps_cpp takes messages with sequences in a way that has no event
+// (`take_buffer_aware`); the time stamp is the first field of `rmw_message_info_t`.
+int rmw_take_with_info(const void *subscription, void *message, bool *taken, int64_t *info,
+                       void *allocation) {
+  BEHIND(rmw_take_with_info, const void *, void *, bool *, int64_t *, void *);
+  own.latest = 0;
+  int result = behind(subscription, message, taken, info, allocation);
+  if (result == 0 && *taken && own.latest != number_rmw_take)
+    ros_trace_rmw_take((uintptr_t)subscription, (uintptr_t)message, (uint64_t)*info, true, 0);
+  return result;
+}
 
 // Functions of rcl, of which ros2_tracing has no event. Since Jazzy the one may call the other.
 typedef int (*timer_function)(uint64_t timer, uint64_t information);
