@@ -193,6 +193,20 @@ def test_a_python_node_in_the_chain() -> None:
     assert "without callback events" in data_flow(story.tables()).notes[0]
 
 
+def test_messages_that_rmw_takes_without_an_event_are_counted() -> None:
+    """As Lyrical's rmw_fastrtps_cpp does with those that have sequences; others have theirs."""
+    story = Story()
+    reader = story.subscription(story.node("/a", 1), "/t1")
+    other = story.subscription(story.node("/b", 2), "/t1")
+    for time in range(10, 200, 10):
+        story.event("rcl_take", time + 2, 1, message=1)
+        story.event("rcl_take", time + 2, 2, message=1)
+        story.take(other, time + 1, sent=time)
+    story.take(reader, 11, sent=10)
+    (note,) = data_flow(story.tables()).notes
+    assert note.startswith("19 messages were taken without an event of rmw")
+
+
 def test_a_driver_that_publishes_from_a_thread_of_its_own() -> None:
     # No callback of /driver publishes /t1: the chain is measured from the publications.
     story = Story()

@@ -6,6 +6,7 @@ And which launch file a `ros2 launch …` means, and the same command for anothe
 import ast
 import json
 import shutil
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from chainshaper.planning.plan import publish_slots, revised
 from chainshaper.splicing.shaping_process import zero_copy_lost
 from chainshaper.splicing.spliced_launch import parse_launch_command, undo_splice
 from chainshaper.values.errors import InputError, PlatformError
+from chainshaper.values.plan_choices import NodeKind
 from chainshaper.values.recording import Recording, open_recording
 
 MS = 1_000_000
@@ -48,13 +50,15 @@ def robot(tmp_path: Path) -> Path:
     return path
 
 
-def recorded(folder: Path, *endpoints: tuple[str, str, str], type_: str | None = None) -> Recording:
+def recorded(
+    folder: Path, *endpoints: tuple[str, str, str], type_: str | None = None, **about: str
+) -> Recording:
     """A recording that saw nothing but who has which topic: nodes, topics, kinds."""
     place = folder / "recording"
     place.mkdir()
     keys = ("node", "topic", "kind")
     seen = [{**dict(zip(keys, one, strict=True)), "type": type_} for one in endpoints]
-    info = {"source": "lttng", "clock_offset_ns": 0, "endpoints": seen}
+    info = {"source": "lttng", "clock_offset_ns": 0, "endpoints": seen, **about}
     (place / "recording.json").write_text(json.dumps(info))
     return open_recording(place)
 
@@ -260,6 +264,25 @@ def test_a_recording_knows_the_type_and_a_standby_is_no_second_publisher(robot: 
     spliced = splice_launch_files(PLAN, [robot], out, node="typed", recording=seen)
     assert spliced.processes[0].package == "shaping_std_msgs_header"
     assert redirects(spliced) == {"/pose": ("/pose_tmp", ("/ndt",))}
+
+
+@pytest.mark.parametrize("distribution", ["jazzy", "lyrical"])
+@pytest.mark.parametrize("node", ["python", "typed"])
+@pytest.mark.parametrize("field", ["uint8[] data  # bytes", "uint8[4] data"])
+def test_a_node_that_would_get_no_message_is_refused(
+    robot: Path, monkeypatch: pytest.MonkeyPatch, node: NodeKind, distribution: str, field: str
+) -> None:
+    """Lyrical's Fast DDS has another reader for messages with bytes, which `typed` takes from."""
+    definition = robot.parent / "share" / "robot_msgs" / "msg" / "Cloud.msg"
+    definition.parent.mkdir(parents=True)
+    definition.write_text(f"float32 x\n{field}\n")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", f"/elsewhere:{robot.parent}")
+    ends = [("/ndt", "/pose", "publisher")]
+    known = {"rmw": "rmw_fastrtps_cpp", "distribution": distribution}
+    seen = recorded(robot.parent, *ends, type_="robot_msgs/msg/Cloud", **known)
+    refused = (node, distribution, field[:7]) == ("python", "lyrical", "uint8[]")
+    with pytest.raises(InputError, match="use --node typed") if refused else nullcontext():
+        splice_launch_files(PLAN, [robot], robot.parent / "out", node=node, recording=seen)
 
 
 def test_an_input_reaches_its_subscribers_by_way_of_one_throttler(

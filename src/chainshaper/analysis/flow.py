@@ -106,6 +106,12 @@ def data_flow(
             "other event tells (before Iron, or not enabled): chains cannot be followed through "
             "them."
         )
+    if missing := _without_events_of_rmw(tables):
+        notes.append(
+            f"{missing} messages were taken without an event of rmw (from Lyrical on"
+            " rmw_fastrtps_cpp has none for messages with sequences): chains cannot be followed"
+            " through them. `record --source preload` sees them."
+        )
     return DataFlow(objects, instances, published, taken, tables, tuple(notes))
 
 
@@ -229,6 +235,16 @@ def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     calls = events.table(tables, "rcl_timer_call")
     found = latest_before(calls, timers, ["pid", "timer_handle"], "time", "valid_from")
     return found.drop_nulls("callback_id").select("callback_id", "observed", "pid", "tid", "time")
+
+
+def _without_events_of_rmw(tables: events.EventTables) -> int:
+    """How many messages rcl took in processes where rmw has an event of hardly any."""
+    taken = events.table(tables, "rmw_take", ["taken"])
+    taken = taken.filter(pl.col("taken").fill_null(1) != 0)
+    by_rmw = taken.group_by("pid").len("by_rmw")
+    by_rcl = events.table(tables, "rcl_take").group_by("pid").len("by_rcl")
+    both = by_rcl.join(by_rmw, on="pid", how="left").fill_null(0)
+    return int(both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum())
 
 
 def _with_assumed_readers(

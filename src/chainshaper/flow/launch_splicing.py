@@ -8,8 +8,10 @@ redirected, behind a throttler the subscribers: a player or a driver often is st
 
 import difflib
 import json
+import os
+import re
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -132,6 +134,9 @@ def splice_launch_files(
         for _, one, publisher in every
         if not one.in_process
     ]
+    if recording is not None:
+        by_nodes = [one.output for _, one, _ in every if not one.in_process]
+        _refuse_undelivered(recording, by_nodes, node)
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
     logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
@@ -162,6 +167,38 @@ def splice_launch_files(
     pairs = [(logs[one.name], one.standby) for one in spliced.processes]
     standbys = (log.with_stem(standby.name) for log, standby in pairs if standby is not None)
     return replace(spliced, logs=(*logs.values(), *standbys))
+
+
+def _refuse_undelivered(recording: "Recording", outputs: Iterable[str], node: NodeKind) -> None:
+    """Refuse nodes that take an output serialized where the middleware does not deliver it so.
+
+    From Lyrical on rmw_fastrtps_cpp has a reader of its own for messages with a field ``uint8[]``,
+    at which `rmw_take_serialized_message` does not look (rmw_fastrtps 9.4.7, `take_buffer_aware`).
+    Raises InputError.
+    """
+    info = recording.info
+    where = (info.rmw, info.distribution)
+    if node not in ("python", "cpp") or where not in _LEFT_WITH_ANOTHER_READER:
+        return
+    types = {one.topic: one.type for one in info.endpoints if one.type}
+    for output in outputs:
+        if _has_bytes(types.get(output, "")):
+            raise InputError(
+                f"{output} is of {types[output]}: on {info.distribution}, {info.rmw} delivers no"
+                " message with a field uint8[] to nodes that take it serialized, as with --node"
+                f" {node}: use --node typed, whose standby gets none either, or another RMW"
+            )
+
+
+_LEFT_WITH_ANOTHER_READER = (("rmw_fastrtps_cpp", "lyrical"), ("rmw_fastrtps_cpp", "rolling"))
+
+
+def _has_bytes(message_type: str) -> bool:
+    """Whether a message of ROS 2's environment has a field ``uint8[]``."""
+    prefixes = map(Path, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    definitions = (prefix / "share" / f"{message_type}.msg" for prefix in prefixes)
+    found = next((one.read_text() for one in definitions if one.is_file()), "")
+    return re.search(r"^\s*(uint8|char)\[\]", found, re.MULTILINE) is not None
 
 
 def splice_throttlers(
