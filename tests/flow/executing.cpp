@@ -145,15 +145,18 @@ class Worker : public rclcpp::Node {
 };
 
 std::unique_ptr<rclcpp::Executor> executor_of(const std::string& name) {
-  if (name == "multi") return std::make_unique<rclcpp::executors::MultiThreadedExecutor>(rclcpp::ExecutorOptions{}, 4);
+  const rclcpp::ExecutorOptions usual;
+  if (name == "single") return std::make_unique<rclcpp::executors::SingleThreadedExecutor>();
+  if (name == "multi") return std::make_unique<rclcpp::executors::MultiThreadedExecutor>(usual, 4);
+  if (name == "events") return std::make_unique<EventsExecutor>();
 #if RCLCPP_VERSION_GTE(32, 0, 0)
-  if (name == "cbg") return std::make_unique<rclcpp::executors::EventsCBGExecutor>(rclcpp::ExecutorOptions{}, 3);
+  if (name == "cbg") return std::make_unique<rclcpp::executors::EventsCBGExecutor>(usual, 3);
+  if (name == "events-timers")
+    return std::make_unique<EventsExecutor>(usual, std::make_unique<SimpleEventsQueue>(), true);
 #else
   if (name == "static") return std::make_unique<rclcpp::executors::StaticSingleThreadedExecutor>();
-#endif
-  if (name == "events") return std::make_unique<EventsExecutor>();
   if (name == "events-timers") return std::make_unique<EventsExecutor>(std::make_unique<SimpleEventsQueue>(), true);
-  if (name == "single") return std::make_unique<rclcpp::executors::SingleThreadedExecutor>();
+#endif
   std::cerr << "this rclcpp has no executor " << name << std::endl;
   std::exit(1);
 }

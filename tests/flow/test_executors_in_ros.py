@@ -188,7 +188,7 @@ def test_traversals_and_threads_are_what_the_callbacks_say(
     ran: Ran, tmp_path: Path, language: str, executor_and_source: str, threads: list[int]
 ) -> None:
     executor, source = executor_and_source.split()
-    several = executor in {"multi", "cbg"}
+    several = executor == "multi"
     words = f"{executor} line 60 {30 if several else 5} {150 if several else 30} sleep"
     folder, _ = ran("record", language, words, "--source", source, "--duration", "8s")
     recording, names = open_recording(folder), ("timer", "work", "last")
@@ -218,7 +218,7 @@ def test_sets_that_several_threads_complete(ran: Ran, tmp_path: Path, first: str
 @pytest.mark.parametrize(
     ("language", "executor", "threads"),
     [
-        *(("C++", "multi", 4), ("C++", "static", 1), ("C++", "events", 2), ("C++", "cbg", 3)),
+        *(("C++", "multi", 4), ("C++", "static", 1), ("C++", "events", 2)),
         *(("Python", "multi", 5), ("Python", "events", 1)),
     ],
 )
