@@ -160,7 +160,7 @@ def up_to(profile: Profile, percentile: float) -> Profile:
 
 
 def other_beginnings(profile: Profile) -> str | None:
-    """Which nodes begin what the chain waits for, beside its first callback; None: no other does."""
+    """Which nodes begin what the chain waits for, beside its first callback; None: no others."""
     first = (*profile.nodes[:1], *profile.topics[:1])
     begin = dict.fromkeys(one.node for one in profile.callbacks if not one.after)
     own = {one.node for one in profile.callbacks if (one.node, one.publishes) == first}
