@@ -3,13 +3,18 @@
 The flow itself needs ROS 2 and minutes; every step of it is tested where it is at home.
 """
 
+import json
 from pathlib import Path
 
 import pytest
 from command_line import called, refused
+from small_chain import small_chain_plan
 
-from chainshaper import shape_launch
+from chainshaper import open_recording, shape_launch
+from chainshaper.flow.launch_shaping import _with_types
+from chainshaper.planning.application_plan import whole
 from chainshaper.values.errors import InputError, PlatformError
+from chainshaper.values.recording import Recording
 
 
 @pytest.fixture
@@ -62,3 +67,20 @@ def test_missing_build_tools_are_named_before_minutes_are_spent(
     with pytest.raises(PlatformError, match="colcon, which building the shaping node needs"):
         shape_launch(["ros2", "launch", str(launch_file)], tmp_path / "out", node="cpp")
     assert not (tmp_path / "out").exists()
+
+
+def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
+    """Discovery of Fast DDS has not always shown all types when a recording ends."""
+    plan = whole(small_chain_plan(5_000_000, 20_000_000, core=1))
+
+    def recorded(name: str, type_: str | None) -> Recording:
+        (tmp_path / name).mkdir()
+        end = {"node": "/n", "topic": "/t3", "kind": "publisher", "type": type_}
+        info = {"source": "preload", "clock_offset_ns": 0, "endpoints": [end]}
+        (tmp_path / name / "recording.json").write_text(json.dumps(info))
+        return open_recording(tmp_path / name)
+
+    first, before = recorded("first", None), recorded("before", "std_msgs/msg/Header")
+    assert _with_types([first, before], plan) is before
+    assert _with_types([before, first], plan) is before
+    assert _with_types([first], plan) is first

@@ -196,7 +196,7 @@ def shape_launch(
         splicing = splice_launch_files(
             *(plan, [launch.file], folder / "launch"),
             node=node,
-            recording=first,
+            recording=_with_types([first, *(before for before, _ in measured.values())], plan),
         )
         found += splicing.notes
         shaped = [*setup, *_sourced(splicing), *launch.with_file(*set(splicing.launch.values()))]
@@ -266,6 +266,16 @@ def _planned(
         plan, remarks = plan_application(profiles, request)
         return plan, remarks + doubts
     return whole(plan_chain(profiles[0], request, profiles[1:])), doubts
+
+
+def _with_types(recordings: Sequence[Recording], plan: ApplicationPlan) -> Recording:
+    """The first recording by whose end discovery had shown the types of all outputs, if any."""
+    outputs = {node.output for node in plan.shaping_nodes}
+
+    def knows(one: Recording) -> bool:
+        return outputs <= {end.topic for end in one.info.endpoints if end.type}
+
+    return next(filter(knows, recordings), recordings[0])
 
 
 def _chosen(first: Recording, choose: Choose | None) -> str:
