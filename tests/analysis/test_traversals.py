@@ -194,7 +194,7 @@ def test_a_python_node_in_the_chain() -> None:
 
 
 def test_messages_that_rmw_takes_without_an_event_are_counted() -> None:
-    """As Lyrical's rmw_fastrtps_cpp does with those that have sequences; others have theirs."""
+    """As Lyrical's rmw_fastrtps_cpp does with those that have bytes; others have theirs."""
     story = Story()
     reader = story.subscription(story.node("/a", 1), "/t1")
     other = story.subscription(story.node("/b", 2), "/t1")

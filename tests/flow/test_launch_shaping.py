@@ -3,18 +3,17 @@
 The flow itself needs ROS 2 and minutes; every step of it is tested where it is at home.
 """
 
-import json
 from pathlib import Path
 
 import pytest
+from bare_recordings import recorded
 from command_line import called, refused
 from small_chain import small_chain_plan
 
-from chainshaper import open_recording, shape_launch
+from chainshaper import shape_launch
 from chainshaper.flow.launch_shaping import _with_types
 from chainshaper.planning.application_plan import whole
 from chainshaper.values.errors import InputError, PlatformError
-from chainshaper.values.recording import Recording
 
 
 @pytest.fixture
@@ -72,15 +71,11 @@ def test_missing_build_tools_are_named_before_minutes_are_spent(
 def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
     """Discovery of Fast DDS has not always shown all types when a recording ends."""
     plan = whole(small_chain_plan(5_000_000, 20_000_000, core=1))
-
-    def recorded(name: str, type_: str | None) -> Recording:
-        (tmp_path / name).mkdir()
-        end = {"node": "/n", "topic": "/t3", "kind": "publisher", "type": type_}
-        info = {"source": "preload", "clock_offset_ns": 0, "endpoints": [end]}
-        (tmp_path / name / "recording.json").write_text(json.dumps(info))
-        return open_recording(tmp_path / name)
-
-    first, before = recorded("first", None), recorded("before", "std_msgs/msg/Header")
+    ends, known = [("/n", "/t3", "publisher")], "std_msgs/msg/Header"
+    folders = [tmp_path / name for name in ("first", "before")]
+    for folder in folders:
+        folder.mkdir()
+    first, before = recorded(folders[0], *ends), recorded(folders[1], *ends, type_=known)
     assert _with_types([first, before], plan) is before
     assert _with_types([before, first], plan) is before
     assert _with_types([first], plan) is first

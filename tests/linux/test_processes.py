@@ -175,6 +175,7 @@ def test_middleware_that_is_known_in_part_is_named(
     assert process.participates is (limit != "unnamed" and bool(names))
 
 
+@pytest.mark.skipif(shutil.which("g++") is None, reason="g++ is not installed")
 def test_threads_of_fast_dds_that_have_no_names_are_known_by_what_they_wait_for(
     tmp_path: Path,
 ) -> None:

@@ -4,13 +4,13 @@ And which launch file a `ros2 launch …` means, and the same command for anothe
 """
 
 import ast
-import json
 import shutil
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import pytest
+from bare_recordings import recorded
 from launch_cases import NDT, ROBOTS, plan_for
 from node_run import parameters_of
 
@@ -21,7 +21,7 @@ from chainshaper.splicing.shaping_process import zero_copy_lost
 from chainshaper.splicing.spliced_launch import parse_launch_command, undo_splice
 from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.plan_choices import NodeKind
-from chainshaper.values.recording import Recording, open_recording
+from chainshaper.values.recording import Recording
 
 MS = 1_000_000
 REAR = ThrottledInput(topic="/rear", period_ns=100 * MS)
@@ -48,19 +48,6 @@ def robot(tmp_path: Path) -> Path:
     path = tmp_path / "robot.launch.xml"
     path.write_text(NDT)
     return path
-
-
-def recorded(
-    folder: Path, *endpoints: tuple[str, str, str], type_: str | None = None, **about: str
-) -> Recording:
-    """A recording that saw nothing but who has which topic: nodes, topics, kinds."""
-    place = folder / "recording"
-    place.mkdir()
-    keys = ("node", "topic", "kind")
-    seen = [{**dict(zip(keys, one, strict=True)), "type": type_} for one in endpoints]
-    info = {"source": "lttng", "clock_offset_ns": 0, "endpoints": seen, **about}
-    (place / "recording.json").write_text(json.dumps(info))
-    return open_recording(place)
 
 
 @pytest.fixture

@@ -31,6 +31,7 @@ from chainshaper.analysis.messages import (
     link_takes,
     publications,
     service_calls,
+    taken_by_rmw,
     takes,
     with_departures,
 )
@@ -109,8 +110,8 @@ def data_flow(
     if missing := _without_events_of_rmw(tables):
         notes.append(
             f"{missing} messages were taken without an event of rmw (from Lyrical on"
-            " rmw_fastrtps_cpp has none for messages with sequences): chains cannot be followed"
-            " through them. `record --source preload` sees them."
+            " rmw_fastrtps_cpp has none for messages with a field uint8[]): chains cannot be"
+            " followed through them. `record --source preload` sees them."
         )
     return DataFlow(objects, instances, published, taken, tables, tuple(notes))
 
@@ -239,9 +240,7 @@ def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
 
 def _without_events_of_rmw(tables: events.EventTables) -> int:
     """How many messages rcl took in processes where rmw has an event of hardly any."""
-    taken = events.table(tables, "rmw_take", ["taken"])
-    taken = taken.filter(pl.col("taken").fill_null(1) != 0)
-    by_rmw = taken.group_by("pid").len("by_rmw")
+    by_rmw = taken_by_rmw(tables).group_by("pid").len("by_rmw")
     by_rcl = events.table(tables, "rcl_take").group_by("pid").len("by_rcl")
     both = by_rcl.join(by_rmw, on="pid", how="left").fill_null(0)
     return int(both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum())

@@ -212,6 +212,14 @@ def _handed_over(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     return found.select("handed", "intra_time", "pid", "tid", *_PUBLISHER)
 
 
+def taken_by_rmw(tables: events.EventTables) -> pl.DataFrame:
+    """The events ``rmw_take`` that found a message."""
+    taken = events.table(tables, "rmw_take", ["taken"])
+    if (taken["taken"] == 0).any():
+        taken = taken.filter(pl.col("taken").fill_null(1) != 0)
+    return taken
+
+
 def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> pl.DataFrame:
     """All messages taken by known subscriptions, sorted by time.
 
@@ -227,9 +235,7 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
         owner.select("subscription", "callback_id"), on="subscription", how="left"
     ).with_columns(created="valid_from", rmw_subscription_handle="rmw_handle")
     columns = ["callback_id", "node", "topic"]
-    taken = events.table(tables, "rmw_take", ["taken"])
-    if (taken["taken"] == 0).any():
-        taken = taken.filter(pl.col("taken").fill_null(1) != 0)
+    taken = taken_by_rmw(tables)
     key = ["pid", "rmw_subscription_handle"]
     from_dds = subscriptions.select(*key, *columns, "created")
     parts = [latest_before(taken, from_dds, key, "time", "created")]

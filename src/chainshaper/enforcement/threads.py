@@ -552,10 +552,10 @@ def scheduling_around(
     receiving_pids = {one.thread.thread.pid for one in receiving}
     busy = {server.core for server in servers}
     receiving = [one for one in receiving if not _placed_already(one, busy)]
-    planned = {one.thread.thread.identity: one.thread.thread.pid for one in (*own, *receiving)}
+    planned = in_servers | {one.thread.thread.identity for one in receiving}
     free_cores = tuple(sorted(set(available_cores) - busy))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
-    concerned = set(planned.values()) | receiving_pids
+    concerned = receiving_pids | {one.thread.thread.pid for one in own}
     if any(one.thread.pid in concerned and is_of_zenoh(one.thread) for one in allocation.threads):
         concerned |= {one.thread.pid for one in allocation.threads if set(one.nodes) & ROUTERS}
     beside = (

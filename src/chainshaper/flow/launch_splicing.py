@@ -8,10 +8,8 @@ redirected, behind a throttler the subscribers: a player or a driver often is st
 
 import difflib
 import json
-import os
-import re
 import tempfile
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,11 +24,13 @@ from chainshaper.splicing.application import nothing_to_splice
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (
     GATES,
+    OF_ONE_TYPE,
     STANDBY,
     ShapingProcess,
     delivery_settings,
     gate_library,
     gate_settings,
+    has_bytes,
     write_shaping_process,
     write_throttler,
 )
@@ -134,11 +134,11 @@ def splice_launch_files(
         for _, one, publisher in every
         if not one.in_process
     ]
-    if recording is not None:
-        by_nodes = [one.output for _, one, _ in every if not one.in_process]
-        _refuse_undelivered(recording, by_nodes, node)
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
+    if recording is not None and node not in OF_ONE_TYPE:
+        by_nodes = (one.output for _, one, _ in every if not one.in_process)
+        _refuse_undelivered(recording, {end: types.get(end, "") for end in by_nodes}, node)
     logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
 
     def written(into: Path) -> _Written:
@@ -169,36 +169,23 @@ def splice_launch_files(
     return replace(spliced, logs=(*logs.values(), *standbys))
 
 
-def _refuse_undelivered(recording: "Recording", outputs: Iterable[str], node: NodeKind) -> None:
-    """Refuse nodes that take an output serialized where the middleware does not deliver it so.
+def _refuse_undelivered(recording: "Recording", types: Mapping[str, str], node: NodeKind) -> None:
+    """Refuse nodes that take outputs of these types serialized where none is delivered so.
 
     From Lyrical on rmw_fastrtps_cpp has a reader of its own for messages with a field ``uint8[]``,
     at which `rmw_take_serialized_message` does not look (rmw_fastrtps 9.4.7, `take_buffer_aware`).
     Raises InputError.
     """
     info = recording.info
-    where = (info.rmw, info.distribution)
-    if node not in ("python", "cpp") or where not in _LEFT_WITH_ANOTHER_READER:
+    if info.rmw != "rmw_fastrtps_cpp" or info.distribution not in ("lyrical", "rolling"):
         return
-    types = {one.topic: one.type for one in info.endpoints if one.type}
-    for output in outputs:
-        if _has_bytes(types.get(output, "")):
+    for output, message_type in types.items():
+        if has_bytes(message_type):
             raise InputError(
-                f"{output} is of {types[output]}: on {info.distribution}, {info.rmw} delivers no"
+                f"{output} is of {message_type}: on {info.distribution}, {info.rmw} delivers no"
                 " message with a field uint8[] to nodes that take it serialized, as with --node"
                 f" {node}: use --node typed, whose standby gets none either, or another RMW"
             )
-
-
-_LEFT_WITH_ANOTHER_READER = (("rmw_fastrtps_cpp", "lyrical"), ("rmw_fastrtps_cpp", "rolling"))
-
-
-def _has_bytes(message_type: str) -> bool:
-    """Whether a message of ROS 2's environment has a field ``uint8[]``."""
-    prefixes = map(Path, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
-    definitions = (prefix / "share" / f"{message_type}.msg" for prefix in prefixes)
-    found = next((one.read_text() for one in definitions if one.is_file()), "")
-    return re.search(r"^\s*(uint8|char)\[\]", found, re.MULTILINE) is not None
 
 
 def splice_throttlers(

@@ -1,4 +1,4 @@
-"""From recordings to a plan, and a run of a described application that the plan shapes.
+"""From recordings to profiles, and to a plan.
 
 A chain in a graph waits at synchronising callbacks for branches that are not part of it (paper,
 section 2.3). Whoever plans slots for its callbacks has to plan for those branches too, so they are

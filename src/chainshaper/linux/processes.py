@@ -12,13 +12,16 @@ Upstream: proc(5), credentials(7), getauxval(3); rcl, `arguments.c` and `remap.c
 """
 
 import os
+import platform
 import pwd
 import re
 import struct
+from bisect import bisect
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from pathlib import PurePath
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+from typing import NamedTuple
 
 from chainshaper.linux.threads import (
     Thread,
@@ -29,7 +32,6 @@ from chainshaper.linux.threads import (
     parents,
     read_proc,
     status_field,
-    with_unnamed_receivers,
 )
 from chainshaper.values.errors import InputError
 
@@ -204,9 +206,79 @@ def _participation(pid: int, threads: tuple[Thread, ...]) -> tuple[bool, tuple[T
         with suppress(OSError):  # another user's: its threads' names are all there is to see
             mapped = read_proc(f"/proc/{pid}/maps")
             if _FAST_DDS in mapped:
-                threads = with_unnamed_receivers(threads, mapped)
+                threads = _with_receivers(threads, list(regions_in(mapped)))
             return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS), threads
     return False, threads
+
+
+class Region(NamedTuple):
+    """An area of a process's memory; ``offset`` is where in its file it begins. The ``path`` is the
+    file's, what the kernel calls it (``[stack]``), or nothing.
+    """
+
+    start: int
+    end: int
+    offset: int
+    executable: bool
+    path: str
+
+
+def regions_in(maps: bytes) -> Iterator[Region]:
+    """The regions in the content of a file /proc/PID/maps, by address."""
+    for line in maps.decode(errors="replace").splitlines():
+        span, rights, offset, _, _, *path = line.split(maxsplit=5)
+        start, end = (int(bound, 16) for bound in span.split("-"))
+        yield Region(start, end, int(offset, 16), "x" in rights, path[0] if path else "")
+
+
+def region_at(regions: Sequence[Region], address: int) -> Region | None:
+    """The region, of those of a process by address, that has this one."""
+    number = bisect(regions, address, key=lambda one: one.start) - 1
+    return regions[number] if number >= 0 and address < regions[number].end else None
+
+
+_SYSCALLS = {"x86_64": ((45, 47), 202), "aarch64": ((207, 212), 98)}  # recvfrom, recvmsg; futex
+_OF_LANGUAGE = re.compile(r"/(lib(c|pthread|stdc\+\+|gcc_s)|ld-linux[-\w]*)[-.]|\[vdso\]")
+_OUTERMOST = 16_384  # so near are a thread's first frames to where it waits, and to its stack's end
+
+
+def _with_receivers(threads: tuple[Thread, ...], regions: Sequence[Region]) -> tuple[Thread, ...]:
+    """The threads of a process that has a Fast DDS before 2.13, of which those that receive have
+    their role.
+
+    They wait for a datagram, or for a word in the memory of a port, and the library's function is
+    the first on their stack. One that runs at this instant stays unknown, and all do where we may
+    not look at the process (ptrace(2), PTRACE_MODE_ATTACH).
+    """
+    return tuple(
+        replace(one, role="dds", kind="receive")
+        if one.tid != one.pid and _receives_for_fast_dds(one, regions)
+        else one
+        for one in threads
+    )
+
+
+def _receives_for_fast_dds(thread: Thread, regions: Sequence[Region]) -> bool:
+    receive, futex = _SYSCALLS.get(platform.machine(), ((), -1))
+    try:
+        number, *values = read_proc(f"/proc/{thread.pid}/task/{thread.tid}/syscall").split()
+        if len(values) < 8:  # it runs, or sleeps outside of a system call
+            return False
+        word, stack = (region_at(regions, int(values[k], 16)) for k in (0, 6))
+        at_port = int(number) == futex and word is not None and "/fastrtps_port" in word.path
+        if stack is None or not (at_port or int(number) in receive):
+            return False
+        top = int(values[6], 16)
+        with Path(f"/proc/{thread.pid}/mem").open("rb") as memory:
+            data = os.pread(memory.fileno(), min(_OUTERMOST, stack.end - top) & -8, top)
+    except OSError:  # it ended, or may not be looked at
+        return False
+    lowest = regions[0].start
+    for (address,) in reversed([*struct.iter_unpack("=Q", data)]):  # the outermost frame first
+        found = region_at(regions, address) if address >= lowest else None
+        if found is not None and found.executable and not _OF_LANGUAGE.search(found.path):
+            return _FAST_DDS.decode() in found.path
+    return False
 
 
 def middleware_limit(process: Process) -> str | None:

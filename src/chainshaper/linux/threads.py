@@ -2,26 +2,23 @@
 
 A thread is identified by its id *and* its start: ids are used again. Cyclone DDS has always named
 its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); before, those that receive are known by what
-they wait for. Zenoh's names are short words (`rx-0`), so they count only in a process that has
-several of them.
+they wait for (:mod:`.processes`). Zenoh's names are short words (`rx-0`), so they count only in a
+process that has several of them.
 
-Upstream: proc(5); ptrace(2), "Ptrace access mode checking"; Cyclone DDS, `ddsi_create_thread`; Fast
-DDS, "Concurrency and multithreading"; Zenoh, `commons/zenoh-runtime` and `zenoh-shm/src/watchdog`;
-RTI Connext, User's Manual, "Identifying Threads".
+Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading";
+Zenoh, `commons/zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, User's Manual,
+"Identifying Threads".
 """
 
 import functools
 import os
-import platform
 import re
-import struct
 import zlib
-from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import Literal, TypeAlias
 
 SCHED_DEADLINE = 6
 RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
@@ -145,70 +142,6 @@ def with_zenoh(threads: Iterable[Thread]) -> tuple[Thread, ...]:
         else one
         for one in every
     )
-
-
-def with_unnamed_receivers(threads: Iterable[Thread], mapped: bytes) -> tuple[Thread, ...]:
-    """The threads of a process that has a Fast DDS before 2.13, of which those that receive have
-    their role; ``mapped`` is its /proc/PID/maps.
-
-    They wait for a datagram, or for a word in the memory of a port, and the library's function is
-    the first on their stack. One that runs at this instant stays unknown, and all do where we may
-    not look at the process (PTRACE_MODE_ATTACH).
-    """
-    every, areas = tuple(threads), _areas(mapped)
-    return tuple(
-        replace(one, role="dds", kind="receive")
-        if one.tid != one.pid and _receives_for_fast_dds(one, areas)
-        else one
-        for one in every
-    )
-
-
-class _Area(NamedTuple):
-    """An area of a process's memory; its end is the first address behind it."""
-
-    start: int
-    end: int
-    is_code: bool
-    file: bytes
-
-
-_SYSCALLS = {"x86_64": ((45, 47), 202), "aarch64": ((207, 212), 98)}  # recvfrom, recvmsg; futex
-_OF_LANGUAGE = re.compile(rb"/(lib(c|pthread|stdc\+\+|gcc_s)|ld-linux[-\w]*)[-.]|\[vdso\]")
-_OUTERMOST = 16_384  # so near are a thread's first frames to where it waits, and to its stack's end
-
-
-def _areas(mapped: bytes) -> list[_Area]:
-    areas = []
-    for line in mapped.splitlines():
-        between, rights, *rest = line.split(maxsplit=5)
-        start, end = (int(address, 16) for address in between.split(b"-"))
-        areas.append(_Area(start, end, b"x" in rights, rest[3] if len(rest) > 3 else b""))
-    return areas
-
-
-def _receives_for_fast_dds(thread: Thread, areas: Sequence[_Area]) -> bool:
-    def area_of(address: int) -> _Area:
-        area = areas[bisect_right(areas, address, key=lambda one: one.start) - 1]
-        return area if area.start <= address < area.end else _Area(0, 0, False, b"")
-
-    receive, futex = _SYSCALLS.get(platform.machine(), ((), -1))
-    try:
-        number, *values = read_proc(f"/proc/{thread.pid}/task/{thread.tid}/syscall").split()
-        if len(values) < 8:  # it runs, or sleeps outside of a system call
-            return False
-        first, stack = int(values[0], 16), int(values[6], 16)
-        at_port = int(number) == futex and b"/fastrtps_port" in area_of(first).file
-        if not at_port and int(number) not in receive:
-            return False
-        with Path(f"/proc/{thread.pid}/mem").open("rb", buffering=0) as memory:
-            memory.seek(stack)
-            words = memory.read(min(_OUTERMOST, area_of(stack).end - stack) & -8)
-    except OSError:  # it ended, or may not be looked at
-        return False
-    code = (area for (word,) in struct.iter_unpack("=Q", words) if (area := area_of(word)).is_code)
-    began = [area.file for area in code if not _OF_LANGUAGE.search(area.file)]
-    return bool(began) and b"/libfastrtps.so" in began[-1]
 
 
 def is_of_zenoh(thread: Thread) -> bool:

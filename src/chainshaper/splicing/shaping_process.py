@@ -425,20 +425,32 @@ def message_type_named(text: str) -> MessageType:
             "sensor_msgs/msg/PointCloud2, as `ros2 topic type TOPIC` prints it"
         )
     package, name = match.groups()
-    prefixes = [one for one in os.environ.get("AMENT_PREFIX_PATH", "").split(":") if one]
-    folders = [Path(prefix) / "share" / package / "msg" for prefix in prefixes]
+    folders = _message_folders(package)
     installed = sorted({path.stem for folder in folders for path in folder.glob("*.msg")})
-    if prefixes and not installed:
+    if folders and not installed:
         raise InputError(
             f"{text}: no package {package} with messages in this ROS 2 environment: source the "
             "workspace that has it, or correct the name"
         )
-    if prefixes and name not in installed:
+    if folders and name not in installed:
         near = ", ".join(close_names(name, installed)) or ", ".join(installed[:5])
         raise InputError(
             f"{text}: the package {package} has no message {name}: did you mean {near}?"
         )
     return MessageType(package, name)
+
+
+def has_bytes(message_type: str) -> bool:
+    """Whether a message of the ROS 2 environment has a field ``uint8[]``."""
+    package, _, name = message_type.partition("/msg/")
+    definitions = (folder / f"{name}.msg" for folder in _message_folders(package))
+    found = next((one.read_text() for one in definitions if one.is_file()), "")
+    return re.search(r"^\s*(uint8|char)\[\]", found, re.MULTILINE) is not None
+
+
+def _message_folders(package: str) -> list[Path]:
+    prefixes = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
+    return [Path(prefix) / "share" / package / "msg" for prefix in prefixes]
 
 
 def generic_package() -> dict[str, str]:

@@ -15,14 +15,13 @@ import ctypes
 import os
 import stat
 import struct
-from bisect import bisect
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
-from typing import NamedTuple
 
+from chainshaper.linux.processes import Region, region_at, regions_in
 from chainshaper.linux.threads import read_proc
 
 _LONGEST_FILE = 512 << 20
@@ -99,23 +98,10 @@ def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, s
                 yield address, content[begin : content.index(b"\0", begin)].decode()
 
 
-class Region(NamedTuple):
-    """Memory that a file is mapped to; ``offset`` is where in the file it begins."""
-
-    start: int
-    end: int
-    offset: int
-    executable: bool
-    path: str
-
-
 def mapped_regions(pid: int) -> Iterator[Region]:
-    """The regions of a process's memory, by address. Raises OSError: gone, or another user's."""
-    for line in read_proc(f"/proc/{pid}/maps").decode(errors="replace").splitlines():
-        span, rights, offset, _, _, *path = line.split(maxsplit=5)
-        if path and path[0].startswith("/"):
-            start, end = (int(bound, 16) for bound in span.split("-"))
-            yield Region(start, end, int(offset, 16), "x" in rights, path[0])
+    """The regions that files are mapped to, by address. Raises OSError: gone, or another user's."""
+    regions = regions_in(read_proc(f"/proc/{pid}/maps"))
+    return (one for one in regions if one.path.startswith("/"))
 
 
 class _Process:
@@ -131,9 +117,7 @@ class _Process:
         return struct.unpack_from(f"={len(data) // 8}Q", data)
 
     def region(self, address: int) -> Region | None:
-        number = bisect(self.regions, address, key=lambda one: one.start) - 1
-        found = self.regions[number] if number >= 0 else None
-        return found if found is not None and address < found.end else None
+        return region_at(self.regions, address)
 
     def class_of(self, table: int) -> str | None:
         """The class whose table of virtual functions begins at an address, if one does."""

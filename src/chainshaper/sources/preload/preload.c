@@ -479,7 +479,7 @@ int rmw_send_response(const void *service, struct request_id *id, void *response
 TAKE(rmw_take_request)
 TAKE(rmw_take_response)
 
-// From Lyrical on rmw_fastrtps_cpp takes messages with sequences in a way that has no event
+// From Lyrical on rmw_fastrtps_cpp takes messages with a field `uint8[]` in a way that has no event
 // (`take_buffer_aware`); the time stamp is the first field of `rmw_message_info_t`.
 int rmw_take_with_info(const void *subscription, void *message, bool *taken, int64_t *info,
                        void *allocation) {

@@ -116,8 +116,11 @@ void * behind(const char * name) {
   }())
 
 [[maybe_unused]] bool is_humble() {
-  const char * const distribution = std::getenv("ROS_DISTRO");
-  return distribution != nullptr && std::strcmp(distribution, "humble") == 0;
+  static const bool is = [] {  // asked for each message
+    const char * const distribution = std::getenv("ROS_DISTRO");
+    return distribution != nullptr && std::strcmp(distribution, "humble") == 0;
+  }();
+  return is;
 }
 
 // Whether we know this ROS 2; said once where we do not.
