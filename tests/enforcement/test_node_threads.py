@@ -350,7 +350,7 @@ def test_the_cycle_begins_with_the_first_node() -> None:
     nodes = enumerate(("/b", "/chainshaper_out", "/a"))
     found = _allocation(*(_node(name, pid, "executor") for pid, name in nodes))
     for one in (plan, let_per_chain(plan)):
-        assert [thread.pid for thread in first_threads(whole(one), found)] == [2]
+        assert [[thread.pid for thread in own] for own in first_threads(whole(one), found)] == [[2]]
 
 
 def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:

@@ -131,7 +131,7 @@ def test_a_timer_that_comes_earlier_is_not_counted_twice(
 
     monkeypatch.setattr(DriftWatch, "_look", look)
     monkeypatch.setattr(DriftWatch, "EVERY_S", 0.0)
-    watch = DriftWatch(1, 1, 100 * MS, 48 * MS)
+    watch = DriftWatch(1, [1], 100 * MS, 48 * MS)
     wait_for(lambda: watch.looks == 1, "the look")
     here: Any = SimpleNamespace(path=tmp_path / "j", strangers=None, arm=lambda _: None)
     run = _Run(plan, plan, Choice("freezer", ""), here, (), frozenset(), Event())
@@ -207,7 +207,7 @@ def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
     run.state = SimpleNamespace(servers=[governed], anchor_ns=0)  # type: ignore[assignment]
     first = SimpleNamespace(pid=7, tid=7, identity=(7, 1))
     watched: list[Any] = []
-    monkeypatch.setattr(threads, "first_threads", lambda *_: [first])
+    monkeypatch.setattr(threads, "first_threads", lambda *_: [(first,)])
     monkeypatch.setattr(applying, "DriftWatch", lambda *given, **_: watched.append(given[-1]))
     run.drift_watches()
     assert watched == [slots]

@@ -1,6 +1,7 @@
 """Threads that appear while a plan is in force, on a run whose processes and servers stand in."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from threading import Event
 from types import SimpleNamespace
@@ -40,8 +41,10 @@ class Watch:
 
     looks, latest_ns, surely_ns, look_soon = 0, None, None, False
 
-    def __init__(self, _pid: int, tid: int, _cycle_ns: int, expected_ns: int, *_: Any, **__: Any):
-        self.watched, self.ended = (tid, expected_ns), False
+    def __init__(
+        self, _: int, tids: Sequence[int], __: int, expected_ns: int, *___: Any, **____: Any
+    ):
+        self.watched, self.ended = (*tids, expected_ns), False
 
     def end(self) -> None:
         self.ended = True
@@ -59,7 +62,9 @@ def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> _Run:
     monkeypatch.setattr(applying, "change_all", lambda *_: None)
     monkeypatch.setattr(applying, "note_descendants", lambda *_: set())
     monkeypatch.setattr(applying, "DriftWatch", Watch)
-    monkeypatch.setattr(threads, "measure_phase", lambda _, tid, *__, **___: Phase(TIMERS[tid], 0))
+    monkeypatch.setattr(
+        threads, "measure_phase", lambda _, tids, *__, **___: Phase(TIMERS[tids[0]], 0)
+    )
     run.found = found(7)
     run.begin_state((), "")
     run.find_anchor(None, lambda *_: None)
@@ -121,6 +126,19 @@ def test_slots_count_from_the_new_timer_of_a_first_node_that_is_started_again(
     assert watches[1].ended, "a program that goes on would keep it"
 
 
+def test_a_thread_more_in_the_executor_that_begins_is_no_other_beginning(
+    run: _Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As rclpy's pool gets: the slots, which stop its other threads, stay where they are."""
+    assigned: list[int] = []
+    here = servers(lambda tid, _, __: assigned.append(tid), lambda _: pytest.fail("slots moved"))
+    pool = tuple(replace(node(tid), thread=replace(node(tid).thread, pid=7)) for tid in (7, 8))
+    monkeypatch.setattr(run, "find", lambda: Allocation(pool, ()))
+    assert run.look_again(here, ())[1] == ""
+    assert 8 in assigned
+    assert run.anchor_ns == 7 * MS
+
+
 def test_a_first_node_that_is_started_again_without_a_timer_yet_is_looked_at_again(
     run: _Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -153,8 +171,8 @@ def test_of_two_chains_only_the_timer_that_is_new_is_measured(
     start = Allocation((node(7, "/a"), node(9, "/b")), ())
     phases = [Phase(5 * MS, 0), Phase(58 * MS, 0)]
 
-    def measure(_: int, tid: int, *__: Any, **___: Any) -> Phase:
-        measured.append(tid)
+    def measure(_: int, tids: Sequence[int], *__: Any, **___: Any) -> Phase:
+        measured.extend(tids)
         return phases[1]
 
     monkeypatch.setattr(threads, "measure_phase", measure)

@@ -53,6 +53,25 @@ while True:
         pass
 """
 
+TAKING_TURNS = """
+import sys, threading, time
+from itertools import cycle
+period, first = int(sys.argv[1]), int(sys.argv[2])
+ready = [threading.Event() for _ in range(3)]
+def work(own):
+    while True:
+        own.wait()
+        own.clear()
+workers = [threading.Thread(target=work, args=(one,), daemon=True) for one in ready]
+for one in workers:
+    one.start()
+print(*(one.native_id for one in workers), flush=True)
+for own in cycle(ready):
+    now = time.monotonic_ns()
+    time.sleep(((first - now) % period or period) / 1e9)
+    own.set()
+"""
+
 
 def circular(one: int, other: int, cycle: int = CYCLE) -> int:
     return abs((one - other + cycle // 2) % cycle - cycle // 2)
@@ -108,7 +127,18 @@ def test_a_process_that_ticks_is_measured() -> None:
     """The reference is the phase that it was given; half a slot's lead is the tolerance."""
     period, first = 50 * MS, 17 * MS
     with running(TICKING, period, first) as (pid, _):
-        phase = measure_phase(pid, pid, period)
+        phase = measure_phase(pid, [pid], period)
+    assert circular(phase.at_ns, first, period) < period // 10
+
+
+def test_an_executor_begins_with_any_of_its_threads() -> None:
+    """Each of three begins every third cycle only, as in rclcpp's EventsCBGExecutor."""
+    period, first = 50 * MS, 17 * MS
+    with running(TAKING_TURNS, period, first) as (pid, printed):
+        tids = [*map(int, printed.split())]
+        phase = measure_phase(pid, tids, period)
+        with pytest.raises(OperationError, match="does not wake up once"):
+            measure_phase(pid, tids[:1], period, 6)
     assert circular(phase.at_ns, first, period) < period // 10
 
 
@@ -124,7 +154,7 @@ def test_a_thread_that_ends_or_never_wakes_has_no_phase(
 ) -> None:
     body = f"import time; print(flush=True); time.sleep({lasts})"
     with running(body) as (pid, _), pytest.raises(OperationError, match=words):
-        measure_phase(pid, pid, cycle)
+        measure_phase(pid, [pid], cycle)
 
 
 def test_being_stopped_at_a_slots_end_is_no_beginning() -> None:
@@ -161,15 +191,15 @@ def test_wake_ups_without_work_can_be_left_out_and_others_not_looked_for() -> No
         "        pass\n"
     )
     with running(body) as (pid, printed):
-        every = watch_wake_ups(pid, pid, 800 * MS)
-        working = watch_wake_ups(pid, pid, 1200 * MS, least_ns=MS)
+        every = watch_wake_ups(pid, [pid], 800 * MS)
+        working = watch_wake_ups(pid, [pid], 1200 * MS, least_ns=MS)
         closes = int(printed) + 70 * MS  # and opens 100 ms later, 30 ms before it works
 
         def until_then(now_ns: int) -> int:
             place = (now_ns - closes) % (200 * MS)
             return 0 if place > 100 * MS else 100 * MS - place
 
-        some = watch_wake_ups(pid, pid, 800 * MS, rest_ns=until_then)
+        some = watch_wake_ups(pid, [pid], 800 * MS, rest_ns=until_then)
     assert len(some) > 0
     assert ((some - closes) % (200 * MS) > 99 * MS).all()
     assert len(working) >= 3
@@ -249,7 +279,7 @@ def test_one_look_at_a_busy_machine_moves_nothing(monkeypatch: pytest.MonkeyPatc
 
     monkeypatch.setattr(DriftWatch, "_look", look)
     monkeypatch.setattr(DriftWatch, "EVERY_S", 0.0)
-    watch = DriftWatch(1, 1, CYCLE, 0)
+    watch = DriftWatch(1, [1], CYCLE, 0)
     wait_for(lambda: len(surely) == 6, "the looks")
     assert surely == [None, 0, 10_000, -20_000, -20_000, 400_000]
     assert watch.looks == 5
@@ -258,7 +288,7 @@ def test_one_look_at_a_busy_machine_moves_nothing(monkeypatch: pytest.MonkeyPatc
 def test_a_watch_ends_when_it_is_to(monkeypatch: pytest.MonkeyPatch) -> None:
     """A program that has applied a plan and goes on had kept each one, at a real-time priority."""
     monkeypatch.setattr(DriftWatch, "_look", lambda *_: 0)
-    before, watch = set(threading.enumerate()), DriftWatch(1, 1, CYCLE, 0)
+    before, watch = set(threading.enumerate()), DriftWatch(1, [1], CYCLE, 0)
     (thread,) = set(threading.enumerate()) - before
     watch.end()
     thread.join(5)

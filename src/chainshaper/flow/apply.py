@@ -179,7 +179,7 @@ class _Run:
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured
     followers: dict[int, SlotFollower] = field(default_factory=dict)  # by their chains' places
     drifts: list[DriftWatch] = field(default_factory=list)  # one for each chain
-    origins: list[tuple[int, int]] = field(default_factory=list)  # the threads that these watch
+    origins: list[set[tuple[int, int]]] = field(default_factory=list)  # the threads they watch
     moved_ns: dict[int, int] = field(default_factory=dict)  # by how much their slots are
     arming: threading.Lock = field(default_factory=threading.Lock)  # followers move slots as well
     descendants: set[tuple[int, int]] = field(default_factory=set)  # at the last look
@@ -497,27 +497,28 @@ class _Run:
             yield track.opens_ns
 
     def drift_watches(self) -> list[DriftWatch]:
-        """Watches over where chains begin, one for each first thread."""
+        """Watches over where chains begin, one for each first executor."""
         gated, cores = gates(self.choice.name), {server.core for server in self.plan.servers}
-        watches: dict[int, DriftWatch] = {}
+        watches: dict[tuple[int, ...], DriftWatch] = {}
         origins = threads.first_threads(self.plan, self.found)
-        self.origins = [origin.identity for origin in origins]
-        for place, (chain, origin) in enumerate(zip(self.plan.chains, origins, strict=True)):
+        self.origins = [{one.identity for one in origin} for origin in origins]
+        tids = [tuple(one.tid for one in origin) for origin in origins]
+        for place, (chain, own_tids) in enumerate(zip(self.plan.chains, tids, strict=True)):
             own = (
                 one.slots
                 for one in chain.servers
                 for state in self.state.servers
-                if gated and state.name == one.name and origin.tid in state.threads
+                if gated and state.name == one.name and own_tids[0] in state.threads
                 if not self.early(place)  # else nothing stops it, and short runs count too
             )
-            if origin.tid not in watches:
-                watches[origin.tid] = DriftWatch(
-                    *(origin.pid, origin.tid, chain.cycle_ns),
+            if own_tids not in watches:
+                watches[own_tids] = DriftWatch(
+                    *(origins[place][0].pid, own_tids, chain.cycle_ns),
                     self.begins(place),
                     next(own, ()),
                     cores=set(available_cores()) - cores,
                 )
-        return [watches[origin.tid] for origin in origins]
+        return [watches[one] for one in tids]
 
     def look_at(self, servers: BackEnd, drift_ns: int | None) -> None:
         """What the servers have done so far, and why the plan is no longer in force, if so."""
@@ -565,10 +566,12 @@ class _Run:
 
         Raises OperationError: it has no regular beginning yet, or slots cannot be moved there.
         """
-        origins = [one.identity for one in threads.first_threads(self.plan, self.found)]
-        if origins == self.origins:
+        origins = threads.first_threads(self.plan, self.found)
+        now = [{one.identity for one in origin} for origin in origins]
+        # An executor that has got another thread was not started again.
+        again = {place for place, own in enumerate(now) if own.isdisjoint(self.origins[place])}
+        if not again:
             return
-        again = {place for place, one in enumerate(origins) if one != self.origins[place]}
         if self.waits_ns:
             timers = zip(self.plan.chains, self.waits_ns, strict=True)
             known = {

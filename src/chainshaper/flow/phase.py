@@ -5,6 +5,7 @@ just after its timer. The timer wakes the executor of the chain's first node, wh
 counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core,
 the second for how long it was ready before that. The wake-ups that come once in every cycle at the
 same place are the timer's; of several such places the one after the longest rest is the beginning.
+Of an executor with several threads any may begin a cycle: they are watched together.
 
 Outputs without a stamp are released by the cycle, whose beginning no message carries: shaping nodes
 in ROS 2 get it as a parameter. That takes a second or two, in a process of its own, as the user of
@@ -17,7 +18,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from io import FileIO
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -53,68 +54,90 @@ class Phase:
 
 def measure_phase(
     pid: int,
-    tid: int,
+    tids: Sequence[int],
     cycle_ns: int,
     cycles: int = 12,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Phase:
-    """Watch a thread for some cycles and find its phase; again, where it was disturbed meanwhile.
-    Raises OperationError: it ended, or does not wake up regularly.
+    """Watch the threads of an executor for some cycles and find its phase; again, where they were
+    disturbed meanwhile. Raises OperationError: one ended, or none wakes up regularly.
     """
     for _ in range(MOST_TRIES):
-        found = watch_wake_ups(pid, tid, cycles * cycle_ns, progress)
+        found = watch_wake_ups(pid, tids, cycles * cycle_ns, progress)
         if (phase := find_phase(found, cycle_ns, cycles)) is not None:
             return phase
+    named = ", ".join(map(str, tids))
     raise OperationError(
-        f"thread {tid} of process {pid} was watched for {duration_text(cycles * cycle_ns)} and does"
-        f" not wake up once in every {duration_text(cycle_ns)} ({len(found)} wake-ups): is the"
+        f"thread {named} of process {pid} was watched for {duration_text(cycles * cycle_ns)} and"
+        f" does not wake up once in every {duration_text(cycle_ns)} ({len(found)} wake-ups): is the"
         " chain running, with the period of the plan? Its phase can also be given (--phase)"
     )
 
 
 def watch_wake_ups(
     pid: int,
-    tid: int,
+    tids: Sequence[int],
     for_ns: int,
     progress: Callable[[float], None] = lambda _: None,
     *,
     least_ns: int = 0,
     rest_ns: Callable[[int], int] = lambda _: 0,
 ) -> npt.NDArray[np.int64]:
-    """When a thread became ready to run (ns of CLOCK_MONOTONIC): the later of two looks, minus the
-    time that it waited for its core. Raises OperationError: it has ended.
+    """When threads of a process became ready to run (ns of CLOCK_MONOTONIC, in order): the later of
+    two looks, minus the time that one waited for its core. Raises OperationError: one has ended.
 
-    Wake-ups after which it ran for less than ``least_ns`` are left out. ``rest_ns`` says at any
-    time for how long not to look.
+    Wake-ups after which a thread ran for less than ``least_ns`` are left out. ``rest_ns`` says at
+    any time for how long not to look.
     """
-    # When it woke up (0: a rest begins, or the end), and how long it had run by then.
-    found: list[tuple[int, int]] = []
-    path = Path(f"/proc/{pid}/task/{tid}/schedstat")
+    # When each woke up (0: a rest begins, or the end), and how long it had run by then.
+    found: list[list[tuple[int, int]]] = [[] for _ in tids]
     started = now = time.monotonic_ns()
-    born = start_of(pid, tid)
+    born = [start_of(pid, tid) for tid in tids]
     try:
-        with _undisturbed(), path.open("rb", buffering=0) as file:
-            ran, waited, times = map(int, file.read().split())
+        with _undisturbed(), contextlib.ExitStack() as until:
+            files = [until.enter_context(_schedstat(pid, tid)) for tid in tids]
+            seen = [_counters(file) for file in files]
             while now < started + for_ns:
                 rest = rest_ns(now)
                 time.sleep(max(rest, POLL_NS) / 1e9)
-                file.seek(0)
-                ran_by_now, waited_by_now, times_by_now = map(int, file.read().split())
+                before, seen = seen, [_counters(file) for file in files]
                 now = time.monotonic_ns()
-                if rest > 0:
-                    found.append((0, ran))
-                elif times_by_now > times:
-                    found.append((now - (waited_by_now - waited), ran))
-                ran, waited, times = ran_by_now, waited_by_now, times_by_now
+                for own, (_, waited, times), (ran, waited_by_now, times_by_now) in zip(
+                    found, before, seen, strict=True
+                ):
+                    if rest > 0:
+                        own.append((0, ran))
+                    elif times_by_now > times:
+                        own.append((now - (waited_by_now - waited), ran))
                 progress(min(1.0, (now - started) / for_ns))
-        if born is None or has_ended(tid, born):
-            raise ProcessLookupError(tid)  # a zombie
+        for tid, its_start in zip(tids, born, strict=True):
+            if its_start is None or has_ended(tid, its_start):
+                raise ProcessLookupError(tid)  # a zombie
     except (OSError, ValueError) as error:
         raise OperationError(
-            f"thread {tid} of process {pid} ended while its phase was measured: start the "
-            "application again"
+            f"process {pid}, or its thread {', '.join(map(str, tids))}, ended while its phase was"
+            " measured: start the application again"
         ) from error
-    when, ran_by_then = np.array([*found, (0, ran)], dtype=np.int64).T
+    when = [_after_rests(own, ran, least_ns) for own, (ran, _, _) in zip(found, seen, strict=True)]
+    return np.sort(np.concatenate(when))
+
+
+def _schedstat(pid: int, tid: int) -> FileIO:
+    return FileIO(f"/proc/{pid}/task/{tid}/schedstat")
+
+
+def _counters(file: FileIO) -> tuple[int, int, int]:
+    """How long a thread ran, how long it waited for a core (ns), how often it was put on one."""
+    file.seek(0)
+    ran, waited, times = map(int, file.read().split())
+    return ran, waited, times
+
+
+def _after_rests(
+    found: Sequence[tuple[int, int]], ran_in_all: int, least_ns: int
+) -> npt.NDArray[np.int64]:
+    """The wake-ups of one thread after which it ran for so long."""
+    when, ran_by_then = np.array([*found, (0, ran_in_all)], dtype=np.int64).T
     worked = np.diff(ran_by_then) >= least_ns
     return np.asarray(when[:-1][worked & (when[:-1] > 0)], dtype=np.int64)
 
@@ -168,14 +191,14 @@ def find_drift(
 
 
 class DriftWatch:
-    """Looks every ten seconds, in a thread of its own, where a thread begins its cycles now.
+    """Looks every ten seconds, in a thread of its own, where an executor begins its cycles now.
 
     ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
     ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
     thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
     takes a tenth of a core: it is done on ``cores``, if there are any, and only near where the
-    thread began last. A thread that is not seen there any more is looked for in the whole cycle.
-    It ends with the thread, or when it is to.
+    cycle began last. What is not seen there any more is looked for in the whole cycle. It ends with
+    one of the threads, or when it is to.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -185,7 +208,7 @@ class DriftWatch:
     def __init__(
         self,
         pid: int,
-        tid: int,
+        tids: Sequence[int],
         cycle_ns: int,
         expected_ns: int,
         slots: Sequence[tuple[int, int]] = (),
@@ -195,7 +218,7 @@ class DriftWatch:
         self.latest_ns: int | None = None
         self._before_ns = 0  # what the look before saw
         self.looks, self.look_soon = 0, False
-        self._thread, self._cycle_ns, self._expected_ns = (pid, tid), cycle_ns, expected_ns
+        self._threads, self._cycle_ns, self._expected_ns = (pid, tids), cycle_ns, expected_ns
         self._slots, self._cores, self._stop = slots, cores, threading.Event()
         threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
 
@@ -244,7 +267,7 @@ class DriftWatch:
 
         least_ns, cycles = TO_STOP_NS if self._slots else 0, self.CYCLES
         seen = watch_wake_ups(
-            *self._thread, cycles * cycle_ns, least_ns=least_ns, rest_ns=until_near
+            *self._threads, cycles * cycle_ns, least_ns=least_ns, rest_ns=until_near
         )
         return find_drift(seen, cycle_ns, cycles, expected_ns, self._slots)
 

@@ -383,10 +383,10 @@ def places_in(server: Server, order: Sequence[str]) -> int:
     return max(1, len(ordered) + (len(ordered) < len(nodes)))
 
 
-def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
-    """The running thread that begins each chain."""
+def first_threads(plan: ApplicationPlan, found: Allocation) -> list[tuple[Thread, ...]]:
+    """The running threads that begin each chain: any of an executor's may, where it has several."""
     allocation.server_members(plan, found)  # none is in two servers
-    begin: list[Thread] = []
+    begin: list[tuple[Thread, ...]] = []
     for chain in plan.chains:
         planned = allocation.first_planned(chain)
         if planned is None:
@@ -394,7 +394,7 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[Thread]:
                 f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
                 " cycle the chain begins: give its phase (--phase)"
             )
-        begin.append(allocation.threads_for(planned, found)[0].thread)
+        begin.append(tuple(one.thread for one in allocation.threads_for(planned, found)))
     return begin
 
 
@@ -408,10 +408,10 @@ def chain_phases(
     their chains' places.
     """
     wanted = [
-        (origin.pid, origin.tid, chain.cycle_ns)
+        (origin[0].pid, tuple(one.tid for one in origin), chain.cycle_ns)
         for chain, origin in zip(plan.chains, first_threads(plan, found), strict=True)
     ]
-    phases: dict[tuple[int, int, int], Phase] = {}
+    phases: dict[tuple[int, tuple[int, ...], int], Phase] = {}
     # Chains of one graph begin alike.
     parts = dict.fromkeys(one for place, one in enumerate(wanted) if place not in known)
     for number, one in enumerate(parts):
