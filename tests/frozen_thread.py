@@ -6,6 +6,7 @@ stands it, and independent of the back end that does it well.
 
 import os
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -70,6 +71,7 @@ def _open_and_close(
     freeze = os.open(group / "cgroup.freeze", os.O_WRONLY)
     with suppress(PermissionError):  # what else runs on this machine must not move the slots
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+    anchor_ns -= max(0, anchor_ns - time.monotonic_ns()) // cycle_ns * cycle_ns
     try:
         while not over.is_set():
             sleep_until(anchor_ns + slot[0])

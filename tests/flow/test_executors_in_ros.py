@@ -218,7 +218,7 @@ def test_sets_that_several_threads_complete(ran: Ran, tmp_path: Path, first: str
 @pytest.mark.parametrize(
     ("language", "executor", "threads"),
     [
-        *(("C++", "multi", 4), ("C++", "static", 1), ("C++", "events", 2)),
+        *(("C++", "multi", 4), ("C++", "static", 1), ("C++", "events", 2), ("C++", "cbg", 3)),
         *(("Python", "multi", 5), ("Python", "events", 1)),
     ],
 )

@@ -20,6 +20,7 @@ from gate_table import Case, cases, walk
 
 from chainshaper.gate.decision import Gate, gate_parameters
 from chainshaper.gate.handover import page_folders
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing import shaping_process
@@ -303,6 +304,21 @@ def test_messages_that_wait_as_their_publisher_ends_are_counted(run: Callable[..
 def test_a_child_of_fork_has_no_gate_and_ends(run: Callable[..., Run]) -> None:
     lines = [at(20 * MS, stamp=0), (40 * MS, f"fork {40 * MS} 1"), at(120 * MS, stamp=100 * MS)]
     assert run({"/t5": SLOT}, lines).written() == [0, 1]
+
+
+@pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
+def test_who_has_a_mutex_runs_with_the_priority_of_who_waits_for_it(tmp_path: Path) -> None:
+    """20 ms of work behind a thread of middle priority that takes the core for 200 ms."""
+    program = tmp_path / "mutexes"
+    source = str(Path(__file__).with_name("mutexes.c"))
+    subprocess.run(["gcc", "-O1", "-Wall", source, "-o", program, "-lpthread"], check=True)
+
+    def waited_ms(**env: str) -> float:
+        words = [str(program), str(available_cores()[-1])]
+        run = subprocess.run(words, env={**os.environ, **env}, check=True, capture_output=True)
+        return float(run.stdout)
+
+    assert waited_ms(LD_PRELOAD=str(gate_library())) < waited_ms() / 2
 
 
 def test_cycles_begin_elsewhere_from_the_next_one_on(run: Callable[..., Run]) -> None:

@@ -37,6 +37,7 @@ from chainshaper.verify.overruns import (
     overruns_in,
     overruns_text,
 )
+from chainshaper.workload import live
 from chainshaper.workload.description import Application, ExecutionTime
 from chainshaper.workload.live import Enforcement, StartedNodes
 
@@ -336,9 +337,10 @@ def _stopped_once(nodes: StartedNodes) -> Iterator[None]:
 
 
 def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
-    tmp_path: Path, plan: Plan
+    tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A node is stopped; the machine is said to stall while its output waits."""
+    monkeypatch.setattr(live, "ENFORCING_NS", 0)  # so that cycles count from the given anchor
     application = small_chain(tmp_path)
 
     def shape(place: Path) -> Recording:

@@ -18,7 +18,6 @@ from chainshaper.planning import PlanRequest
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import measure_latency
-from chainshaper.workload import live
 from chainshaper.workload.description import Application
 from chainshaper.workload.executor import AsynchronousWriter, PublisherThread
 from chainshaper.workload.live import run_application
@@ -139,14 +138,12 @@ def test_the_publication_is_when_the_message_was_sent_not_handed_over(tmp_path: 
 )
 def test_a_publisher_that_is_stopped_for_long_loses_messages_and_the_executor_goes_on(
     tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
     quality: dict[str, object],
     outcome: str,
     longest_periods: int,
 ) -> None:
     """The thread runs in every tenth cycle only."""
     need_threaded_cgroups()
-    monkeypatch.setattr(live, "ENFORCING_NS", 200_000_000)  # it takes some milliseconds
     gating = freezing_publisher_of("/third", SLOT, 10 * PERIOD_NS)
     application = _asynchronous(tmp_path, **quality)
     recording = run_application(application, tmp_path / "rec", cycles=20, enforcement=gating)

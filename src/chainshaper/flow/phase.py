@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from chainshaper.sources.ros import Script
 
 
-POLL_NS = 250_000
+POLL_NS = 100_000
 WATCHER_PRIORITY = 95
 TO_STOP_NS = 20_000  # stopping and continuing a thread takes 5 to 7 us of its time, a timer tens
 SEEN_IN = 0.8  # a place counts when wake-ups come there in this share of the cycles
@@ -83,8 +83,9 @@ def watch_wake_ups(
     least_ns: int = 0,
     rest_ns: Callable[[int], int] = lambda _: 0,
 ) -> npt.NDArray[np.int64]:
-    """When threads of a process became ready to run (ns of CLOCK_MONOTONIC, in order): the later of
-    two looks, minus the time that one waited for its core. Raises OperationError: one has ended.
+    """When threads of a process became ready to run (ns of CLOCK_MONOTONIC, in order): half way
+    between two looks, minus the time that one waited for its core. Raises OperationError: one has
+    ended.
 
     Wake-ups after which a thread ran for less than ``least_ns`` are left out. ``rest_ns`` says at
     any time for how long not to look.
@@ -101,14 +102,14 @@ def watch_wake_ups(
                 rest = rest_ns(now)
                 time.sleep(max(rest, POLL_NS) / 1e9)
                 before, seen = seen, [_counters(file) for file in files]
-                now = time.monotonic_ns()
+                looked, now = now, time.monotonic_ns()
                 for own, (_, waited, times), (ran, waited_by_now, times_by_now) in zip(
                     found, before, seen, strict=True
                 ):
                     if rest > 0:
                         own.append((0, ran))
                     elif times_by_now > times:
-                        own.append((now - (waited_by_now - waited), ran))
+                        own.append(((looked + now) // 2 - (waited_by_now - waited), ran))
                 progress(min(1.0, (now - started) / for_ns))
         for tid, its_start in zip(tids, born, strict=True):
             if its_start is None or has_ended(tid, its_start):

@@ -327,7 +327,7 @@ GATES = "CHAINSHAPER_GATES"
 _GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp", "in_front_of_rmw.hpp")
 _GATE_FILE = "libchainshaper_gate.so"
 _GATE_OPTIONS = ("-O2", "-std=c++17", "-shared", "-fPIC", "-static-libstdc++", "-static-libgcc")
-_EXPORTED = "{ global: rcl_*; rmw_*; ros_trace_*; local: *; };\n"
+_EXPORTED = "{ global: rcl_*; rmw_*; ros_trace_*; pthread_mutex_init; local: *; };\n"
 
 
 def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:

@@ -5,6 +5,7 @@ threads SCHED_FIFO on another, interference low. All of it concerns processes th
 that end with the run, so nothing on the machine is different afterwards.
 """
 
+import math
 import os
 import time
 from collections import Counter
@@ -66,7 +67,8 @@ class StartedNodes:
 
     ``pids`` has the process of each node's full name; ``anchor_ns`` (CLOCK_MONOTONIC) is the
     first expiry of the timer that starts the chain, from which its cycles count; ``start_ns`` the
-    common start of all timers.
+    common start of all timers. Where servers are in force early, both come some hyper-periods
+    sooner than it says here.
     """
 
     pids: dict[str, int]
@@ -80,7 +82,8 @@ Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]
 WARM_UP_CYCLES = 5
 LEAD_NS = 300_000_000
 ENFORCING_NS = 2_000_000_000
-"""Servers have to be in force before the first cycle; starting their processes takes a while."""
+"""Servers have to be in force before the first cycle; starting their processes takes so long at
+most. What is left of it is not waited for."""
 DISCOVERY_NS = 20_000_000_000
 LOOK_NS = 1_000_000_000
 """How often is looked who governs the nodes: others write it down every second."""
@@ -138,10 +141,10 @@ def run_application(
         lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
         timing = timing_of(application, cycles, time.monotonic_ns() + lead)
         offset = clock_offset()
-        processes = {child.pid: node_name(name) for name, child in nodes.items()}
-        pids = {node: pid for pid, node in processes.items()}
+        pids = {node_name(name): child.pid for name, child in nodes.items()}
         started = StartedNodes(pids, timing.anchor_ns, timing.start_ns)
         with nullcontext() if enforcement is None else enforcement(started):
+            timing = _sooner(application, cycles, timing)
             for child in [*nodes.values(), *meters.values()]:
                 child.tell(**asdict(timing))
             threads, governed, ended_ns = _watch(nodes, meters, timing, progress)
@@ -168,7 +171,7 @@ def run_application(
         rmw="cyclonedds",
         clock_offset_ns=offset,
         command=tuple(command),
-        processes=processes,
+        processes={pid: node for node, pid in pids.items()},
         threads=threads,
         realtime=realtime,
         notes=tuple(notes),
@@ -235,6 +238,13 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
         meter_from_ns=anchor + far_from(releases),
         period_ns=period,
     )
+
+
+def _sooner(application: Application, cycles: int, timing: Timing) -> Timing:
+    """The same run so many whole hyper-periods of its timers earlier as there is time to spare."""
+    hyper = math.lcm(*(cb.timer_ns for _, cb in application.callbacks() if cb.timer_ns))
+    spare = max(0, timing.start_ns - LEAD_NS - time.monotonic_ns())
+    return timing_of(application, cycles, timing.start_ns - spare // hyper * hyper)
 
 
 def _ended_early(children: Sequence[Child], timing: Timing, ended_ns: int) -> Timing:

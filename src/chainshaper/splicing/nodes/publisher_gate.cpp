@@ -455,3 +455,23 @@ EXPORTED void ros_trace_rcl_publish(const void * handle, const void * message) {
     }
   EMIT(rcl_publish, handle, message);
 }
+
+// A thread of real-time priority that waits for a mutex hands its priority on to the thread that has
+// it, as does the kernel for what is `PTHREAD_PRIO_INHERIT`: else an ordinary thread of the process
+// which loses its core within DDS keeps the chain's threads and the gate's waiting until it has one
+// again. Each call into Cyclone DDS takes a mutex that all threads share (`dds_handle_pin`).
+EXPORTED int pthread_mutex_init(pthread_mutex_t * mutex, const pthread_mutexattr_t * given) {
+  static const auto init =
+      reinterpret_cast<decltype(&pthread_mutex_init)>(dlsym(RTLD_NEXT, "pthread_mutex_init"));
+  pthread_mutexattr_t attributes;
+  int protocol = PTHREAD_PRIO_NONE;
+  if (given != nullptr) {
+    attributes = *given;
+    pthread_mutexattr_getprotocol(given, &protocol);
+  } else {
+    pthread_mutexattr_init(&attributes);
+  }
+  if (protocol == PTHREAD_PRIO_NONE)
+    pthread_mutexattr_setprotocol(&attributes, PTHREAD_PRIO_INHERIT);
+  return init(mutex, &attributes) == 0 ? 0 : init(mutex, given);
+}
