@@ -77,7 +77,7 @@ PACKAGE = "autoware_reference_system"
 LAUNCH = HERE / f"{NAME}.launch.xml"
 CHAIN = "/FrontLidarDriver../ObjectCollisionEstimator"
 
-REQUEST = PlanRequest(epsilon_ns=300_000, percentile=99.5, publication="in-process")
+REQUEST = PlanRequest(epsilon_ns=100_000, percentile=99.5, publication="in-process")
 """The longest latency counts here, so the slot begins shortly behind what 99.5 % of the measured
 cycles took; what comes later leaves at once. The gate is in the program's own process: with a
 shaping node and its standby beside it DDS finds more participants, the program's nodes are created
