@@ -1,31 +1,32 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
-.PHONY: demo test test-untimed test-timed test-tracers test-kernel lint benchmark experiments docs clean
+.PHONY: demo test test-untimed test-timed test-waiting test-kernel lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
-# Tests that need the machine's cores for themselves, and beside them those that trace real
-# processes, all others (tests/conftest.py), and what looks at the code.
+# Tests that need the machine's cores for themselves, and beside them those that mostly wait for
+# tracers and other programs, all others, which leave the cores to these (tests/conftest.py), and what
+# looks at the code.
 test: .venv/.ready-dev
 	scripts/test-tools
-	$(MAKE) --jobs=4 --output-sync=line lint test-untimed test-timed test-tracers
+	$(MAKE) --jobs=4 --output-sync=line lint test-untimed test-timed test-waiting
 
 # What fails beside the others is named, and tried once more when those are through; what fails again
 # has failed.
-tried = run='.venv/bin/python -m pytest -m "$(1)" -o cache_dir=.pytest_cache/$(2)'; \
+tried = run='$(3) .venv/bin/python -m pytest -m "$(1)" -o cache_dir=.pytest_cache/$(2)'; \
 	eval "$$run"; code=$$?; [ $$code = 1 ] || exit $$code; \
 	while pgrep -f "[p]ytest -m [a-z]" >/dev/null; do sleep 1; done; \
 	echo "tried once more, alone:"; eval "$$run --last-failed --last-failed-no-failures none"
 
 test-untimed: .venv/.ready-dev
-	@$(call tried,not timed and not tracers,untimed)
+	@$(call tried,not timed and not waiting,untimed,nice)
 
 test-timed: .venv/.ready-dev
 	@$(call tried,timed,timed)
 
-test-tracers: .venv/.ready-dev
-	@$(call tried,tracers and not timed,tracers)
+test-waiting: .venv/.ready-dev
+	@$(call tried,waiting and not timed,waiting)
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.

@@ -278,8 +278,10 @@ COLUMNS = (
 )
 
 
-def notes(lines: Sequence[Line], seconds: int, blocks: int) -> str:
-    """One row per configuration over all cycles, whether the goal is met, and what is not kept."""
+def notes(lines: Sequence[Line], shaped: Sequence[Block], seconds: int) -> str:
+    """One row per configuration over all cycles, whether the goal is met, also in the single blocks
+    that were ``shaped``, and what is not kept.
+    """
     of = {line.what: line.ros_all for line in lines}
     names = [one.name for one in CONFIGURATIONS]
     table = [f"| all cycles, ms | {' | '.join(title for title, _ in COLUMNS)} |"]
@@ -303,10 +305,14 @@ def notes(lines: Sequence[Line], seconds: int, blocks: int) -> str:
         (f"maximum {share:.1%} of the best other's, goal {GOAL_LONGER:.0%}", share <= GOAL_LONGER),
     )
     verdict = "; ".join(f"{text}: {'met' if met else '**not met**'}" for text, met in goals)
+    finished = (one.latency.latency_ns[one.latency.latency_ns >= 0] for one in shaped)
+    single = ", ".join(value_text(value_of("p0.5–p99.5", one)) for one in finished)
     return (
         "\n".join(table)
-        + f"\n\nShaped, over all cycles: {verdict}.\n\n"
-        + f"{blocks} blocks of {seconds} s, two programs that compute all the time beside each."
+        + f"\n\nShaped, over all cycles: {verdict}. "
+        + f"p0.5–p99.5 of the single blocks: {single} ms.\n\n"
+        + f"{len(shaped)} blocks of {seconds} s, two programs that compute all the time beside"
+        + " each."
         + f" What is not kept: a node computes for {CRUNCH_MS:.1f} ms at the most instead of about"
         + f" 10 ms ({CALLS:.0f} callbacks a second would fill {CALLS / 100:.1f} cores); two cores"
         + " of a virtual machine, shared with others, instead of four of a Raspberry Pi 4; no core"
@@ -342,7 +348,7 @@ def main() -> None:
         keep = given.keep or Path(until.enter_context(tempfile.TemporaryDirectory()))
         found = in_turns(keep, seconds=given.seconds, blocks=given.blocks)
     runs, lines = runs_and_lines(found)
-    said = notes(lines, given.seconds, given.blocks)
+    said = notes(lines, found["shaped"][0], given.seconds)
     save(NAME, title, lines, runs=runs, notes=said, folder=given.results)
     print(said)
 

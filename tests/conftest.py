@@ -56,8 +56,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         timed = file.parent.as_posix() in TIMED and file.as_posix() not in TIMELESS
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
         # One tracer at a time, but no core for itself: they mostly wait, in a process of their own.
-        tracers = item.get_closest_marker("tracers") and not item.get_closest_marker("ros2")
-        if not tracers and (timed or live or item.get_closest_marker("ros2")):
+        waiting = item.get_closest_marker("waiting") and not item.get_closest_marker("ros2")
+        if not waiting and (timed or live or item.get_closest_marker("ros2")):
             item.add_marker("timed")
 
 

@@ -48,7 +48,9 @@ def with_live_runs(page: Path) -> bool:
 
 
 PAGES_WITH_COMMANDS = [
-    pytest.param(page, id=page.name, marks=[pytest.mark.timed] if with_live_runs(page) else [])
+    pytest.param(
+        page, id=page.name, marks=pytest.mark.timed if with_live_runs(page) else pytest.mark.waiting
+    )
     for page in PAGES
     if commands(page)
 ]

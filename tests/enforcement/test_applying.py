@@ -43,7 +43,7 @@ from applied_plans import (
     server,
     started,
 )
-from command_line import called, chainshaper
+from command_line import called
 from gated import kill, needs_cgroups
 from known import known
 from processes import wait_for
@@ -117,7 +117,7 @@ def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_pa
     path = tmp_path / "plan.yaml"
     save_plan(one_server_plan(), path)
     for words, how in (("false",), "ended with code 1"), (KILLED, "was killed by SIGKILL"):
-        ended = chainshaper("apply", path, *FIFO, "--", *words)
+        ended = called("apply", path, *FIFO, "--", *words)
         assert ended.code == 1
         assert f"the command {how} before all nodes" in ended.err
     shaped = plan_shaping(
@@ -129,10 +129,10 @@ def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_pa
     )
     save_plan(shaped, tmp_path / "shaped.yaml")
     command = ("timeout", "3", *node_command("origin", tmp_path / "windows"))
-    without = chainshaper("apply", tmp_path / "shaped.yaml", *FIFO, "--", *command)
+    without = called("apply", tmp_path / "shaped.yaml", *FIFO, "--", *command)
     assert without.code == 1
     assert "shaping node /chainshaper_out is not running, all other nodes are" in without.err
-    absent = chainshaper("apply", path, *FIFO)
+    absent = called("apply", path, *FIFO)
     assert absent.code == 1
     assert "/origin" in absent.err
     assert called("apply", path, "--backend", "magic").code == 2

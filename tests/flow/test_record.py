@@ -21,7 +21,7 @@ from chainshaper.values.errors import OperationError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-pytestmark = pytest.mark.tracers
+pytestmark = pytest.mark.waiting
 
 CYCLES = 30
 

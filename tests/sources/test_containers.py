@@ -16,7 +16,7 @@ from chainshaper.linux.processes import Process, user_of
 from chainshaper.sources.preload import installed_library
 from chainshaper.sources.system import NEXT_HOST
 
-pytestmark = [needs_namespaces, pytest.mark.tracers]
+pytestmark = [needs_namespaces, pytest.mark.waiting]
 
 
 def _running(

@@ -35,7 +35,7 @@ from chainshaper.values.recording import EndpointInfo, open_recording
 
 __all__ = ["open_folder"]
 
-pytestmark = pytest.mark.tracers  # each has the kernel compile and check its programs
+pytestmark = pytest.mark.waiting  # each has the kernel compile and check its programs
 
 CYCLES, PERIOD_NS = 20, 50_000_000
 TOPICS = ("/ebpf1", "/ebpf2")

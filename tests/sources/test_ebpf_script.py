@@ -43,7 +43,7 @@ def point(event: str, version: str | None = "8.2.3") -> TracePoint:
     return found
 
 
-@pytest.mark.tracers
+@pytest.mark.waiting
 def test_bpftrace_accepts_the_script_of_a_distribution_that_is_not_traced_here(
     tmp_path: Path,
 ) -> None:

@@ -23,7 +23,7 @@ from chainshaper.values.errors import InputError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-pytestmark = pytest.mark.tracers  # other tests' recordings are sessions of the same one
+pytestmark = pytest.mark.waiting  # other tests' recordings are sessions of the same one
 
 DEPTH = 7  # of every queue in chain_node.c
 ANOTHER = """

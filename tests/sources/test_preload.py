@@ -44,7 +44,7 @@ from chainshaper.sources.preload import (
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
-pytestmark = pytest.mark.tracers
+pytestmark = pytest.mark.waiting
 
 RING, RINGS = 1 << 14, 64
 ELF_MACHINES = {"x86_64": 62, "aarch64": 183}

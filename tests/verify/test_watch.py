@@ -43,7 +43,7 @@ from chainshaper.verify.budgets import load_budget
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 
-pytestmark = pytest.mark.tracers
+pytestmark = pytest.mark.waiting
 
 CHAIN, PERIOD_NS = "/ebpf1../ebpf2", 50_000_000
 LONGEST_NS = SECOND // 5
