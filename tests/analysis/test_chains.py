@@ -65,6 +65,11 @@ LOOP = graph(source=[(None, ("/a",))], one=[("/a", ("/b",))], two=[("/b", ("/out
 SHAPED = graph(
     node4=[(None, ("/t4",))], node5=[("/t4", ("/t5_tmp",))], shaper=[("/t5_tmp", ("/t5",))]
 )
+STOOD_IN = graph(  # for the shaping node, which ended before the others
+    node5=[(None, ("/t5_tmp",))],
+    chainshaper_t5_standby=[("/t5_tmp", ("/t5",))],
+    chainshaper_t5=[("/t5_tmp", ("/t5",))],
+)
 FUSED = of_callbacks(
     [
         callback(0, "/f", 1, "/a", "/out", on=("/out",)),  # it waits for the one on /b
@@ -100,6 +105,8 @@ def test_malformed_chains(text: str) -> None:
         (DIAMOND, "/raw../left../fused", (0, 1, 3), "/raw /left /fused"),
         (DIAMOND, "/raw../right../fused", (0, 2, 4), "/raw /right /fused"),
         (SHAPED, "/t4../t5", (0, 1, 2), "/t4 /t5_tmp /t5"),
+        (STOOD_IN, "/t5_tmp../t5", (0, 2), "/t5_tmp /t5"),
+        (STOOD_IN, "/chainshaper_t5_standby../t5", (1,), "/t5"),
         (FUSED, "/out", (1,), "/out"),  # who only passes a topic on does not begin its chain
         (FUSED, "/a../out", (2, 0), "/a /out"),
         (LOOP, "/a../out", (0, 1, 2), "/a /b /out"),  # a cycle beside it does no harm

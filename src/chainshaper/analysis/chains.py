@@ -33,6 +33,7 @@ from chainshaper.values.application import (
     Chain,
 )
 from chainshaper.values.errors import InputError
+from chainshaper.values.plan_choices import STANDBY
 from chainshaper.values.yaml_file import PlainData, compose, read_text
 
 HANDFUL = 5  # so many names or paths a message lists
@@ -107,7 +108,8 @@ class ChainEnumeration:
 
 
 def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
-    """The one chain of ``graph`` that ``spec`` means.
+    """The one chain of ``graph`` that ``spec`` means. Where a standby has stood in for a shaping
+    node for a while, it is the path by that node.
 
     Raises InputError: a topic or node that does not exist, no path, or only a cyclic one.
     SeveralPathsError: several.
@@ -117,6 +119,7 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     chains = list(dict.fromkeys(_chain(spec, path) for path in paths))
     if not chains:
         raise InputError(search.why_no_path())
+    chains = [one for one in chains if not _by_standby(graph, one)] or chains
     if len(chains) > 1 or not complete:
         raise SeveralPathsError(_ambiguous(graph, spec, chains, complete))
     return chains[0]
@@ -159,6 +162,10 @@ def enumerate_chains(
         heaviest=heaviest,
         heaviest_ns=heaviest_ns if heaviest else None,
     )
+
+
+def _by_standby(graph: ApplicationGraph, chain: Chain) -> bool:
+    return any(graph.callbacks[number].node.endswith(STANDBY) for number in chain.callbacks)
 
 
 def _chain(spec: str | None, path: GraphPath) -> Chain:

@@ -25,7 +25,6 @@ from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import (
     GATES,
     OF_ONE_TYPE,
-    STANDBY,
     ShapingProcess,
     delivery_settings,
     gate_library,
@@ -46,7 +45,7 @@ from chainshaper.splicing.spliced_launch import (
     usable,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
-from chainshaper.values.plan_choices import Fallback, NodeKind
+from chainshaper.values.plan_choices import STANDBY, Fallback, NodeKind
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from chainshaper.planning.plan import Plan, ShapingNode, server_of
 from chainshaper.sources.preload import compile_library, in_cache
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.files import write_whole
-from chainshaper.values.plan_choices import NodeKind
+from chainshaper.values.plan_choices import STANDBY, NodeKind
 
 OF_ONE_TYPE = ("typed", "component")
 _SOURCES = Path(__file__).parents[2]
@@ -39,7 +39,6 @@ _NODES = Path(__file__).parent / "nodes"
 RESPAWN = {"respawn": True, "respawn_delay": 0.1}
 """What a launch file says of every added process; the delay (s): it may end at once each time."""
 
-STANDBY = "_standby"  # what a standby's name has behind that of its shaping node
 SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half a cycle
 
 

@@ -22,6 +22,9 @@ Policy: TypeAlias = Literal[
 Fallback: TypeAlias = Literal["bypass", "silence"]
 """What becomes of an output while its shaping node is not there."""
 
+STANDBY = "_standby"
+"""What the name of who then stands in for a shaping node has behind that node's."""
+
 Publication: TypeAlias = Literal["synchronous", "asynchronous", "in-process"]
 """By a shaping node, by the publisher's own thread (section 3.2), or by a gate in its process."""
 

@@ -27,8 +27,8 @@ from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output, slots_of_latency
 from chainshaper.planning.plan import publisher_servers, shaping_nodes
-from chainshaper.splicing.shaping_process import STANDBY
 from chainshaper.values import events
+from chainshaper.values.plan_choices import STANDBY
 from chainshaper.values.recording import Recording
 
 _DONE = {
