@@ -43,7 +43,7 @@ from applied_plans import (
     server,
     started,
 )
-from command_line import called
+from command_line import called, chainshaper
 from gated import kill, needs_cgroups
 from known import known
 from processes import wait_for
@@ -129,7 +129,7 @@ def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_pa
     )
     save_plan(shaped, tmp_path / "shaped.yaml")
     command = ("timeout", "3", *node_command("origin", tmp_path / "windows"))
-    without = called("apply", tmp_path / "shaped.yaml", *FIFO, "--", *command)
+    without = chainshaper("apply", tmp_path / "shaped.yaml", *FIFO, "--", *command)
     assert without.code == 1
     assert "shaping node /chainshaper_out is not running, all other nodes are" in without.err
     absent = called("apply", path, *FIFO)

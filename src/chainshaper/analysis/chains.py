@@ -119,7 +119,8 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     chains = list(dict.fromkeys(_chain(spec, path) for path in paths))
     if not chains:
         raise InputError(search.why_no_path())
-    chains = [one for one in chains if not _by_standby(graph, one)] or chains
+    standbys = {one.id for one in graph.callbacks if one.node.endswith(STANDBY)}
+    chains = [one for one in chains if standbys.isdisjoint(one.callbacks)] or chains
     if len(chains) > 1 or not complete:
         raise SeveralPathsError(_ambiguous(graph, spec, chains, complete))
     return chains[0]
@@ -162,10 +163,6 @@ def enumerate_chains(
         heaviest=heaviest,
         heaviest_ns=heaviest_ns if heaviest else None,
     )
-
-
-def _by_standby(graph: ApplicationGraph, chain: Chain) -> bool:
-    return any(graph.callbacks[number].node.endswith(STANDBY) for number in chain.callbacks)
 
 
 def _chain(spec: str | None, path: GraphPath) -> Chain:
