@@ -4,12 +4,14 @@ import os
 import re
 import subprocess
 from collections.abc import Generator, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TypeVar
 from unittest import mock
 
 import pytest
 from calm_runs import calm_run
+from cores import cores
 from hypothesis import settings
 from ros2 import ros2_environment
 from small_chain import EXECUTOR_CORE, small_chain, small_chain_plan, small_chain_text
@@ -59,6 +61,13 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         waiting = item.get_closest_marker("waiting") and not item.get_closest_marker("ros2")
         if not waiting and (timed or live or item.get_closest_marker("ros2")):
             item.add_marker("timed")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_protocol(item: pytest.Item) -> Generator[None, object, object]:
+    """Timed tests have the cores, also while their fixtures are made."""
+    with cores() if item.get_closest_marker("timed") else nullcontext():
+        return (yield)
 
 
 ALLOWED_SKIPS = [

@@ -19,10 +19,12 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterable
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
 from command_line import Finished, called, json_of
+from cores import cores
 
 from chainshaper import load_application_plan, open_recording
 
@@ -35,7 +37,9 @@ LIVE_RUN = re.compile(
     r"chainshaper (?P<verb>run|shape) (?P<files>\S+\.yaml( \S+\.yaml)?) -o (?P<output>\S+)"
     r" --cycles (?P<cycles>\d+)"
 )
+RUNS_LIVE = re.compile(r"^chainshaper (apply|demo|run|shape)\b|run_application")
 CYCLES = (12, 40, 120)
+pytestmark = pytest.mark.waiting  # for the cores
 
 
 def commands(page: Path) -> list[str]:
@@ -43,17 +47,7 @@ def commands(page: Path) -> list[str]:
     return [line[2:] for block in blocks for line in block.splitlines() if line.startswith("$ ")]
 
 
-def with_live_runs(page: Path) -> bool:
-    return any(re.match(r"chainshaper (apply|demo|run|shape)", line) for line in commands(page))
-
-
-PAGES_WITH_COMMANDS = [
-    pytest.param(
-        page, id=page.name, marks=pytest.mark.timed if with_live_runs(page) else pytest.mark.waiting
-    )
-    for page in PAGES
-    if commands(page)
-]
+PAGES_WITH_COMMANDS = [pytest.param(page, id=page.name) for page in PAGES if commands(page)]
 
 
 def shortened(command: str, cycles: int) -> str:
@@ -104,6 +98,12 @@ def executed(command: str, folder: Path, recorded: Path) -> Finished:
         if finished.code == 0:
             shutil.copytree(folder / run["output"], known)
         return finished
+    with cores() if RUNS_LIVE.search(command) else nullcontext():
+        return finished_of(command, folder)
+
+
+def finished_of(command: str, folder: Path) -> Finished:
+    """A command: of ours, called here; of others, as a process."""
     program, *words = shlex.split(command)
     if program == "chainshaper" and "--" not in words:
         with pytest.MonkeyPatch.context() as patch:
@@ -162,7 +162,6 @@ def demo_puts_everything_into_one_folder(folder: Path) -> None:
     assert paths == ["before", "after"] * 2
 
 
-@pytest.mark.timed
 def test_the_python_example_of_the_readme_runs(tmp_path: Path, recorded: Path) -> None:
     (example,) = PYTHON.findall((ROOT / "README.md").read_text())
 
