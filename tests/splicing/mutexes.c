@@ -9,7 +9,7 @@
 #include <unistd.h>
 
 static pthread_mutex_t mutex;
-static volatile int locked, over;
+static volatile int locked;
 
 static double now(void) {
   struct timespec at;
@@ -46,8 +46,8 @@ static void *middle(void *core) {
   return NULL;
 }
 
-int main(int count, char **words) {
-  int core = count > 1 ? atoi(words[1]) : 0;
+int main(int count, char **words) {  // the core
+  int core = atoi(words[1]);
   pthread_t threads[2];
   pthread_mutex_init(&mutex, NULL);
   pthread_create(&threads[0], NULL, low, &core);

@@ -92,7 +92,8 @@ def test_every_traversal_is_complete(run: str, request: pytest.FixtureRequest) -
     assert statistics.count == _count_of(recording, "callback_start")["/first"]
     assert known(statistics.min_ns) >= 3_000_000, "three callbacks of 1 ms and more"
     for pid in {thread.pid for thread in recording.info.threads}:
-        # Another process may have got its number meanwhile.
+        # A stranger may have got its number meanwhile.
+        assert pid not in children_of(os.getpid()), "a process is left"
         assert "chainshaper.workload" not in command_line(pid), "a process is left"
 
 

@@ -96,7 +96,8 @@ def watch_wake_ups(
     born = [start_of(pid, tid) for tid in tids]
     try:
         with _undisturbed(), contextlib.ExitStack() as until:
-            files = [until.enter_context(_schedstat(pid, tid)) for tid in tids]
+            paths = (f"/proc/{pid}/task/{tid}/schedstat" for tid in tids)
+            files = [until.enter_context(FileIO(path)) for path in paths]
             seen = [_counters(file) for file in files]
             while now < started + for_ns:
                 rest = rest_ns(now)
@@ -121,10 +122,6 @@ def watch_wake_ups(
         ) from error
     when = [_after_rests(own, ran, least_ns) for own, (ran, _, _) in zip(found, seen, strict=True)]
     return np.sort(np.concatenate(when))
-
-
-def _schedstat(pid: int, tid: int) -> FileIO:
-    return FileIO(f"/proc/{pid}/task/{tid}/schedstat")
 
 
 def _counters(file: FileIO) -> tuple[int, int, int]:
@@ -197,7 +194,7 @@ class DriftWatch:
     ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
     ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
     thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
-    takes a tenth of a core: it is done on ``cores``, if there are any, and only near where the
+    takes a fifth of a core: it is done on ``cores``, if there are any, and only near where the
     cycle began last. What is not seen there any more is looked for in the whole cycle. It ends with
     one of the threads, or when it is to.
     """
