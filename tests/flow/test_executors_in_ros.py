@@ -179,7 +179,7 @@ OUTPUTS = ("last", "left", "right")
         ("C++", "groups preload", [1, 1, 1]),
         ("Python", "single preload", [1]),
         ("Python", "single lttng", [1]),
-        ("Python", "multi preload", [5]),
+        ("Python", "multi preload", []),
         ("Python", "events preload", [1]),
         ("Python", "events lttng", [1]),
     ],
@@ -198,9 +198,12 @@ def test_traversals_and_threads_are_what_the_callbacks_say(
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     (worker,) = recording.events["rcl_node_init"].filter(node_name="worker")["pid"]
     own = [one for one in executors(flow) if one.pid == worker]
-    assert sorted(len(one.threads) for one in own) == threads
     ran_by = {one.tid for one in noted(tmp_path / "notes")}
-    assert ran_by <= {tid for one in own for tid in one.threads}
+    if threads:
+        assert sorted(len(one.threads) for one in own) == threads
+        assert ran_by <= {tid for one in own for tid in one.threads}
+    else:  # rclpy's pool begins a thread only when none is idle; the main one hands out the work
+        assert [{*one.threads} for one in own] == [ran_by | {worker}]
 
 
 @pytest.mark.parametrize("first", ["left", "right"])

@@ -23,7 +23,11 @@ from chainshaper.planning import (
     plan_warnings,
 )
 from chainshaper.planning.margins import late_share
-from chainshaper.planning.profile import deciding_cycles, other_beginnings
+from chainshaper.planning.profile import (
+    deciding_cycles,
+    interfering_callback,
+    other_beginnings,
+)
 from chainshaper.planning.request import on_cores
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
@@ -395,6 +399,38 @@ def test_who_begins_what_the_chain_waits_for_is_named() -> None:
     alone = (times[0], replace(times[2], after=(0,)))
     assert other_beginnings(replace(profile, callbacks=alone)) is None
     assert other_beginnings(Profile(np.array([10, 11]) * MS, 100 * MS)) is None
+
+
+def test_what_else_a_thread_of_the_chain_runs_is_named_with_what_keeps_it_away() -> None:
+    """/filter also takes /settings, in one cycle while the chain lasts, and between all others."""
+    story = Story()
+    sensor, filtering, settings = (story.node(f"/{n}", k) for k, n in enumerate("sfg", start=1))
+    timer, raw = story.timer(sensor, period=100 * MS), story.publisher(sensor, "/raw")
+    read, out = story.subscription(filtering, "/raw"), story.publisher(filtering, "/out")
+    set_it, own = story.subscription(filtering, "/settings"), story.publisher(settings, "/settings")
+    every, answer = story.timer(settings, period=100 * MS), story.publisher(filtering, "/set")
+    for cycle in range(4):
+        t = (1000 + 100 * cycle) * MS
+        at = t + (3 if cycle == 2 else 50) * MS
+        story.runs(every, at - 2, at, writes=((own, at - 1),))
+        story.runs(set_it, at, at + 2 * MS, reads=at - 1, writes=((answer, at + MS),))
+        story.runs(timer, t, t + MS, writes=((raw, t + MS - 1),))
+        begun = t + (5 if cycle == 2 else 1) * MS
+        story.runs(read, begun, begun + 4 * MS, reads=t + MS - 1, writes=((out, begun + 3 * MS),))
+    info = RecordingInfo(source="simulated", clock_offset_ns=OFFSET)
+    (profile,) = profile_chains(Recording(Path("story"), info, story.tables()), ["/raw../out"])
+    assert profile.interfering == (("/f ← /settings", ("/g",), 0.25, 2 * MS),)
+    said = "/raw../out: in 25% of its cycles one of its threads also runs /f ← /settings, which is"
+    said += " not part of it, for up to 2.0 ms: "
+    behind = "with --best-effort /g what triggers it runs only when the chain does not"
+    assert interfering_callback(profile) == said + behind
+    (one,) = profile.interfering
+    of_a_timer = replace(profile, interfering=(one._replace(origins=()),))
+    apart = "give it a callback group and an executor of its own"
+    assert interfering_callback(of_a_timer) == said + apart
+    within = replace(profile, interfering=(one._replace(origins=("/s",)),))
+    assert interfering_callback(within) == said + apart
+    assert interfering_callback(replace(profile, interfering=(one._replace(share=0.05),))) is None
 
 
 def test_many_long_cycles_are_no_outliers() -> None:

@@ -106,6 +106,19 @@ def test_earlier_stages_on_a_core_are_more_urgent(nodes: dict[str, int], tmp_pat
         assert front_one.cores == rear_one.cores == (core,)
 
 
+def test_a_best_effort_node_runs_behind_the_chain_on_its_core(
+    nodes: dict[str, int], tmp_path: Path
+) -> None:
+    core, (front, rear) = available_cores()[-1], nodes
+    before = _states(nodes)
+    with profiling_condition([front], core, tmp_path, best_effort={rear: core}) as see_to_it:
+        see_to_it(list_processes(nodes.values()))
+        front_one, rear_one = (list_threads(nodes[node])[0] for node in (front, rear))
+        assert (front_one.policy, front_one.cores) == ("SCHED_FIFO", (core,))
+        assert (rear_one.policy, rear_one.cores) == ("SCHED_OTHER", (core,))
+    assert _states(nodes) == before
+
+
 def test_all_is_as_before_when_the_run_fails(nodes: dict[str, int], tmp_path: Path) -> None:
     before = _states(nodes)
     with pytest.raises(ZeroDivisionError), profiling_condition(folder=tmp_path) as see_to_it:
@@ -190,6 +203,9 @@ def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Pat
     with pytest.raises(InputError, match="/nowhere"):
         chain_nodes(open_recording(first), "/x../nowhere")
     chain: tuple[str | Path, ...] = ("--chain", "/x../y", "--like", first)
+    unknown = "--best-effort /source2: no node of the recording, name /source"
+    beside = ("--best-effort", "source2")
+    assert unknown in refused(2, "profile", "-o", second, *chain, *beside, "--", *command)
     arguments = ("-o", second, *chain, "--duration", "2s", "--", *command)
     assert called("profile", *LTTNG, *arguments).code == 0
     recording = open_recording(second)
@@ -214,6 +230,7 @@ def test_profile_says_what_it_needs(tmp_path: Path) -> None:
         ("--cores", "0,0"): "names a core twice",
         ("--cores", "0,1", "--core", "1"): "give one of them",
         ("--cores", ",".join(map(str, available_cores()))): "name these with --chain",
+        ("--best-effort", "/beside"): "a node beside the chain: name the chain",
     }.items():
         assert reason in refused(
             3 if "4000" in reason else 2, "profile", "-o", path, *options, *command

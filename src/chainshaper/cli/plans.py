@@ -56,7 +56,7 @@ def plan(
         plan_warnings,
         publish_slots,
     )
-    from chainshaper.planning.profile import deciding_cycles, other_beginnings
+    from chainshaper.planning.profile import deciding_cycles, doubts_about
     from chainshaper.planning.request import on_cores
     from chainshaper.reporting.figures import ENDINGS, draw_curve
     from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
@@ -74,7 +74,7 @@ def plan(
     profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], how)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     outliers = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
-    strange = [*filter(None, map(other_beginnings, profiles))]
+    strange = [doubt for one in profiles for doubt in doubts_about(one)]
     strange += [
         f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
         for core in sorted({*(request.cores or ())} - {*available_cores()})

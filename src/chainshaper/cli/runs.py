@@ -450,7 +450,7 @@ def _publisher(watched: "Watch", until: ExitStack) -> "Callable[[Seen], None]":
     return take
 
 
-@opt.takes_wishes("cores", "policy")
+@opt.takes_wishes("cores", "policy", "best_effort")
 def profile(
     output: Path = opt.RECORDING_OUTPUT,
     command: list[str] | None = COMMAND,
@@ -490,6 +490,7 @@ def profile(
     """
     from chainshaper.flow.profiling import check_profiling, profiled_cores, undelayed
     from chainshaper.linux.own_processes import check_command
+    from chainshaper.planning.request import best_effort_cores
     from chainshaper.values.recording import refuse_existing
 
     if not command:
@@ -514,19 +515,27 @@ def profile(
             "--cores are distributed by what chains do at the same time: name these with --chain,"
             " and a recording that has them with --like"
         )
-    core_of = dict.fromkeys(names, cores[0])
+    core_of, seen = dict.fromkeys(names, cores[0]), tuple["cs.Profile", ...]()
     if earlier is not None and chains:
         seen, found = profiled_cores(earlier, chains, request)
         core_of |= found
         if len(undelayed(seen, found)) > 1:
             out.notes(["chains that share a core delay each other here: profile them one by one"])
+    if request.best_effort and not core_of:
+        raise InputError(
+            "--best-effort is a node beside the chain: name the chain (--chain, --like) or its"
+            " nodes (--node)"
+        )
     _record_and_show(
         *(output, command, json, buffer),
         source=source,
         duration_ns=duration,
         chain=chains[0] if chains else None,
         scheduling=cs.profiling_condition(
-            core_of, core_of or cores[0], like=earlier, policy=request.policy
+            *(core_of, core_of or cores[0]),
+            like=earlier,
+            best_effort=best_effort_cores(seen, request, core_of),
+            policy=request.policy,
         ),
         watch_stalls=True,
     )

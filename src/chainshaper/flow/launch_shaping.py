@@ -45,8 +45,9 @@ from chainshaper.planning import (
     save_application_plan,
 )
 from chainshaper.planning.application_plan import whole
-from chainshaper.planning.profile import other_beginnings
+from chainshaper.planning.profile import doubts_about
 from chainshaper.planning.request import (
+    best_effort_cores,
     refuse_contradictions,
     refuse_entangled,
     refuse_simulated,
@@ -176,6 +177,7 @@ def shape_launch(
             *(cores, cores),
             like=first,
             before=stages_before(seen, request),
+            best_effort=best_effort_cores(seen, request, core_of),
             policy=request.policy,
         )
         before = record(
@@ -261,7 +263,7 @@ def _planned(
     """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
     if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
-    doubts = [*filter(None, map(other_beginnings, profiles[:chains]))]
+    doubts = [doubt for one in profiles[:chains] for doubt in doubts_about(one)]
     if chains > 1:
         plan, remarks = plan_application(profiles, request)
         return plan, remarks + doubts

@@ -26,9 +26,10 @@ from chainshaper.analysis.latency import Executor
 from chainshaper.linux.threads import dds_kind
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.margins import read_latencies
+from chainshaper.planning.profile import Interfering
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.values import events
-from chainshaper.values.application import ApplicationGraph, Callback, Chain
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
@@ -174,6 +175,7 @@ def _profile_of(
         lost_events=sum(recording.info.lost.values()) or None,
         **_writer(recording, flow, stages[-1].node, chain.topics[-1]),
         simulated=simulated,
+        interfering=_interfering(flow, analysis, running, {*planned, *chain.callbacks}),
         all_disturbed=all_disturbed or None,
     )
 
@@ -472,6 +474,27 @@ def _executors(
         cores,
         {name: one.priority for name, one in found.items() if one.priority},
     )
+
+
+def _interfering(
+    flow: DataFlow, analysis: LatencyAnalysis, running: Sequence[Executor], planned: Collection[int]
+) -> tuple[Interfering, ...]:
+    """What else the executors of a chain run while its complete traversals last."""
+    cycles = analysis.traversals.filter("complete")
+    start, end = (cycles[name].to_numpy() for name in ("start", "end"))
+    theirs = {number for one in running for number in one.callbacks}.difference(planned)
+    ran = flow.instances.drop_nulls("end").with_columns(lasted=pl.col("end") - pl.col("start"))
+    found = []
+    for callback in analysis.graph.callbacks:
+        own = ran.filter(callback_id=callback.id)
+        if callback.id not in theirs or callback.trigger in INTERNAL_TOPICS or not own.height:
+            continue
+        within = overlapping(start, end, own["start"].to_numpy(), own["end"].to_numpy())
+        writers = (one for one in analysis.graph.callbacks if callback.trigger in one.publishes)
+        origins = tuple(dict.fromkeys(one.node for one in writers))
+        longest = int(own["lasted"].max())  # type: ignore[arg-type]
+        found.append(Interfering(callback.label, origins, float(within.mean()), longest))
+    return tuple(found)
 
 
 def _writer(recording: Recording, flow: DataFlow, node: str, topic: str) -> dict[str, Any]:

@@ -19,7 +19,7 @@ from chainshaper.enforcement.threads import Allocation, NodeThread, allocate, sc
 from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
-from chainshaper.linux.scheduling import available_cores, check_cores, may_use_fifo
+from chainshaper.linux.scheduling import Scheduling, available_cores, check_cores, may_use_fifo
 from chainshaper.planning.plan import PER_CALLBACK
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
@@ -41,6 +41,7 @@ def profiling_condition(
     like: Recording | None = None,
     *,
     before: Mapping[str, int] = MappingProxyType({}),
+    best_effort: Mapping[str, int] = MappingProxyType({}),
     policy: Policy = "shaped",
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
     """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
@@ -49,9 +50,9 @@ def profiling_condition(
     The first of ``nodes`` are the most urgent, as in a plan of this ``policy``; all, where none is
     named, have one priority. ``core`` is where the executors run (default: the last that we may
     use), or the core of each of ``nodes``, ``before`` how many stages of a pipeline are more urgent
-    there, as a plan has it. ``folder`` is where journals are (default: `/run/chainshaper`). An
-    earlier recording that this one is ``like`` says which components a container has, and which
-    executors several threads.
+    there, as a plan has it, and ``best_effort`` the core of nodes that run when these do not.
+    ``folder`` is where journals are (default: `/run/chainshaper`). An earlier recording that this
+    one is ``like`` says which components a container has, and which executors several threads.
 
     Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
     governs one of the nodes, or the core; a node does not appear; not all could be changed or put
@@ -91,11 +92,15 @@ def profiling_condition(
         around = scheduling_around(
             *(at_home, servers.values(), found, available_cores()), order=order, clear=clear
         )
-        new = [
-            (one.thread.thread, one.wanted)
-            for one in around
-            if one.thread.thread.identity not in done
+        wishes = [(one.thread.thread, one.wanted) for one in around]
+        wishes += [
+            (one.thread, Scheduling(0, (best_effort[node],)))
+            for one in found.threads
+            if one.thread.role == "executor" and one not in members
+            for node in one.nodes
+            if node in best_effort
         ]
+        new = [(thread, wish) for thread, wish in wishes if thread.identity not in done]
         change_all(journal, new)
         done.update(thread.identity for thread, _ in new)
         return not new

@@ -41,6 +41,18 @@ _Stage: TypeAlias = tuple[str, str | None]
 START_UP_NS = 3_000_000_000  # in so long an application starts, or ends
 APART = 1.3  # so many times as long as others is no part of their tail
 FEWEST = 20  # cycles, to tell one from the others
+OFTEN = 0.05  # of a chain's cycles: so often a callback of others on its threads is worth a note
+
+
+class Interfering(NamedTuple):
+    """A callback that is not part of a chain, on a thread that is; ``origins`` are the nodes that
+    trigger it. It ran in this ``share`` of the chain's cycles, for ``longest_ns`` at most.
+    """
+
+    label: str
+    origins: tuple[str, ...]
+    share: float
+    longest_ns: int
 
 
 @dataclass(frozen=True)
@@ -62,7 +74,8 @@ class Profile:
     :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
     are what each callback of the chain took, a row per latency. ``asynchronous``: the process of
     the output's writer has a thread that publishes; ``together`` are nodes that share a process,
-    ``simulated`` nodes of the chain that follow `/clock`. The rest is
+    ``simulated`` nodes of the chain that follow `/clock`, ``interfering`` what else the chain's
+    threads run. The rest is
     :class:`~chainshaper.planning.plan.Evidence`, and :class:`~.plan.ChainOfPlan`.
     """
 
@@ -99,6 +112,7 @@ class Profile:
     asynchronous: bool | None = None
     intra_process: Literal[True] | None = None
     simulated: tuple[str, ...] = ()
+    interfering: tuple[Interfering, ...] = ()
     lost_events: int | None = None
     all_disturbed: bool | None = None
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
@@ -159,6 +173,11 @@ def up_to(profile: Profile, percentile: float) -> Profile:
     return replace(profile.chosen(latencies <= np.sort(latencies)[fit - 1]), of_modes=of_modes)
 
 
+def doubts_about(profile: Profile) -> list[str]:
+    """What else than the chain decides its latencies, one sentence each."""
+    return [*filter(None, (other_beginnings(profile), interfering_callback(profile)))]
+
+
 def other_beginnings(profile: Profile) -> str | None:
     """Which nodes begin what the chain waits for, beside its first callback; None: no others."""
     first = (*profile.nodes[:1], *profile.topics[:1])
@@ -171,6 +190,25 @@ def other_beginnings(profile: Profile) -> str | None:
         f" another time beside {profile.nodes[0]} after every start of the application unless they"
         " are started together, and its latency is another then: measure it after other starts too,"
         " or let slots follow (--adapt)"
+    )
+
+
+def interfering_callback(profile: Profile) -> str | None:
+    """Which callback that is not part of a chain delays it most on its own threads, and what keeps
+    it away; None: none does in more than :data:`OFTEN` of its cycles.
+    """
+    often = [one for one in profile.interfering if one.share > OFTEN]
+    if not often:
+        return None
+    worst = max(often, key=lambda one: one.share * one.longest_ns)
+    remedy = "give it a callback group and an executor of its own"
+    if worst.origins and not set(worst.origins) & {*profile.core_of}:
+        nodes = " and ".join(f"--best-effort {node}" for node in worst.origins)
+        remedy = f"with {nodes} what triggers it runs only when the chain does not"
+    return (
+        f"{profile.name}: in {worst.share:.0%} of its cycles one of its threads also runs"
+        f" {worst.label}, which is not part of it, for up to"
+        f" {milliseconds(worst.longest_ns, 1)} ms: {remedy}"
     )
 
 

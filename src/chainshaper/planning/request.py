@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
 from itertools import combinations, permutations
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -189,10 +190,19 @@ def _apart(profile: Profile) -> Profile:
     return alone(profile)
 
 
-def best_effort_cores(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
-    """The core of each node that is best effort: its own, if it has one, or the first chain's."""
+def best_effort_cores(
+    profiles: Sequence[Profile],
+    request: PlanRequest,
+    core_of: Mapping[str, int] = MappingProxyType({}),
+) -> dict[str, int]:
+    """The core of each node that is best effort: its own, if it has one, or the first chain's, by
+    ``core_of`` where that is to be moved.
+    """
     cores = {node: core for one in profiles for node, core in one.cores.items()}
-    chain = profiles[0].core_of.get(profiles[0].last or "", DEFAULT_CORE)
+    homes, last = core_of, None
+    for one in profiles[:1]:
+        homes, last = core_of or one.core_of, one.last
+    chain = homes.get(last or "", next(iter(homes.values()), DEFAULT_CORE))
     names = ["/" + name.strip("/") for name in request.best_effort]
     known = sorted({node for one in profiles for node in one.every_node})
     for name in names if known else ():
