@@ -43,6 +43,7 @@ from chainshaper.linux.cgroups import (
     move_thread,
     moves_are_quick,
     remount,
+    threads_in,
 )
 from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import may_use_fifo
@@ -364,7 +365,7 @@ def test_the_last_of_two_runs_at_once_leaves_it_mounted_as_the_first_found_it(
         assert mount_options() == plain
 
 
-def test_a_thread_that_is_moved_away_and_a_group_that_is_removed_are_told(tmp_path: Path) -> None:
+def test_a_thread_that_is_moved_away_is_told(tmp_path: Path) -> None:
     with stamping(tmp_path, 20) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
         back_end.assign(spinner.tid, "a")
         back_end.arm(0)
@@ -372,10 +373,43 @@ def test_a_thread_that_is_moved_away_and_a_group_that_is_removed_are_told(tmp_pa
         assert back_end.failure() is None
         (folder,) = groups_left(os.getpid())
         (folder.parent / "cgroup.threads").write_text(str(spinner.tid))
-        assert f"thread {spinner.tid} was moved out" in str(back_end.failure())
+        moved = f"thread {spinner.tid} was moved out"
+        assert moved in str(back_end.failure())
         folder.rmdir()
-        removed = "a cgroup of server a was removed"
-        wait_for(lambda: removed in str(back_end.failure()), "the reason")
+        assert moved in str(back_end.failure())
+
+
+def test_a_container_that_ends_takes_its_group_along_and_the_next_of_its_name_is_gated(
+    tmp_path: Path,
+) -> None:
+    """As a service manager or a container engine removes it, while its sibling goes on."""
+    with (
+        own_cgroup("container") as home,
+        stamping(tmp_path, 30, OTHER_CORE) as sibling,
+        freezer(tmp_path, server("a", (5, 12)), server("b", (0, 7), core=OTHER_CORE)) as back_end,
+    ):
+        back_end.assign(sibling.tid, "b")
+        back_end.arm(0)
+        for name in ("first", "second"):
+            place = tmp_path / name
+            place.mkdir()
+            with stamping(place, 30) as inside:
+                (home / "cgroup.procs").write_text(str(inside.tid))
+                back_end.assign(inside.tid, "a")
+                begun(back_end)
+                begin = time.monotonic_ns()
+                with ahead_of_others(inside.tid, sibling.tid):
+                    time.sleep(0.4)
+                    end = time.monotonic_ns()
+                assert inside_its_slots(inside, begin, end, (5, 12)) > 0.99
+            (own,) = [one for one in groups_left(os.getpid()) if one.parent == home]
+            wait_for(lambda: not threads_in(own), "its end")  # noqa: B023 - in this round
+            own.rmdir()
+            home.rmdir()
+            assert back_end.failure() is None
+            assert back_end.members() == {"a": (), "b": (sibling.tid,)}
+            home.mkdir()
+        assert inside_its_slots(sibling, begin, end, (0, 7)) > 0.99
 
 
 def test_one_run_at_a_time_has_a_thread(tmp_path: Path) -> None:

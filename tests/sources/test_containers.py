@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -25,9 +26,11 @@ def _running(
     environment: Mapping[str, str] | None = None,
     *,
     user: bool = False,
+    overlaid: Path | None = None,
 ) -> Process:
     """The program in a container, once its objects are there."""
-    started, process = stack.enter_context(contained(command, environment, user=user))
+    container = contained(command, environment, user=user, overlaid=overlaid)
+    started, process = stack.enter_context(container)
     assert known(started.stdout).readline() == "ready\n"
     known(started.stdin).write("\n")
     known(started.stdin).flush()
@@ -92,3 +95,22 @@ def test_two_containers_are_recorded_by_ebpf(tmp_path: Path) -> None:
         recording = cs.open_recording(tmp_path / "rec")
         threads = cs.find_threads(recording=recording).threads
         assert {t.thread.pid for t in threads if t.known_by == "recording"} == pids
+
+
+def test_containers_of_one_image_are_recorded_once_each_by_ebpf(tmp_path: Path) -> None:
+    """Both see the image's file through an overlay of their own, as Docker has it: one inode."""
+    skip_without_bpftrace()
+    program = built()
+    command = program.command("chain", "40", "--ros-args", "-r", "__node:=both")
+    with ExitStack() as both:
+        inside = [_running(both, command, overlaid=program.prefix) for _ in range(2)]
+        _recorded(tmp_path / "rec", "ebpf", inside)
+    tables = cs.open_recording(tmp_path / "rec").events
+    for process in inside:
+        started, ended = (
+            tables[name].filter(pid=process.pid)["time"].to_list()
+            for name in ("callback_start", "callback_end")
+        )
+        assert started
+        assert all(a < b for a, b in pairwise(sorted([*started, *ended])))
+        assert all(a < b < c for a, b, c in zip(started, ended, started[1:], strict=False))

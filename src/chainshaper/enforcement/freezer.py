@@ -156,9 +156,9 @@ class CoreNumbers(ctypes.Structure):
 
 
 class ServerNumbers(ctypes.Structure):
-    """Slots, late entries, longest lateness (ns), overruns (-1: unknown), groups lost."""
+    """Slots, late entries, longest lateness (ns), overruns (-1: unknown)."""
 
-    _fields_ = _numbers("slots", "late", "longest", "overruns", "lost")
+    _fields_ = _numbers("slots", "late", "longest", "overruns")
 
 
 class CounterPage:
@@ -239,7 +239,7 @@ class Freezer(BackEnd):
         self._dispatchers: dict[int, subprocess.Popen[str]] = {}
         self._ends: dict[int, str] = {}
         self._memory = os.memfd_create("counters")
-        os.truncate(self._memory, 8 + 80 * len(table.servers))  # there are not more cores
+        os.truncate(self._memory, 8 + 64 * len(table.servers))  # there are not more cores
         page = Path(f"/proc/{pid}/fd/{self._memory}")
         self._page = CounterPage(page, table)
         self._run = FreezerRun((pid, start_of(pid, pid) or 0), table, page)
@@ -324,7 +324,7 @@ class Freezer(BackEnd):
         return {core: process.pid for core, process in self._dispatchers.items()}
 
     def failure(self) -> str | None:
-        """See :meth:`BackEnd.failure`. A lost group or thread leaves the others enforced."""
+        """See :meth:`BackEnd.failure`. A lost thread leaves the others enforced."""
         if self._released:
             return None
         # Threads are let go when a dispatcher is lost: that is looked at last.
@@ -387,9 +387,9 @@ class Freezer(BackEnd):
         return f"{ended}: {said}" if said else ended
 
     def _lost(self) -> str | None:
-        for name, numbers in self._page.servers.items():
-            if numbers.lost:
-                return f"a cgroup of server {name} was removed: its threads run freely; {_AGAIN}"
+        """A thread that runs freely. A service or container that ends takes its groups with it."""
+        for folder in [one for one in self._groups if not one.is_dir()]:
+            del self._groups[folder]
         inside = {tid for tids in self.members().values() for tid in tids}
         for tid in self._born.keys() - inside:
             if not has_ended(tid, self._born[tid]):

@@ -11,6 +11,7 @@ its parent's original. All others are strangers, and so is a daemon whose parent
 these: :func:`look_alikes` names them, and they are left alone.
 """
 
+import os
 from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -80,10 +81,17 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
         except ProcessLookupError:
             continue
         except PermissionError as error:
-            raise PlatformError(
-                f"{_whose(thread)} may not be given {state_text(target)}: run as root or with "
-                "CAP_SYS_NICE, or as the user of that process with an rtprio limit of 98"
-            ) from error
+            remedy = (
+                "run as root or with CAP_SYS_NICE, or as the user of that process with an rtprio"
+                " limit of 98"
+            )
+            if os.geteuid() == 0:
+                remedy = (
+                    "CAP_SYS_NICE is missing; or, with control groups of version 1, the group of"
+                    " its container has no real-time: see its cpu.rt_runtime_us, and those above"
+                )
+            refused = f"{_whose(thread)} may not be given {state_text(target)}: {remedy}"
+            raise PlatformError(refused) from error
         except OSError as error:
             raise OperationError(_refused(thread, target, error)) from error
 

@@ -16,6 +16,7 @@ undoes the whole run.
 """
 
 import contextlib
+import errno
 import json
 import os
 import signal
@@ -178,11 +179,10 @@ class Dispatcher:
             for folder, files in list(self.groups[server].items()):
                 try:
                     os.pwrite(files[0], value, 0)
-                except OSError:  # it was removed, with its threads: the others go on
-                    del self.groups[server][folder]
-                    for file in files:
-                        os.close(file)
-                    self.counters[server].lost += 1
+                except OSError as error:
+                    if error.errno != errno.ENODEV:
+                        raise
+                    self._forget(server, folder)  # its threads have ended: the others go on
 
     def _tick_until_boundary(self) -> None:
         """Tick until the boundary is near. Where there is never room, after ten at the latest."""
@@ -252,14 +252,18 @@ class Dispatcher:
                 self.upcoming = next(self.ahead)
             self.own.acknowledged = command["number"]
 
+    def _forget(self, server: int, folder: str) -> None:
+        for file in self.groups[server].pop(folder, ()):
+            os.close(file)
+
     def _add(self, server: int, folder: str) -> None:
+        self._forget(server, folder)  # of a container of that name that ended
         try:
             self.groups[server][folder] = (
                 os.open(f"{folder}/cgroup.freeze", os.O_WRONLY | os.O_CLOEXEC),
                 os.open(f"{folder}/cgroup.threads", os.O_RDONLY | os.O_CLOEXEC),
             )
-        except OSError:  # another process was quick to remove it
-            self.counters[server].lost += 1
+        except FileNotFoundError:  # another process was quick to remove it
             return
         closed = self.open is not None and server not in self.open
         self._write([server], b"1" if closed else b"0")

@@ -23,7 +23,10 @@ Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1; bpftr
 rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
 """
 
+import ctypes
+import os
 import re
+import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -41,6 +44,7 @@ LIBRARY = "libtracetools.so"
 _INSTALLATIONS = Path("/opt/ros")
 _VERSION = re.compile(r"<version>\s*((\d{1,9})(?!\d)[^<\s]{0,99})\s*</version>")
 _LONGEST_PACKAGE = 1 << 20  # bytes
+_OVERLAY = 0x794C7630
 
 CODE = ("code", "time", "pid", "tid", "cpu")
 VALUES = tuple(f"value_{number}" for number in range(10))
@@ -171,7 +175,7 @@ def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary,
 
 def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...]]:
     """Process → the libraries that it has mapped; only those that have one."""
-    known: dict[tuple[int, int], TracingLibrary] = {}
+    known: dict[tuple[int, ...], TracingLibrary] = {}
     found = {pid: tuple(_found(_mapped(pid), known)) for pid in pids}
     return {pid: libraries for pid, libraries in found.items() if libraries}
 
@@ -188,15 +192,28 @@ def _mapped(pid: int) -> Iterator[Path]:
 
 
 def _found(
-    paths: Iterable[Path], known: dict[tuple[int, int], TracingLibrary]
+    paths: Iterable[Path], known: dict[tuple[int, ...], TracingLibrary]
 ) -> Iterator[TracingLibrary]:
-    """The libraries at some paths; ``known`` has them by device and inode, as uprobes do."""
+    """The libraries at some paths; ``known`` has them by what uprobes are set in.
+
+    That is a device's inode. Containers of one image share it, each through an overlay of its own:
+    a probe in every one of these would fire for all.
+    """
     for path in paths:
         status = path.stat()
-        key = status.st_dev, status.st_ino
+        key: tuple[int, ...] = (status.st_dev, status.st_ino)
+        if _is_overlaid(path):
+            key = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
         if key not in known:
             known[key] = TracingLibrary(path, exported_functions(path), version_of(path))
         yield known[key]
+
+
+def _is_overlaid(path: Path) -> bool:
+    """Whether an overlay shows the file. Upstream: statfs(2), OVERLAYFS_SUPER_MAGIC."""
+    status = ctypes.create_string_buffer(256)
+    ctypes.CDLL(None).statfs(os.fsencode(path), status)
+    return int.from_bytes(status.raw[:4], sys.byteorder) == _OVERLAY
 
 
 def version_of(library: Path) -> str | None:

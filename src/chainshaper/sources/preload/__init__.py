@@ -340,7 +340,7 @@ def preloading(library: Path) -> str:
 
 NO_PROCESS = (
     "no process of these users runs with the library in front: set what `chainshaper watch "
-    "--environment` prints before the application is started"
+    "--environment` prints before the application is started, or name its user (--user)"
 )
 _MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
 

@@ -32,6 +32,7 @@ SNAPSHOT = "_chainshaper_snapshot"  # nodes' names; hidden: `ros2 node list` doe
 SETTER = "_chainshaper_parameter"
 WATCHER = "_chainshaper_watch"
 QUIET_S, LOOK_S = 2.0, 0.2
+FIRST_S = 4.0  # to hear of any node: one of Fast DDS may call again only after three seconds
 ANSWER_S, SPIN_S = 5.0, 0.05
 INFINITE_NS = 1 << 62
 """Durations beyond are no durations: RMW_DURATION_INFINITE, and what RMWs make of it."""
@@ -78,7 +79,9 @@ def print_graph(patience: float = 10.0) -> None:
         begun = quiet_since = time.monotonic()
         known = -1
         found: list[dict[str, Any]] = []
-        while time.monotonic() - quiet_since < QUIET_S and time.monotonic() - begun < patience:
+        while time.monotonic() < min(
+            quiet_since + (QUIET_S if found else FIRST_S), begun + patience
+        ):
             found = endpoints(node)
             if len(found) != known:
                 known, quiet_since = len(found), time.monotonic()
