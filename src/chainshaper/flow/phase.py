@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 
 POLL_NS = 100_000
+SPARING_POLL_NS = 250_000  # on a core that the chain needs, whose work a look would delay
 WATCHER_PRIORITY = 95
 TO_STOP_NS = 20_000  # stopping and continuing a thread takes 5 to 7 us of its time, a timer tens
 SEEN_IN = 0.8  # a place counts when wake-ups come there in this share of the cycles
@@ -82,13 +83,14 @@ def watch_wake_ups(
     *,
     least_ns: int = 0,
     rest_ns: Callable[[int], int] = lambda _: 0,
+    poll_ns: int = POLL_NS,
 ) -> npt.NDArray[np.int64]:
     """When threads of a process became ready to run (ns of CLOCK_MONOTONIC, in order): half way
     between two looks, minus the time that one waited for its core. Raises OperationError: one has
     ended.
 
     Wake-ups after which a thread ran for less than ``least_ns`` are left out. ``rest_ns`` says at
-    any time for how long not to look.
+    any time for how long not to look, else it is done every ``poll_ns``.
     """
     # When each woke up (0: a rest begins, or the end), and how long it had run by then.
     found: list[list[tuple[int, int]]] = [[] for _ in tids]
@@ -101,7 +103,7 @@ def watch_wake_ups(
             seen = [_counters(file) for file in files]
             while now < started + for_ns:
                 rest = rest_ns(now)
-                time.sleep(max(rest, POLL_NS) / 1e9)
+                time.sleep(max(rest, poll_ns) / 1e9)
                 before, seen = seen, [_counters(file) for file in files]
                 looked, now = now, time.monotonic_ns()
                 for own, (_, waited, times), (ran, waited_by_now, times_by_now) in zip(
@@ -194,9 +196,9 @@ class DriftWatch:
     ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
     ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
     thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
-    takes a fifth of a core: it is done on ``cores``, if there are any, and only near where the
-    cycle began last. What is not seen there any more is looked for in the whole cycle. It ends with
-    one of the threads, or when it is to.
+    takes a fifth of a core: it is done on ``cores`` or, where there are none, less often, and only
+    near where the cycle began last. What is not seen there any more is looked for in the whole
+    cycle. It ends with one of the threads, or when it is to.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -265,7 +267,10 @@ class DriftWatch:
 
         least_ns, cycles = TO_STOP_NS if self._slots else 0, self.CYCLES
         seen = watch_wake_ups(
-            *self._threads, cycles * cycle_ns, least_ns=least_ns, rest_ns=until_near
+            *(*self._threads, cycles * cycle_ns),
+            least_ns=least_ns,
+            rest_ns=until_near,
+            poll_ns=POLL_NS if self._cores else SPARING_POLL_NS,
         )
         return find_drift(seen, cycle_ns, cycles, expected_ns, self._slots)
 
