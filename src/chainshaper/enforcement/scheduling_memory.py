@@ -82,14 +82,12 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
             continue
         except PermissionError as error:
             remedy = (
-                "run as root or with CAP_SYS_NICE, or as the user of that process with an rtprio"
-                " limit of 98"
+                "CAP_SYS_NICE is missing; or, with control groups of version 1, the group of its"
+                " container has no real-time: see its cpu.rt_runtime_us, and those above"
+                if os.geteuid() == 0
+                else "run as root or with CAP_SYS_NICE, or as the user of that process with an"
+                " rtprio limit of 98"
             )
-            if os.geteuid() == 0:
-                remedy = (
-                    "CAP_SYS_NICE is missing; or, with control groups of version 1, the group of"
-                    " its container has no real-time: see its cpu.rt_runtime_us, and those above"
-                )
             refused = f"{_whose(thread)} may not be given {state_text(target)}: {remedy}"
             raise PlatformError(refused) from error
         except OSError as error:

@@ -483,17 +483,18 @@ def _interfering(
     cycles = analysis.traversals.filter("complete")
     start, end = (cycles[name].to_numpy() for name in ("start", "end"))
     theirs = {number for one in running for number in one.callbacks}.difference(planned)
-    ran = flow.instances.drop_nulls("end").with_columns(lasted=pl.col("end") - pl.col("start"))
-    found = []
-    for callback in analysis.graph.callbacks:
-        own = ran.filter(callback_id=callback.id)
-        if callback.id not in theirs or callback.trigger in INTERNAL_TOPICS or not own.height:
+    callbacks, found = analysis.graph.callbacks, []
+    for callback in callbacks:
+        if callback.id not in theirs or callback.trigger in INTERNAL_TOPICS:
             continue
-        within = overlapping(start, end, own["start"].to_numpy(), own["end"].to_numpy())
-        writers = (one for one in analysis.graph.callbacks if callback.trigger in one.publishes)
-        origins = tuple(dict.fromkeys(one.node for one in writers))
-        longest = int(own["lasted"].max())  # type: ignore[arg-type]
-        found.append(Interfering(callback.label, origins, float(within.mean()), longest))
+        own = flow.instances.filter(callback_id=callback.id).drop_nulls("end")
+        if not own.height:
+            continue
+        began, ended = own["start"].to_numpy(), own["end"].to_numpy()
+        share = float(overlapping(start, end, began, ended).mean())
+        writers = (one.node for one in callbacks if callback.trigger in one.publishes)
+        longest_ns = int((ended - began).max())
+        found.append(Interfering(callback.label, tuple(dict.fromkeys(writers)), share, longest_ns))
     return tuple(found)
 
 

@@ -198,11 +198,12 @@ def best_effort_cores(
     """The core of each node that is best effort: its own, if it has one, or the first chain's, by
     ``core_of`` where that is to be moved.
     """
+    if not request.best_effort:
+        return {}
     cores = {node: core for one in profiles for node, core in one.cores.items()}
-    homes, last = core_of, None
-    for one in profiles[:1]:
-        homes, last = core_of or one.core_of, one.last
-    chain = homes.get(last or "", next(iter(homes.values()), DEFAULT_CORE))
+    homes = core_of or profiles[0].core_of
+    last = (profiles[0].last if profiles else None) or ""
+    chain = homes.get(last, next(iter(homes.values()), DEFAULT_CORE))
     names = ["/" + name.strip("/") for name in request.best_effort]
     known = sorted({node for one in profiles for node in one.every_node})
     for name in names if known else ():
