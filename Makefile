@@ -1,5 +1,8 @@
 # `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
 
+# Where it is set, as images of containers like to, every process of a test compiles all it imports.
+export PYTHONDONTWRITEBYTECODE =
+
 .PHONY: demo test test-untimed test-timed test-waiting test-kernel lint benchmark experiments docs clean
 
 demo: .venv/.ready
