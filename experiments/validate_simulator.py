@@ -9,10 +9,12 @@ are compared with. Execution times are the same ones in all. Recordings that are
 are used.
 
 The same application then runs shaped: with the servers of its plan in force by freezing, with one
-band and with three, planned from the short run, and simulated with the costs of another short run
-under the same plan: what opens and closes servers takes time too. Outputs that missed the slot they
-have in the simulation, or made one that they miss there, are off by a whole band or period: so many
-of them as the median and p99 say.
+band and with three, planned from the short run. It runs in blocks, one and three bands in turns,
+and each block is simulated with the costs of a short run under the same plan just before it: what
+opens and closes servers takes time too, and what it takes changes with the machine. Every block
+runs twice, with the same execution times: no simulation can be expected to be nearer to a run than
+another run is. Outputs that missed the slot they have in the simulation, or made one that they miss
+there, are off by a whole band or period: so many of them as the median and p99 say.
 
 Cycles that the machine disturbed are left out, on the stall meters' evidence and no other: those
 that it stalled, and then those in which one of the cores ran at another pace than in the short
@@ -31,8 +33,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import polars as pl
+from configurations import BLOCKS, output_of
 from configurations import live as live_shaped
-from configurations import output_of
 from measured_costs import measured_costs
 
 from chainshaper import (
@@ -59,6 +61,9 @@ SHARE_OF_BAND = 0.03
 CALIBRATION_SEED = 1_000_003
 CALIBRATION_CYCLES = 100
 OFF_PACE = 1.5
+
+Block = tuple[pl.DataFrame, ...]
+"""Cycles of a block: measured, measured again, simulated."""
 
 
 def live(application: Application, path: Path, cycles: int) -> Recording:
@@ -160,44 +165,78 @@ def shaped(
     described: Application, calibration: Recording, options: argparse.Namespace, folder: Path
 ) -> None:
     """Print how far apart the two are with one band and with three, servers in force."""
-    other_seed = described.model_copy(update={"seed": CALIBRATION_SEED})
-    for bands in (1, 3):
-        plan = plan_recording(calibration, request=PlanRequest(bands=bands, overrun="wait"))
-        name = f"{bands} band{'s' if bands > 1 else ''}"
-        in_force, before = partial(live_shaped, folder=folder, servers=True), f"{name}, calibration"
-        in_force(before, other_seed, plan, cycles=CALIBRATION_CYCLES)
-        in_force(name, described, plan, cycles=options.cycles)
-        own = [node.thread.node for node in shaping_nodes(plan)]
-        costs = measured_costs(output_of(folder, before), but_for=own)
-        calibrated = described.model_copy(update={"simulation": costs})
-        since = int(output_of(folder, f"{name}.in_force").read_text())
-        recording = open_recording(output_of(folder, name))
-        measured = by_cycle(recording, since)
-        with tempfile.TemporaryDirectory() as scratch:
-            most = int(measured["cycle"].max()) + 1  # type: ignore[arg-type]
-            simulated = by_cycle(
-                simulate(calibrated, Path(scratch) / "simulated", plan, cycles=most)
+    plans = {
+        f"{bands} band{'s' if bands > 1 else ''}": plan_recording(
+            calibration, request=PlanRequest(bands=bands, overrun="wait")
+        )
+        for bands in (1, 3)
+    }
+    blocks: dict[str, list[Block]] = {name: [] for name in plans}
+    for number in range(BLOCKS):
+        for name, plan in plans.items():
+            own = folder / f"block_{number}"
+            own.mkdir(exist_ok=True)
+            blocks[name].append(
+                shaped_block(name, described, plan, number, cycles=options.cycles, folder=own)
             )
+    for name, plan in plans.items():
+        measured, again, simulated = (
+            pl.concat(frames) for frames in zip(*blocks[name], strict=True)
+        )
         not_stalled = measured.filter(~pl.col("disturbed"))
+        calm_again = again.filter(~pl.col("disturbed"))
         compare(f"{name}, all", measured, simulated)
         compare(f"{name}, not stalled", not_stalled, simulated)
-        shares(plan, not_stalled, simulated.join(not_stalled, on="cycle", how="semi"))
+        compare(f"{name}, live again", not_stalled, calm_again)
+        shares(plan, not_stalled, {"simulated": simulated, "live again": calm_again})
 
 
-def shares(plan: Plan, measured: pl.DataFrame, simulated: pl.DataFrame) -> None:
-    """Print which share of outputs left with each band, live and simulated, and which was late."""
+def shaped_block(
+    name: str, described: Application, plan: Plan, number: int, *, cycles: int, folder: Path
+) -> Block:
+    """What one block of ``cycles`` / BLOCKS measured, measured again and, as calibrated, simulated.
+
+    Cycles of block ``number`` are numbered from ``number`` million.
+    """
+    seeds = {"calibration": CALIBRATION_SEED + number, "": described.seed + number}
+    in_force = partial(live_shaped, cycles=-(-cycles // BLOCKS), folder=folder, servers=True)
+    for which, seed in (*seeds.items(), ("again", described.seed + number)):
+        in_force(f"{name} {which}".strip(), described.model_copy(update={"seed": seed}), plan)
+    shaping = [node.thread.node for node in shaping_nodes(plan)]
+    costs = measured_costs(output_of(folder, f"{name} calibration"), but_for=shaping)
+    measured, again = (
+        by_cycle(
+            open_recording(output_of(folder, one)),
+            int(output_of(folder, f"{one}.in_force").read_text()),
+        )
+        for one in (name, f"{name} again")
+    )
+    calibrated = described.model_copy(update={"simulation": costs, "seed": seeds[""]})
+    most = int(measured["cycle"].max()) + 1  # type: ignore[arg-type]
+    with tempfile.TemporaryDirectory() as scratch:
+        simulated = by_cycle(simulate(calibrated, Path(scratch) / "simulated", plan, cycles=most))
+    numbered = pl.col("cycle") + number * 1_000_000
+    return tuple(frame.with_columns(numbered) for frame in (measured, again, simulated))
+
+
+def shares(plan: Plan, measured: pl.DataFrame, others: Mapping[str, pl.DataFrame]) -> None:
+    """Print which share of outputs left with each band and which was late, of the same cycles."""
     starts = [start for start, _ in publish_slots(plan)]
     edges = [*starts, starts[0] + plan.cycle_ns]
-    both = []
-    for frame in (measured, simulated):
+
+    def of(frame: pl.DataFrame) -> npt.NDArray[np.float64]:
         place = np.searchsorted(edges, frame["latency_ns"].to_numpy(), side="right") - 1
-        both.append(np.bincount(np.maximum(place, 0), minlength=len(edges)) / max(len(frame), 1))
-    apart = np.abs(both[0] - both[1]).max()
-    for which, row in zip(("live", "simulated"), both, strict=True):
-        bands = ", ".join(f"{share:.1%}" for share in row[:-1])
-        print(f"{'':<28}{which}: share per band {bands}; late {row[-1]:.1%}")
-    met = "met" if apart <= SHARE_OF_BAND else "missed"
-    print(f"{'':<28}at most {apart:.1%} apart, goal {SHARE_OF_BAND:.0%}  {met}")
+        return np.bincount(np.maximum(place, 0), minlength=len(edges)) / max(len(frame), 1)
+
+    for which, frame in others.items():
+        same = of(measured.join(frame, on="cycle", how="semi"))
+        theirs = of(frame.join(measured, on="cycle", how="semi"))
+        apart = np.abs(same - theirs).max()
+        met = "met" if apart <= SHARE_OF_BAND else "missed"
+        for one, row in (("live", same), (which, theirs)):
+            bands = ", ".join(f"{share:.1%}" for share in row[:-1])
+            print(f"{'':<28}{one}: share per band {bands}; late {row[-1]:.1%}")
+        print(f"{'':<28}at most {apart:.1%} apart, goal {SHARE_OF_BAND:.0%}  {met}")
 
 
 def main() -> None:
