@@ -39,7 +39,11 @@ _PRIORITY = 98
 _LOOK_S = 0.02
 _LOOKS_UNTIL_THAWED = 4
 _LOOKS_UNTIL_HUNG = 24
-_IDLE_S = 0.1
+_IDLE_S = 1.0
+"""Where no dispatcher is known. A look takes a tenth of a millisecond, above all others on a core
+that may be the one on which DDS delivers the output: ten a second, by each of two guardians, delayed
+two of a hundred deliveries of a chain at 100 ms, by up to 0.3 ms."""
+
 _LOOKS_AT_ONCE = 5
 """Between two at the journal: nothing that can wait is to keep a core from those in their slots."""
 _START_S = 20.0
