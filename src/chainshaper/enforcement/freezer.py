@@ -148,12 +148,11 @@ def _numbers(*names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
 
 
 class CoreNumbers(ctypes.Structure):
-    """``beats`` move as long as the dispatcher does, whose next boundary is ``upcoming`` (ns);
-    ``acknowledged`` is its last command. Guardians write ``let_go``, when (ns) they thawed the
-    threads of one that hangs, and ``silent``.
+    """``beats`` move as long as the dispatcher does; ``acknowledged`` is its last command.
+    Guardians write ``let_go``, when (ns) they thawed the threads of one that hangs, and ``silent``.
     """
 
-    _fields_ = _numbers("beats", "upcoming", "acknowledged", "let_go", "silent")
+    _fields_ = _numbers("beats", "acknowledged", "let_go", "silent")
 
 
 class ServerNumbers(ctypes.Structure):
@@ -240,7 +239,7 @@ class Freezer(BackEnd):
         self._dispatchers: dict[int, subprocess.Popen[str]] = {}
         self._ends: dict[int, str] = {}
         self._memory = os.memfd_create("counters")
-        os.truncate(self._memory, 8 + 72 * len(table.servers))  # there are not more cores
+        os.truncate(self._memory, 8 + 64 * len(table.servers))  # there are not more cores
         page = Path(f"/proc/{pid}/fd/{self._memory}")
         self._page = CounterPage(page, table)
         self._run = FreezerRun((pid, start_of(pid, pid) or 0), table, page)

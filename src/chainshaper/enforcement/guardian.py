@@ -40,11 +40,10 @@ _LOOK_S = 0.02
 _LOOKS_UNTIL_THAWED = 4
 _LOOKS_UNTIL_HUNG = 24
 _IDLE_S = 1.0
-"""Where no dispatcher is known."""
-_QUIET_NS = (500_000, 2_000_000)
-"""Before and behind a boundary, where outputs are delivered. A look takes a tenth of a millisecond
-above all others on a core that may be the one on which DDS delivers: looks at any time delayed two
-of a hundred deliveries of a chain at 100 ms, by up to 0.3 ms."""
+"""Where no dispatcher is known. A look takes a tenth of a millisecond, above all others on a core
+that may be the one on which DDS delivers the output: ten a second, by each of two guardians, delayed
+two of a hundred deliveries of a chain at 100 ms, by up to 0.3 ms."""
+
 _LOOKS_AT_ONCE = 5
 """Between two at the journal: nothing that can wait is to keep a core from those in their slots."""
 _START_S = 20.0
@@ -141,7 +140,7 @@ class _Watch:
         while self.journal_is_there():
             lost = self.look_for_dispatchers()
             for _ in range(_LOOKS_AT_ONCE):
-                ended = self.poll.poll(1000 * self.time_to_look())
+                ended = self.poll.poll(1000 * (_LOOK_S if self.cores else _IDLE_S))
                 if any(pidfd == self.owner for pidfd, _ in ended):
                     return True
                 if self.page is None or self.page.released.value:
@@ -151,18 +150,6 @@ class _Watch:
                     self.forget_dispatchers()
                     return True
         return False
-
-    def time_to_look(self) -> float:
-        """Until the next look (s): not while an output may be delivered, if that is known."""
-        if self.page is None or not self.cores:
-            return _IDLE_S
-        now, look_ns = time.monotonic_ns(), int(_LOOK_S * 1e9)
-        before, behind = _QUIET_NS
-        for at in sorted(self.page.cores[core].upcoming for core in self.cores.values()):
-            boundary = at - now
-            if boundary - before < look_ns < boundary + behind:
-                look_ns = boundary + behind
-        return look_ns / 1e9
 
     def journal_is_there(self) -> bool:
         try:

@@ -212,7 +212,6 @@ class Dispatcher:
     def _give_sign(self, now: int) -> None:
         """Show that we live, and close again what a guardian, or the other later, has thawed."""
         self.own.beats += 1
-        self.own.upcoming = self.upcoming[0]
         let_go = self.own.let_go
         if self.open is not None and (
             let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
