@@ -27,10 +27,11 @@ from processes import is_alive, wait_for
 
 from chainshaper.enforcement.freezer import CoreNumbers, CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, _Watch, let_go
+from chainshaper.enforcement.threads import _BEST_SERVER_PRIORITY, DDS_PRIORITY
 from chainshaper.enforcement.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
 from chainshaper.linux.runs import Journal, find_journals
-from chainshaper.linux.scheduling import state_of
+from chainshaper.linux.scheduling import available_cores, state_of
 from chainshaper.linux.threads import list_threads
 
 pytestmark = [needs_cgroups, needs_fifo]
@@ -249,14 +250,45 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
         for pid in run.guardians:
             assert os.getsid(pid) == pid
             assert cgroup_of(pid) == mount_point() / GROUP
-            (thread,) = list_threads(pid)
-            (dispatcher,) = list_threads(run.dispatchers[0])
-            assert thread.priority > dispatcher.priority
             for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
                 kill(pid, number)
         time.sleep(0.2)
         assert all(map(is_alive, run.guardians))
         assert run.ask("failure") == "None"
+
+
+@pytest.mark.skipif(len(available_cores()) < 2, reason="it needs a core beside the servers'")
+def test_guardians_look_below_dds_and_above_dispatchers_where_they_share_a_core(
+    node: Governed,
+) -> None:
+    """DDS delivers outputs on a core without servers; a dispatcher that spins is there for good."""
+    with run_on(node) as run:
+        wait_for(
+            lambda: not any(map(beside_the_dispatcher, run.guardians)), "them to look elsewhere"
+        )
+        wait_for(
+            lambda: all(
+                _BEST_SERVER_PRIORITY < priority_of(one) < DDS_PRIORITY for one in run.guardians
+            ),
+            "their class",
+        )
+    available = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {CORE})
+    try:
+        with run_on(node) as run:
+            time.sleep(0.2)
+            assert all(priority_of(one) > priority_of(run.dispatchers[0]) for one in run.guardians)
+    finally:
+        os.sched_setaffinity(0, available)
+
+
+def beside_the_dispatcher(pid: int) -> bool:
+    return CORE in os.sched_getaffinity(pid)
+
+
+def priority_of(pid: int) -> int:
+    (thread,) = list_threads(pid)
+    return thread.priority
 
 
 def test_once_it_knows_all_dispatchers_a_journal_that_grows_is_read_no_more() -> None:

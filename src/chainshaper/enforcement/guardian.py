@@ -5,8 +5,8 @@
 Every run has two, which do the same: each is there should the other be killed or stopped at the
 same instant as what they watch over. They learn of a death from a pidfd, at once, and of a
 dispatcher that hangs from its sign of life; then they undo all that the journal says. Each has a
-session and a cgroup of its own, and a priority above the dispatchers'. On its standard output it
-says when it watches.
+session and a cgroup of its own, and a priority above the dispatchers' where it shares a core with
+one. On its standard output it says when it watches.
 
 A dispatcher without a sign of life for a tenth of a second may hang, or its core may have been
 taken from the machine for a moment. So its threads are let go first; one that stays away for half a
@@ -36,14 +36,14 @@ from chainshaper.values.errors import OperationError
 GROUP = "chainshaper.guardians"
 _HOW_MANY = 2
 _PRIORITY = 98
+_ELSEWHERE_PRIORITY = 88
+"""On cores without a dispatcher: above all servers, below DDS, which delivers outputs there. Above
+it, looks of a tenth of a millisecond delayed two of a hundred outputs, by up to 0.3 ms."""
 _LOOK_S = 0.02
 _LOOKS_UNTIL_THAWED = 4
 _LOOKS_UNTIL_HUNG = 24
 _IDLE_S = 1.0
-"""Where no dispatcher is known. A look takes a tenth of a millisecond, above all others on a core
-that may be the one on which DDS delivers the output: ten a second, by each of two guardians, delayed
-two of a hundred deliveries of a chain at 100 ms, by up to 0.3 ms."""
-
+"""Where no dispatcher is known: from above all others, too."""
 _LOOKS_AT_ONCE = 5
 """Between two at the journal: nothing that can wait is to keep a core from those in their slots."""
 _START_S = 20.0
@@ -181,8 +181,9 @@ class _Watch:
             else:
                 self.cores[pidfd] = one.core
                 self.poll.register(pidfd, select.POLLIN)
-        if elsewhere := self.available - set(self.cores.values()):
-            os.sched_setaffinity(0, elsewhere)
+        elsewhere = self.available - set(self.cores.values())
+        os.sched_setaffinity(0, elsewhere or self.available)
+        become_fifo(_ELSEWHERE_PRIORITY if elsewhere else _PRIORITY)
         return lost
 
     def forget_dispatchers(self) -> None:
