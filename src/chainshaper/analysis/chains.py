@@ -304,7 +304,8 @@ class _Search:
             writers = ", ".join(self.graph.publishers.get(name, ())) or "no node in the recording"
             raise InputError(
                 f"chain {self.spec!r}: no callback was seen to publish {name} (its publisher: "
-                f"{writers}); begin the chain at a topic that a callback publishes"
+                f"{writers}); begin the chain at a topic that a callback publishes; Humble has no"
+                " trace points for messages within a process: run without use_intra_process_comms"
             )
         return starts
 
