@@ -150,7 +150,8 @@ def become_realtime(node: Node) -> None:
             policy = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
             os.sched_setscheduler(0, policy, os.sched_param(priority))
     except OSError as error:
-        warn(f"SCHED_FIFO is refused: {error.strerror}", "give the user an rtprio limit of 98")
+        remedy = "give the user an rtprio limit of 98, or the container cpu.rt_runtime_us"
+        warn(f"SCHED_FIFO is refused: {error.strerror}", remedy)
     try:
         if core >= 0:
             os.sched_setaffinity(0, {core})

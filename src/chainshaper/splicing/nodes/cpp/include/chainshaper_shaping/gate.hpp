@@ -422,7 +422,9 @@ inline bool set_core(std::int64_t core) {
 template <typename Warn>
 void schedule(const Parameters & parameters, Warn warn) {
   if (parameters.fifo_priority > 0 && !set_fifo(parameters.fifo_priority))
-    warn("SCHED_FIFO is refused", "give the user an rtprio limit of 98");
+    warn(
+      "SCHED_FIFO is refused",
+      "give the user an rtprio limit of 98, or the container cpu.rt_runtime_us");
   if (parameters.core >= 0 && !set_core(parameters.core))
     warn("core " + std::to_string(parameters.core) + " is refused", "name another in the plan");
 }
