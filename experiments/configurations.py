@@ -58,6 +58,7 @@ __all__ = [
     "Configuration",
     "Options",
     "Panel",
+    "block_seed",
     "draw_latencies",
     "first_cycles",
     "joined",
@@ -218,7 +219,7 @@ def live_in_turns(
     def measure(number: int, block: int) -> tuple[Run, Path]:
         one, own = configurations[number], folder / f"block_{block}"
         own.mkdir(exist_ok=True)
-        seed = one.application.seed + 1 + block
+        seed = block_seed(one.application, block)
         run = live(
             one.name,
             one.application.model_copy(update={"seed": seed}),
@@ -231,6 +232,13 @@ def live_in_turns(
         return run, output_of(own, one.name)
 
     return [joined(*one) for one in taking_turns(len(configurations), blocks, measure)]
+
+
+def block_seed(application: Application, block: int) -> int:
+    """What execution times of a block are drawn from: others than a profile's, which has the seed
+    of the application itself.
+    """
+    return application.seed + 1 + block
 
 
 def taking_turns(

@@ -128,6 +128,9 @@ def _share_taken(instances: pl.DataFrame) -> float:
 
 
 def _ordinary(costs: pl.Series) -> pl.Series:
-    """What costs took, but for those that took so long that they waited for something else."""
+    """What costs took, but for those that took so long that they waited for something else.
+
+    In ascending order: rows of joins come in any, and simulations are to draw the same again.
+    """
     median = costs.median()
-    return costs.filter(costs <= FAR * median) if isinstance(median, float) else costs
+    return (costs.filter(costs <= FAR * median) if isinstance(median, float) else costs).sort()

@@ -27,14 +27,12 @@ beside them. Shaped, all cycles that were not stalled are judged, with the share
 import argparse
 import tempfile
 from collections.abc import Iterator, Mapping
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from configurations import BLOCKS, output_of
-from configurations import live as live_shaped
+from configurations import BLOCKS, Configuration, block_seed, live_in_turns, output_of
 from measured_costs import measured_costs
 
 from chainshaper import (
@@ -61,9 +59,6 @@ SHARE_OF_BAND = 0.03
 CALIBRATION_SEED = 1_000_003
 CALIBRATION_CYCLES = 100
 OFF_PACE = 1.5
-
-Block = tuple[pl.DataFrame, ...]
-"""Cycles of a block: measured, measured again, simulated."""
 
 
 def live(application: Application, path: Path, cycles: int) -> Recording:
@@ -165,24 +160,23 @@ def shaped(
     described: Application, calibration: Recording, options: argparse.Namespace, folder: Path
 ) -> None:
     """Print how far apart the two are with one band and with three, servers in force."""
+    other = described.model_copy(update={"seed": CALIBRATION_SEED})
     plans = {
         f"{bands} band{'s' if bands > 1 else ''}": plan_recording(
             calibration, request=PlanRequest(bands=bands, overrun="wait")
         )
         for bands in (1, 3)
     }
-    blocks: dict[str, list[Block]] = {name: [] for name in plans}
-    for number in range(BLOCKS):
-        for name, plan in plans.items():
-            own = folder / f"block_{number}"
-            own.mkdir(exist_ok=True)
-            blocks[name].append(
-                shaped_block(name, described, plan, number, cycles=options.cycles, folder=own)
-            )
+    configurations = [
+        Configuration(f"{name}{which}", application, plan, servers=True)
+        for name, plan in plans.items()
+        for which, application in ((" calibration", other), ("", described), (" again", described))
+    ]
+    runs = live_in_turns(configurations, cycles=options.cycles, folder=folder)
+    print(f"{sum(run.repeats for run in runs)} blocks repeated, in which the machine stood still")
     for name, plan in plans.items():
-        measured, again, simulated = (
-            pl.concat(frames) for frames in zip(*blocks[name], strict=True)
-        )
+        blocks = [shaped_block(name, described, plan, block, folder) for block in range(BLOCKS)]
+        measured, again, simulated = (pl.concat(frames) for frames in zip(*blocks, strict=True))
         not_stalled = measured.filter(~pl.col("disturbed"))
         calm_again = again.filter(~pl.col("disturbed"))
         compare(f"{name}, all", measured, simulated)
@@ -192,30 +186,28 @@ def shaped(
 
 
 def shaped_block(
-    name: str, described: Application, plan: Plan, number: int, *, cycles: int, folder: Path
-) -> Block:
-    """What one block of ``cycles`` / BLOCKS measured, measured again and, as calibrated, simulated.
+    name: str, described: Application, plan: Plan, block: int, folder: Path
+) -> tuple[pl.DataFrame, ...]:
+    """The cycles of a block: measured, measured again, and simulated with its calibration's costs.
 
-    Cycles of block ``number`` are numbered from ``number`` million.
+    Cycles of block ``block`` are numbered from ``block`` million.
     """
-    seeds = {"calibration": CALIBRATION_SEED + number, "": described.seed + number}
-    in_force = partial(live_shaped, cycles=-(-cycles // BLOCKS), folder=folder, servers=True)
-    for which, seed in (*seeds.items(), ("again", described.seed + number)):
-        in_force(f"{name} {which}".strip(), described.model_copy(update={"seed": seed}), plan)
-    shaping = [node.thread.node for node in shaping_nodes(plan)]
-    costs = measured_costs(output_of(folder, f"{name} calibration"), but_for=shaping)
+    own = folder / f"block_{block}"
     measured, again = (
         by_cycle(
-            open_recording(output_of(folder, one)),
-            int(output_of(folder, f"{one}.in_force").read_text()),
+            open_recording(output_of(own, one)),
+            int(output_of(own, f"{one}.in_force").read_text()),
         )
         for one in (name, f"{name} again")
     )
-    calibrated = described.model_copy(update={"simulation": costs, "seed": seeds[""]})
+    shaping = [node.thread.node for node in shaping_nodes(plan)]
+    costs = measured_costs(output_of(own, f"{name} calibration"), but_for=shaping)
+    as_live = {"simulation": costs, "seed": block_seed(described, block)}
     most = int(measured["cycle"].max()) + 1  # type: ignore[arg-type]
     with tempfile.TemporaryDirectory() as scratch:
+        calibrated = described.model_copy(update=as_live)
         simulated = by_cycle(simulate(calibrated, Path(scratch) / "simulated", plan, cycles=most))
-    numbered = pl.col("cycle") + number * 1_000_000
+    numbered = pl.col("cycle") + block * 1_000_000
     return tuple(frame.with_columns(numbered) for frame in (measured, again, simulated))
 
 

@@ -245,7 +245,7 @@ def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_
 
 
 def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) -> None:
-    """They have a session, a cgroup and a priority of their own, and hear no terminal."""
+    """They have a session and a cgroup of their own, and hear no terminal."""
     with run_on(node) as run:
         for pid in run.guardians:
             assert os.getsid(pid) == pid
@@ -258,10 +258,8 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
 
 
 @pytest.mark.skipif(len(available_cores()) < 2, reason="it needs a core beside the servers'")
-def test_guardians_look_below_dds_and_above_dispatchers_where_they_share_a_core(
-    node: Governed,
-) -> None:
-    """DDS delivers outputs on a core without servers; a dispatcher that spins is there for good."""
+def test_guardians_elsewhere_are_below_dds_and_above_all_servers(node: Governed) -> None:
+    """DDS delivers outputs on a core without servers."""
     with run_on(node) as run:
         wait_for(
             lambda: not any(map(beside_the_dispatcher, run.guardians)), "them to look elsewhere"
@@ -272,6 +270,10 @@ def test_guardians_look_below_dds_and_above_dispatchers_where_they_share_a_core(
             ),
             "their class",
         )
+
+
+def test_guardians_are_above_a_dispatcher_that_they_share_a_core_with(node: Governed) -> None:
+    """One that spins would keep them from it for good."""
     available = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {CORE})
     try:

@@ -43,7 +43,7 @@ _LOOK_S = 0.02
 _LOOKS_UNTIL_THAWED = 4
 _LOOKS_UNTIL_HUNG = 24
 _IDLE_S = 1.0
-"""Where no dispatcher is known: from above all others, too."""
+"""Where no dispatcher is known. Not more often: such looks come from above all others, too."""
 _LOOKS_AT_ONCE = 5
 """Between two at the journal: nothing that can wait is to keep a core from those in their slots."""
 _START_S = 20.0
