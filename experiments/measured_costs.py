@@ -132,5 +132,5 @@ def _ordinary(costs: pl.Series) -> pl.Series:
 
     In ascending order: rows of joins come in any, and simulations are to draw the same again.
     """
-    median = costs.median()
-    return (costs.filter(costs <= FAR * median) if isinstance(median, float) else costs).sort()
+    costs, median = costs.sort(), costs.median()
+    return costs.filter(costs <= FAR * median) if isinstance(median, float) else costs
