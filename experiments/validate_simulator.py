@@ -2,26 +2,19 @@
 
     python experiments/validate_simulator.py [APP.yaml] [--cycles 1000] [--keep FOLDER]
 
-The application runs live, with and without the nodes that only interfere, and each is simulated
-twice: with what waking up, taking and publishing cost by default, and with what they cost here,
-measured in a short run before with another seed, so that nothing is taken over from the runs that
-are compared with. Execution times are the same ones in all. Recordings that are in FOLDER already
-are used.
+The application runs live under SCHED_FIFO, with and without the nodes that only interfere, and with
+the servers of its plan in force by freezing, with one band and with three. These cases take turns,
+in blocks, and what waking up, taking and publishing cost is measured in a short run of the same
+case with another seed just before each block: it changes with the machine. Execution times are the
+same ones live and simulated. Every block runs twice, with the same execution times: no simulation
+can be expected to be nearer to a run than another run is. With bands, outputs that missed the slot
+they have in the simulation, or made one that they miss there, are off by a whole band or period: so
+many of them as the median and p99 say. Recordings that are in FOLDER already are used.
 
-The same application then runs shaped: with the servers of its plan in force by freezing, with one
-band and with three, planned from the short run. It runs in blocks, one and three bands in turns,
-and each block is simulated with the costs of a short run under the same plan just before it: what
-opens and closes servers takes time too, and what it takes changes with the machine. Every block
-runs twice, with the same execution times: no simulation can be expected to be nearer to a run than
-another run is. Outputs that missed the slot they have in the simulation, or made one that they miss
-there, are off by a whole band or period: so many of them as the median and p99 say.
-
-Cycles that the machine disturbed are left out, on the stall meters' evidence and no other: those
-that it stalled, and then those in which one of the cores ran at another pace than in the short
-run, by a factor of 1.5 or more. (What a simulation does not know, hops, publications, interrupts,
-takes some 2.3 ms of a cycle of the example; at 1.5 times that it is off by more than 1 ms.)
-Unshaped, figures with both kinds left out are judged; those without stalled cycles only stand
-beside them. Shaped, all cycles that were not stalled are judged, with the share of each band.
+Cycles that the machine stalled are left out of what is judged, on the stall meters' evidence and no
+other. A simulation does not know either how the pace of the cores changes within a block: beside
+what is judged stands the same without cycles in which it was another than in the block's short run,
+by a factor of 1.5 or more.
 """
 
 import argparse
@@ -32,7 +25,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 import polars as pl
-from configurations import BLOCKS, Configuration, block_seed, live_in_turns, output_of
+from configurations import BLOCKS, Configuration, block_seed, live, live_in_turns, output_of
 from measured_costs import measured_costs
 
 from chainshaper import (
@@ -40,7 +33,6 @@ from chainshaper import (
     measure_latency,
     open_recording,
     plan_recording,
-    run_application,
     simulate,
 )
 from chainshaper.planning import Plan, PlanRequest
@@ -57,21 +49,13 @@ SHARE_OF_BAND = 0.03
 """The goal of the share of cycles that leave with each band."""
 
 CALIBRATION_SEED = 1_000_003
-CALIBRATION_CYCLES = 100
+PROFILE_CYCLES = 100
 OFF_PACE = 1.5
-
-
-def live(application: Application, path: Path, cycles: int) -> Recording:
-    """A live run, unless it has been recorded already."""
-    if path.exists():
-        return open_recording(path)
-    print(f"running {application.name} live for {cycles} cycles", flush=True)
-    return run_application(application, path, cycles=cycles)
 
 
 def with_and_without_interference(application: Application) -> Iterator[tuple[str, Application]]:
     """The application, and without nodes that exchange no messages with others if it has any."""
-    yield "live", application
+    yield "beside interference", application
     nodes = {
         name: node
         for name, node in application.nodes.items()
@@ -81,17 +65,20 @@ def with_and_without_interference(application: Application) -> Iterator[tuple[st
         yield "alone", application.model_copy(update={"nodes": nodes})
 
 
-def by_cycle(recording: Recording, since_ns: int = 0) -> pl.DataFrame:
-    """Start, end, latency and disturbance by the number of the cycle, of those since ``since_ns``.
+def by_cycle(output: Path, ordinary: Mapping[int, float] | None = None) -> pl.DataFrame:
+    """Latency by the number of the cycle, whether the machine stalled it, and ran at another pace
+    than ``ordinary``; of those cycles that began with all servers in force.
 
     Numbers are those of the chain's traversals, which count from the first that was recorded: a
     timer that is held over an expiry draws its next execution time in the cycle behind.
     """
+    recording = open_recording(output)
+    in_force = output.with_name(f"{output.name}.in_force")
+    since_ns = int(in_force.read_text()) if in_force.exists() else 0
     frame = measure_latency(recording).analysis.traversals.drop_nulls("latency_ns")
-    own = frame.select(
-        pl.col("traversal").alias("cycle"), "start", "end", "latency_ns", "disturbed"
-    )
-    return own.filter(pl.col("start") >= since_ns)
+    frame = frame.filter(pl.col("start") >= since_ns)
+    columns = pl.col("traversal").alias("cycle"), "latency_ns", "disturbed"
+    return frame.select(*columns, off_pace(recording, frame, ordinary or {}))
 
 
 def ordinary_pace(tables: events.EventTables) -> dict[int, float]:
@@ -156,59 +143,29 @@ def compare(name: str, measured: pl.DataFrame, simulated: pl.DataFrame) -> None:
     )
 
 
-def shaped(
-    described: Application, calibration: Recording, options: argparse.Namespace, folder: Path
-) -> None:
-    """Print how far apart the two are with one band and with three, servers in force."""
-    other = described.model_copy(update={"seed": CALIBRATION_SEED})
-    plans = {
-        f"{bands} band{'s' if bands > 1 else ''}": plan_recording(
-            calibration, request=PlanRequest(bands=bands, overrun="wait")
-        )
-        for bands in (1, 3)
-    }
-    configurations = [
-        Configuration(f"{name}{which}", application, plan, servers=True)
-        for name, plan in plans.items()
-        for which, application in ((" calibration", other), ("", described), (" again", described))
-    ]
-    runs = live_in_turns(configurations, cycles=options.cycles, folder=folder)
-    print(f"{sum(run.repeats for run in runs)} blocks repeated, in which the machine stood still")
-    for name, plan in plans.items():
-        blocks = [shaped_block(name, described, plan, block, folder) for block in range(BLOCKS)]
-        measured, again, simulated = (pl.concat(frames) for frames in zip(*blocks, strict=True))
-        not_stalled = measured.filter(~pl.col("disturbed"))
-        calm_again = again.filter(~pl.col("disturbed"))
-        compare(f"{name}, all", measured, simulated)
-        compare(f"{name}, not stalled", not_stalled, simulated)
-        compare(f"{name}, live again", not_stalled, calm_again)
-        shares(plan, not_stalled, {"simulated": simulated, "live again": calm_again})
-
-
-def shaped_block(
-    name: str, described: Application, plan: Plan, block: int, folder: Path
+def block_of(
+    name: str, described: Application, plan: Plan | None, block: int, folder: Path
 ) -> tuple[pl.DataFrame, ...]:
-    """The cycles of a block: measured, measured again, and simulated with its calibration's costs.
+    """The cycles of a block: measured, measured again, and simulated with default costs and with
+    its calibration's.
 
     Cycles of block ``block`` are numbered from ``block`` million.
     """
     own = folder / f"block_{block}"
-    measured, again = (
-        by_cycle(
-            open_recording(output_of(own, one)),
-            int(output_of(own, f"{one}.in_force").read_text()),
-        )
-        for one in (name, f"{name} again")
-    )
-    shaping = [node.thread.node for node in shaping_nodes(plan)]
-    costs = measured_costs(output_of(own, f"{name} calibration"), but_for=shaping)
-    as_live = {"simulation": costs, "seed": block_seed(described, block)}
-    most = int(measured["cycle"].max()) + 1  # type: ignore[arg-type]
-    with tempfile.TemporaryDirectory() as scratch:
-        calibrated = described.model_copy(update=as_live)
-        simulated = by_cycle(simulate(calibrated, Path(scratch) / "simulated", plan, cycles=most))
+    calibration = open_recording(output_of(own, f"{name} calibration"))
+    ordinary = ordinary_pace(calibration.events)
+    measured, again = (by_cycle(output_of(own, one), ordinary) for one in (name, f"{name} again"))
+    shaping = [node.thread.node for node in shaping_nodes(plan)] if plan else []
+    costs = measured_costs(calibration, but_for=shaping)
+    default = described.model_copy(update={"seed": block_seed(described, block)})
+    frames = [measured, again]
+    for one in (default, default.model_copy(update={"simulation": costs})):
+        with tempfile.TemporaryDirectory() as scratch:
+            most = int(measured["cycle"].max()) + 1  # type: ignore[arg-type]
+            simulate(one, output := Path(scratch) / "simulated", plan, cycles=most)
+            frames.append(by_cycle(output))
     numbered = pl.col("cycle") + block * 1_000_000
-    return tuple(frame.with_columns(numbered) for frame in (measured, again, simulated))
+    return tuple(frame.with_columns(numbered) for frame in frames)
 
 
 def shares(plan: Plan, measured: pl.DataFrame, others: Mapping[str, pl.DataFrame]) -> None:
@@ -231,41 +188,70 @@ def shares(plan: Plan, measured: pl.DataFrame, others: Mapping[str, pl.DataFrame
         print(f"{'':<28}at most {apart:.1%} apart, goal {SHARE_OF_BAND:.0%}  {met}")
 
 
+def cases(described: Application, folder: Path) -> Iterator[tuple[str, Application, Plan | None]]:
+    """What is compared: the application without a plan, and with plans from a run of its own."""
+    for name, application in with_and_without_interference(described):
+        yield name, application, None
+    other = described.model_copy(update={"seed": CALIBRATION_SEED})
+    live("profile", other, cycles=PROFILE_CYCLES, folder=folder)
+    for bands in (1, 3):
+        request = PlanRequest(bands=bands, overrun="wait")
+        plan = plan_recording(output_of(folder, "profile"), request=request)
+        yield f"{bands} band{'s' if bands > 1 else ''}", described, plan
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("application", nargs="?", default="examples/synthetic_chain.yaml")
     parser.add_argument("--cycles", type=int, default=1000)
     parser.add_argument("--keep", type=Path, help="keep the recordings here, and use those there")
     options = parser.parse_args()
-    application = load_application(options.application)
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.keep or Path(scratch)
         folder.mkdir(exist_ok=True)
-        other_seed = application.model_copy(update={"seed": CALIBRATION_SEED})
-        calibration = live(other_seed, folder / "calibration", CALIBRATION_CYCLES)
-        costs = measured_costs(calibration)
-        ordinary = ordinary_pace(calibration.events)
-        if not ordinary:
-            raise SystemExit("nobody watched the machine's pace: run it with real-time scheduling")
-        for which, described in with_and_without_interference(application):
-            recording = live(described, folder / which, options.cycles)
-            measured = by_cycle(recording)
-            not_stalled = measured.filter(~pl.col("disturbed"))
-            at_pace = not_stalled.filter(~off_pace(recording, not_stalled, ordinary))
-            print(
-                f"\n{', '.join(described.nodes)}\n"
-                f"{'|simulated − live|':<28}{'cycles':>7}{'median':>9}{'p99':>9}{'max':>9}"
-                f"{'bias':>9}{'max live':>10}{'max sim.':>10}{'apart':>8}   (ms)"
+        all_cases = list(cases(load_application(options.application), folder))
+        configurations = [
+            Configuration(
+                f"{name}{which}",
+                application.model_copy(update={"seed": seed}),
+                plan,
+                servers=plan is not None,
             )
-            calibrated = described.model_copy(update={"simulation": costs})
-            for name, simulated in (("default costs", described), ("measured costs", calibrated)):
-                path = Path(scratch) / f"{which} {name}"
-                cycles = by_cycle(simulate(simulated, path, cycles=options.cycles))
-                compare(f"{name}, not stalled", not_stalled, cycles)
-                compare(f"{name}, at pace too", at_pace, cycles)
-            print(f"{'goal':<28}{'':>7}{MEDIAN_MS:>9.3f}{P99_MS:>9.3f}{'':>38}{MAXIMA:>8.2%}")
-        print("\nshaped, servers in force")
-        shaped(application, calibration, options, folder)
+            for name, application, plan in all_cases
+            for which, seed in (
+                (" calibration", CALIBRATION_SEED),
+                ("", application.seed),
+                (" again", application.seed),
+            )
+        ]
+        runs = live_in_turns(configurations, cycles=options.cycles, folder=folder)
+        print(f"{sum(run.repeats for run in runs)} blocks repeated, the machine stood still")
+        for name, application, plan in all_cases:
+            report(
+                name,
+                plan,
+                [block_of(name, application, plan, block, folder) for block in range(BLOCKS)],
+            )
+
+
+def report(name: str, plan: Plan | None, blocks: list[tuple[pl.DataFrame, ...]]) -> None:
+    """Print how far a case is apart from its simulation, and from itself."""
+    measured, again, default, simulated = (
+        pl.concat(frames) for frames in zip(*blocks, strict=True)
+    )
+    not_stalled, again = (frame.filter(~pl.col("disturbed")) for frame in (measured, again))
+    print(
+        f"\n{name}\n{'|simulated − live|':<28}{'cycles':>7}{'median':>9}{'p99':>9}{'max':>9}"
+        f"{'bias':>9}{'max live':>10}{'max sim.':>10}{'apart':>8}   (ms)"
+    )
+    compare("default costs", not_stalled, default)
+    compare("stalled ones too", measured, simulated)
+    compare("judged: not stalled", not_stalled, simulated)
+    compare("not stalled, at pace", not_stalled.filter(~pl.col("off_pace")), simulated)
+    compare("live again", not_stalled, again)
+    if plan:
+        shares(plan, not_stalled, {"simulated": simulated, "live again": again})
+    print(f"{'goal':<28}{'':>7}{MEDIAN_MS:>9.3f}{P99_MS:>9.3f}{'':>38}{MAXIMA:>8.2%}")
 
 
 if __name__ == "__main__":
