@@ -10,16 +10,16 @@ The number of simple paths grows exponentially with cycles and fan-in, and count
 Without cycles every step forward leads to an end, so listing needs no search. With cycles the
 shortest paths are listed first; if they are few, a search backwards from the ends at every step
 avoids dead ends; both have a budget. Counting and the heaviest path come from dynamic programming
-over the edges that lead forwards in one order of the vertices: exact without cycles, else a bound,
-closer the more edges agree with the order, for which two are tried.
+over the edges that lead forwards in one order of the vertices: exact without cycles, else a bound.
 """
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
+from heapq import heappop, heappush
 from itertools import count as counting
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias, TypeVar
 
@@ -72,17 +72,14 @@ def parse_chain(text: str) -> tuple[str, ...]:
     Raises InputError: nothing between two dots, more than two dots in a row, a way point twice.
     """
     waypoints = tuple(part.strip() for part in text.split(".."))
+    problem = None
     if any(not part or part.startswith(".") or part.endswith(".") for part in waypoints):
-        raise InputError(
-            f"chain {text!r}: write way points (topics or nodes) with two dots between them, "
-            "such as /t1../t5"
-        )
-    repeated = [part for part in waypoints if waypoints.count(part) > 1]
-    if repeated:
-        raise InputError(
-            f"chain {text!r}: {repeated[0]} stands twice in it; a cyclic chain has no end-to-end "
-            "latency, name each way point once"
-        )
+        problem = "write way points (topics or nodes) with two dots between them, such as /t1../t5"
+    elif repeated := [part for part in waypoints if waypoints.count(part) > 1]:
+        problem = f"{repeated[0]} stands twice in it; a cyclic chain has no end-to-end latency,"
+        problem += " name each way point once"
+    if problem:
+        raise InputError(f"chain {text!r}: {problem}")
     return waypoints
 
 
@@ -108,8 +105,8 @@ class ChainEnumeration:
 
 
 def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
-    """The one chain of ``graph`` that ``spec`` means. Where a standby has stood in for a shaping
-    node for a while, it is the path by that node.
+    """The one chain of ``graph`` that ``spec`` means; of a shaping node that a standby has stood in
+    for, it is the path by that node.
 
     Raises InputError: a topic or node that does not exist, no path, or only a cyclic one.
     SeveralPathsError: several.
@@ -118,7 +115,7 @@ def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     paths, complete, _ = search.listed(HANDFUL + 1)
     chains = list(dict.fromkeys(_chain(spec, path) for path in paths))
     if not chains:
-        raise InputError(search.why_no_path())
+        raise search.no_path()
     standbys = {one.id for one in graph.callbacks if one.node.endswith(STANDBY)}
     chains = [one for one in chains if standbys.isdisjoint(one.callbacks)] or chains
     if len(chains) > 1 or not complete:
@@ -148,7 +145,7 @@ def enumerate_chains(
     count, heaviest_path, heaviest_ns = search.counted(weights)
     paths, complete, met = search.listed(limit)
     if not paths and waypoints:
-        raise InputError(search.why_no_path())
+        raise search.no_path()
     chains = tuple(dict.fromkeys(_chain(None, path) for path in paths))
     heaviest = _chain(None, heaviest_path) if heaviest_path and weights else None
     for chain in chains if weights else ():
@@ -174,14 +171,13 @@ def _chain(spec: str | None, path: GraphPath) -> Chain:
 def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], complete: bool) -> str:
     more = "" if complete and len(chains) <= HANDFUL else "at least "
     lines = [f"chain {spec!r}: {more}{len(chains)} paths match; add a way point:"]
-    callbacks = {callback.id: callback for callback in graph.callbacks}
     shown = chains[:HANDFUL]
-    passed = [(*chain.topics, *(callbacks[c].node for c in chain.callbacks)) for chain in shown]
+    passed = [(*one.topics, *(c.node for c in graph.path(one))) for one in shown]
     for chain, names in zip(shown, passed, strict=True):
         others = {name for other in passed if other is not names for name in other}
         own = next((name for name in names if name not in others), None)
         remedy = f"  (only this one passes {own})" if own else ""
-        way = " → ".join((callbacks[chain.callbacks[0]].label, *chain.topics))
+        way = " → ".join((graph.path(chain)[0].label, *chain.topics))
         lines.append(f"  {way}{remedy}")
     return "\n".join(lines)
 
@@ -190,10 +186,6 @@ def _some(names: Iterable[str]) -> str:
     """A handful of names for a message."""
     listed = sorted(names)
     return ", ".join(listed[:HANDFUL]) + (", ..." if len(listed) > HANDFUL else "")
-
-
-class _Spent(Exception):  # noqa: N818 - it ends a search, and is no error
-    """The budget of a search is used up."""
 
 
 class _Search:
@@ -247,12 +239,11 @@ class _Search:
         self.edges: dict[Vertex, list[Vertex]] = {}
         for (vertex, _), following in self.successors.items():
             self.edges.setdefault(vertex, []).extend(after for after, _ in following)
-        self.order = depth_first_order(self.edges, [vertex for vertex, _ in self.roots])
-        self.cyclic = any(
-            self.order[after] >= self.order[vertex]
-            for vertex, onward in self.edges.items()
-            for after in onward
-        )
+        rank = self.order = depth_first_order(self.edges, [vertex for vertex, _ in self.roots])
+        self.cyclic = any(rank[a] >= rank[v] for v, onward in self.edges.items() for a in onward)
+
+    def wrong(self, problem: str) -> InputError:
+        return InputError(f"chain {self.spec!r}: {problem}")
 
     def _stage(self, name: str) -> tuple[str, frozenset[Vertex]]:
         """What a way point stands for: a topic, a service's messages, or a node's callbacks."""
@@ -271,24 +262,19 @@ class _Search:
             if calls := topics & {candidate + REQUEST, candidate + RESPONSE}:
                 return candidate, frozenset[Vertex](calls)
             if candidate in services:
-                raise InputError(
-                    f"chain {self.spec!r}: no call of the service {candidate} was recorded; before "
-                    "Kilted (tracetools 8.5), calls have no trace points: `record --source "
-                    "preload` sees them on all distributions"
+                raise self.wrong(
+                    f"no call of the service {candidate} was recorded; before Kilted (tracetools"
+                    " 8.5), calls have no trace points: `record --source preload` sees them on all"
+                    " distributions"
                 )
         if not topics:
-            raise InputError(
-                f"chain {self.spec!r}: the recording shows no topics at all; tracing has to start "
-                "before the application does"
-            )
-        close = close_names(name, topics | nodes.keys())
-        hint = (
-            f"did you mean {' or '.join(close)}?"
-            if close
-            else f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)}; "
-            "`chainshaper graph` shows all of them"
-        )
-        raise InputError(f"chain {self.spec!r}: no topic or node is called {name}; {hint}")
+            problem = "the recording shows no topics at all; tracing has to start before the"
+            raise self.wrong(f"{problem} application does")
+        hint = f"the names there are: {_some(topics - INTERNAL_TOPICS or topics)};"
+        hint += " `chainshaper graph` shows all of them"
+        if close := close_names(name, topics | nodes.keys()):
+            hint = f"did you mean {' or '.join(close)}?"
+        raise self.wrong(f"no topic or node is called {name}; {hint}")
 
     def _starts(self, name: str, vertices: frozenset[Vertex]) -> set[int]:
         if not any(isinstance(vertex, str) for vertex in vertices):
@@ -302,10 +288,10 @@ class _Search:
         }
         if not starts:
             writers = ", ".join(self.graph.publishers.get(name, ())) or "no node in the recording"
-            raise InputError(
-                f"chain {self.spec!r}: no callback was seen to publish {name} (its publisher: "
-                f"{writers}); begin the chain at a topic that a callback publishes; Humble has no"
-                " trace points for messages within a process: run without use_intra_process_comms"
+            raise self.wrong(
+                f"no callback was seen to publish {name} (its publisher: {writers}); begin the"
+                " chain at a topic that a callback publishes; Humble has no trace points for"
+                " messages within a process: run without use_intra_process_comms"
             )
         return starts
 
@@ -349,18 +335,17 @@ class _Search:
         distance = self.distance
         return tuple(sorted((s for s in states if s in distance), key=distance.__getitem__))
 
-    def why_no_path(self) -> str:
-        """Why there is no path, for a message."""
+    def no_path(self) -> InputError:
+        """Why there is no path."""
         if self.roots and not self.cyclic:
-            return (
-                f"chain {self.spec!r}: it leads through a service to a node that did not call it; "
-                "responses go back to the node that sent the request"
+            return self.wrong(
+                "it leads through a service to a node that did not call it; responses go back to"
+                " the node that sent the request"
             )
         if self.roots:
-            return (
-                f"chain {self.spec!r}: it can only be closed by passing the same callback or topic "
-                "twice; a cyclic chain has no end-to-end latency, give its way points in the order "
-                "of the data"
+            return self.wrong(
+                "it can only be closed by passing the same callback or topic twice; a cyclic chain"
+                " has no end-to-end latency, give its way points in the order of the data"
             )
         met = self.furthest
         from_name = self.stages[max(met - 1, 0)][0]
@@ -368,47 +353,53 @@ class _Search:
         heard = {c.trigger for c in self.graph.callbacks if c.publishes}
         stops = [topic for topic in topics if topic not in heard] or topics
         if not met or not stops:
-            return f"chain {self.spec!r}: no callback of {from_name} publishes anything"
+            return self.wrong(f"no callback of {from_name} publishes anything")
         goal = self.stages[min(met, len(self.stages) - 1)][0]
-        return (
-            f"chain {self.spec!r}: no path leads from {from_name} to {goal}; from there the data "
-            f"gets as far as {_some(stops)}"
-        )
+        way = f"no path leads from {from_name} to {goal}"
+        return self.wrong(f"{way}; from there the data gets as far as {_some(stops)}")
 
     def listed(self, limit: int) -> tuple[tuple[GraphPath, ...], bool, int]:
         """Up to ``limit`` paths, whether they are all, and how many were met on the way.
 
         Where there are cycles, the shortest ones come first.
         """
-        if not self.cyclic:
-            paths = tuple(islice(self._walked(lambda states, _: states), limit + 1))
-            return paths[:limit], len(paths) <= limit, min(len(paths), limit)
-        shortest, count, complete = self._by_length(limit)
-        if complete or len(shortest) == limit:
-            return tuple(shortest), complete and count == len(shortest), count
-        others, complete = self._without_dead_ends(limit)
+        shortest, met = list[GraphPath](), 0
+        if self.cyclic:
+            shortest, met, complete = self._shortest(limit)
+            if complete or len(shortest) == limit:
+                return tuple(shortest), complete and met == len(shortest), met
+        others, complete = self._depth_first(limit)
         paths = tuple(dict.fromkeys((*shortest, *others)))
-        return paths[:limit], complete, max(count, len(paths))
+        return paths[:limit], complete, max(met, len(paths))
 
-    def _walked(
-        self, onward: Callable[[Sequence[State], Mapping[Vertex, None]], Iterable[State]]
-    ) -> Iterator[GraphPath]:
-        """Paths, depth first. ``onward`` chooses from the next states, given the path so far."""
-        for root in self.roots:
-            path: dict[Vertex, None] = {}
-            stack = [iter(onward((root,), path))]
-            while stack:
-                state = next(stack[-1], None)
-                if state is None:
-                    stack.pop()
-                    if path:
-                        path.popitem()
-                elif state in self.ends:
-                    if self._returns((*path, state[0])):
-                        yield (*path, state[0])
-                else:
-                    path[state[0]] = None
-                    stack.append(iter(onward(self.successors[state], path)))
+    def _depth_first(self, limit: int) -> tuple[list[GraphPath], bool]:
+        """Up to ``limit`` paths, and whether that is all.
+
+        Where there are cycles, every step goes where an end can still be reached without meeting
+        the path again.
+        """
+        found: list[GraphPath] = []
+        searches = 0
+        stack: list[tuple[GraphPath, State]] = [((), root) for root in reversed(self.roots)]
+        while stack:
+            before, state = stack.pop()
+            path, following = (*before, state[0]), self.successors[state]
+            if state in self.ends:
+                if self._returns(path):
+                    if len(found) == limit:
+                        return found, False
+                    found.append(path)
+                continue
+            if self.cyclic:
+                if searches == SEARCHES:
+                    return found, False
+                searches += 1
+                free = {s: f for s, f in self.successors.items() if s[0] not in path}
+                useful = _distances(free, self.ends & free.keys())
+                leading = (after for after in following if after in useful)
+                following = tuple(sorted(leading, key=useful.__getitem__))
+            stack += [(path, after) for after in reversed(following)]
+        return found, True
 
     def _returns(self, path: GraphPath) -> bool:
         """Whether responses go to the nodes that sent their requests."""
@@ -423,64 +414,29 @@ class _Search:
             callers[after] = here
         return True
 
-    def _by_length(self, limit: int) -> tuple[list[GraphPath], int, bool]:
+    def _shortest(self, limit: int) -> tuple[list[GraphPath], int, bool]:
         """The shortest paths: up to ``limit`` of them, how many were met, whether that is all.
 
-        Iterative deepening: no step is taken from which the nearest end is too far for the bound.
+        Best first: the path goes on whose nearest end would make it the shortest, of several the
+        one that is there soonest.
         """
         found: list[GraphPath] = []
-        count, steps, beyond = 0, counting(1), True
-        before, bound = 0, min((self.distance[root] for root in self.roots), default=0)
-
-        def near_enough(states: Sequence[State], path: Mapping[Vertex, None]) -> Iterator[State]:
-            nonlocal beyond
-            for state in states:
-                if next(steps) == STEPS:
-                    raise _Spent
-                if state[0] in path:
-                    continue
-                if len(path) + self.distance[state] <= bound:
-                    yield state
-                else:
-                    beyond = True
-
-        try:
-            while beyond:
-                beyond = False
-                for path in self._walked(near_enough):
-                    if len(path) - 1 > before:
-                        count += 1
-                        found += [path] * (len(found) < limit)
-                before, bound = bound, bound + 2  # a hop is a callback and a topic
-        except _Spent:
-            return found, count, False
-        return found, count, True
-
-    def _without_dead_ends(self, limit: int) -> tuple[list[GraphPath], bool]:
-        """Up to ``limit`` paths, and whether that is all.
-
-        Every step goes where an end can still be reached without meeting the path again.
-        """
-        found: list[GraphPath] = []
-        searches = counting()
-
-        def leading_on(states: Sequence[State], path: Mapping[Vertex, None]) -> Sequence[State]:
-            if not path:
-                return states
-            if next(searches) == SEARCHES:
-                raise _Spent
-            free = {s: f for s, f in self.successors.items() if s[0] not in path}
-            useful = _distances(free, {end for end in self.ends if end in free})
-            return sorted((s for s in states if s in useful), key=useful.__getitem__)
-
-        try:
-            for path in self._walked(leading_on):
-                if len(found) == limit:
-                    return found, False
-                found.append(path)
-        except _Spent:
-            return found, False
-        return found, True
+        met, number = 0, counting()
+        waiting: list[tuple[int, int, int, GraphPath, State]]
+        waiting = [(self.distance[root], 0, next(number), (), root) for root in self.roots]
+        for _ in range(STEPS):
+            if not waiting:
+                return found, met, True
+            _, _, _, before, state = heappop(waiting)
+            path = (*before, state[0])
+            if state in self.ends and self._returns(path):
+                met += 1
+                found += [path] * (len(found) < limit)
+            for after in self.successors[state]:
+                if after[0] not in path:
+                    length = len(path) + self.distance[after]
+                    heappush(waiting, (length, -len(path), next(number), path, after))
+        return found, met, False
 
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).

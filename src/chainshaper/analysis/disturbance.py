@@ -118,8 +118,8 @@ def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
         return starts
     gaps = places.diff().fill_null(places[0] + cycle_ns - places[-1])
     earliest: int = places[gaps.arg_max() or 0]
-    behind: pl.Series = starts - (earliest - WAKE_UP_NS)
-    return pl.select(behind % cycle_ns).to_series()
+    late: pl.Series = (starts - (earliest - WAKE_UP_NS)) % cycle_ns
+    return late
 
 
 def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
@@ -136,9 +136,7 @@ def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
 
 def _last_slot(frame: pl.DataFrame, due: Due | None) -> tuple[pl.Expr, pl.Expr]:
     """Start and end of the last slot that is open to each output, from the slots' origin on, where
-    it was moved to.
-
-    Without a plan the latest place at which one in time was let go stands for the start.
+    it was moved to. Without a plan the latest place at which one in time was let go stands for it.
     """
     if due is None or not due.slots:
         in_time = frame.filter(pl.col("overrun").is_null() & (pl.col("cycles_waited") == 0))

@@ -16,11 +16,10 @@ are assumed (``assumed``, no ``end``, no response time):
   (then they are not ``assumed``).
 * A driver's own thread, a player of recorded data or a Python timer without such events publishes
   outside all callbacks that events show. A topic that its node publishes only like this gets a
-  callback of kind ``unknown``, with the handle 0 and one instance per publication, so that chains
-  can begin there.
+  callback of kind ``unknown``, with the handle 0 and one instance per publication.
 """
 
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -83,9 +82,7 @@ def data_flow(
         published = publications(tables, objects, sent)
         taken = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
-    instances, taken = _with_assumed_readers(
-        instances, taken, timer_calls(tables, objects), objects, tables
-    )
+    instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
@@ -94,26 +91,34 @@ def data_flow(
         published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
-    notes = list(objects.notes)
+    notes = (*objects.notes, *_notes(tables, instances))
+    return DataFlow(objects, instances, published, taken, tables, notes)
+
+
+def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]:
+    """What cannot be known of instances and messages, in plain words."""
     if "sched_switch" in tables and instances.height and not instances["execution_ns"].count():
-        notes.append(
+        yield (
             "sched_switch was recorded, but shows none of the application's threads (inside a "
             "container threads have other numbers): execution times cannot be known."
         )
     within = int(instances["intra_process"].sum())
     if within and not events.table(tables, "rclcpp_ring_buffer_dequeue").height:
-        notes.append(
+        yield (
             f"{within} callback instances got their message within their process, of which no "
             "other event tells (before Iron, or not enabled): chains cannot be followed through "
             "them."
         )
-    if missing := _without_events_of_rmw(tables):
-        notes.append(
+    # Messages that rcl took in processes where rmw has an event of hardly any.
+    by_rmw = taken_by_rmw(tables).group_by("pid").len("by_rmw")
+    by_rcl = events.table(tables, "rcl_take").group_by("pid").len("by_rcl")
+    both = by_rcl.join(by_rmw, on="pid", how="left").fill_null(0)
+    if missing := both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum():
+        yield (
             f"{missing} messages were taken without an event of rmw (from Lyrical on"
             " rmw_fastrtps_cpp has none for messages with a field uint8[]): chains cannot be"
             " followed through them. `record --source preload` sees them."
         )
-    return DataFlow(objects, instances, published, taken, tables, tuple(notes))
 
 
 def left_when_taken(flow: DataFlow, topics: Collection[str | None]) -> DataFlow:
@@ -186,8 +191,7 @@ def cpu_time(tables: events.EventTables, spans: pl.DataFrame) -> pl.Series:
         since = pl.when("running").then(pl.col(edge) - pl.col("switched")).otherwise(0)
         rows = rows.with_columns((pl.col("used") + since).alias(f"used_at_{edge}"))
         rows = rows.drop("switched", "used", "running")
-    used = pl.col("used_at_end") - pl.col("used_at_start")
-    return rows.sort("row").select(execution_ns=used).to_series()
+    return rows.sort("row").select(pl.col("used_at_end") - pl.col("used_at_start")).to_series()
 
 
 def _plausible(frame: pl.DataFrame) -> pl.DataFrame:
@@ -205,12 +209,11 @@ def _plausible(frame: pl.DataFrame) -> pl.DataFrame:
 def _running_time(tables: events.EventTables) -> pl.DataFrame:
     """``tid, switched, used, running``: CPU time used by each thread at each of its switches."""
     switches = events.table(tables, "sched_switch")
+    both = (("prev_tid", False), ("next_tid", True))
     changes = pl.concat(
-        [
-            switches.select(tid="prev_tid", switched="time", running=pl.lit(False)),
-            switches.select(tid="next_tid", switched="time", running=pl.lit(True)),
-        ]
-    ).filter(pl.col("tid") != 0)  # 0 is every core's idle thread
+        switches.select(tid=tid, switched="time", running=pl.lit(runs)) for tid, runs in both
+    )
+    changes = changes.filter(pl.col("tid") != 0)  # 0 is every core's idle thread
     changes = changes.sort("tid", "switched", "running", maintain_order=True)
     first = changes.unique("tid", keep="first", maintain_order=True).filter(~pl.col("running"))
     began = pl.lit(switches["time"].min(), dtype=pl.Int64)
@@ -230,28 +233,15 @@ def timer_calls(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     added = added.select("pid", "timer_handle", handle="callback", valid_from="time")
     timers = objects.callbacks.filter(pl.col("kind") == "timer")
     timers = timers.join(added, on=["pid", "handle", "valid_from"], how="left").select(
-        *("pid", "valid_from", "callback_id", "observed"),
-        timer_handle=pl.coalesce("timer_handle", "handle"),
+        *("pid", "valid_from", "callback_id", "observed"), pl.coalesce("timer_handle", "handle")
     )
     calls = events.table(tables, "rcl_timer_call")
     found = latest_before(calls, timers, ["pid", "timer_handle"], "time", "valid_from")
     return found.drop_nulls("callback_id").select("callback_id", "observed", "pid", "tid", "time")
 
 
-def _without_events_of_rmw(tables: events.EventTables) -> int:
-    """How many messages rcl took in processes where rmw has an event of hardly any."""
-    by_rmw = taken_by_rmw(tables).group_by("pid").len("by_rmw")
-    by_rcl = events.table(tables, "rcl_take").group_by("pid").len("by_rcl")
-    both = by_rcl.join(by_rmw, on="pid", how="left").fill_null(0)
-    return int(both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum())
-
-
 def _with_assumed_readers(
-    instances: pl.DataFrame,
-    taken: pl.DataFrame,
-    calls: pl.DataFrame,
-    objects: Objects,
-    tables: events.EventTables,
+    instances: pl.DataFrame, taken: pl.DataFrame, objects: Objects, tables: events.EventTables
 ) -> tuple[pl.DataFrame, pl.DataFrame]:
     """Add an instance for every take, or timer's call, of what has no callback events.
 
@@ -264,13 +254,11 @@ def _with_assumed_readers(
     silent = objects.callbacks.filter(~pl.col("observed")).unique("callback_id")
     silent = silent.select("callback_id", by_executor=by_executor)
     assumed = taken.join(silent, on="callback_id", maintain_order="left").select(
-        *("callback_id", "pid", "tid", "take", "intra_process", "by_executor"),
-        start="time",
-        assumed=pl.lit(True),
+        *("callback_id", "pid", "tid", "take", "intra_process", "by_executor"), start="time"
     )
-    called = calls.filter(~pl.col("observed")).drop("observed").rename({"time": "start"})
-    called = called.with_columns(intra_process=pl.lit(False), assumed=pl.lit(True))
-    assumed = pl.concat([assumed, called], how="diagonal")
+    called = timer_calls(tables, objects).filter(~pl.col("observed")).drop("observed")
+    called = called.rename({"time": "start"}).with_columns(intra_process=pl.lit(False))
+    assumed = pl.concat([assumed, called], how="diagonal").with_columns(assumed=pl.lit(True))
     if assumed.is_empty():
         return instances, taken.with_columns(assumed_instance=pl.lit(None, dtype=pl.UInt32))
     if assumed["by_executor"].any():
@@ -280,7 +268,6 @@ def _with_assumed_readers(
         assumed = first_after(assumed, looks.sort("end"), ["pid", "tid"], "start", "end")
         end = pl.when("by_executor").then("end")
         assumed = assumed.with_columns(end=end, assumed=end.is_null())
-    assumed = assumed.drop("by_executor")
     every = pl.concat([instances.drop("instance"), assumed], how="diagonal_relaxed")
     every = every.sort("start", maintain_order=True).with_row_index("instance")
     of_take = by_number(every.drop_nulls("take"), "take", "instance", taken.height)
@@ -415,7 +402,7 @@ def _with_assumed_writers(
     objects: Objects, instances: pl.DataFrame, published: pl.DataFrame
 ) -> tuple[Objects, pl.DataFrame, pl.DataFrame]:
     """Add a callback, and (last) instances, for topics published only outside callbacks."""
-    key = ["pid", "node", "topic"]
+    key, columns = ["pid", "node", "topic"], ["instance", "callback_id"]
     # By publisher first: one number per row to group by instead of three.
     of_publisher = published.group_by("publisher").agg(
         pl.col(key).first(), inside=pl.col("instance").count(), valid_from=pl.col("time").min()
@@ -426,28 +413,21 @@ def _with_assumed_writers(
     if outside.is_empty():
         return objects, instances, published
     last: int | None = objects.callbacks.select(pl.col("callback_id").max()).item()
-    outside = outside.sort("valid_from", "topic").with_row_index(
-        "callback_id", offset=0 if last is None else last + 1
-    )
+    first = 0 if last is None else last + 1
+    outside = outside.sort("valid_from", "topic").with_row_index("callback_id", offset=first)
     own = outside.select(*key, "callback_id")
-    assumed = published.drop("instance", "callback_id").join(own, on=key, maintain_order="left")
+    assumed = published.drop(columns).join(own, on=key, maintain_order="left")
     assumed = assumed.with_row_index("instance", offset=instances.height)
     more = assumed.select(
-        *("instance", "callback_id", "pid", "tid"),
+        *(*columns, "pid", "tid"),
         start="time",
         intra_process=pl.lit(False),
         assumed=pl.lit(True),
     )
     published = published.with_columns(
         pl.coalesce(column, by_number(assumed, "publication", column, published.height))
-        for column in ("instance", "callback_id")
+        for column in columns
     )
-    every = pl.concat([instances, more], how="diagonal").select(instances.columns)
-    return _with_callbacks(objects, outside), every, published
-
-
-def _with_callbacks(objects: Objects, outside: pl.DataFrame) -> Objects:
-    """The objects with callbacks ``pid, node, topic, valid_from, callback_id`` outside events."""
     new = outside.select(
         *("pid", "valid_from", "callback_id"),
         node=pl.col("node").cast(pl.String),
@@ -455,13 +435,13 @@ def _with_callbacks(objects: Objects, outside: pl.DataFrame) -> Objects:
         handle=pl.lit(0, dtype=pl.UInt64),
         observed=pl.lit(False),
     )
-    callbacks = pl.concat([objects.callbacks, new], how="diagonal_relaxed").select(
-        pl.col(name).cast(type_) for name, type_ in CALLBACK_SCHEMA.items()
-    )
+    callbacks = pl.concat([objects.callbacks, new], how="diagonal_relaxed").cast(CALLBACK_SCHEMA)  # type: ignore[arg-type]
     notes = (
         f"{node} publishes {topic} outside its callbacks (from a thread of its own, from Python, "
         "or from a service client's callback): a chain that begins there is measured from the "
         "publication."
         for node, topic in outside.select("node", "topic").iter_rows()
     )
-    return replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))
+    objects = replace(objects, callbacks=callbacks, notes=(*objects.notes, *notes))
+    every = pl.concat([instances, more], how="diagonal").select(instances.columns)
+    return objects, every, published

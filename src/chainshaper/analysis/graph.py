@@ -9,8 +9,7 @@ callback and published in another of the same node:
   topic, and it either is registered by message_filters (its symbol says so) or publishes nothing.
 * **A synchroniser of the application's own** keeps its latest inputs, and publishes in the callback
   of whichever comes last. Several subscription callbacks of a node that publish topic X are taken
-  to be its inputs when each of them ran as often as X was published. Such topics stand in
-  ``Callback.in_turns``.
+  to be its inputs when each of them ran as often as X was published: ``Callback.in_turns``.
 * **An action's goal** leads to the feedback that its server's node publishes next.
 * **Stored messages**: a subscription callback in a node whose subscription callbacks publish
   nothing at all, but whose timers do, is taken to store the message for the timers.
@@ -37,10 +36,7 @@ MESSAGE_FILTER = "message_filters::"
 
 
 def application_graph(tables: events.EventTables) -> ApplicationGraph:
-    """The graph of callbacks and topics that the events of a recording show.
-
-    Callback ids are those of the analysis frames.
-    """
+    """The graph of callbacks (by the ids of analysis frames) and topics that events show."""
     return graph_of(data_flow(tables))
 
 
@@ -57,52 +53,40 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
         Callback(**row, publishes=tuple(sorted(writes[row["id"]])))
         for row in known.iter_rows(named=True)
     ]
-    everything = defaultdict[tuple[int, str], set[str]](set)
     of_node = defaultdict[tuple[int, str], list[Callback]](list)
     for callback in callbacks:
-        everything[callback.pid, callback.node].update(callback.publishes)
-        if callback.kind != "unknown":
-            of_node[callback.pid, callback.node].append(callback)
+        of_node[callback.pid, callback.node].append(callback)
     turns = _in_turns(flow, of_node.values())
     nodes = flow.objects.nodes.select("node", "pid").unique(maintain_order=True)
+    complete = []
+    for one in callbacks:
+        passed = _passed_on(one, of_node[one.pid, one.node])
+        sets = ({*one.publishes, *passed}, passed, turns[one.id])
+        publishes, passes_on, in_turns = (tuple(sorted(topics)) for topics in sets)
+        complete.append(replace(one, publishes=publishes, passes_on=passes_on, in_turns=in_turns))
     return ApplicationGraph(
         nodes=tuple(Node(name, pid) for name, pid in nodes.iter_rows()),
-        callbacks=tuple(
-            replace(
-                _with_feedback(one, everything[one.pid, one.node])
-                if one.kind == "service"
-                else _with_passed_on(one, of_node[one.pid, one.node]),
-                in_turns=tuple(sorted(turns[one.id])),
-            )
-            for one in callbacks
-        ),
+        callbacks=tuple(complete),
         publishers=_by_topic(flow.objects.publishers),
         subscribers=_by_topic(flow.objects.subscriptions),
     )
 
 
-def _with_passed_on(callback: Callback, siblings: list[Callback]) -> Callback:
-    """The callback with the topics that a sibling of its node publishes for it."""
+def _passed_on(callback: Callback, siblings: list[Callback]) -> set[str]:
+    """The topics that another callback of its node publishes for one."""
+    own = set(callback.publishes)
+    if callback.kind == "service":  # an action's: a thread of the goal publishes as a rule
+        action, goal, _ = (callback.topic or "").partition("/_action/send_goal")
+        published = {topic for one in siblings for topic in one.publishes}
+        return {f"{action}/_action/feedback"} & published - own if goal else set()
     if callback.kind != "subscription" or callback.topic in {None, *INTERNAL_TOPICS}:
-        return callback
-    own = set(callback.publishes) - INTERNAL_TOPICS
-    filtered = MESSAGE_FILTER in (callback.symbol or "")
-    passed: set[str] = set()
+        return set()
     if not _outputs(siblings, "subscription"):
-        passed = _outputs(siblings, "timer")
-    elif filtered or not own:  # no callback synchronises a topic with itself
+        return _outputs(siblings, "timer")
+    if MESSAGE_FILTER in (callback.symbol or "") or not own - INTERNAL_TOPICS:
         others = [one for one in siblings if one.topic != callback.topic]
-        passed = _outputs(others, "subscription") - own
-    publishes = tuple(sorted({*callback.publishes, *passed}))
-    return replace(callback, publishes=publishes, passes_on=tuple(sorted(passed)))
-
-
-def _with_feedback(callback: Callback, published: set[str]) -> Callback:
-    """An action's server with the feedback, which a thread of the goal publishes as a rule."""
-    action, goal, _ = (callback.topic or "").partition("/_action/send_goal")
-    passed = {f"{action}/_action/feedback"} & published - set(callback.publishes) if goal else set()
-    publishes = tuple(sorted({*callback.publishes, *passed}))
-    return replace(callback, publishes=publishes, passes_on=tuple(sorted(passed)))
+        return _outputs(others, "subscription") - own  # none synchronises a topic with itself
+    return set()
 
 
 def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[str]]:
@@ -115,25 +99,23 @@ def _in_turns(flow: DataFlow, nodes: Iterable[list[Callback]]) -> dict[int, set[
     found = defaultdict[int, set[str]](set)
     for callbacks in nodes:
         for topic in _outputs(callbacks, "subscription"):
-            writers = [one for one in callbacks if topic in one.publishes]
+            writers = [c for c in callbacks if topic in c.publishes and c.kind != "unknown"]
             inputs = {one.topic for one in writers if one.kind == "subscription"}
             if len(writers) < 2 or len(inputs) < len(writers):
                 continue  # one alone; or a timer publishes it too, or two callbacks of one topic do
             ids = [one.id for one in writers]
-            own = pl.col("callback_id").is_in(ids) & (pl.col("topic") == topic)
-            written = (
-                flow.publications.filter(own).join(flow.instances, on="instance").sort("start")
-            )
+            own = flow.publications.filter(pl.col("callback_id").is_in(ids), topic=topic)
+            written = own.join(flow.instances, on="instance").sort("start")
             if len(written) < 2:
                 continue  # nothing lies between
-            ran = flow.instances.filter(pl.col("callback_id").is_in(ids))
-            ran = ran.sort("start").select("callback_id", "start")
             since, until = written["start"][0], written["time"][1:]
+            ran = flow.instances.filter(pl.col("callback_id").is_in(ids), pl.col("start") > since)
+            ran = ran.sort("start")
+            starts = (ran.filter(callback_id=one)["start"] for one in ids)
             places = np.arange(1, len(written))
-            starts = (ran.filter(pl.col("start") > since, callback_id=one)["start"] for one in ids)
-            if all((own.search_sorted(until).to_numpy() >= places).all() for own in starts):
-                for one in ids:
-                    found[one].add(topic)
+            if all((one.search_sorted(until).to_numpy() >= places).all() for one in starts):
+                for number in ids:
+                    found[number].add(topic)
     return found
 
 

@@ -24,12 +24,11 @@ PERCENTILES: tuple[float, ...] = (0.5, 1, 5, 25, 50, 75, 95, 99, 99.5)
 class LatencyStatistics:
     """Statistics of a sample of latencies, in whole nanoseconds; None where there is no sample.
 
-    ``count`` latencies were measured; ``incomplete`` traversals have none, those apart that came to
-    a lifecycle node while it was not active; ``disturbed`` of
-    ``count`` were hit by a stall of the machine; ``late`` of them came behind the slot or cycle
-    they were due in (None: when they were due is not known). ``jitter_ns`` is max − min (paper: J),
-    ``spread_ns`` p99.5 − p0.5. ``percentiles_ns`` has :data:`PERCENTILES` as text for keys; they
-    interpolate linearly between the two nearest values, then are rounded.
+    ``count`` latencies were measured; ``incomplete`` traversals have none, but for those that came
+    to a lifecycle node while it was not active; ``disturbed`` of ``count`` were hit by a stall of
+    the machine; ``late`` of them came behind the slot or cycle they were due in (None: not known).
+    ``jitter_ns`` is max − min (paper: J), ``spread_ns`` p99.5 − p0.5. ``percentiles_ns`` has
+    :data:`PERCENTILES` as text for keys; they interpolate linearly between the two nearest values.
     """
 
     count: int
@@ -66,10 +65,10 @@ def latency_statistics(
     return LatencyStatistics(len(sample), incomplete, hit, *figures, late)
 
 
-def summary(column: str, values: pl.Expr) -> pl.Expr:
-    """Times as a struct ``{min, mean, max}`` called ``column``; null where there are none."""
-    figures = pl.struct(min=values.min(), mean=values.mean(), max=values.max())
-    return pl.when(values.count() > 0).then(figures).alias(column)
+def summary(times: pl.Expr) -> pl.Expr:
+    """Times as a struct ``{min, mean, max}``; null where there are none."""
+    figures = pl.struct(min=times.min(), mean=times.mean(), max=times.max())
+    return pl.when(times.count() > 0).then(figures)
 
 
 def callback_statistics(flow: DataFlow) -> pl.DataFrame:
@@ -80,25 +79,17 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     floats), null where no instance has such a time. ``period_ns`` is the timer's own period.
     """
     about = flow.objects.callbacks.unique("callback_id", maintain_order=True)
-    figures = (
-        flow.instances.filter(~pl.col("assumed"))
-        .group_by("callback_id")
-        .agg(
-            summary("response_ns", pl.col("end") - pl.col("start")),
-            summary("execution_ns", pl.col("execution_ns")),
-            tids=pl.col("tid").unique().sort(),
-            count=pl.len(),
-            unfinished=pl.col("end").null_count(),
-        )
+    ran = flow.instances.filter(~pl.col("assumed")).group_by("callback_id")
+    figures = ran.agg(
+        tids=pl.col("tid").unique().sort(),
+        count=pl.len(),
+        unfinished=pl.col("end").null_count(),
+        response_ns=summary(pl.col("end") - pl.col("start")),
+        execution_ns=summary(pl.col("execution_ns")),
     )
-    return (
-        about.join(figures, on="callback_id")
-        .sort("callback_id")
-        .select(
-            *("callback_id", "node", "kind", "topic", "period_ns", "symbol", "pid"),
-            *("tids", "count", "unfinished", "response_ns", "execution_ns"),
-        )
-    )
+    names = ("callback_id", "node", "kind", "topic", "period_ns", "symbol", "pid")
+    found = about.select(names).join(figures, on="callback_id")
+    return found.sort("callback_id")
 
 
 def named_callbacks(flow: DataFlow) -> pl.DataFrame:
@@ -203,6 +194,16 @@ class LatencyAnalysis:
     silent: int
     notes: tuple[str, ...]
 
+    @property
+    def decided(self) -> pl.DataFrame:
+        """What gates decided about the chain's outputs."""
+        return self.releases.filter(pl.col("hop") == len(self.chain.callbacks) - 1)
+
+    @property
+    def calm(self) -> pl.DataFrame:
+        """The complete traversals that the machine did not disturb."""
+        return self.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
+
 
 def analyse_latency(
     source: Recording | events.EventTables | DataFlow,
@@ -250,9 +251,7 @@ def analyse_latency(
         frame = frame.filter((pl.col("start") >= since_ns) & before)
         hops, releases = (t.join(frame, on="traversal", how="semi") for t in (hops, releases))
     reasons = frame.select("reason").drop_nulls().group_by("reason").len().sort("reason")
-    calm, calmly_received = (
-        frame.filter(~pl.col(column)) for column in ("disturbed", "reception_disturbed")
-    )
+    calm, well_received = (frame.filter(~pl.col(f"{of}disturbed")) for of in ("", "reception_"))
     read = frame["reception_ns"].count() > 0
     return LatencyAnalysis(
         chain=chain,
@@ -263,7 +262,7 @@ def analyse_latency(
         statistics=_statistics(frame, "latency_ns"),
         undisturbed=_statistics(calm, "latency_ns"),
         subscriber=_statistics(frame, "reception_ns") if read else None,
-        subscriber_undisturbed=_statistics(calmly_received, "reception_ns") if read else None,
+        subscriber_undisturbed=_statistics(well_received, "reception_ns") if read else None,
         incomplete=dict(reasons.iter_rows()),
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),

@@ -19,11 +19,8 @@ Requests and responses of services are messages, too: a client publishes ``SERVI
 the server takes, and takes ``SERVICE:response``. In place of a source timestamp they have the
 number of their call, which is below 0 (:func:`service_calls`).
 
-Publishing and leaving are two things where a thread of its own sends for the executor: the
-`rmw_publish` of an asynchronous publisher is recorded when the message is handed over;
-`asynchronous_send` says when, and whether, it was sent. A gate's decision about a message
-(`gate_release`) is found by its callback and the message's source timestamp; where the message came
-without DDS, and so has none, by the instance that ran on the gate's thread then.
+Where a thread of its own sends for the executor, `rmw_publish` is recorded when the message is
+handed over; `asynchronous_send` says when, and whether, it was sent.
 """
 
 from collections.abc import Mapping
@@ -36,8 +33,12 @@ from chainshaper.values import events
 from chainshaper.values.application import REQUEST
 
 _PUBLISHER = ["publisher", "node", "topic"]
+_END: list[str | pl.Expr] = [
+    "pid",
+    "rmw_handle",
+    pl.col("valid_from").alias("created"),
+]  # of an endpoint, as a key
 _NO_TIME = pl.lit(None, dtype=pl.Int64)
-
 
 _CALLS = {"rmw_send_request": "client", "rmw_take_request": "service"}
 _CALLS |= {"rmw_send_response": "service", "rmw_take_response": "client"}
@@ -60,26 +61,22 @@ def service_calls(
         return (none := none.select(*columns, call="sequence_number")), none
     found = {}
     for name, role in _CALLS.items():
-        optional = [column for column in ("taken", "source_timestamp") if "take" in name]
-        rows = events.table(tables, name, optional).rename({f"rmw_{role}_handle": "rmw_handle"})
+        rows = events.table(tables, name, ["taken", "source_timestamp"] if "take" in name else [])
         if "taken" in rows.columns:
             rows = rows.filter(pl.col("taken").fill_null(1) != 0)
-        found[name] = rows
+        found[name] = rows.rename({f"rmw_{role}_handle": "rmw_handle"})
     requests = objects.publishers.filter(pl.col("topic").cast(pl.String).str.ends_with(REQUEST))
-    clients = requests.select(
-        "pid", "rmw_handle", "topic", client="publisher", created="valid_from"
-    )
+    clients = requests.select(*_END, "topic", client="publisher")
     for name in ("rmw_send_request", "rmw_take_response"):
-        key = ["pid", "rmw_handle"]
-        found[name] = latest_before(found[name], clients, key, "time", "created")
+        found[name] = latest_before(found[name], clients, ["pid", "rmw_handle"], "time", "created")
     owners = _gid_owners(tables, objects, found, clients, clock_offset_ns)
     for name in ("rmw_take_request", "rmw_send_response"):
         rows = found[name].with_columns(gid=_gid_text("client_gid"))
         found[name] = rows.join(owners, on="gid", how="left", maintain_order="left")
     number = pl.col("client").cast(pl.Int64) * (1 << _CALL_BITS) + pl.col("sequence_number")
     calls = {name: rows.select(*columns, call=-1 - number) for name, rows in found.items()}
-    send_request, take_request, send_response, take_response = (calls[name] for name in _CALLS)
-    return pl.concat([send_request, send_response]), pl.concat([take_request, take_response])
+    sent, taken = ([calls[name] for name in _CALLS if way in name] for way in ("send", "take"))
+    return pl.concat(sent), pl.concat(taken)
 
 
 def _gid_owners(
@@ -94,19 +91,18 @@ def _gid_owners(
     `rmw_client_init` says so. Else it is the client that sent the latest request of the same number
     to the service before the source timestamp of the one taken, in most of the gid's calls.
     """
+    key = ["pid", "rmw_handle"]
     created = events.table(tables, "rmw_client_init").rename({"rmw_client_handle": "rmw_handle"})
-    created = first_after(created, clients, ["pid", "rmw_handle"], "time", "created")
-    servers = objects.subscriptions.select("pid", "rmw_handle", "topic", created="valid_from")
-    came = found["rmw_take_request"]
-    came = latest_before(came, servers, ["pid", "rmw_handle"], "time", "created")
+    created = first_after(created, clients, key, "time", "created")
+    servers = objects.subscriptions.select(*_END, "topic")
+    came = latest_before(found["rmw_take_request"], servers, key, "time", "created")
     came = came.with_columns(at=pl.col("source_timestamp") - clock_offset_ns)
     sent = found["rmw_send_request"].select("topic", "sequence_number", "client", sent="time")
     came = latest_before(came, sent, ["topic", "sequence_number"], "at", "sent")
     votes = came.group_by("client", "client_gid").len().sort("len", descending=True)
     named = created.select("client", gid=_gid_text("gid"))
-    voted = votes.select("client", gid=_gid_text("client_gid"))
-    owners = pl.concat([named, voted]).drop_nulls()
-    return owners.unique("gid", keep="first", maintain_order=True)
+    owners = pl.concat([named, votes.select("client", gid=_gid_text("client_gid"))])
+    return owners.drop_nulls().unique("gid", keep="first", maintain_order=True)
 
 
 def _gid_text(column: str) -> pl.Expr:
@@ -124,19 +120,16 @@ def publications(tables: events.EventTables, objects: Objects, calls: pl.DataFra
     """
     written = _written(tables, objects, calls)
     handed = _handed_over(tables, objects)
-    if not handed.height:
-        every = written.with_columns(intra_time=_NO_TIME)
-    else:
+    every = written.with_columns(intra_time=_NO_TIME)
+    if handed.height:
         # One publish() may do both, ring buffers first: the next write by the same publisher on
         # the same thread is the same message.
         both = latest_before(written, handed, ["pid", "tid", "publisher"], "time", "intra_time")
         first = pl.col("handed").is_first_distinct() & pl.col("handed").is_not_null()
         both = both.with_columns(pl.when(first).then("intra_time"))
-        alone = handed.join(both.drop_nulls("intra_time"), on="handed", how="anti").with_columns(
-            time="intra_time", source_timestamp=_NO_TIME
-        )
-        columns = [*written.columns, "intra_time"]
-        every = pl.concat([both.select(columns), alone.select(columns)])
+        alone = handed.join(both.drop_nulls("intra_time"), on="handed", how="anti")
+        alone = alone.with_columns(time="intra_time", source_timestamp=_NO_TIME)
+        every = pl.concat([one.select(every.columns) for one in (both, alone)])
     return in_order(every, "time", "pid", "tid").with_row_index("publication")
 
 
@@ -144,14 +137,11 @@ def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) 
     """Messages given to DDS: ``time, pid, tid, publisher, node, topic, source_timestamp``."""
     writes = _writes(tables)
     if calls.height:
-        names = {"rmw_handle": "rmw_publisher_handle", "call": "source_timestamp"}
-        writes = pl.concat([writes, calls.rename(names)], how="diagonal")
-    by_rmw = objects.publishers.select(
-        "pid", *_PUBLISHER, rmw_publisher_handle="rmw_handle", created="valid_from"
-    )
-    nameless = pl.col("rmw_publisher_handle").is_null()
+        writes = pl.concat([writes, calls.rename({"call": "source_timestamp"})], how="diagonal")
+    by_rmw = objects.publishers.select(*_END, *_PUBLISHER)
+    nameless = pl.col("rmw_handle").is_null()
     known = writes.filter(~nameless)
-    found = [latest_before(known, by_rmw, ["pid", "rmw_publisher_handle"], "time", "created")]
+    found = [latest_before(known, by_rmw, ["pid", "rmw_handle"], "time", "created")]
     if known.height < writes.height:
         # The publisher is that of the rcl_publish of the same message just before. Addresses of
         # messages repeat, so a rcl_publish counts for the first write after it only.
@@ -161,17 +151,17 @@ def _written(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) 
         rows = latest_before(writes.filter(nameless), published, message, "time", "published")
         again = pl.col("rcl") == pl.col("rcl").shift(1).over(message)
         rows = rows.with_columns(pl.when(~again.fill_null(False)).then("publisher_handle"))
-        by_rcl = _by_rcl_handle(objects)
-        found.append(latest_before(rows, by_rcl, ["pid", "publisher_handle"], "time", "created"))
+        found.append(_by_rcl_handle(rows, objects, "time"))
     columns = ["time", "pid", "tid", *_PUBLISHER, "source_timestamp"]
     every = pl.concat([frame.select(columns) for frame in found])
     return every.drop_nulls("publisher") if every["publisher"].null_count() else every
 
 
-def _by_rcl_handle(objects: Objects) -> pl.DataFrame:
-    return objects.publishers.select(
+def _by_rcl_handle(rows: pl.DataFrame, objects: Objects, time: str) -> pl.DataFrame:
+    publishers = objects.publishers.select(
         "pid", *_PUBLISHER, publisher_handle="handle", created="valid_from"
     )
+    return latest_before(rows, publishers, ["pid", "publisher_handle"], time, "created")
 
 
 def _writes(tables: events.EventTables) -> pl.DataFrame:
@@ -181,12 +171,11 @@ def _writes(tables: events.EventTables) -> pl.DataFrame:
     if name == "rmw_publish":
         writes = events.table(tables, name, ["rmw_publisher_handle", "timestamp"])
         stamp = pl.when(pl.col("timestamp") > 0).then("timestamp")  # 0: not supported by the RMW
-        writes = writes.with_columns(source_timestamp=stamp)
+        writes = writes.with_columns(source_timestamp=stamp, rmw_handle="rmw_publisher_handle")
     else:
-        no_handle = pl.lit(None, dtype=pl.UInt64)
-        writes = events.table(tables, name).with_columns(
-            source_timestamp=_NO_TIME, rmw_publisher_handle=no_handle
-        )
+        nowhere = pl.lit(None, dtype=pl.UInt64)
+        writes = events.table(tables, name)
+        writes = writes.with_columns(source_timestamp=_NO_TIME, rmw_handle=nowhere)
     bound = events.table(tables, "dds_bind_addr_to_stamp")
     if bound.height:
         message = ["pid", "tid", "message"]
@@ -196,20 +185,14 @@ def _writes(tables: events.EventTables) -> pl.DataFrame:
         other = pl.col("bound") == pl.col("bound").shift(-1).over(message)
         stamp = pl.when(~other.fill_null(False)).then("source_stamp")
         writes = writes.with_columns(pl.coalesce("source_timestamp", stamp))
-    return writes.select(
-        "time", "pid", "tid", "message", "rmw_publisher_handle", "source_timestamp"
-    )
+    return writes.select("time", "pid", "tid", "message", "rmw_handle", "source_timestamp")
 
 
 def _handed_over(tables: events.EventTables, objects: Objects) -> pl.DataFrame:
     """Messages given to ring buffers: ``handed, intra_time, pid, tid, publisher, node, topic``."""
-    handed = events.table(tables, "rclcpp_intra_publish").select(
-        "pid", "tid", "publisher_handle", intra_time="time"
-    )
-    by_rcl = _by_rcl_handle(objects)
-    found = latest_before(handed, by_rcl, ["pid", "publisher_handle"], "intra_time", "created")
-    found = found.drop_nulls("publisher").with_row_index("handed")
-    return found.select("handed", "intra_time", "pid", "tid", *_PUBLISHER)
+    handed = events.table(tables, "rclcpp_intra_publish").rename({"time": "intra_time"})
+    found = _by_rcl_handle(handed, objects, "intra_time").drop_nulls("publisher")
+    return found.with_row_index("handed").select("handed", "intra_time", "pid", "tid", *_PUBLISHER)
 
 
 def taken_by_rmw(tables: events.EventTables) -> pl.DataFrame:
@@ -231,16 +214,14 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
     types = {name: objects.subscriptions.schema[name] for name in ("node", "topic")}
     callbacks = objects.callbacks.cast(types)  # type: ignore[arg-type]
     owner = callbacks.drop_nulls("subscription").unique("subscription", maintain_order=True)
-    subscriptions = objects.subscriptions.join(
-        owner.select("subscription", "callback_id"), on="subscription", how="left"
-    ).with_columns(created="valid_from", rmw_subscription_handle="rmw_handle")
-    columns = ["callback_id", "node", "topic"]
-    taken = taken_by_rmw(tables)
-    key = ["pid", "rmw_subscription_handle"]
-    from_dds = subscriptions.select(*key, *columns, "created")
+    owner = owner.select("subscription", "callback_id")
+    columns, key = ["callback_id", "node", "topic"], ["pid", "rmw_handle"]
+    subscriptions = objects.subscriptions.join(owner, on="subscription", how="left")
+    from_dds = subscriptions.select(*_END, *columns)
+    taken = taken_by_rmw(tables).rename({"rmw_subscription_handle": "rmw_handle"})
     parts = [latest_before(taken, from_dds, key, "time", "created")]
     if calls.height:
-        calls = calls.rename({"rmw_handle": "rmw_subscription_handle", "call": "source_timestamp"})
+        calls = calls.rename({"call": "source_timestamp"})
         parts.append(latest_before(calls, from_dds, key, "time", "created"))
     if taken.is_empty():
         owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
@@ -371,8 +352,8 @@ def _sends(published: pl.DataFrame, tables: events.EventTables, objects: Objects
     """``publication, time, outcome`` of what publisher threads dealt with."""
     publishers = objects.publishers.select("pid", "publisher", rmw_publisher_handle="rmw_handle")
     sends = events.table(tables, "asynchronous_send").rename({"timestamp": "source_timestamp"})
-    sends = sends.join(publishers, on=["pid", "rmw_publisher_handle"])
     stamped = published.select("publication", "publisher", "source_timestamp")
+    sends = sends.join(publishers, on=["pid", "rmw_publisher_handle"])
     return sends.join(stamped, on=["publisher", "source_timestamp"])
 
 
@@ -400,18 +381,17 @@ def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame
     key = ["pid", "callback"]
     callbacks = objects.callbacks.with_columns(callback="handle")
     handles = callbacks.select(*key, "callback_id").unique()
-    known = decisions.join(handles, on=key, maintain_order="left")
-    known = known.with_columns(start=_NO_TIME)
+    known = decisions.join(handles, on=key, maintain_order="left").with_columns(start=_NO_TIME)
     nameless = decisions.join(handles, on=key, how="anti", maintain_order="left")
     if not nameless.height:
         return known
-    unstamped = pl.col("source_timestamp").is_null()
+    stamped = pl.col("source_timestamp").is_not_null()
     began = events.table(tables, "callback_start").select("pid", "tid", "callback", start="time")
-    within = nameless.filter(unstamped).drop("callback")
+    within = nameless.filter(~stamped).drop("callback")
     within = latest_before(within, began, ["pid", "tid"], "time", "start").join(handles, on=key)
-    nameless = nameless.filter(~unstamped).with_columns(start=_NO_TIME)
     listening = callbacks.filter(pl.col("kind") == "subscription").select("pid", "callback_id")
-    unknown = nameless.join(listening.unique(), on="pid", maintain_order="left")
+    unknown = nameless.filter(stamped).with_columns(start=_NO_TIME)
+    unknown = unknown.join(listening.unique(), on="pid", maintain_order="left")
     return pl.concat([known, *(one.select(known.columns) for one in (unknown, within))])
 
 

@@ -2,9 +2,9 @@
 
 Events name objects by handles: addresses that are unique only within one process, and only until
 they are freed. So a handle is looked up as (process, handle, time): the object created there last,
-at or before the event. Handles that were never initialised belong to no object:
-`ros_discovery_info` is published and taken under such (Cyclone DDS), as is everything that existed
-before tracing began. The order of the events is that of rclcpp's constructors (ros2_tracing).
+at or before the event. Handles that were never initialised belong to no object: such are those of
+`ros_discovery_info` (Cyclone DDS), and of everything that existed before tracing began. The order
+of the events is that of rclcpp's constructors (ros2_tracing).
 """
 
 from dataclasses import dataclass
@@ -79,8 +79,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         _timers_of_python(tables, nodes),
         clients,
     ]
-    callbacks = pl.concat([registered, *others], how="diagonal_relaxed")
-    callbacks = numbered(tables, callbacks)
+    callbacks = numbered(tables, pl.concat([registered, *others], how="diagonal_relaxed"))
     names = []
     for column in ("node", "topic"):
         known = [frame[column].cast(pl.String) for frame in (publishers, subscriptions, callbacks)]
@@ -115,18 +114,14 @@ def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFr
 
 
 def _endpoints(tables: events.EventTables, nodes: pl.DataFrame, kind: str) -> pl.DataFrame:
-    created = events.table(tables, f"rcl_{kind}_init").select(
-        "pid",
-        "node_handle",
-        handle=f"{kind}_handle",
-        rmw_handle=f"rmw_{kind}_handle",
-        valid_from="time",
-        topic="topic_name",
-    )
+    rmw = f"rmw_{kind}_handle"
+    names = {f"{kind}_handle": "handle", rmw: "rmw_handle", "time": "valid_from"}
+    created = events.table(tables, f"rcl_{kind}_init").rename(names | {"topic_name": "topic"})
+    columns = ["pid", "node_handle", *names.values(), "topic"]
+    ends = [created, *(_service_ends(tables, role, kind) for role in ("client", "service"))]
+    created = pl.concat(one.select(columns) for one in ends).with_row_index(kind)
     columns = [kind, "pid", "handle", "rmw_handle", "valid_from", "node", "topic"]
-    ends = (_service_ends(tables, role, kind) for role in ("client", "service"))
-    created = pl.concat([created, *ends])
-    return _with_node(created.with_row_index(kind), nodes, "valid_from").select(columns)
+    return _with_node(created, nodes, "valid_from").select(columns)
 
 
 def _service_ends(tables: events.EventTables, role: str, kind: str) -> pl.DataFrame:
@@ -166,50 +161,41 @@ def _subscription_callbacks(
         "pid", "subscription", "node", "topic", rcl_handle="handle", rcl_from="valid_from"
     )
     # Both constructors ran after rcl_subscription_init; without `created` there is no rcl handle.
-    joined = joined.drop("subscription").with_columns(
-        known=pl.max_horizontal("created", "valid_from")
-    )
-    joined = latest_before(joined, rcl, ["pid", "rcl_handle"], "known", "rcl_from")
-    return joined.select(
-        "pid", "handle", "valid_from", "node", "topic", "subscription", kind=pl.lit("subscription")
+    known = pl.max_horizontal("created", "valid_from")
+    joined = joined.drop("subscription").with_columns(known=known, kind=pl.lit("subscription"))
+    return latest_before(joined, rcl, ["pid", "rcl_handle"], "known", "rcl_from").select(
+        "pid", "handle", "valid_from", "node", "topic", "subscription", "kind"
     )
 
 
 def _timer_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
     """Callback ← timer (its period before, its node after `rclcpp_timer_callback_added`)."""
     timer = ["pid", "timer_handle"]
-    created = events.table(tables, "rcl_timer_init").select(
-        *timer, period_ns="period", created="time"
-    )
-    linked = events.table(tables, "rclcpp_timer_link_node").select(
-        *timer, "node_handle", linked="time"
-    )
-    added = _added(tables, "timer", "timer_handle")
+    created = events.table(tables, "rcl_timer_init")
+    created = created.select(*timer, period_ns="period", created="time")
+    linked = events.table(tables, "rclcpp_timer_link_node")
+    linked = linked.select(*timer, "node_handle", linked="time")
+    added = _added(tables, "timer", "timer_handle").with_columns(kind=pl.lit("timer"))
     joined = latest_before(added, created, timer, "valid_from", "created")
     joined = first_after(joined, linked, timer, "valid_from", "linked")
     # `joined` is sorted by valid_from: a link made after the address was used again is another's.
     next_use = pl.col("valid_from").shift(-1).over(timer)
     own = next_use.is_null() | (pl.col("linked") < next_use)
-    joined = joined.with_columns(
-        pl.when(own).then("node_handle"), at=pl.max_horizontal("linked", "valid_from")
-    )
-    joined = _with_node(joined, nodes, "at")
-    return joined.select("pid", "handle", "valid_from", "node", "period_ns", kind=pl.lit("timer"))
+    at = pl.max_horizontal("linked", "valid_from")
+    joined = _with_node(joined.with_columns(pl.when(own).then("node_handle"), at=at), nodes, "at")
+    return joined.select("pid", "handle", "valid_from", "node", "period_ns", "kind")
 
 
 def _service_callbacks(
     tables: events.EventTables, nodes: pl.DataFrame, subscriptions: pl.DataFrame
 ) -> pl.DataFrame:
     service = ["pid", "service_handle"]
-    created = events.table(tables, "rcl_service_init").select(
-        *service, "node_handle", topic="service_name", created="time"
-    )
-    added = _added(tables, "service", "service_handle")
-    joined = latest_before(added, created, service, "valid_from", "created")
+    created = events.table(tables, "rcl_service_init")
+    created = created.select(*service, "node_handle", topic="service_name", created="time")
+    added = _added(tables, "service", "service_handle").with_columns(kind=pl.lit("service"))
+    joined = latest_before(added, created, service, "valid_from", "created").drop("created")
     joined = _with_node(joined, nodes, "valid_from")
-    joined = _listening(joined.rename({"service_handle": "end"}), subscriptions, REQUEST)
-    columns = ["pid", "handle", "valid_from", "node", "topic", "subscription"]
-    return joined.select(*columns, kind=pl.lit("service"))
+    return _listening(joined.rename({"service_handle": "end"}), subscriptions, REQUEST)
 
 
 def _client_callbacks(
@@ -217,23 +203,22 @@ def _client_callbacks(
 ) -> pl.DataFrame:
     """Clients of services: they exist, but no version of rclcpp says when their callback runs."""
     created = events.table(tables, "rcl_client_init").select(
-        "pid", "node_handle", handle="client_handle", valid_from="time", topic="service_name"
-    )
-    created = _listening(created.with_columns(end="handle"), subscriptions, RESPONSE)
-    return _with_node(created, nodes, "valid_from").select(
-        *("pid", "handle", "valid_from", "node", "topic", "subscription"),
+        *("pid", "node_handle"),
+        handle="client_handle",
+        end="client_handle",
+        valid_from="time",
+        topic="service_name",
         kind=pl.lit("client"),
         observed=pl.lit(False),
     )
+    return _listening(_with_node(created, nodes, "valid_from"), subscriptions, RESPONSE)
 
 
 def _listening(ends: pl.DataFrame, subscriptions: pl.DataFrame, to: str) -> pl.DataFrame:
     """Add the ``subscription`` as which an end of a service is listed, if its calls were seen."""
     own = subscriptions.filter(pl.col("topic").str.ends_with(to))
     own = own.select("pid", "subscription", end="handle", created="valid_from")
-    return latest_before(
-        ends.drop("created", strict=False), own, ["pid", "end"], "valid_from", "created"
-    )
+    return latest_before(ends, own, ["pid", "end"], "valid_from", "created")
 
 
 def _with_symbols(tables: events.EventTables, registered: pl.DataFrame) -> pl.DataFrame:
@@ -257,15 +242,8 @@ def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
     first = started.group_by(key).agg(valid_from=pl.col("time").min()).collect()
     first = first.join(known, on=key, how="left")
     early = pl.col("valid_to").is_null() | (pl.col("valid_from") < pl.col("valid_to"))
-    return (
-        first.filter(early)
-        .sort("valid_from", *key)
-        .select(
-            *("pid", "handle", "valid_from", "valid_to"),
-            kind=pl.lit("unknown"),
-            observed=pl.lit(True),
-        )
-    )
+    unknown = first.with_columns(kind=pl.lit("unknown"), observed=pl.lit(True))
+    return unknown.filter(early).sort("valid_from", *key)
 
 
 def _callbackless(
@@ -295,16 +273,12 @@ def _timers_of_python(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Dat
     called = events.table(tables, "rcl_timer_call").select(timer).unique()
     created = events.table(tables, "rcl_timer_init").join(called, on=timer, how="semi")
     added = events.table(tables, "rclcpp_timer_callback_added")
-    bare = created.join(added, on=timer, how="anti")
-    owned = latest_before(bare, nodes.drop("handle"), ["pid"], "time", "valid_from")
-    return owned.select(
-        *("pid", "node"),
-        handle="timer_handle",
-        valid_from="time",
-        period_ns="period",
-        kind=pl.lit("timer"),
-        observed=pl.lit(False),
+    bare = created.join(added, on=timer, how="anti").select(
+        "pid", handle="timer_handle", valid_from="time", period_ns="period", kind=pl.lit("timer")
     )
+    owners = nodes.select("pid", "node", node_from="valid_from")
+    owned = latest_before(bare, owners, ["pid"], "valid_from", "node_from")
+    return owned.with_columns(observed=pl.lit(False))
 
 
 def _buffers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
@@ -340,7 +314,7 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
     notes: list[str] = []
     unknown = callbacks.filter(pl.col("kind") == "unknown")
     if len(unknown):
-        processes = ", ".join(str(pid) for pid in sorted(unknown["pid"].unique()))
+        processes = ", ".join(map(str, unknown["pid"].unique().sort()))
         notes.append(
             f"{len(unknown)} callbacks (process {processes}) ran without having been registered: "
             "tracing started after the application, or their events were lost; their node, kind "
@@ -350,16 +324,14 @@ def _notes(tables: events.EventTables, callbacks: pl.DataFrame) -> tuple[str, ..
     def some(*names: str) -> bool:
         return any(events.table(tables, name).height for name in names)
 
-    if some("rmw_take", "rmw_publish"):
-        if not some("rcl_publisher_init", "rcl_subscription_init"):
-            notes.append(
-                "no publisher or subscription was created during the recording: the topics of "
-                "messages cannot be known, so no chain can be followed."
-            )
-        elif not some("rcl_node_init"):
-            notes.append(
-                "no node was created during the recording: names of nodes cannot be known."
-            )
+    messages = some("rmw_take", "rmw_publish")
+    if messages and not some("rcl_publisher_init", "rcl_subscription_init"):
+        notes.append(
+            "no publisher or subscription was created during the recording: the topics of "
+            "messages cannot be known, so no chain can be followed."
+        )
+    elif messages and not some("rcl_node_init"):
+        notes.append("no node was created during the recording: names of nodes cannot be known.")
     silent = callbacks.filter(~pl.col("observed") & (pl.col("kind") == "subscription"))
     silent = silent.filter(~pl.col("topic").str.contains("/_action/", literal=True))
     notes += [

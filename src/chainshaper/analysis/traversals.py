@@ -48,7 +48,8 @@ REASONS: dict[str, str] = {
 }
 """Why a traversal is incomplete."""
 
-_IN_NODE = ["not published", "inactive", "discarded", "not sent", "still running"]
+_SILENT = ["not published", "inactive"]
+_IN_NODE = [*_SILENT, "discarded", "not sent", "still running"]
 _REASON = pl.Enum(list(REASONS))
 _VIA = pl.Enum(["instance", "sibling"])
 
@@ -89,11 +90,9 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
     # `take_h` it read, the `publication_h` it went into and whether that was a `sibling_h`'s.
     # Numbers are rows of the data flow's frames, so times are looked up when they are needed.
     graph = graph or graph_of(flow)
-    callbacks = {callback.id: callback for callback in graph.callbacks}
-    path = [callbacks[number] for number in chain.callbacks]
+    path = graph.path(chain)
     state = _begun(flow, path[0])
-    silent = 0
-    notes: list[str] = []
+    silent, notes = 0, list[str]()
     for hop, (callback, topic) in enumerate(zip(path, chain.topics, strict=True)):
         if hop:
             state = _take(flow, state, hop, callback)
@@ -104,9 +103,8 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         state = _unless_published(flow, state, hop)
         state = _unless_active(flow, state, hop, callback)
         if hop == 0:
-            quiet = pl.col("reason").is_in(["not published", "inactive"]).fill_null(False)
-            silent = int(state.select(quiet.sum()).item())
-            state = state.filter(~quiet)
+            begun = state.filter(~pl.col("reason").is_in(_SILENT).fill_null(False))
+            silent, state = state.height - begun.height, begun
     frame = _described(flow, chain, state)
     hops = pl.concat(_hop(flow, chain, frame, hop) for hop in range(len(path)))
     return Traversals(chain, frame.select(_SUMMARY), hops, silent, tuple(notes))
@@ -134,13 +132,10 @@ def _publish(
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
     if first.count() == inside.height:
-        found = {publication: first.gather(state[instance])}
-        return state.with_columns(**found, **{f"sibling_{hop}": pl.lit(False)})
-    # An instance that publishes several times begins as many traversals.
-    named = inside.select(
-        pl.col("instance").alias(instance), pl.col("publication").alias(publication)
-    )
-    state = state.join(named, on=instance, how="left", maintain_order="left")
+        state = state.with_columns(first.gather(state[instance]).alias(publication))
+    else:  # an instance that publishes several times begins as many traversals
+        named = inside.select(**{instance: "instance", publication: "publication"})
+        state = state.join(named, on=instance, how="left", maintain_order="left")
     return state.with_columns(pl.lit(False).alias(f"sibling_{hop}"))
 
 
@@ -156,8 +151,7 @@ def _publish_by_sibling(
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
     of_node = (pl.col("pid") == callback.pid) & (pl.col("node") == callback.node)
     here = flow.publications.filter((pl.col("topic") == topic) & of_node)
-    began = _looked_up(flow.instances, "start", "instance")
-    began = pl.coalesce(began, "time")
+    began = pl.coalesce(_looked_up(flow.instances, "start", "instance"), "time")
     here = here.select("publisher", "callback_id", "time", later="publication", began=began)
     here = here.join(publishers, on="publisher", how="left", maintain_order="left")
     waiting = pl.col(publication).is_null() & pl.col(f"instance_{hop}").is_not_null()
@@ -302,9 +296,8 @@ def _described(flow: DataFlow, chain: Chain, state: pl.DataFrame) -> pl.DataFram
 
 def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.DataFrame:
     instance, take = f"instance_{hop}", f"take_{hop}"
-    before = _published_at(flow, hop - 1, chain) if hop else pl.lit(None, dtype=pl.Int64)
-    start, publish = pl.col("start"), pl.col("publish")
-    sibling = pl.when(f"sibling_{hop}").then(pl.lit("sibling")).otherwise(pl.lit("instance"))
+    sent = _published_at(flow, hop - 1, chain) if hop else pl.lit(None, dtype=pl.Int64)
+    via = pl.when(f"sibling_{hop}").then(pl.lit("sibling")).otherwise(pl.lit("instance"))
     reached = frame.filter(pl.col(instance).is_not_null()).select(
         "traversal",
         hop=pl.lit(hop, dtype=pl.UInt8),
@@ -316,13 +309,13 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
         publish=_published_at(flow, hop, chain),
         end=_looked_up(flow.instances, "end", instance),
         source_timestamp=_looked_up(flow.takes, "source_timestamp", take),
-        communication_ns=before,
-        via=sibling.cast(_VIA),
+        communication_ns=sent,
+        via=via.cast(_VIA),
     )
     return reached.with_columns(
-        communication_ns=start - pl.col("communication_ns"),
-        computation_ns=publish - start,
-        via=pl.when(publish.is_not_null()).then("via"),
+        communication_ns=pl.col("start") - pl.col("communication_ns"),
+        computation_ns=pl.col("publish") - pl.col("start"),
+        via=pl.when(pl.col("publish").is_not_null()).then("via"),
     )
 
 
@@ -343,11 +336,8 @@ def reception(flow: DataFlow, traversals: Traversals, graph: ApplicationGraph) -
     (from the traversal's start). The subscriber is the first subscription callback of the last
     topic that received anything at all.
     """
-    candidates = [
-        callback.id
-        for callback in graph.callbacks
-        if callback.trigger == traversals.chain.topics[-1]
-    ]
+    output = traversals.chain.topics[-1]
+    candidates = [callback.id for callback in graph.callbacks if callback.trigger == output]
     taken = flow.takes.filter(pl.col("callback_id").is_in(candidates))
     taken = taken.drop_nulls(["publication", "instance"])
     taken = taken.filter(pl.col("callback_id") == pl.col("callback_id").min())

@@ -93,8 +93,7 @@ def draw_distribution(measurements: Sequence[Measurement], path: str | Path) -> 
     """Cumulative distribution of the latency over undisturbed cycles, publish slots shaded."""
     figure, axes = _new_figure()
     for measurement, colour in zip(measurements, cycle(COLOURS), strict=False):
-        frame = measurement.analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
-        latency = np.sort(frame["latency_ns"].to_numpy()) / 1e6
+        latency = np.sort(measurement.analysis.calm["latency_ns"].to_numpy()) / 1e6
         share = np.arange(1, len(latency) + 1) / max(1, len(latency))
         label = f"{measurement.recording.path.name} ({len(latency)} cycles)"
         axes.step(latency, share, where="post", color=colour, label=label)

@@ -10,12 +10,13 @@ tables and pictures unless asked for; in JSON it is marked.
 The layout is that of Sugiyama, Tagawa and Toda (1981): edges that close cycles are turned around;
 every box gets a column, as far left as its predecessors permit; columns are sorted so that few
 edges cross (barycentres, swept back and forth); heights are least squares under the order and the
-gaps of a column (isotonic regression), so that edges run straight. Edges over several columns pass
-them through places of their own. Parts that are not connected are laid out one below the other.
+gaps of a column, so that edges run straight. Edges over several columns pass them through places of
+their own. Parts that are not connected are laid out one below the other.
 """
 
 import json
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import accumulate, pairwise
@@ -58,18 +59,17 @@ COLOURS = {
     "client": "#3b7d4f",
     "unknown": "#777777",
 }
-_STYLE = """\
+_DEFINED = """\
+<defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7" markerHeight="7"
+  orient="auto-start-reverse"><path d="M 0 1 L 10 5 L 0 9 z" fill="#555"/></marker><style>
 text { font-family: "DejaVu Sans", Verdana, Helvetica, Arial, sans-serif; font-size: 12px;
   fill: #1a1a1a; }
 .title { font-weight: bold; } .small { font-size: 10px; fill: #666; }
-.node { fill: #fff; stroke: #444; stroke-width: 1.3; }
-.head { fill: #eceff3; }
-.line { stroke: #d5d9df; }
-.topic { fill: #fff6d6; stroke: #b8962e; }
+.node { fill: #fff; stroke: #444; stroke-width: 1.3; } .head { fill: #eceff3; }
+.line { stroke: #d5d9df; } .topic { fill: #fff6d6; stroke: #b8962e; }
 .arrow { fill: none; stroke: #555; stroke-width: 1.3; marker-end: url(#tip); }
-.passes { stroke-dasharray: 5 4; }
-.back { stroke: #b03a3a; }
-"""
+.passes { stroke-dasharray: 5 4; } .back { stroke: #b03a3a; }
+</style></defs>"""
 
 
 Point: TypeAlias = tuple[float, float]
@@ -90,8 +90,10 @@ def without_internals(application: ApplicationDescription) -> ApplicationDescrip
         for one in graph.callbacks
         if not is_internal(one.topic)
     )
-    publishers = {t: nodes for t, nodes in graph.publishers.items() if not is_internal(t)}
-    subscribers = {t: nodes for t, nodes in graph.subscribers.items() if not is_internal(t)}
+    publishers, subscribers = (
+        {topic: nodes for topic, nodes in ends.items() if not is_internal(topic)}
+        for ends in (graph.publishers, graph.subscribers)
+    )
     left = replace(graph, callbacks=callbacks, publishers=publishers, subscribers=subscribers)
     return replace(application, graph=left)
 
@@ -99,20 +101,19 @@ def without_internals(application: ApplicationDescription) -> ApplicationDescrip
 def application_json(application: ApplicationDescription) -> dict[str, Any]:
     """Nodes, callbacks, topics and services as plain data."""
     graph = application.graph
-    callbacks = []
-    for one in graph.callbacks:
-        names = ("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes")
-        values = {name: getattr(one, name) for name in (*names, "passes_on")}
-        callbacks.append({**values, "internal": is_internal(one.topic)})
+    names = ("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes", "passes_on")
+    callbacks = [
+        {name: getattr(one, name) for name in names} | {"internal": is_internal(one.topic)}
+        for one in graph.callbacks
+    ]
     topics = []
     for topic in graph.topics:
         ends = graph.publishers.get(topic, ()), graph.subscribers.get(topic, ())
         found = {"name": topic, "publishers": list(ends[0]), "subscribers": list(ends[1])}
         topics.append({**found, "internal": is_internal(topic)})
     services: dict[str, dict[str, Any]] = {}
-    for name, role, node, _ in application.services.sort(
-        "service", maintain_order=True
-    ).iter_rows():
+    rows = application.services.sort("service", maintain_order=True)
+    for name, role, node, _ in rows.iter_rows():
         fresh = {"name": name, "servers": [], "clients": [], "internal": is_internal(name)}
         services.setdefault(name, fresh)[f"{role}s"].append(node or "")
     return {
@@ -130,11 +131,12 @@ def application_table(application: ApplicationDescription) -> ResultTable:
     names = [*words("node"), Column("process"), *words("callback", "publishes", "function")]
     table = ResultTable("Application", names)
     for node in sorted(_nodes(application), key=lambda node: (node.name, node.pid)):
-        for one in node.callbacks:
-            cells = callback_text(one), ", ".join(one.publishes), short_symbol(one.symbol)
-            table.add(node.name, str(node.pid), *cells)
-        if not node.callbacks:
-            table.add(node.name, str(node.pid), "", "", "")
+        cells = [
+            (callback_text(one), ", ".join(one.publishes), short_symbol(one.symbol))
+            for one in node.callbacks
+        ]
+        for own in cells or [("", "", "")]:
+            table.add(node.name, str(node.pid), *own)
     return table
 
 
@@ -183,10 +185,9 @@ class _NodeBox:
         return Box(max(widths) + 2 * PAD, TITLE + ROW * len(self.callbacks))
 
     def svg(self, corner: Point) -> str:
-        x, y = corner
-        width, height = self.box.width, self.box.height
+        width, height = self.box
         parts = [
-            f'<g transform="translate({x:.1f} {y:.1f})">',
+            _group(corner),
             f'<rect class="node" width="{width:.1f}" height="{height:.1f}" rx="5"/>',
             f'<rect class="head" x="1" y="1" width="{width - 2:.1f}" height="{TITLE - 2:.1f}"'
             ' rx="4"/>',
@@ -234,24 +235,26 @@ def application_svg(application: ApplicationDescription) -> str:
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" width="{width:.0f}" height="{height:.0f}"'
         f' viewBox="{-MARGIN} {-MARGIN} {width:.1f} {height:.1f}">',
-        '<defs><marker id="tip" viewBox="0 0 10 10" refX="9" refY="5" markerWidth="7"'
-        ' markerHeight="7" orient="auto-start-reverse"><path d="M 0 1 L 10 5 L 0 9 z" fill="#555"/>'
-        f"</marker><style>{_STYLE}</style></defs>",
+        _DEFINED,
         f'<rect x="{-MARGIN}" y="{-MARGIN}" width="{width:.1f}" height="{height:.1f}"'
         ' fill="#fff"/>',
     ]
     parts += [_arrow(route, style) for route, (_, style) in zip(layout.routes, arrows, strict=True)]
     parts += [node.svg(corner) for node, corner in zip(nodes, layout.corners, strict=False)]
-    for topic, pill, (x, y) in zip(topics, pills, layout.corners[len(nodes) :], strict=True):
+    for topic, pill, corner in zip(topics, pills, layout.corners[len(nodes) :], strict=True):
         parts.append(
-            f'<g transform="translate({x:.1f} {y:.1f})">'
-            f'<rect class="topic" width="{pill.width:.1f}" height="{pill.height:.1f}" rx="13"/>'
+            f"{_group(corner)}"
+            f'<rect class="topic" width="{pill.width:.1f}" height="{PILL:.1f}" rx="13"/>'
             f'<text x="{pill.width / 2:.1f}" y="17" text-anchor="middle">{escape(topic)}</text></g>'
         )
     if any(application.lost.values()):
         y, text = layout.height + MARGIN / 2, escape(lost_text(application.lost))
         parts.append(f'<text class="small" x="0" y="{y:.1f}">{text}</text>')
     return "\n".join([*parts, "</svg>", ""])
+
+
+def _group(corner: Point) -> str:
+    return f'<g transform="translate({corner[0]:.1f} {corner[1]:.1f})">'
 
 
 def _arrows(
@@ -304,8 +307,8 @@ def application_dot(application: ApplicationDescription) -> str:
     if any(application.lost.values()):
         lines.append(f"  label={_quoted(lost_text(application.lost))};")
     for index, node in enumerate(_nodes(application)):
-        lines.append(f"  subgraph cluster_{index} {{")
-        lines.append(f"    label={_quoted(f'{node.name} (process {node.pid})')};")
+        title = _quoted(f"{node.name} (process {node.pid})")
+        lines += [f"  subgraph cluster_{index} {{", f"    label={title};"]
         lines.append(f'    node_{index} [shape=point, style=invis, label=""];')
         for one in node.callbacks:
             label = _quoted(f"{callback_text(one)}\n{short_symbol(one.symbol)}".strip())
@@ -313,12 +316,13 @@ def application_dot(application: ApplicationDescription) -> str:
         lines.append("  }")
     lines += [f"  {_quoted(topic)} [shape=ellipse];" for topic in graph.topics]
     for one in graph.callbacks:
-        vertex = f"callback_{one.id}"
+        vertex, trigger = f"callback_{one.id}", one.topic
         if one.trigger in graph.topics:
-            lines.append(f"  {_quoted(one.trigger)} -> {vertex};")
-        elif one.topic is not None:  # of whose calls there are no events
-            lines.append(f"  {_quoted(one.topic)} [shape=cds];")
-            lines.append(f"  {_quoted(one.topic)} -> {vertex};")
+            trigger = one.trigger
+        elif trigger is not None:  # of whose calls there are no events
+            lines.append(f"  {_quoted(trigger)} [shape=cds];")
+        if trigger is not None:
+            lines.append(f"  {_quoted(trigger)} -> {vertex};")
         for topic in one.publishes:
             style = " [style=dashed]" if topic in one.passes_on else ""
             lines.append(f"  {vertex} -> {_quoted(topic)}{style};")
@@ -366,15 +370,17 @@ class Edge(NamedTuple):
 
 
 class Layout(NamedTuple):
-    """Left upper corners of the boxes, way points of the edges, and the size of it all.
-
-    An edge's way points lead from the right side of its source to the left side of its target.
-    """
+    """Left upper corners of the boxes, ways of the edges, from the right side of the source to the
+    left side of the target, and the size of it all."""
 
     corners: list[Point]
     routes: list[list[Point]]
     width: float
     height: float
+
+
+Beside: TypeAlias = dict[int, list[tuple[int, float, float]]]
+"""Vertex → neighbour, height of the edge's end inside the vertex, share inside the neighbour."""
 
 
 @dataclass
@@ -389,18 +395,17 @@ class _Part:
     """Left and right vertex, and the heights inside them."""
     y: dict[int, float] = field(default_factory=dict)
 
-    def beside(self) -> tuple["Beside", "Beside"]:
+    def beside(self) -> tuple[Beside, Beside]:
         """The neighbours of each vertex, to its left and to its right."""
-        before: Beside = {vertex: [] for vertex in self.layer}
-        after: Beside = {vertex: [] for vertex in self.layer}
+        before, after = defaultdict[int, Any](list), defaultdict[int, Any](list)
         for left, right, leaves, enters in self.segments:
             before[right].append((left, enters, leaves / (self.height[left] + 1)))
             after[left].append((right, leaves, enters / (self.height[right] + 1)))
         return before, after
 
-
-Beside: TypeAlias = dict[int, list[tuple[int, float, float]]]
-"""Vertex → neighbour, height of the edge's end inside the vertex, share inside the neighbour."""
+    def place(self) -> dict[int, int]:
+        """The place of each vertex in its column."""
+        return {v: place for column in self.columns for place, v in enumerate(column)}
 
 
 def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
@@ -452,9 +457,7 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
     entered = {edge.target for edge in edges.values()}
     rank = depth_first_order(follows, sorted(chosen, key=entered.__contains__))
     ends = {
-        number: (edge.source, edge.target)
-        if rank[edge.target] < rank[edge.source]
-        else (edge.target, edge.source)
+        number: tuple(sorted((edge.source, edge.target), key=rank.__getitem__, reverse=True))
         for number, edge in edges.items()
     }
     before: dict[int, set[int]] = {vertex: set() for vertex in chosen}
@@ -472,17 +475,17 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
     part = _Part(dict(sorted(layer.items())), {v: boxes[v].height for v in chosen})
     fresh = len(boxes)
     for number, (left, right) in ends.items():
+        passed = range(layer[left] + 1, layer[right])
+        places = part.places[number] = list(range(fresh, fresh + len(passed)))
+        fresh += len(passed)
+        part.layer.update(zip(places, passed, strict=True))
+        part.height.update(dict.fromkeys(places, PLACE_HEIGHT))
         edge = edges[number]
         heights = {edge.source: edge.leaves, edge.target: edge.enters}
-        passed = range(layer[left] + 1, layer[right])
-        part.places[number] = list(range(fresh, fresh + len(passed)))
-        fresh += len(passed)
-        part.layer.update(zip(part.places[number], passed, strict=True))
-        part.height.update(dict.fromkeys(part.places[number], PLACE_HEIGHT))
-        heights |= dict.fromkeys(part.places[number], PLACE_HEIGHT / 2)
-        way = [left, *part.places[number], right]
+        heights |= dict.fromkeys(places, PLACE_HEIGHT / 2)
         if left != right:
-            part.segments += [(a, b, heights[a], heights[b]) for a, b in pairwise(way)]
+            way = pairwise([left, *places, right])
+            part.segments += [(a, b, heights[a], heights[b]) for a, b in way]
     part.columns = [[] for _ in range(max(part.layer.values()) + 1)]
     for vertex, column in part.layer.items():
         part.columns[column].append(vertex)
@@ -497,7 +500,7 @@ def _sort_columns(part: _Part) -> None:
         forwards = sweep % 2 == 0
         beside = before if forwards else after
         for column in part.columns[1:] if forwards else part.columns[-2::-1]:
-            place = {v: index for column in part.columns for index, v in enumerate(column)}
+            place = part.place()
             means = {
                 v: float(np.mean([place[w] + inside for w, _, inside in beside[v]] or [place[v]]))
                 for v in column
@@ -511,14 +514,11 @@ def _sort_columns(part: _Part) -> None:
 
 def _crossings(part: _Part) -> int:
     """How many pairs of segments cross: those whose ends are in another order than their begins."""
-    place = {v: index for column in part.columns for index, v in enumerate(column)}
-    by_column: dict[int, list[tuple[float, float]]] = {}
+    place, by_column = part.place(), defaultdict[int, list[tuple[float, float]]](list)
     for left, right, leaves, enters in part.segments:
-        ends = (
-            place[left] + leaves / (part.height[left] + 1),
-            place[right] + enters / (part.height[right] + 1),
-        )
-        by_column.setdefault(part.layer[left], []).append(ends)
+        begin = place[left] + leaves / (part.height[left] + 1)
+        end = place[right] + enters / (part.height[right] + 1)
+        by_column[part.layer[left]].append((begin, end))
     ends_at = [np.array([end for _, end in sorted(pairs)]) for pairs in by_column.values()]
     return sum(int(np.count_nonzero(np.triu(at[:, None] > at))) for at in ends_at)
 
@@ -549,9 +549,8 @@ def _choose_heights(part: _Part) -> None:
 
 
 def _apart(sizes: list[float], wanted: list[float], weights: list[float]) -> list[float]:
-    """The heights nearest to ``wanted`` that keep order and gaps (isotonic regression).
-
-    SciPy has one, too, but takes longer to import than a whole drawing.
+    """The heights nearest to ``wanted`` that keep order and gaps (isotonic regression; SciPy's own
+    takes longer to import than a whole drawing).
     """
     offsets = list(accumulate(sizes, initial=0.0))[:-1]
     blocks: list[tuple[float, float, int]] = []  # mean, weight, members

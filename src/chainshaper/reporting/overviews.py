@@ -93,13 +93,15 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
     """The system that was recorded, and how often each event happened."""
     contents = contents_json(recording)
     system = ResultTable(str(recording.path), words("", ""))
-    system.add("source", contents["source"])
-    system.add("distribution", contents["distribution"] or UNKNOWN)
-    system.add("RMW", contents["rmw"] or UNKNOWN)
-    system.add("hosts", ", ".join(contents["hosts"]) or UNKNOWN)
-    system.add("clock offset", f"{contents['clock_offset_ns']} ns to CLOCK_REALTIME")
-    for pid, name in contents["processes"].items():
-        system.add(f"process {pid}", name)
+    for title, value in (
+        ("source", contents["source"]),
+        ("distribution", contents["distribution"] or UNKNOWN),
+        ("RMW", contents["rmw"] or UNKNOWN),
+        ("hosts", ", ".join(contents["hosts"]) or UNKNOWN),
+        ("clock offset", f"{contents['clock_offset_ns']} ns to CLOCK_REALTIME"),
+        *((f"process {pid}", name) for pid, name in contents["processes"].items()),
+    ):
+        system.add(title, value)
     total = f"{sum(contents['events'].values()):,}"
     columns = [Column("event", words=True, footer="together"), Column("count", footer=total)]
     events = ResultTable("Events", columns)
@@ -126,18 +128,16 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
     for name in measured:
         columns += figures(*(f"{name}\n{figure}" for figure in ("min", "mean", "max")))
     table = ResultTable("Callbacks [ms]", columns)
-    rows = []
-    for row in statistics.to_dicts():
-        trigger = trigger_text(row["topic"], row["period_ns"])
-        rows.append((f"{row['kind']} {trigger}".rstrip(), row))
-    alike = Counter((row["pid"], row["node"], trigger) for trigger, row in rows)
-    for trigger, row in rows:
+    rows = statistics.to_dicts()
+    triggers = [f"{r['kind']} {trigger_text(r['topic'], r['period_ns'])}".rstrip() for r in rows]
+    keys = [(row["pid"], row["node"], own) for own, row in zip(triggers, rows, strict=True)]
+    alike = Counter(keys)
+    for key, trigger, row in zip(keys, triggers, rows, strict=True):
         symbol = short_symbol(row["symbol"])
-        doubtful = symbol and alike[row["pid"], row["node"], trigger] > 1
-        cells = [f"{trigger} ({symbol})" if doubtful else trigger, symbol, listed(row["tids"])]
-        cells.append(str(row["count"]))
+        shown = f"{trigger} ({symbol})" if symbol and alike[key] > 1 else trigger
         times = (cell for name in measured for cell in min_mean_max(row[f"{name}_ns"]))
-        table.add(row["node"] or "", *cells, *times)
+        cells = (row["node"] or "", shown, symbol, listed(row["tids"]), str(row["count"]))
+        table.add(*cells, *times)
     return table
 
 
@@ -146,18 +146,13 @@ def chains_json(graph: ApplicationGraph, found: ChainEnumeration) -> dict[str, A
     heaviest = None
     if found.heaviest is not None:
         heaviest = {**_chain(graph, found.heaviest), "response_ns": found.heaviest_ns}
-    return {
-        "count": found.count,
-        "exact": found.exact,
-        "complete": found.complete,
-        "heaviest": heaviest,
-        "chains": [_chain(graph, chain) for chain in found.chains],
-    }
+    chains = [_chain(graph, chain) for chain in found.chains]
+    known = {name: getattr(found, name) for name in ("count", "exact", "complete")}
+    return {**known, "heaviest": heaviest, "chains": chains}
 
 
 def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
-    callbacks = {callback.id: callback for callback in graph.callbacks}
-    path = [callbacks[number] for number in chain.callbacks]
+    path = graph.path(chain)
     return {
         "chain": chain.spec,
         "nodes": [callback.node for callback in path],
@@ -190,10 +185,7 @@ def threads_json(allocation: Allocation) -> dict[str, Any]:
         {
             "nodes": list(found.nodes),
             "nodes_known_by": found.nodes_known_by or None,
-            "pid": found.thread.pid,
-            "tid": found.thread.tid,
-            "comm": found.thread.comm,
-            "role": found.thread.role,
+            **{name: getattr(found.thread, name) for name in ("pid", "tid", "comm", "role")},
             "callbacks": [{"node": node, "callback": name} for node, name in found.callbacks],
             "dds_kind": found.thread.kind,
             "known_by": found.known_by or None,
@@ -296,30 +288,31 @@ def condition_table(
 
     A recording has a measurement for each of its chains.
     """
-    rows: dict[str, list[str]] = {}
+    columns = []
     for one, *others in recordings:
         info, plans = one.recording.info, [m.plan for m in (one, *others) if m.plan is not None]
         in_force = "\n".join(f"{p.policy}, for {p.chain.spec or 'a chain'}" for p in plans)
-        for title, cell in (
-            ("folder", str(one.recording.path)),
-            ("first cycle", _begun(one)),
-            ("source", info.source),
-            ("host", info.host),
-            ("kernel", info.kernel),
-            ("ROS 2 distribution", info.distribution),
-            ("RMW", info.rmw),
-            ("command", " ".join(info.command)),
-            ("real-time scheduling", YES_NO.get(info.realtime)),
-            ("scheduling in force", _scheduling(info.threads)),
-            ("machine watched for stalls", _watched(info.stall_meter)),
-            ("events", f"{event_counts(one.recording)['count'].sum():,}"),
-            ("events lost", lost_text(info.lost).partition(": ")[2]),
-            ("plan in force", in_force or "none"),
-        ):
-            rows.setdefault(title, []).append(cell or UNKNOWN)
+        columns.append(
+            {
+                "folder": str(one.recording.path),
+                "first cycle": _begun(one),
+                "source": info.source,
+                "host": info.host,
+                "kernel": info.kernel,
+                "ROS 2 distribution": info.distribution,
+                "RMW": info.rmw,
+                "command": " ".join(info.command),
+                "real-time scheduling": YES_NO.get(info.realtime),
+                "scheduling in force": _scheduling(info.threads),
+                "machine watched for stalls": _watched(info.stall_meter),
+                "events": f"{event_counts(one.recording)['count'].sum():,}",
+                "events lost": lost_text(info.lost).partition(": ")[2],
+                "plan in force": in_force or "none",
+            }
+        )
     table = ResultTable("", words("", *names))
-    for title, cells in rows.items():
-        table.add(title, *cells)
+    for title in columns[0]:
+        table.add(title, *(own[title] or UNKNOWN for own in columns))
     return table
 
 
@@ -372,11 +365,11 @@ def plan_table(plan: Plan) -> ResultTable:
     columns = [*words("server"), *figures("core", "priority"), *words("slots", "threads")]
     table = ResultTable(f"Plan for {plan.chain.spec or 'a chain'} [ms]", columns)
     for server in plan.servers:
-        threads = (
-            f"{thread.node} ({what})" if what else thread.node
-            for thread in server.threads
-            for what in ["publisher" if thread.role == "publisher" else ", ".join(thread.callbacks)]
-        )
+        threads = []
+        for thread in server.threads:
+            publishes = thread.role == "publisher"
+            what = "publisher" if publishes else ", ".join(thread.callbacks)
+            threads.append(f"{thread.node} ({what})" if what else thread.node)
         where = str(server.core), str(server.priority)
         table.add(server.name, *where, slots_ms(*server.slots), ", ".join(threads))
     offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
@@ -418,15 +411,16 @@ def choice_table(choice: BandChoice) -> ResultTable:
 
 def choice_json(choice: BandChoice) -> dict[str, Any]:
     """The same as plain data."""
-    curve = [(len(one.slot_ends_ns), one) for one in choice.curve]
-    return {
-        "curve": [
-            {"bands": bands, "mean_ns": round(one.mean_ns), "bands_ns": list(one.slot_ends_ns)}
-            for bands, one in curve
-        ],
-        "chosen": len(choice.chosen.slot_ends_ns),
-        "reason": choice.reason,
-    }
+    curve = [
+        {
+            "bands": len(one.slot_ends_ns),
+            "mean_ns": round(one.mean_ns),
+            "bands_ns": list(one.slot_ends_ns),
+        }
+        for one in choice.curve
+    ]
+    chosen = len(choice.chosen.slot_ends_ns)
+    return {"curve": curve, "chosen": chosen, "reason": choice.reason}
 
 
 def servers_table(state: RunState) -> ResultTable:
@@ -463,12 +457,9 @@ def run_line(state: RunState) -> str:
 def _counted(server: ServerState) -> dict[str, str]:
     counters = server.counters
     lateness = counters.longest_lateness_ns
-    values = {
-        "slots": counters.slots,
-        "late": counters.late_entries,
-        "worst": None if lateness is None else f"{milliseconds(lateness)} ms",
-        "overruns": counters.overruns,
-    }
+    worst = None if lateness is None else f"{milliseconds(lateness)} ms"
+    values = {"slots": counters.slots, "late": counters.late_entries, "worst": worst}
+    values["overruns"] = counters.overruns
     return {name: "-" if value is None else str(value) for name, value in values.items()}
 
 

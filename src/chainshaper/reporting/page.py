@@ -2,10 +2,10 @@
 
 It loads nothing: it works from a disk, in an archive, and without a network. Tables are written
 here; charts are drawn in the page by its script, from data that it carries: small enough for a
-page, exact where it counts. A screen has some thousand columns of pixels. Of many more cycles, the
-chart over time has of every stretch the shortest and the longest, so that no extreme is lost, and
-of the others every n-th, so that their density is not distorted; the histogram counts all cycles
-in bins so fine that they are joined for every drawing.
+page, exact where it counts. Of many cycles, the chart over time has of every stretch the shortest
+and the longest, so that no extreme is lost, and of the others every n-th, so that their density is
+not distorted; the histogram counts all cycles in bins so fine that they are joined for every
+drawing.
 
 Nothing that a recording says is trusted. Text is escaped where tables are written; data stands in
 a block that browsers do not execute, with every character escaped that could end it; and the page
@@ -69,8 +69,7 @@ def write_report(
     """Write the report of one chain in one or several recordings, whole or not at all.
 
     Of several chains of an application, give a comparison each, of the same recordings. ``cycles``
-    are numbers of cycles that the timeline has to show, should there be so many that it cannot show
-    all.
+    are numbers of cycles that the timeline has to show, should it not have room for all.
 
     Raises InputError: the path exists already or is no HTML file, or there is no such cycle.
     OperationError: it cannot be written; nothing is left behind.
@@ -99,20 +98,18 @@ def report_page(
     names = distinct_names([one.recording.path for one in shared])
     recorded = {id(one.recording): one.recording for one in every}  # once, whatever its chains
     flows = {key: data_flow(one.events, one.info.clock_offset_ns) for key, one in recorded.items()}
-    parts = []
-    for chain in chains:
-        named = zip(names, chain.measurements, strict=True)
-        parts.append([_part(name, one, flows[id(one.recording)]) for name, one in named])
-    drawn = [_drawn(of_one, cycles, number) for number, of_one in enumerate(parts)]
-    folder = resources.files("chainshaper.reporting")
     page, of_each, style, script = (
-        (folder / name).read_text("utf-8")
+        (resources.files("chainshaper.reporting") / name).read_text("utf-8")
         for name in ("page.html", "chain.html", "page.css", "page.js")
     )
-    blocks = []
-    for of_one, data in zip(parts, drawn, strict=True):
-        places = _tables(of_one, data["n"], several) | _beside_charts(of_one, data["recordings"])
+    blocks, drawn = [], []
+    for number, chain in enumerate(chains):
+        named = zip(names, chain.measurements, strict=True)
+        parts = [_part(name, one, flows[id(one.recording)]) for name, one in named]
+        data = _drawn(parts, cycles, number)
+        places = _tables(parts, data["n"], several) | _beside_charts(parts, data["recordings"])
         blocks.append(Template(of_each).substitute(places, n=data["n"]))
+        drawn.append(data)
     digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
     embedded = json.dumps(_safe(drawn), ensure_ascii=True, separators=(",", ":"))
     about = f"{len(chains)} chains" if several else chains[0].chain
@@ -140,9 +137,9 @@ def _part(name: str, one: Measurement, flow: DataFlow) -> _Part:
 def _plans_of(parts: Sequence[_Part]) -> dict[str, Plan]:
     """The plans that were in force, by the names of their recordings; equal ones stand once."""
     plans: dict[str, tuple[list[str], Plan]] = {}
-    for name, one in ((part.name, part.measurement) for part in parts):
-        if one.plan is not None:
-            plans.setdefault(dump_plan(one.plan), ([], one.plan))[0].append(name)
+    for part in parts:
+        if (plan := part.measurement.plan) is not None:
+            plans.setdefault(dump_plan(plan), ([], plan))[0].append(part.name)
     return {", ".join(users): plan for users, plan in plans.values()}
 
 
@@ -199,38 +196,32 @@ def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str
         + of_chain.breakdown_table(one.measurement.analysis).html()
         for one in parts
     )
+    plans = (_plan(f"{n}{suffix}", *one) for n, one in enumerate(_plans_of(parts).items()))
+    every = "Every cycle that began is complete."
+    section = f'<section id="callbacks">\n<h2>Callbacks</h2>\n{callbacks}\n</section>'
     return {
         "heading": f"<h1>{escape(compared.chain)}</h1>\n{verdict}" if several else "",
-        "callbacks": ""
-        if suffix
-        else f'<section id="callbacks">\n<h2>Callbacks</h2>\n{callbacks}\n</section>',
+        "callbacks": "" if suffix else section,
         "before_and_after": "Before and after" if len(parts) > 1 else "Figures",
         "comparison": of_chain.comparison_table(compared, names).html(),
         "predictions": "\n".join(map(_prediction, parts)),
         "hops": "\n".join(hops),
         "overruns": "\n".join(_overruns(part) + _moves(part) for part in parts),
-        "incomplete": incomplete.html()
-        if incomplete.rows
-        else _paragraph("Every cycle that began is complete."),
+        "incomplete": incomplete.html() if incomplete.rows else _paragraph(every),
         "stalls": "\n".join(map(_stalls, parts)),
-        "plans": "\n".join(
-            _plan(f"{n}{suffix}", *one) for n, one in enumerate(_plans_of(parts).items())
-        ),
+        "plans": "\n".join(plans),
     }
 
 
 def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:
     """How each recording was taken, and what is to be known about it and its chains."""
     recordings = [*zip(*(chain.measurements for chain in chains), strict=True)]
-    notes = [
-        f"{name}: {note}"
-        for name, own in zip(names, recordings, strict=True)
-        for note in dict.fromkeys(note for one in own for note in one.analysis.notes)
-    ]
-    threads = (_recorded_threads(name, own[0]) for name, own in zip(names, recordings, strict=True))
-    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    table = overviews.condition_table(names, recordings).html()
-    return "\n".join([table, *threads, f'<ul class="notes">{items}</ul>'])
+    parts, items = [overviews.condition_table(names, recordings).html()], ""
+    for name, own in zip(names, recordings, strict=True):
+        parts.append(_recorded_threads(name, own[0]))
+        for note in dict.fromkeys(note for one in own for note in one.analysis.notes):
+            items += f"<li>{escape(f'{name}: {note}')}</li>"
+    return "\n".join([*parts, f'<ul class="notes">{items}</ul>'])
 
 
 def _beside_charts(parts: Sequence[_Part], data: Sequence[dict[str, Any]]) -> dict[str, str]:
@@ -312,8 +303,7 @@ def _overruns(part: _Part) -> str:
     columns = [*words("policy"), *figures("late", "discarded", "next cycle hit")]
     outcomes = ResultTable("", columns)
     for policy, one in measurement.outcomes.items():
-        hit = next_cycles({policy: one})
-        outcomes.add(policy, str(one.late), str(one.discarded), hit)
+        outcomes.add(policy, str(one.late), str(one.discarded), next_cycles({policy: one}))
     about += outcomes.html() if outcomes.rows else ""
     latencies = measurement.analysis.traversals.select("traversal", "latency_ns")
     late = part.timeline.holds.filter(pl.col("overrun").is_not_null()).join(
@@ -321,19 +311,10 @@ def _overruns(part: _Part) -> str:
     )
     if not late.height:
         return about
-    table = ResultTable(
-        "",
-        [
-            *figures("cycle", "arrived, from its anchor [ms]"),
-            *words("what was done"),
-            *figures("latency [ms]"),
-        ],
-    )
-    for cycle, arrival, origin, done, latency in (
-        late.head(LISTED)
-        .select("traversal", "arrival", "origin", "overrun", "latency_ns")
-        .iter_rows()
-    ):
+    columns = [*figures("cycle", "arrived, from its anchor [ms]"), *words("what was done")]
+    table = ResultTable("", [*columns, *figures("latency [ms]")])
+    shown = late.select("traversal", "arrival", "origin", "overrun", "latency_ns").head(LISTED)
+    for cycle, arrival, origin, done, latency in shown.iter_rows():
         table.add(str(cycle), ms(arrival - origin), done, ms(latency))
     rest = f"The first {LISTED} of {late.height} are listed." if late.height > LISTED else ""
     return about + table.html() + _paragraph(rest)
@@ -445,22 +426,16 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
     ``disturbed`` are their places in these lists. ``of`` says how many complete cycles there are,
     ``incomplete`` when the others began.
     """
-    complete = traversals.filter("complete").select("traversal", "start", "latency_ns", "disturbed")
-    drawn = complete
+    drawn = complete = traversals.filter("complete")
     if complete.height > limit:
         stretches = max(1, limit // 8)  # two extremes each of two kinds: half of the points
-        stretch = pl.int_range(pl.len()) * stretches // pl.len()
-        extremes = (
-            complete.with_columns(row=pl.int_range(pl.len()))
-            .group_by(stretch.alias("stretch"), "disturbed")
-            .agg(
-                pl.col("row").get(pl.col("latency_ns").arg_min()).alias("shortest"),
-                pl.col("row").get(pl.col("latency_ns").arg_max()).alias("longest"),
-            )
-        )
+        stretch = (pl.int_range(pl.len()) * stretches // pl.len()).alias("stretch")
+        rows = complete.select("disturbed", "latency_ns", stretch).with_row_index("row")
+        latency, groups = pl.col("latency_ns"), rows.group_by("stretch", "disturbed")
+        ends = ("row", latency.arg_min()), ("row", latency.arg_max())
+        extremes = [groups.agg(pl.col(row).get(place))[row] for row, place in ends]
         sample = pl.arange(0, complete.height, -(-2 * complete.height // limit), eager=True)
-        rows = pl.concat([extremes["shortest"], extremes["longest"], sample]).unique().sort()
-        drawn = complete[rows]
+        drawn = complete[pl.concat([*extremes, sample.cast(pl.UInt32)]).unique().sort()]
     broken = traversals.filter(~pl.col("complete"))["start"] - zero
     gaps = broken.gather_every(max(1, -(-len(broken) // limit)))
     return {
@@ -479,13 +454,9 @@ def latency_histogram(traversals: pl.DataFrame, bins: int = BINS) -> dict[str, A
     ``bin`` are the numbers n of those that are not empty, ``count`` how many are in them, ``total``
     how many there are.
     """
-    latencies = traversals.filter(pl.col("complete") & ~pl.col("disturbed"))[
-        "latency_ns"
-    ].to_numpy()
-    if not len(latencies):
-        return {"width": 1, "bin": [], "count": [], "total": 0}
-    width = 1
-    while int(latencies.max()) // width - int(latencies.min()) // width >= bins:
+    calm = traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
+    latencies, width = calm["latency_ns"].to_numpy(), 1
+    while len(latencies) and latencies.max() // width - latencies.min() // width >= bins:
         width *= 10
     numbers, counts = np.unique(latencies // width, return_counts=True)
     counted = {"bin": numbers.tolist(), "count": counts.tolist()}

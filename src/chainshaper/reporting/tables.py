@@ -88,9 +88,7 @@ class ResultTable:
         used = [number for number, column in enumerate(self.columns) if not column.detail]
         names = [number for number in used if self.columns[number].words]
         heads = {n: self.columns[n].title.split("\n") for n in used if n not in names}
-        rows = [row for row in self.rows if row.cells and not row.detail]
-        if any(column.footer for column in self.columns):
-            rows.append(_Row(tuple(column.footer for column in self.columns)))
+        rows = self._with_footer([row for row in self.rows if not row.detail])
         cells = [row.cells for row in rows if not row.title]
         width = {n: max(map(cell_len, [*heads[n], *(str(row[n]) for row in cells)])) for n in heads}
 
@@ -142,15 +140,17 @@ class ResultTable:
             f'<th scope="col"{_kind(column.words or not number)}>{escape(column.title)}</th>'
             for number, column in enumerate(self.columns)
         )
-        rows = [row for row in self.rows if row.cells]
-        if any(column.footer for column in self.columns):
-            rows.append(_Row(tuple(column.footer for column in self.columns)))
-        body = "\n".join(map(self._row_html, rows))
+        body = "\n".join(self._row_html(row) for row in self._with_footer(self.rows))
         return (
             f'<div class="scroll"><table{" class=wide" * self._wide}>\n'
             f"<thead><tr>{titles}</tr></thead>\n"
             f"<tbody>\n{body}\n</tbody></table></div>"
         )
+
+    def _with_footer(self, rows: Sequence[_Row]) -> list[_Row]:
+        """Those of the rows that are no lines, and the footer, where there is one."""
+        footer = tuple(column.footer for column in self.columns)
+        return [*(row for row in rows if row.cells), *([_Row(footer)] if any(footer) else [])]
 
     @property
     def _wide(self) -> bool:

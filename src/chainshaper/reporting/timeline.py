@@ -96,7 +96,7 @@ def timeline_of(
         "execution_ns",
     )
     holds = pl.DataFrame(schema=_GATED) if analysis is None else analysis.releases.select(*_GATED)
-    origins = _origins(analysis, plan, holds)
+    origins = _origins(analysis, plan)
     servers = () if plan is None else plan.servers
     slots = [(one.name, n, *slot) for one in servers for n, slot in enumerate(one.slots)]
     # Cycles that two traversals share (the gate counts from its own) are drawn once.
@@ -140,9 +140,7 @@ def _threads(
     return rows.drop("place").with_columns(pl.Series("about", texts, dtype=pl.String))
 
 
-def _origins(
-    analysis: LatencyAnalysis | None, plan: Plan | None, holds: pl.DataFrame
-) -> pl.DataFrame:
+def _origins(analysis: LatencyAnalysis | None, plan: Plan | None) -> pl.DataFrame:
     """The gate says from when it counted; else the chain's stamp, or where cycles seem to start.
 
     Cycles of which the recording says nothing are taken to start as
@@ -150,8 +148,7 @@ def _origins(
     """
     if analysis is None or plan is None:
         return pl.DataFrame(schema=_ORIGINS)
-    last = len(analysis.chain.callbacks) - 1
-    decided = holds.filter(pl.col("hop") == last).select("traversal", decided="origin")
+    decided = analysis.decided.select("traversal", decided="origin")
     rows = analysis.traversals.select("traversal", "start").join(
         decided.unique("traversal"), on="traversal", how="left", maintain_order="left"
     )

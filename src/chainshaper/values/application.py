@@ -95,6 +95,11 @@ class ApplicationGraph:
     def topics(self) -> tuple[str, ...]:
         return tuple(sorted(self.publishers.keys() | self.subscribers.keys()))
 
+    def path(self, chain: "Chain") -> list[Callback]:
+        """The callbacks of a chain."""
+        by_id = {callback.id: callback for callback in self.callbacks}
+        return [by_id[number] for number in chain.callbacks]
+
 
 @dataclass(frozen=True)
 class Chain:

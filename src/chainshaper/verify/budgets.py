@@ -134,8 +134,8 @@ class Judged:
         """In one line: ``/t1../t5: maximum 81.2ms, budget 80ms (only in disturbed cycles)``."""
         if self.found is None:
             return f"{self.where}: {self.what} could not be measured; {self.because}"
-        line = f"{self.where}: {self.what} {self._value(self.found)}"
-        line += f", budget {self._value(self.limit)}"
+        found, limit = self._value(self.found), self._value(self.limit)
+        line = f"{self.where}: {self.what} {found}, budget {limit}"
         if not self.met and self.undisturbed is not None and self.undisturbed <= self.limit:
             line += f", {self._value(self.undisturbed)} where the machine disturbed nothing"
         return line if self.because is None else f"{line}; {self.because}"
@@ -210,10 +210,8 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         try:
             analysis = measure_latency(recording, chain.chain, flow=flow).analysis
         except InputError as error:
-            found += (
-                Judged(name, chain.chain, what, limit, None, because=str(error))
-                for what, limit, _ in _chain_limits(chain, None, None)
-            )
+            limits = _chain_limits(chain, None, None)
+            found += [Judged(name, chain.chain, *one, because=str(error)) for one in limits]
             continue
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))
@@ -222,8 +220,8 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         calm = _missing(cycles.filter(~pl.col("disturbed")), open_ns)
         every = _chain_limits(chain, analysis.statistics, _missing(cycles, open_ns))
         undisturbed = _chain_limits(chain, analysis.undisturbed, calm)
-        for (what, limit, value), (_, _, at_rest) in zip(every, undisturbed, strict=True):
-            one = Judged(name, chain.chain, what, limit, value, at_rest)
+        for limit, (_, _, at_rest) in zip(every, undisturbed, strict=True):
+            one = Judged(name, chain.chain, *limit, at_rest)
             found.append(one if one.met else replace(one, because=because))
         found += hops
     return [*found, *_judged_callbacks(name, budget.callbacks, longest_times(flow))]
@@ -238,8 +236,8 @@ def check_budgets(
     """Recordings and traces against a budget, in their order, as many at a time as there are cores,
     or as the cluster of a Dask ``scheduler`` computes.
 
-    What cannot be read breaks the budget as well, with the reason: the others are judged all the
-    same. Raises: as :func:`~chainshaper.linux.computing.engine`.
+    What cannot be read breaks the budget as well, with the reason. Raises: as
+    :func:`~chainshaper.linux.computing.engine`.
     """
     return computed(
         _checked, paths, budget, scheduler=scheduler, purpose="a check", progress=progress
@@ -376,8 +374,7 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
         return f"from {worst.text.partition(': ')[2]}"
     if not parts["count"].sum():
         return None
-    parts = parts.sort("computation_share", descending=True, nulls_last=True)
-    longest = parts.row(0, named=True)
+    longest = parts.sort("computation_share", descending=True, nulls_last=True).row(0, named=True)
     mean = duration_text(round(longest["computation_ns"]["mean"]))
     return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
 
@@ -414,5 +411,4 @@ def markdown_report(
     lines = [f"**{len(broken)} of {len(judged)} {noun} are {bad}**", ""]
     lines += [f"| recording | {noun.removesuffix('s')} |", "|---|---|"]
     cells = ((shown(t).replace("|", "\\|") for t in (o.recording, o.text)) for o in broken)
-    lines += [f"| {' | '.join(own)} |" for own in cells]
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *(f"| {' | '.join(own)} |" for own in cells), ""])

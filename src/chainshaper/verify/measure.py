@@ -54,28 +54,24 @@ class LeftOut:
     @property
     def text(self) -> str | None:
         """In words; None where it is nothing."""
-        parts = [
-            f"the {which} {duration_text(round(lasted, -6))}, {when}"
-            for which, lasted, when in (
-                ("first", self.before_ns, "before the plan came into force"),
-                ("last", self.after_ns, "after it was released"),
-            )
-            if round(lasted, -6)
-        ]
+        before, after = (round(lasted, -6) for lasted in (self.before_ns, self.after_ns))
+        parts = [f"the first {duration_text(before)}, before the plan came into force"] * bool(
+            before
+        )
+        parts += [f"the last {duration_text(after)}, after it was released"] * bool(after)
         return f"left out: {' and '.join(parts)}" if parts else None
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """A recording with its chain's latency analysis.
+    """A recording with its chain's latency analysis, of the time in which the plan was in force.
 
     ``longest_stall_ns`` is the machine's own (None: it was not watched), ``overruns`` counts
     outputs that came too late for their publish slot, per policy (None: nothing was gated),
     ``outcomes`` says what became of those of the chain, and of the cycles behind them,
     ``into_open_slots`` those that came in time, but too late to wait until their slot's start,
     ``dropped`` messages that were lost at a gate, per reason (None: no gate decided). ``plan`` is
-    the plan in force, ``prediction`` its own beside this measurement. All of it is about the time
-    in which the plan was in force; ``left_out`` names the rest.
+    the plan in force, ``prediction`` its own beside this measurement; ``left_out`` names the rest.
     """
 
     recording: Recording
@@ -235,9 +231,7 @@ def compare_chains(
     """Measure every chain of an application in ``least`` recordings or more.
 
     They are the chains of the plan that was in force in the last of them, if it has several;
-    otherwise each recording's own. ``chain`` names one.
-
-    Raises: as :func:`compare_recordings`.
+    otherwise each recording's own. ``chain`` names one. Raises: as :func:`compare_recordings`.
     """
     if len(recordings) < least:
         raise InputError("a comparison needs two recordings, such as `compare before after`")
@@ -263,13 +257,13 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
     node published for it), and for both parts ``…_ns``, a struct ``{min, mean, max}`` in ns (null
     without traversals, and for the first hop's communication), and ``…_share`` of the mean latency.
     """
-    callbacks = {callback.id: callback for callback in analysis.graph.callbacks}
-    path = [callbacks[number] for number in analysis.chain.callbacks]
+    path = analysis.graph.path(analysis.chain)
     complete = analysis.traversals.filter("complete")
     latency = pl.lit(complete["latency_ns"].mean(), dtype=pl.Float64)
-    hops = analysis.hops.join(complete, on="traversal", how="semi")
-    found = hops.group_by("hop").agg(
-        *(summary(f"{part}_ns", pl.col(f"{part}_ns")) for part in PARTS),
+    times = [f"{part}_ns" for part in PARTS]
+    found = analysis.hops.join(complete, on="traversal", how="semi").group_by("hop")
+    figures = found.agg(
+        *(summary(pl.col(name)).alias(name) for name in times),
         count=pl.len(),
         by_sibling=(pl.col("via") == "sibling").sum(),
     )
@@ -283,14 +277,12 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
         },
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
     )
-    return rows.join(found, on="hop", how="left", maintain_order="left").select(
+    means = (pl.col(name).struct.field("mean") for name in times)
+    return rows.join(figures, on="hop", how="left", maintain_order="left").select(
         *rows.columns,
         pl.col("count", "by_sibling").fill_null(0),
-        *(f"{part}_ns" for part in PARTS),
-        *(
-            (pl.col(f"{part}_ns").struct.field("mean") / latency).alias(f"{part}_share")
-            for part in PARTS
-        ),
+        *times,
+        *((mean / latency).alias(f"{part}_share") for part, mean in zip(PARTS, means, strict=True)),
     )
 
 

@@ -94,7 +94,7 @@ def overruns_in(
         cycles, due_until = analysis.traversals, (cycles_until_output(plan) + 1) * plan.cycle_ns
         counts["wait"] += cycles.filter(pl.col("latency_ns") >= due_until).height
         if plan.overrun == "publish":
-            behind = pl.col("place_ns") >= _slots_end(plan)
+            behind = pl.col("place_ns") >= slots_of_latency(plan)[-1][1]
             counts["publish"] += cycles.filter(behind & ~pl.col("late")).height
     return {policy: counts[policy] for policy in (*_DONE, *_WITHOUT_NODE) if counts[policy]}
 
@@ -102,9 +102,7 @@ def overruns_in(
 @dataclass(frozen=True)
 class Outcome:
     """Of a chain's outputs that overran under one policy, ``late`` left and ``discarded`` did not.
-
-    Behind ``followed`` of them the recording has the next cycle whole; ``next_hit`` of these were
-    hit.
+    Behind ``followed`` of them the recording has the next cycle; ``next_hit`` of these were hit.
     """
 
     late: int
@@ -115,14 +113,12 @@ class Outcome:
 
 def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outcome]:
     """What became of the outputs that overran, per policy that was applied to them."""
-    decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
-    cycles = analysis.traversals.join(
-        decided.select("traversal", "overrun"), on="traversal", how="left", maintain_order="left"
-    )
+    decided = analysis.decided.select("traversal", "overrun")
+    cycles = analysis.traversals.join(decided, on="traversal", how="left", maintain_order="left")
     missed = pl.col("late").fill_null(False) | (pl.col("reason") == "discarded").fill_null(False)
     policy = pl.col("overrun")
     if plan is not None and not decided.height and any(publisher_servers(plan)):
-        missed |= (pl.col("place_ns") >= _slots_end(plan)).fill_null(False)
+        missed |= (pl.col("place_ns") >= slots_of_latency(plan)[-1][1]).fill_null(False)
         policy = pl.when(missed).then(pl.lit(plan.overrun))
     cut = pl.col("reason").is_in(["not taken", "not sent", "still running"]).fill_null(False)
     hit = pl.when(~cut).then(missed | ~pl.col("complete"))
@@ -137,11 +133,6 @@ def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outco
     return {row.pop("policy"): Outcome(**row) for row in figures.iter_rows(named=True)}
 
 
-def _slots_end(plan: Plan) -> int:
-    """Where the last slot in which an output is in time ends, from the start of its cycle (ns)."""
-    return slots_of_latency(plan)[-1][1]
-
-
 def next_cycles(outcomes: Mapping[str, Outcome]) -> str:
     """How many of the cycles behind overruns were hit: ``1 of 3``."""
     hit = sum(one.next_hit for one in outcomes.values())
@@ -153,19 +144,16 @@ def into_open_slots(decided: pl.DataFrame | None) -> int | None:
 
     They took longer than the plan's L̄ + ε, and make up the jitter that a wide slot lets through.
     """
-    if decided is None:
-        return None
-    at_once = pl.col("release") == pl.col("arrival")
-    return decided.filter(pl.col("overrun").is_null() & at_once).height
+    at_once = pl.col("overrun").is_null() & (pl.col("release") == pl.col("arrival"))
+    return None if decided is None else decided.filter(at_once).height
 
 
 def moves_in(analysis: LatencyAnalysis) -> list[dict[str, int]]:
     """From which cycle on (``from_ns``, its origin) the slots of a chain's output were moved, and
     by how much from where the plan has them (``moved_ns``): slots that follow the latencies.
     """
-    decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
     moved = pl.col("moved_ns")
-    found = decided.sort("origin").filter(moved != moved.shift(1, fill_value=0))
+    found = analysis.decided.sort("origin").filter(moved != moved.shift(1, fill_value=0))
     return found.select(from_ns="origin", moved_ns=moved).to_dicts()
 
 

@@ -120,13 +120,12 @@ class JudgedPrediction:
 
 def due_of(plan: Plan) -> tuple[Due, ...]:
     """When a plan has its outputs leave, as the analysis needs it: the chain's, other sinks'."""
-    modes = plan.modes
-    last = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
+    last = {} if plan.modes is None else {m: band - 1 for m, band in plan.modes.bands.items()}
     own = Due(
         cycle_ns=plan.cycle_ns,
         cycles=cycles_until_output(plan),
         slots=publish_slots(plan),
-        last_slot={} if modes is not None and modes.late == "next-slot" else last,
+        last_slot={} if plan.modes is not None and plan.modes.late == "next-slot" else last,
         from_cycle=_from_cycle(plan),
         margin_ns=plan.margin.epsilon_ns,
         output=plan.chain.output,
@@ -154,40 +153,36 @@ def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
     slots = slots_of_latency(plan)
     from_cycle = _from_cycle(plan)
     outputs = _outputs(slots, analysis, "place_ns" if from_cycle else "latency_ns")
-    late = int(outputs["late"].sum())
+    in_time = outputs.filter(~pl.col("late"))
     shares = plan.predicted.shares
+    bands = []
     if plan.modes is None:
         known = shares if expected(plan) is not None else [None] * len(slots)
-        bands = [
-            _band(slot, share, outputs, pl.col("slot") == number)
-            for number, (slot, share) in enumerate(zip(slots, known, strict=True))
-        ]
+        for number, (slot, share) in enumerate(zip(slots, known, strict=True)):
+            own = in_time.filter(slot=number)
+            bands.append(_band(slot, share, own, in_time.height))
     else:
-        bands = []
         for mode, band in plan.modes.bands.items():
-            own = outputs.filter(pl.col("mode") == mode)
-            promised, behind = (plan.predicted.modes or {}).get(mode), int(own["late"].sum())
+            own = outputs.filter(mode=mode)
+            promised = (plan.predicted.modes or {}).get(mode)
             share = (sum(shares[:band]) or None) if promised is None else promised.shares[0]
-            found = _band(slots[band - 1], share, own, pl.lit(True), own.height)
-            bands.append(replace(found, mode=mode, late=behind))
+            found = _band(slots[band - 1], share, own.filter(~pl.col("late")), own.height)
+            bands.append(replace(found, mode=mode, late=int(own["late"].sum())))
     mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))
+    # So many may be late by the plan's margin, as far as chance goes.
+    count, share = analysis.statistics.count, plan.margin.overrun_probability or 0.0
+    most_late = math.floor(count * share + STANDARD_ERRORS * math.sqrt(count * share))
     return JudgedPrediction(
         mean=mean,
         max=longest,
         jitter=jitter,
         bands=tuple(bands),
-        late=late,
+        late=int(outputs["late"].sum()),
         late_of_all=analysis.statistics.late,
-        cycles=analysis.statistics.count,
+        cycles=count,
         counted_from="cycle" if from_cycle else "chain",
-        most_late=_most_late(plan, analysis.statistics.count),
+        most_late=most_late,
     )
-
-
-def _most_late(plan: Plan, cycles: int) -> int:
-    """How many of so many outputs may be late, by the plan's margin, as far as chance goes."""
-    share = plan.margin.overrun_probability or 0.0
-    return math.floor(cycles * share + STANDARD_ERRORS * math.sqrt(cycles * share))
 
 
 def _figures(
@@ -247,14 +242,12 @@ def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
 def _outputs(slots: Sequence[Slot], analysis: LatencyAnalysis, judged: str) -> pl.DataFrame:
     """Undisturbed complete traversals: ``judged_ns, place_ns, slot, mode, late``.
 
-    The slot is the one that the gate says it released the message in. Without a gate's events it
-    is the last that had started when the output came.
+    The slot is that which the gate released the message in; without a gate's events the last that
+    had started when the output came.
     """
-    chosen = analysis.traversals.filter(pl.col("complete") & ~pl.col("disturbed"))
-    decided = analysis.releases.filter(pl.col("hop") == len(analysis.chain.callbacks) - 1)
-    decided = decided.select("traversal", "slot", "mode", gated=True)
+    decided = analysis.decided.select("traversal", "slot", "mode", gated=True)
     started = [(pl.col("place_ns") >= start).cast(pl.Int32) for start, _ in slots]
-    return chosen.join(decided, on="traversal", how="left").select(
+    return analysis.calm.join(decided, on="traversal", how="left").select(
         *("place_ns", "mode"),
         pl.col("late").fill_null(False),
         judged_ns=judged,
@@ -262,21 +255,9 @@ def _outputs(slots: Sequence[Slot], analysis: LatencyAnalysis, judged: str) -> p
     )
 
 
-def _band(
-    slot: tuple[int, int],
-    predicted: float | None,
-    outputs: pl.DataFrame,
-    mine: pl.Expr,
-    total: int | None = None,
-) -> BandHeld:
-    """The band of a slot: those of ``outputs`` in time that are ``mine``, of ``total``.
-
-    Without ``total`` the share is that of all outputs in time.
-    """
-    in_time = outputs.filter(~pl.col("late"))
-    total = in_time.height if total is None else total
-    own, place = in_time.filter(mine), pl.col("place_ns")
-    found = latency_statistics(own["judged_ns"])
+def _band(slot: Slot, predicted: float | None, own: pl.DataFrame, total: int) -> BandHeld:
+    """The band of a slot: its ``own`` outputs, which were in time, of a ``total``."""
+    found, place = latency_statistics(own["judged_ns"]), pl.col("place_ns")
     return BandHeld(
         slot_start_ns=slot[0],
         slot_end_ns=slot[1],

@@ -67,9 +67,8 @@ class Taken(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """What a recording has for a comparison, callbacks by node and trigger.
-
-    ``chains`` are medians of undisturbed latencies (ns), and the callbacks on the way.
+    """What a recording has for a comparison: callbacks by node and trigger, of ``chains`` the
+    median undisturbed latency (ns) and the callbacks on the way.
     """
 
     recording: str
@@ -140,16 +139,12 @@ def slowdowns_in(
         _read, every, tuple(chains), scheduler=scheduler, purpose=purpose, progress=progress
     )
     compared, notes = find_slowdowns(samples[: len(paths)], samples[len(paths) :])
-    missing = {
-        (chain, one.recording) for chain in chains for one in samples if chain not in one.chains
-    }
+    missing = {(c, one.recording) for c in chains for one in samples if c not in one.chains}
     return compared, [*notes, *(f"{chain} is not in {name}" for chain, name in sorted(missing))]
 
 
 def _read(
-    path: Path,
-    chains: Sequence[str],
-    progress: Callable[[float, str], None] | None = None,
+    path: Path, chains: Sequence[str], progress: Callable[[float, str], None] | None = None
 ) -> Sample:
     return sample_of(open_source(path, progress=progress), chains, str(path))
 
@@ -160,20 +155,13 @@ def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None
     named = named_callbacks(flow).select("callback_id", "node", "starts")
     names = {number: (node, starts) for number, node, starts in named.iter_rows()}
     ended = flow.instances.filter(pl.col("callback_id").is_in([*names]) & ~pl.col("assumed"))
-    ended = ended.drop_nulls("end")
+    ended = ended.drop_nulls("end").with_columns(response=pl.col("end") - pl.col("start"))
     hit = pl.Series(stalled_after(flow, ended["start"].to_numpy(), ended["end"].to_numpy()))
-    calm = ended.join(named, on="callback_id", maintain_order="left").select(
-        *("node", "starts"),
-        *(
-            pl.when(~hit).then(taken.cast(pl.Float64).clip(1)).fill_null(np.nan).alias(time)
-            for time, taken in (
-                ("response", pl.col("end") - pl.col("start")),
-                ("execution", pl.col("execution_ns")),
-            )
-        ),
-    )
+    taken = pl.col("response", "execution_ns").cast(pl.Float64).clip(1)
+    ended = ended.with_columns(pl.when(~hit).then(taken).fill_null(np.nan))
+    calm = ended.join(named, on="callback_id", maintain_order="left")
     callbacks = {
-        (node, starts): Taken(*(own[time].to_numpy() for time in Taken._fields))
+        (node, starts): Taken(own["response"].to_numpy(), own["execution_ns"].to_numpy())
         for (node, starts), own in calm.group_by("node", "starts", maintain_order=True)
     }
     found = {}
@@ -225,19 +213,17 @@ def find_slowdowns(
             f"all callbacks took {expm1(common):+.1%}: the machine, or all of the program;"
             " taken out of each"
         )
-    first = samples[0].recording
-    label = first if len(samples) == 1 else f"{first} and {len(samples) - 1} more"
+    more = f" and {len(samples) - 1} more" if len(samples) > 1 else ""
     compared = []
-    for place, (name, (time, own)) in enumerate(times.items()):
-        median = float(np.median([np.nanmedian(one) for one in own[: len(before)]]))
-        change, p, resolution = (float(figure[place]) for figure in tested)
+    for (name, (time, own)), *figure in zip(times.items(), *tested, strict=True):
+        change, p, resolution = map(float, figure)
         compared.append(
             Compared(
-                recording=label,
+                recording=samples[0].recording + more,
                 node=name[0],
                 starts=name[1],
                 time=time,
-                before_ns=median,
+                before_ns=float(np.median([np.nanmedian(one) for one in own[: len(before)]])),
                 change=expm1(change),
                 p=p,
                 resolution=expm1(resolution),

@@ -3,11 +3,10 @@
     memories of the nodes ─► events of the last seconds ─► traversals ─► figures over three spans
 
 The library of :mod:`chainshaper.sources.preload` is in front of ROS 2 in each process; whoever may
-read the process's memory can follow it, several at a time, and go away without a trace. Every look
-runs the same analysis as `chainshaper latency` over the last few seconds and takes over the cycles
-that are surely over: those that began longer ago than a cycle may take. So figures are those of a
-recording of the same time, and memory does not grow: events are there for seconds, cycles for an
-hour, and only as three numbers each.
+read the process's memory can follow it and go away without a trace. Every look runs the analysis of
+`chainshaper latency` over the last few seconds and takes over the cycles that are surely over:
+those that began longer ago than a cycle may take. So figures are those of a recording of the same
+time, and memory does not grow: events are there for seconds, cycles for an hour as four numbers.
 """
 
 import contextlib
@@ -17,13 +16,14 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
 from chainshaper.analysis import (
+    DataFlow,
     SeveralPathsError,
     data_flow,
     find_chain,
@@ -31,7 +31,7 @@ from chainshaper.analysis import (
     traverse,
     with_restarts,
 )
-from chainshaper.analysis.disturbance import with_punctuality
+from chainshaper.analysis.disturbance import Due, with_punctuality
 from chainshaper.analysis.latency import (
     LatencyStatistics,
     Longest,
@@ -63,6 +63,7 @@ from chainshaper.values.recording import (
     refuse_existing,
     write_recording,
 )
+from chainshaper.verify.measure import PARTS
 from chainshaper.verify.predictions import due_of
 
 SECOND = 1_000_000_000
@@ -77,9 +78,8 @@ _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave 
 
 @dataclass(frozen=True)
 class Hop:
-    """A callback of the chain: its shares of the latency over the last minute (ns).
-
-    Means, and in ``longest_ns`` the longest communication and computation.
+    """A callback of the chain: its mean shares of the latency over the last minute (ns), and in
+    ``longest_ns`` the longest communication and computation.
     """
 
     node: str
@@ -91,8 +91,8 @@ class Hop:
 
 @dataclass(frozen=True)
 class CallbackNow:
-    """A callback, and what starts it; in ``longest_ns`` its longest response and execution time
-    over the last minute (None: not known).
+    """A callback, what starts it, and its longest response and execution time over the last minute
+    (ns; None: not known).
     """
 
     node: str
@@ -150,18 +150,15 @@ class Seen:
         for one in self.chains:
             minute = one.spans["minute"]
             missing = (minute.late or 0) + minute.incomplete
-            text = one.problem or "no output in the last minute"
+            level, text = 2, one.problem or "no output in the last minute"
             if minute.count:
+                level = int(missing > 0)
                 text = f"{minute.count} outputs in the last minute, {missing} late or missing"
             values = {"cycles per second": f"{one.rate_hz:.3f}"}
             for span, own in one.spans.items():
-                found = {"p50": own.percentiles_ns.get("50"), "max": own.max_ns}
-                values |= {
-                    f"{which} of the last {span} [ms]": f"{ns / 1e6:.3f}"
-                    for which, ns in found.items()
-                    if ns is not None
-                }
-            level = 2 if not minute.count else int(missing > 0)
+                for which, ns in (("p50", own.percentiles_ns.get("50")), ("max", own.max_ns)):
+                    if ns is not None:
+                        values[f"{which} of the last {span} [ms]"] = f"{ns / 1e6:.3f}"
             about = {"name": f"chainshaper: {one.chain}", "level": level, "message": text}
             statuses.append({**about, "values": values})
         return statuses
@@ -239,19 +236,18 @@ class _Chain:
         return None
 
 
-def _forget(seen: deque[tuple[int, Any]], now_ns: int) -> None:
-    """Leave out what is older than a minute."""
-    while seen and seen[0][0] < now_ns - SPANS["minute"]:
+def _forget(seen: deque[tuple[int, Any]], before_ns: int) -> None:
+    while seen and seen[0][0] < before_ns:
         seen.popleft()
 
 
 class Watch:
     """The chains of what runs, or will run, with the library in front.
 
-    ``chains`` as `--chain` has them; ``users`` are whose processes are followed, ``longest_ns`` is
-    what a cycle may take: one that takes longer counts as incomplete. ``plan`` says when outputs
-    are due. With ``callbacks`` their times are looked at, too. Between two looks :meth:`read` wants
-    to be called every tenth of a second or so.
+    ``chains`` as `--chain` has them; ``users`` are whose processes are followed; a cycle that takes
+    longer than ``longest_ns`` counts as incomplete. ``plan`` says when outputs are due. With
+    ``callbacks`` their times are looked at, too. Between two looks :meth:`read` wants to be called
+    every tenth of a second or so.
     """
 
     def __init__(
@@ -283,13 +279,13 @@ class Watch:
         self._over_ns = time.monotonic_ns()  # cycles that began until then have been taken over
         self._began_ns = self._looked_from_ns = self._over_ns  # the last look's cycles from then on
 
+    def _due(self, output: str) -> Due | None:
+        return next((due for due in self.due if due.output in (None, output)), None)
+
     def _slots(self, output: str) -> tuple[tuple[int, int], ...]:
-        own = [due for due in self.due if due.output in (None, output)][:1]
-        return tuple(
-            (start + due.cycles * due.cycle_ns, end + due.cycles * due.cycle_ns)
-            for due in own
-            for start, end in due.slots
-        )
+        due = self._due(output) or Due(0)
+        delay = due.cycles * due.cycle_ns
+        return tuple((start + delay, end + delay) for start, end in due.slots)
 
     def read(self) -> None:
         """Take what is new in all memories, and look for new processes now and then."""
@@ -307,8 +303,13 @@ class Watch:
             self._take(pid, process)
         if now - self._tabled_ns > SECOND:
             self._take_fresh(now)
-        if searches:
-            self._leave_ended()
+        # Processes that have ended stay until their last events are too old to be asked for.
+        for pid in self._ended() if searches else ():
+            if self._latest[pid] < self._needed_ns(now):
+                process = self.processes.pop(pid)
+                self._lost_with_ended += process.lost + process.dropped
+                self._created.pop(pid, None)
+                del self._latest[pid]
 
     def _take(self, pid: int, process: TracedProcess, since_ns: int = 0) -> None:
         for part in process.new_records():
@@ -317,25 +318,12 @@ class Watch:
                 self._fresh.append((pid, new))
                 self._latest[pid] = max(self._latest[pid], int(new["time"][-1]))
 
-    def _leave_ended(self) -> None:
-        """Leave processes that have ended, once their last events are too old to be asked for."""
-        for pid in self._ended():
-            if self._latest[pid] < self._needed_ns(self._searched_ns):
-                process = self.processes.pop(pid)
-                self._lost_with_ended += process.lost + process.dropped
-                self._created.pop(pid, None)
-                del self._latest[pid]
-
     def _ended(self) -> list[int]:
         return [one for one in self.processes if not Path(f"/proc/{one}").exists()]
 
     def _needed_ns(self, now_ns: int) -> int:
         """From when on events may be asked for: by the flight recorder, or by a late look."""
-        return self._recorded_ns(now_ns) - self.longest_ns
-
-    def _recorded_ns(self, now_ns: int) -> int:
-        """From when on the flight recorder writes: all cycles of the last look are there."""
-        return min(now_ns - RECORDER_NS, self._looked_from_ns)
+        return min(now_ns - RECORDER_NS, self._looked_from_ns) - self.longest_ns
 
     def look(self) -> Seen:
         """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
@@ -356,38 +344,19 @@ class Watch:
         clear_ns = self._stepped_ns if stampless else 0
         within = pl.col("start").is_between(self._over_ns, over, "right")
         graph = graph_of(flow)
-        callbacks = {one.id: one for one in graph.callbacks}
         for one in self.chains:
-            _forget(one.hops, now)
-            one.problem, chain = None, None
-            try:
-                chain = find_chain(graph, one.text)
-            except InputError as error:
-                one.problem = str(error) if self.processes else NO_PROCESS
-                # Every cycle that is over had its events here: none of them has arrived.
-                if not isinstance(error, SeveralPathsError):
-                    chain = one.beginning(graph)
-            if chain is None:
-                continue
-            found = traverse(flow, chain, graph)
-            due = next((d for d in self.due if d.output in {None, chain.topics[-1]}), None)
-            judged, _ = with_punctuality(flow, found, due)
-            if one.problem is None:
-                path = [callbacks[number] for number in chain.callbacks]
-                one.first, one.output = path[0], chain.topics[-1]
-                one.slots = self._slots(one.output)  # the text may end with a node
-                one.names = [(c.node or "", t) for c, t in zip(path, chain.topics, strict=True)]
-            else:
-                judged = judged.with_columns(latency_ns=None, late=None, complete=False)
-            judged = judged.with_columns(pl.col("place_ns") - moved.get(chain.topics[-1], 0))
-            # A lifecycle node that is not active owes no output.
-            new = judged.filter(within, pl.col("reason").ne_missing("inactive"))
-            one.take_over(clear := new.filter(pl.col("start") > clear_ns), found.hops, now)
-            one.counted["unclear"] += new.height - clear.height
+            _forget(one.hops, now - SPANS["minute"])
+            if (found := self._judged(one, flow, graph)) is not None:
+                judged, hops = found
+                # A lifecycle node that is not active owes no output.
+                new = judged.filter(within, pl.col("reason").ne_missing("inactive"))
+                new = new.with_columns(pl.col("place_ns") - moved.get(one.output, 0))
+                one.take_over(clear := new.filter(pl.col("start") > clear_ns), hops, now)
+                one.counted["unclear"] += new.height - clear.height
         if self.callbacks is not None:
             own = replace(flow, instances=flow.instances.filter(within))
             self.callbacks.append((now, longest_times(own)))
-            _forget(self.callbacks, now)
+            _forget(self.callbacks, now - SPANS["minute"])
         self._looked_from_ns, self._over_ns = self._over_ns, over
         return Seen(
             at_ns=now,
@@ -396,6 +365,30 @@ class Watch:
             chains=tuple(self._now(one, over, moved) for one in self.chains),
             callbacks=tuple(_callbacks([own for _, own in self.callbacks or ()])),
         )
+
+    def _judged(
+        self, one: _Chain, flow: DataFlow, graph: ApplicationGraph
+    ) -> tuple[pl.DataFrame, pl.DataFrame] | None:
+        """The traversals of a chain, judged, and their hops; None where it is not to be found."""
+        one.problem, chain = None, None
+        try:
+            chain = find_chain(graph, one.text)
+        except InputError as error:
+            one.problem = str(error) if self.processes else NO_PROCESS
+            # Every cycle that is over had its events here: none of them has arrived.
+            if not isinstance(error, SeveralPathsError):
+                chain = one.beginning(graph)
+        if chain is None:
+            return None
+        found = traverse(flow, chain, graph)
+        judged, _ = with_punctuality(flow, found, self._due(chain.topics[-1]))
+        if one.problem is not None:
+            return judged.with_columns(latency_ns=None, late=None, complete=False), found.hops
+        path = graph.path(chain)
+        one.first, one.output = path[0], chain.topics[-1]
+        one.slots = self._slots(one.output)  # the text may end with a node
+        one.names = [(c.node or "", t) for c, t in zip(path, chain.topics, strict=True)]
+        return judged, found.hops
 
     def _objects(self, tables: EventTables, since_ns: int) -> Objects:
         """Who exists: as at the last look where nothing was created, and the same ran, since then.
@@ -442,8 +435,7 @@ class Watch:
         self._take_fresh(time.monotonic_ns())
         gone = {pid for pid in self._ended() if self._latest[pid] < since_ns}
         created = (tables for pid, (_, tables, _) in self._created.items() if pid not in gone)
-        recent = (tables for last, tables in self._recent if last >= since_ns)
-        return joined_tables([*created, *recent])
+        return joined_tables([*created, *(own for last, own in self._recent if last >= since_ns)])
 
     def _take_fresh(self, now_ns: int) -> None:
         """Make tables of what was read since the last time, and drop those that are too old."""
@@ -461,8 +453,7 @@ class Watch:
             tables = event_tables(records, pids.astype(np.int32), library)
             self._recent.append((int(records["time"].max()), tables))
         self._fresh, self._tabled_ns = [], now_ns
-        while self._recent and self._recent[0][0] < self._needed_ns(now_ns):
-            self._recent.popleft()
+        _forget(self._recent, self._needed_ns(now_ns))
 
     def save(self, output: str | Path, *, reasons: Sequence[str] = ()) -> Recording:
         """Write the last ten seconds as a recording, or more if the last look had cycles before.
@@ -474,7 +465,9 @@ class Watch:
         """
         output = refuse_existing(output)
         self.read()
-        since = self._recorded_ns(time.monotonic_ns())
+        since = (
+            self._needed_ns(time.monotonic_ns()) + self.longest_ns
+        )  # with the last look's cycles
         tables = events.happened(self._tables(since), since)
         if not tables:
             raise OperationError(f"{output} is not written: no event has been seen yet")
@@ -533,7 +526,7 @@ def exporting(
         return
     library = partial(extra_library, purpose="exporting metrics", extra="metrics")
     metrics, export = (library(f"opentelemetry.sdk.metrics{sub}") for sub in ("", ".export"))
-    observed = library("opentelemetry.metrics").Observation
+    observation = library("opentelemetry.metrics").Observation
     readers = []
     with contextlib.ExitStack() as until:
         if port is not None:
@@ -554,10 +547,17 @@ def exporting(
         provider = metrics.MeterProvider(metric_readers=readers)
         until.callback(provider.shutdown)
         meter, last = provider.get_meter("chainshaper"), list[Seen]()
-        for kind, name, unit, about, values in _METRICS:
+
+        def observed(wanted: str, _options: object) -> Iterator[Any]:
+            for seen in last:
+                for name, value, about in _values(seen):
+                    if name == wanted:
+                        yield observation(value, about)
+
+        for name, (kind, unit, about) in _METRICS.items():
             create = getattr(meter, f"create_observable_{kind}")
-            found = partial(_observations, last, values, observed)
-            create(f"chainshaper.{name}", [found], unit=unit, description=about)
+            values = [partial(observed, name)]
+            create(f"chainshaper.{name}", values, unit=unit, description=about)
 
         def take(seen: Seen) -> None:
             last[:] = [seen]
@@ -565,51 +565,28 @@ def exporting(
         yield take
 
 
-_Values: TypeAlias = Iterator[tuple[float, dict[str, str]]]
+_METRICS = {
+    "chain.latency": ("gauge", "s", "End-to-end latency of a chain over a span"),
+    "hop.time": ("gauge", "s", "Mean share of a hop over the last minute"),
+    "chain.cycles": ("counter", "1", "Cycles of a chain by outcome"),
+    "events.lost": ("counter", "1", "Events that were overwritten before they were read"),
+}
 
 
-def _observations(
-    last: Sequence[Seen],
-    values: Callable[[Seen], _Values],
-    observed: Callable[[float, dict[str, str]], Any],
-    _options: object,
-) -> Iterator[Any]:
-    for seen in last:
-        yield from (observed(value, about) for value, about in values(seen))
-
-
-def _latencies(seen: Seen) -> _Values:
+def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
+    """Each value of :data:`_METRICS`, and its attributes."""
+    yield "events.lost", float(seen.lost), {}
     for one in seen.chains:
+        chain = {"chain": one.chain}
         for span, own in one.spans.items():
             percentiles = {f"p{which}": ns for which, ns in own.percentiles_ns.items()}
             for which, ns in {"min": own.min_ns, "max": own.max_ns, **percentiles}.items():
                 if ns is not None:
-                    yield ns / SECOND, {"chain": one.chain, "span": span, "statistic": which}
-
-
-def _hop_times(seen: Seen) -> _Values:
-    for one in seen.chains:
+                    yield "chain.latency", ns / SECOND, {**chain, "span": span, "statistic": which}
         for hop in one.hops:
-            about = {"chain": one.chain, "node": hop.node, "topic": hop.topic}
-            yield hop.communication_ns / SECOND, {**about, "part": "communication"}
-            yield hop.computation_ns / SECOND, {**about, "part": "computation"}
-
-
-def _counted(seen: Seen) -> _Values:
-    for one in seen.chains:
+            about = {**chain, "node": hop.node, "topic": hop.topic}
+            means = (hop.communication_ns, hop.computation_ns)
+            for part, mean in zip(PARTS, means, strict=True):
+                yield "hop.time", mean / SECOND, {**about, "part": part}
         for outcome, count in one.counted.items():
-            yield count, {"chain": one.chain, "outcome": outcome}
-
-
-_METRICS: tuple[tuple[str, str, str, str, Callable[[Seen], _Values]], ...] = (
-    ("gauge", "chain.latency", "s", "End-to-end latency of a chain over a span", _latencies),
-    ("gauge", "hop.time", "s", "Mean share of a hop over the last minute", _hop_times),
-    ("counter", "chain.cycles", "1", "Cycles of a chain by outcome", _counted),
-    (
-        "counter",
-        "events.lost",
-        "1",
-        "Events that were overwritten before they were read",
-        lambda seen: iter([(float(seen.lost), {})]),
-    ),
-)
+            yield "chain.cycles", count, {**chain, "outcome": outcome}
