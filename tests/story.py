@@ -107,6 +107,21 @@ class Story:
             self.event("rclcpp_callback_register", *at, callback=callback.handle, symbol=symbol)
         return callback
 
+    def source(
+        self, name: str, pid: int, topic: str, period: int = 100
+    ) -> tuple[Callback, Publisher]:
+        """A node whose timer publishes a topic."""
+        node = self.node(name, pid)
+        return self.timer(node, period), self.publisher(node, topic)
+
+    def relay(
+        self, name: str, pid: int, reads: str, writes: str, *, callbackless: bool = False
+    ) -> tuple[Callback, Publisher]:
+        """A node whose subscription publishes another topic."""
+        node = self.node(name, pid)
+        reader = self.subscription(node, reads, callbackless=callbackless)
+        return reader, self.publisher(node, writes)
+
     def client(self, node: Node, service: str, gid: int | None = None) -> Callback:
         """A client of a service; its gid is known where tracetools has `rmw_client_init`."""
         end = Callback(node.pid, self.handle(), self.handle())

@@ -79,12 +79,8 @@ FUSED = of_callbacks(
 )
 
 
-@pytest.mark.parametrize(
-    ("text", "waypoints"),
-    [("/t1../t5", ("/t1", "/t5")), (" /a .. /b/c..d ", ("/a", "/b/c", "d")), ("/t1", ("/t1",))],
-)
-def test_way_points_are_separated_by_two_dots(text: str, waypoints: tuple[str, ...]) -> None:
-    assert parse_chain(text) == waypoints
+def test_way_points_are_separated_by_two_dots() -> None:
+    assert parse_chain(" /a .. /b/c..d ") == ("/a", "/b/c", "d")
 
 
 @pytest.mark.parametrize("text", ["", "..", "/a..", "../b", "/a..../b", "/a.../b"])
@@ -167,8 +163,7 @@ def test_listing_with_count_and_heaviest() -> None:
     found = enumerate_chains(DIAMOND, "/raw", "/fused", response_ns={1: 5.0, 2: 7.0, 0: 1.0})
     assert (found.complete, found.exact, found.count) == (True, True, 2)
     assert found.heaviest is not None
-    assert found.heaviest.topics == ("/raw", "/right", "/fused")
-    assert found.heaviest_ns == 8.0
+    assert (found.heaviest.topics, found.heaviest_ns) == (("/raw", "/right", "/fused"), 8.0)
     for chain in found.chains:  # what is listed can be written back
         assert find_chain(DIAMOND, chain.spec).callbacks == chain.callbacks
 

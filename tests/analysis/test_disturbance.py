@@ -41,9 +41,8 @@ def one_traversal(
     """
     end = 10_000 if release is None else release + 100
     story = Story()
-    source, gate = story.node("/source", 1), story.node("/gate", 2)
-    timer, t1 = story.timer(source), story.publisher(source, "/tmp")
-    hold, out = story.subscription(gate, "/tmp"), story.publisher(gate, "/t1")
+    timer, t1 = story.source("/source", 1, "/tmp")
+    hold, out = story.relay("/gate", 2, "/tmp", "/t1")
     story.runs(timer, 1_000, 1_200, writes=((t1, 1_100),))
     story.runs(hold, 2_000, end + 100, reads=1_100, writes=((out, end),))
     if release is not None:
@@ -100,62 +99,41 @@ def test_a_stall_counts_alike_whether_the_output_is_late_or_not(
     assert one_traversal([stall], release, late, arrival, due) is hit
 
 
-def test_without_a_plan_a_late_output_was_due_when_others_were_let_go() -> None:
+def test_when_an_output_was_due_bounds_what_counts() -> None:
+    """Without a plan, when others were let go; without a gate the end of the cycle, at 7,000."""
     assert one_traversal([(5_000, 200)], release=9_900)
     assert not one_traversal([(5_000, 199)], release=9_900)
-
-
-def test_without_a_gate_what_comes_behind_the_cycle_it_was_due_in_is_no_excuse() -> None:
-    """A cycle of 6,000: the output was due at 7,000, and came at 10,000."""
     assert one_traversal([(6_800, 200)], due=Due(6_000))
     assert not one_traversal([(6_801, 3_000)], due=Due(6_000))
 
 
-def two_traversals(first_end: int) -> list[bool]:
-    """Two traversals of 100 and 150 that start at 1,000 and 2,000; a stall hits only the first."""
+@pytest.mark.parametrize(("first_end", "hit"), [(2_100, [True, True]), (1_900, [True, False])])
+def test_who_queued_behind_a_disturbed_traversal_is_disturbed_with_it(
+    first_end: int, hit: list[bool]
+) -> None:
+    """Two traversals that start at 1,000 and 2,000; a stall hits only the first."""
     story = Story()
-    source = story.node("/source", 1)
-    timer, t1 = story.timer(source), story.publisher(source, "/t1")
+    timer, t1 = story.source("/source", 1, "/t1")
     story.runs(timer, 1_000, first_end, writes=((t1, first_end),), tid=1)
     story.runs(timer, 2_000, 2_150, writes=((t1, 2_150),), tid=2)
     story.event("machine_stall", 1_200, 9, duration=300)
-    return masked(story, "/source../t1")
-
-
-def test_who_queued_behind_a_disturbed_traversal_is_disturbed_with_it() -> None:
-    assert two_traversals(first_end=2_100) == [True, True]
-    assert two_traversals(first_end=1_900) == [True, False]
+    assert masked(story, "/source../t1") == hit
 
 
 SPANS = st.lists(st.tuples(st.integers(0, 30), st.integers(0, 8)), max_size=12)
 
 
-@given(SPANS, SPANS)
-def test_overlaps_agree_with_comparing_all_pairs(
-    windows: list[tuple[int, int]], stalls: list[tuple[int, int]]
-) -> None:
-    start = np.array([a for a, _ in windows], dtype=np.int64)
-    end = np.array([a + d for a, d in windows], dtype=np.int64)
-    began = np.array([a for a, _ in stalls], dtype=np.int64)
-    ended = np.array([a + d + 1 for a, d in stalls], dtype=np.int64)
-    expected = [
-        any(s <= b and t > a for s, t in zip(began, ended, strict=True))
-        for a, b in zip(start, end, strict=True)
-    ]
-    assert overlapping(start, end, began, ended).tolist() == expected
-
-
 @given(SPANS, st.lists(st.tuples(st.integers(0, 30), st.integers(1, 5), st.integers(0, 1))))
-def test_time_lost_agrees_with_counting_nanoseconds(
+def test_overlaps_and_lost_time_agree_with_counting_nanoseconds(
     windows: list[tuple[int, int]], seen: list[tuple[int, int, int]]
 ) -> None:
     start = np.array([a for a, _ in windows], dtype=np.int64)
-    end = np.array([a + d for a, d in windows], dtype=np.int64)
+    end = start + np.array([d for _, d in windows], dtype=np.int64)
     stalls = [(began, began + lasted, core) for began, lasted, core in seen]  # by two, it may be
-    lost = [{t for a, b, core in stalls if core == k for t in range(a, b)} for k in (0, 1)]
-    expected = [
-        max(len(one.intersection(range(a, b))) for one in lost)
-        for a, b in zip(start, end, strict=True)
-    ]
     columns = np.array(stalls, dtype=np.int64).reshape(-1, 3).T
-    assert stalled_within(start, end, *columns).tolist() == expected
+    pairs = list(zip(start, end, strict=True))
+    met = [any(s <= b and t > a for s, t, _ in stalls) for a, b in pairs]
+    assert overlapping(start, end, *columns[:2]).tolist() == met
+    lost = [{t for a, b, core in stalls if core == k for t in range(a, b)} for k in (0, 1)]
+    most = [max(len(one.intersection(range(a, b))) for one in lost) for a, b in pairs]
+    assert stalled_within(start, end, *columns).tolist() == most

@@ -2,7 +2,7 @@
 
 import polars as pl
 import pytest
-from story import Callback, Publisher, Story
+from story import Story
 from test_traversals import spans, traversals
 
 from chainshaper.analysis import data_flow, executors
@@ -41,14 +41,10 @@ def test_what_runs_already_has_got_its_inputs_before(
         writes = tuple((topic, at + 1 + n) for n, (topic, _) in enumerate(inputs))
         story.runs(timer, at, at + 5, writes=writes)
         first, second = (1, 0) if fast else (0, 1)
-        sent = at + (15 if fast else 150)
+        sent, begun = at + (15 if fast else 150), at + (9 if overtaken and k % 3 == 1 else 12)
         story.runs(inputs[first][1], at + 10, at + 11, reads=at + 1 + first, tid=21)
-        story.runs(
-            *(inputs[second][1], at + (9 if overtaken and k % 3 == 1 else 12), sent + 1),
-            reads=at + 1 + second,
-            writes=((out, sent),),
-            tid=22 + k % 2,
-        )
+        about = {"reads": at + 1 + second, "tid": 22 + k % 2}
+        story.runs(inputs[second][1], begun, sent + 1, writes=((out, sent),), **about)
         expected.append((at, sent))
     assert latencies(story, spec) == expected
     if turns:  # else nothing shows that 21 and 22 are one executor's
@@ -73,9 +69,8 @@ def test_a_timer_that_runs_already_does_not_read_what_is_stored_now() -> None:
 def test_instances_of_one_callback_beside_each_other(out_of_order: bool) -> None:
     """Each message is read on a thread of its own, while others are in work there."""
     story = Story()
-    source, work = story.node("/source", 1), story.node("/work", 2)
-    timer, begun = story.timer(source), story.publisher(source, "/begun")
-    callback, done = story.subscription(work, "/begun"), story.publisher(work, "/done")
+    timer, begun = story.source("/source", 1, "/begun")
+    callback, done = story.relay("/work", 2, "/begun", "/done")
     for k in range(6):
         at, ends = 10 * k, 10 * k + (35 - 12 * (k % 3) if out_of_order else 30)
         story.runs(timer, at, at + 2, writes=((begun, at + 1),))
@@ -85,21 +80,16 @@ def test_instances_of_one_callback_beside_each_other(out_of_order: bool) -> None
     assert latencies(story, "/begun../done") == expected
 
 
-def python_timer(story: Story, pid: int) -> int:
-    handle = story.handle()
-    story.event("rcl_timer_init", 0, pid, timer_handle=handle, period=100)
-    return handle
-
-
 def python_node(*, calls: bool) -> Story:
     """A node whose timer publishes /begun, which it takes itself and publishes /done.
 
     On threads in turns: the timer's next call is where the message before was taken.
     """
     story = Story()
-    node = story.node("/python", 10)
+    node, timer = story.node("/python", 10), story.handle()
     begun, done = story.publisher(node, "/begun"), story.publisher(node, "/done")
-    timer, callback = python_timer(story, 10), story.subscription(node, "/begun", callbackless=True)
+    story.event("rcl_timer_init", 0, 10, timer_handle=timer, period=100)
+    callback = story.subscription(node, "/begun", callbackless=True)
     for k in range(4):
         at, one, other = 100 * k, 11 + k % 2, 11 + (k + 1) % 2
         if calls:
@@ -114,16 +104,12 @@ def test_what_a_timer_in_python_publishes_is_not_what_its_thread_took_before() -
     story = python_node(calls=True)
     assert latencies(story, "/begun../done") == [(100 * k, 100 * k + 20) for k in range(4)]
     assert threads(story) == [{10, 11, 12}], "the main thread gives the others their work"
-    timer = data_flow(story.tables()).objects.callbacks.filter(pl.col("kind") == "timer")
-    assert timer.select("node", "period_ns", "observed").rows() == [("/python", 100, False)]
-
-
-def test_an_instance_in_python_lasts_until_its_last_publication() -> None:
-    """Of which a plan is made: 5 of the timer's, 10 of the subscription's."""
-    flow = data_flow(python_node(calls=True).tables())
+    flow = data_flow(story.tables())
+    timer = flow.objects.callbacks.filter(kind="timer").select("node", "period_ns", "observed")
+    assert timer.rows() == [("/python", 100, False)]
+    # Of which a plan is made: 5 of the timer's, 10 of the subscription's.
     none = pl.DataFrame(schema={"start": pl.Int64(), "end": pl.Int64()})
-    seen = _instances_apart_from(flow, none)
-    assert seen["response"].to_list() == [5, 10] * 4
+    assert _instances_apart_from(flow, none)["response"].to_list() == [5, 10] * 4
 
 
 def test_without_calls_of_timers_a_topic_that_came_before_all_takes_is_no_output_of_one() -> None:
@@ -131,17 +117,11 @@ def test_without_calls_of_timers_a_topic_that_came_before_all_takes_is_no_output
     assert found == [(100 * k + 5, 100 * k + 20) for k in range(4)]
 
 
-def events_executor(story: Story) -> tuple[Callback, Publisher, int]:
-    node = story.node("/node", 30)
-    timer = story.timer(node)
-    handle = story.rows["rclcpp_timer_callback_added"][-1]["timer_handle"]
-    return timer, story.publisher(node, "/out"), handle
-
-
 def test_who_calls_timers_belongs_to_the_executor_that_runs_their_callbacks() -> None:
     """rclcpp's events executor: thread 31 calls, the main thread executes."""
     story = Story()
-    timer, out, handle = events_executor(story)
+    timer, out = story.source("/node", 30, "/out")
+    handle = story.rows["rclcpp_timer_callback_added"][-1]["timer_handle"]
     for at in (100, 200):
         story.event("rcl_timer_call", at, 30, 31, timer_handle=handle)
         story.runs(timer, at + 1, at + 5, writes=((out, at + 3),), tid=30)

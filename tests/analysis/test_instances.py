@@ -33,12 +33,9 @@ def test_overlapping_instances_of_processes_and_threads() -> None:
     story = Story()
     first = one_timer(story)
     other = story.timer(story.node("/b", pid=2), handle=first.handle)
-    story.start(first, 10, tid=11)
-    story.start(other, 11)
-    story.start(first, 12, tid=12)
-    story.end(first, 20, tid=12)
-    story.end(first, 30, tid=11)
-    story.end(other, 40)
+    story.runs(first, 10, 30, tid=11)
+    story.runs(other, 11, 40)
+    story.runs(first, 12, 20, tid=12)
     assert pairs(story) == [(11, 10, 30), (2, 11, 40), (12, 12, 20)]
 
 
@@ -104,8 +101,7 @@ def test_pairing_agrees_with_its_definition(starts: Happenings, ends: Happenings
 
 
 def test_more_callbacks_than_the_table_was_made_for() -> None:
-    starts = [(1, callback, 2 * callback) for callback in range(5000)]
-    ends = [(1, callback, 2 * callback + 1) for callback in range(5000)]
+    starts, ends = ([(1, k, 2 * k + late) for k in range(5000)] for late in (0, 1))
     assert paired(starts, ends) == list(range(5000))
 
 
@@ -119,13 +115,8 @@ def test_execution_time_from_thread_time() -> None:
 
 
 def switch(story: Story, time: int, prev: int, following: int) -> None:
-    unused: Any = {
-        "prev_comm": "",
-        "prev_prio": 0,
-        "prev_state": 0,
-        "next_comm": "",
-        "next_prio": 0,
-    }
+    unused: dict[str, Any] = {"prev_comm": "", "prev_prio": 0, "prev_state": 0}
+    unused |= {"next_comm": "", "next_prio": 0}
     story.event("sched_switch", time, 0, prev_tid=prev, next_tid=following, **unused)
 
 

@@ -8,16 +8,6 @@ from story import Story
 from chainshaper.analysis import application_graph, callback_instances, resolve_objects
 
 
-def labels(story: Story) -> list[str]:
-    return [callback.label for callback in application_graph(story.tables()).callbacks]
-
-
-def instances_by_callback(story: Story) -> dict[int, list[int]]:
-    tables = story.tables()
-    instances = callback_instances(tables, resolve_objects(tables).callbacks)
-    return dict(instances.group_by("callback_id", maintain_order=True).agg("start").iter_rows())
-
-
 def _two_processes(story: Story) -> None:
     for start, (name, pid, topic) in ((20, ("/a", 1, "/x")), (50, ("/b", 2, "/y"))):
         callback = story.subscription(story.node(name, pid=pid), topic, handle=0xBEEF)
@@ -80,8 +70,13 @@ def test_whose_a_handle_is_depends_on_process_and_time(
 ) -> None:
     story = Story()
     tell(story)
-    assert labels(story) == callbacks
-    assert instances_by_callback(story) == starts
+    tables = story.tables()
+    graph, objects = application_graph(tables), resolve_objects(tables)
+    assert [callback.label for callback in graph.callbacks] == callbacks
+    found = callback_instances(tables, objects.callbacks).group_by("callback_id").agg("start")
+    assert dict(found.iter_rows()) == starts
+    late = any("tracing started after the application" in note for note in objects.notes)
+    assert late == (tell is _before_registration)
 
 
 def test_symbol_of_a_later_user_of_the_address_is_not_taken() -> None:
@@ -91,17 +86,6 @@ def test_symbol_of_a_later_user_of_the_address_is_not_taken() -> None:
     story.subscription(node, "/y", time=40, handle=0xBEEF, symbol="second()")
     graph = application_graph(story.tables())
     assert [callback.symbol for callback in graph.callbacks] == [None, "second()"]
-
-
-def test_tracing_started_late_leaves_callbacks_unknown_and_says_so() -> None:
-    story = Story()
-    story.event("callback_start", 5, 9, callback=0xABC, is_intra_process=0)
-    story.event("callback_end", 8, 9, callback=0xABC)
-    (callback,) = application_graph(story.tables()).callbacks
-    assert (callback.kind, callback.handle, callback.topic) == ("unknown", 0xABC, None)
-    assert callback.label == "unknown (process 9) callback 0xabc"
-    (note,) = resolve_objects(story.tables()).notes
-    assert "tracing started after the application" in note
 
 
 def test_lost_init_events_leave_what_is_known() -> None:

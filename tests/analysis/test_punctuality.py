@@ -24,9 +24,8 @@ def _chain(
     ``gated`` are the fields of the gate's decisions; the message is at the gate 100 later.
     """
     story = Story()
-    source, gate = story.node("/source", 1), story.node("/gate", 2)
-    timer, raw = story.timer(source, period=period), story.publisher(source, "/raw")
-    hold, out = story.subscription(gate, "/raw"), story.publisher(gate, "/out")
+    timer, raw = story.source("/source", 1, "/raw", period)
+    hold, out = story.relay("/gate", 2, "/raw", "/out")
     for number, (start, end) in enumerate(outputs):
         story.runs(timer, start, start + 60, writes=((raw, start + 50),))
         story.runs(hold, start + 100, end + 10, reads=start + 50, writes=((out, end),), tid=number)
@@ -108,12 +107,9 @@ def test_an_output_is_late_behind_its_slot_or_cycle(
 
 def test_nothing_says_when_an_output_was_due_where_no_timer_starts_the_chain() -> None:
     story = Story()
-    source, gate = story.node("/source", 1), story.node("/gate", 2)
-    ticks, raw = story.subscription(source, "/ticks"), story.publisher(source, "/raw")
-    hold, out = story.subscription(gate, "/raw"), story.publisher(gate, "/out")
+    ticks, raw = story.relay("/source", 1, "/ticks", "/raw")
     story.runs(ticks, 1_000, 1_060, writes=((raw, 1_050),))
-    story.runs(hold, 1_100, 1_310, reads=1_050, writes=((out, 1_300),))
-    found = _analysed(story)
+    found = analyse_latency(story.tables(), "/raw", OFFSET)
     assert found.traversals["late"].to_list() == [None]
     assert found.statistics.late is None
 
@@ -137,23 +133,16 @@ def test_a_late_output_waits_through_a_stall_and_is_not_excused() -> None:
 def _two_gates(same_process: bool, named: bool) -> Story:
     """/source → /g1 → /g2; both gates read messages of one and the same source timestamp."""
     story = Story()
-    source = story.node("/source", 1)
-    first = story.node("/g1", 2)
-    second = story.node("/g2", 2 if same_process else 3)
-    timer, raw = story.timer(source, period=PERIOD), story.publisher(source, "/raw")
-    one, middle = story.subscription(first, "/raw"), story.publisher(first, "/middle")
-    two, out = story.subscription(second, "/middle"), story.publisher(second, "/out")
-    for start in (1_000, 2_000):
-        story.runs(timer, start, start + 60, writes=((raw, start + 50),))
-        story.runs(one, start + 100, start + 210, reads=start + 50, writes=((middle, start + 200),))
-        story.runs(
-            two, start + 250, start + 410, reads=start + 200, writes=((out, start + 400),), tid=9
-        )
-        for gate, sent, arrival, release in ((one, 50, 100, 200), (two, 200, 250, 400)):
-            nameless = {} if named else {"callback": None}
-            story.gate(
-                gate, start + sent, start + arrival, start + release, origin=start, **nameless
-            )
+    timer, raw = story.source("/source", 1, "/raw", PERIOD)
+    one, middle = story.relay("/g1", 2, "/raw", "/middle")
+    two, out = story.relay("/g2", 2 if same_process else 3, "/middle", "/out")
+    nameless = {} if named else {"callback": None}
+    for at in (1_000, 2_000):
+        story.runs(timer, at, at + 60, writes=((raw, at + 50),))
+        story.runs(one, at + 100, at + 210, reads=at + 50, writes=((middle, at + 200),))
+        story.runs(two, at + 250, at + 410, reads=at + 200, writes=((out, at + 400),), tid=9)
+        story.gate(one, at + 50, at + 100, at + 200, origin=at, **nameless)
+        story.gate(two, at + 200, at + 250, at + 400, origin=at, **nameless)
     return story
 
 
@@ -187,23 +176,13 @@ def test_a_shaping_node_that_knows_no_handles_is_told_by_its_process(
     simulated_shaped: Recording,
 ) -> None:
     """What a node in ROS 2 notes of itself: the same rows, but for the handle."""
-    releases = simulated_shaped.events["gate_release"]
-    nameless = releases.with_columns(callback=pl.lit(None, dtype=releases.schema["callback"]))
-    without = {**simulated_shaped.events, "gate_release": nameless}
-
-    flow = data_flow(simulated_shaped.events, simulated_shaped.info.clock_offset_ns)
-    one, other = (
-        gate_decisions(tables, flow.objects) for tables in (simulated_shaped.events, without)
-    )
-    assert one.height == releases.height > 0
+    events, offset = simulated_shaped.events, simulated_shaped.info.clock_offset_ns
+    nameless = events["gate_release"].with_columns(callback=pl.lit(None, pl.UInt64))
+    without, objects = {**events, "gate_release": nameless}, data_flow(events, offset).objects
+    one, other = (gate_decisions(tables, objects) for tables in (events, without))
+    assert one.height == nameless.height > 0
     assert one.drop("callback").equals(other.drop("callback"))
-
-    known = analyse_latency(
-        simulated_shaped.events, "/t1../t3", clock_offset_ns=simulated_shaped.info.clock_offset_ns
-    )
-    found = analyse_latency(
-        without, "/t1../t3", clock_offset_ns=simulated_shaped.info.clock_offset_ns
-    )
+    known, found = (analyse_latency(tables, "/t1../t3", offset) for tables in (events, without))
     assert known.traversals.equals(found.traversals)
 
 
@@ -228,34 +207,35 @@ def _sent_by_thread(outcomes: tuple[str | None, ...]) -> Story:
     return story
 
 
-def test_the_latency_ends_when_the_message_was_sent() -> None:
-    found = analyse_latency(_sent_by_thread(("sent", "sent")).tables(), "/n../t1", OFFSET)
-    assert found.traversals["latency_ns"].to_list() == [70, 70]
-    assert found.traversals["reception_ns"].to_list() == [80, 80]
-    (first, _) = found.hops.select("publish", "end", "computation_ns").rows()
-    assert first == (160, 105, 70), "it left when its callback instance had ended"
-
-
-def test_a_message_that_was_not_sent_has_no_latency() -> None:
-    story = _sent_by_thread(("sent", "expired", "overwritten", None))
-    found = analyse_latency(story.tables(), "/n../t1", OFFSET)
-    assert found.traversals["latency_ns"].to_list() == [70, None, None, None]
-    assert found.traversals["reason"].to_list() == [None, "discarded", "discarded", "not sent"]
-    assert found.traversals["broken_at"].to_list() == [None, "/t1", "/t1", "/t1"]
-    assert found.incomplete == {"discarded": 2, "not sent": 1}
-
-
 @pytest.mark.parametrize(
-    ("asynchronous", "latencies"), [(1, [None, None]), (0, [10, 10]), (None, [10, 10])]
+    ("asynchronous", "outcomes", "latencies", "reasons"),
+    [
+        (1, ("sent", "sent"), [70, 70], [None, None]),
+        (
+            *(1, ("sent", "expired", "overwritten", None), [70, None, None, None]),
+            [None, "discarded", "discarded", "not sent"],
+        ),
+        (1, (None, None), [None, None], ["not sent"] * 2),  # a thread that never ran
+        (0, (None, None), [10, 10], [None, None]),  # without one publishing is sending
+        (None, (None, None), [10, 10], [None, None]),
+    ],
 )
-def test_a_thread_that_never_ran_sent_nothing_and_without_one_publishing_is_sending(
-    asynchronous: int | None, latencies: list[int | None]
+def test_the_latency_ends_when_the_message_was_sent(
+    asynchronous: int | None,
+    outcomes: tuple[str | None, ...],
+    latencies: list[int | None],
+    reasons: list[str | None],
 ) -> None:
-    story = _sent_by_thread((None, None))
+    story = _sent_by_thread(outcomes)
     story.rows["rcl_publisher_init"][0]["asynchronous"] = asynchronous
     found = analyse_latency(story.tables(), "/n../t1", OFFSET)
-    assert found.traversals["latency_ns"].to_list() == latencies
-    assert found.incomplete == ({"not sent": 2} if asynchronous else {})
+    rows = found.traversals.select("latency_ns", "reason", "broken_at").rows()
+    expected = zip(latencies, reasons, strict=True)
+    assert rows == [(latency, why, why and "/t1") for latency, why in expected]
+    if outcomes[0]:
+        assert found.traversals["reception_ns"][0] == 80
+        first = found.hops.select("publish", "end", "computation_ns").row(0)
+        assert first == (160, 105, 70), "it left when its callback instance had ended"
 
 
 def test_where_no_event_says_when_it_was_sent_as_in_ros_the_first_reader_does() -> None:
@@ -271,23 +251,19 @@ def test_where_no_event_says_when_it_was_sent_as_in_ros_the_first_reader_does() 
 
 def test_inside_a_chain_waiting_for_the_thread_belongs_to_the_hop_that_publishes() -> None:
     story = _sent_by_thread(("sent", "expired"))
-    relay = story.node("/relay", 3)
-    callback, t2 = story.subscription(relay, "/t1"), story.publisher(relay, "/t2")
+    callback, t2 = story.relay("/relay", 3, "/t1", "/t2")
     story.runs(callback, 180, 190, reads=100, writes=((t2, 185),))
     found = analyse_latency(story.tables(), "/t1../t2", OFFSET)
-    assert found.traversals["latency_ns"].to_list() == [95, None]
-    assert found.traversals["reason"].to_list() == [None, "discarded"]
-    assert found.traversals["broken_at"].to_list() == [None, "/t1"]
-    hops = found.hops.filter(pl.col("traversal") == 0)
-    assert hops["computation_ns"].to_list() == [70, 5]
-    assert hops["communication_ns"].to_list() == [None, 20]
+    rows = found.traversals.select("latency_ns", "reason", "broken_at").rows()
+    assert rows == [(95, None, None), (None, "discarded", "/t1")]
+    hops = found.hops.filter(traversal=0).select("communication_ns", "computation_ns")
+    assert hops.rows() == [(None, 70), (20, 5)]
 
 
 def test_what_a_gate_discarded_is_not_lost() -> None:
     story = Story()
-    source, gate = story.node("/source", 1), story.node("/gate", 2)
-    timer, t1 = story.timer(source), story.publisher(source, "/tmp")
-    hold, out = story.subscription(gate, "/tmp"), story.publisher(gate, "/t1")
+    timer, t1 = story.source("/source", 1, "/tmp")
+    hold, out = story.relay("/gate", 2, "/tmp", "/t1")
     for start, released in ((1_000, 1_060), (1_100, None), (1_200, 1_260)):
         story.runs(timer, start, start + 20, writes=((t1, start + 10),))
         writes = () if released is None else ((out, released),)

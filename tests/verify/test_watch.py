@@ -16,7 +16,7 @@ from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from threading import Thread
 from types import SimpleNamespace
-from typing import ClassVar
+from typing import Any, ClassVar
 from urllib.request import urlopen
 
 import numpy as np
@@ -30,7 +30,12 @@ from prometheus_client.parser import text_string_to_metric_families
 from traced_program import built
 
 from chainshaper import plan_recording
-from chainshaper.analysis import analyse_latency, data_flow, latency_statistics
+from chainshaper.analysis import (
+    LatencyStatistics,
+    analyse_latency,
+    data_flow,
+    latency_statistics,
+)
 from chainshaper.cli import runs
 from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
@@ -54,13 +59,9 @@ LONGEST_NS = SECOND // 5
 def running(cycles: int, **environment: str) -> "Iterator[subprocess.Popen[str]]":
     """The application, with the library in front; its chain begins when this is entered."""
     variables = {**os.environ, "LD_PRELOAD": str(installed_library()), **environment}
-    with subprocess.Popen(
-        built().command("chain", str(cycles), "wait"),
-        env=variables,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-    ) as process:
+    words = built().command("chain", str(cycles), "wait")
+    pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
+    with subprocess.Popen(words, env=variables, **pipes) as process:
         assert process.stdin is not None
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
@@ -85,10 +86,8 @@ def watched(watch: Watch, seconds: float, every: float = 0.25) -> list[Seen]:
 
 
 def own_watch(*chains: str, plan: ApplicationPlan | None = None, callbacks: bool = False) -> Watch:
-    own = {os.geteuid()}
-    return Watch(
-        chains or (CHAIN,), users=own, plan=plan, longest_ns=LONGEST_NS, callbacks=callbacks
-    )
+    wishes: dict[str, Any] = {"longest_ns": LONGEST_NS, "plan": plan, "callbacks": callbacks}
+    return Watch(chains or (CHAIN,), users={os.geteuid()}, **wishes)
 
 
 def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> None:
@@ -98,7 +97,7 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     with running(80, **{VARIABLE: tracer.start()[VARIABLE]}) as process:
         time.sleep(0.5)
         watch, other = own_watch(callbacks=True), own_watch()
-        seen = watched(watch, 2.0)
+        seen = watched(watch, 2.0)[-1]
         other_seen = other.look()
         process.communicate()
     tracer.remove()
@@ -112,28 +111,25 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     assert [latencies[one] for one in begun] == found.to_list()
     same_time = whole.filter(whole["start"].is_between(begun[0], begun[-1]))
     assert same_time.height == count, "none is passed over, none counted twice"
-    last = seen[-1].chains[0]
-    assert last.spans["hour"].count == count
-    assert last.spans["hour"].max_ns == found.max()
+    last = seen.chains[0]
+    assert (last.spans["hour"].count, last.spans["hour"].max_ns) == (count, found.max())
     assert last.rate_hz == pytest.approx((count - 1) * SECOND / (begun[-1] - begun[0]))
-    assert sum(h.communication_ns + h.computation_ns for h in last.hops) == pytest.approx(
-        found.mean(), rel=1e-6
-    )
-    assert [hop.node for hop in last.hops] == ["/first", "/second"]
+    total = sum(h.communication_ns + h.computation_ns for h in last.hops)
+    assert total == pytest.approx(found.mean(), rel=1e-6)
     own = analysis.hops.join(same_time, on="traversal", how="semi").group_by("hop")
     most = own.agg(pl.col("communication_ns", "computation_ns").max()).sort("hop")
+    assert [hop.node for hop in last.hops] == ["/first", "/second"]
     assert [hop.longest_ns for hop in last.hops] == most.drop("hop").rows()
-    (second,) = (one for one in seen[-1].callbacks if one.node == "/second")
+    (second,) = (one for one in seen.callbacks if one.node == "/second")
     (ran,) = (one for one in analysis.graph.callbacks if one.node == "/second")
     flow = data_flow(tables, info.clock_offset_ns)
-    since, until = watch._began_ns, seen[-1].at_ns - LONGEST_NS  # its own cycles' and no others
-    times = flow.instances.filter(callback_id=ran.id).filter(
-        pl.col("start").is_between(since, until, "right")
-    )
+    since, until = watch._began_ns, seen.at_ns - LONGEST_NS  # its own cycles' and no others
+    within = pl.col("start").is_between(since, until, "right")
+    times = flow.instances.filter(within, callback_id=ran.id)
     assert second.starts == "/ebpf1"
     assert second.longest_ns[0] == (times["end"] - times["start"]).max()
     assert abs(other_seen.chains[0].spans["hour"].count - count) <= 5
-    assert seen[-1].lost == 0
+    assert seen.lost == 0
 
 
 def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path: Path) -> None:
@@ -181,34 +177,29 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
         (slot,) = publish_slots(plan)
         beside = own_watch(CHAIN, "/first../second", plan=whole(plan))
         in_time, by_nodes = watched(beside, 1.0)[-1].chains
-        latest = replace(beside.due[0], cycle_ns=1_000_000, slots=())
-        beside.due = [latest]
+        beside.due = [replace(beside.due[0], cycle_ns=1_000_000, slots=())]
         too_late = watched(beside, 1.0)[-1].chains[0]
     assert in_time.promised_ns == by_nodes.promised_ns == slot[1]
     assert in_time.shares == by_nodes.shares
-    places = beside.chains[0].cycles["place_ns"]
-    inside = places.is_between(slot[0] - 100_000, slot[1], "left")
-    assert in_time.shares == (inside[: in_time.spans["hour"].count].mean(),)
+    first, later = in_time.spans["hour"], too_late.spans["hour"]
+    inside = beside.chains[0].cycles["place_ns"].is_between(slot[0] - 100_000, slot[1], "left")
+    assert in_time.shares == (inside[: first.count].mean(),)
     assert in_time.early > 0.2, "an unshaped program holds no output back"
     assert in_time.early + in_time.shares[0] <= 1.0
-    assert in_time.spans["hour"].late is not None
-    assert in_time.spans["hour"].late <= 2, "of a machine that stands still"
+    assert known(first.late) <= 2, "of a machine that stands still"
+    assert later.count - first.count > 10
+    assert known(later.late) - known(first.late) == later.count - first.count
     measured = measure_latency(recording).analysis
     assert measured.statistics.count >= 20
     assert recording.info.notes[-1] == "too slow"
-    (worst_ns,) = recording.info.worst_ns
-    ((longest_ns, complete),) = (
-        measured.traversals.filter(start=worst_ns).select("latency_ns", "complete").rows()
-    )
-    until_then = measured.traversals.filter(pl.col("start") <= watch._over_ns)
-    assert complete == until_then["complete"].all()
-    assert not complete or longest_ns == until_then["latency_ns"].max()
     assert list(recording.info.processes.values()) == ["/first, /second"]
+    (worst_ns,) = recording.info.worst_ns
+    worst = measured.traversals.filter(start=worst_ns)["latency_ns"].item()
+    until_then = measured.traversals.filter(pl.col("start") <= watch._over_ns)
+    assert (worst is not None) == until_then["complete"].all()
+    assert worst in (None, until_then["latency_ns"].max())
     shown = called("latency", recording.path)
     assert shown.code == 0, shown.err
-    counted = too_late.spans["hour"].count - in_time.spans["hour"].count
-    assert counted > 10
-    assert too_late.spans["hour"].late == in_time.spans["hour"].late + counted
 
 
 def test_shares_are_of_outputs_within_slots() -> None:
@@ -237,11 +228,9 @@ def test_a_node_that_dies_in_a_callback_leaves_a_cycle_that_is_incomplete() -> N
         memory._read[:] = 0
         late._over_ns -= 3 * SECOND  # what began before the watch is none of its cycles
         time.sleep(2 * LONGEST_NS / SECOND)
-        after = late.look().chains[0]
-    assert seen.counted["incomplete"] == 0
-    assert after.counted["incomplete"] == 1
-    assert after.counted["complete"] > 10
-    assert late.lost == 0
+        after = late.look().chains[0].counted
+    assert (seen.counted["incomplete"], after["incomplete"], late.lost) == (0, 1, 0)
+    assert after["complete"] > 10
 
 
 def test_a_full_disk_stops_neither_the_watch_nor_loses_what_it_has(
@@ -314,14 +303,14 @@ def test_a_clock_that_is_set_spoils_no_figure(
     assert counted["unclear"] < 20
 
 
-def test_memory_does_not_grow(tmp_path: Path) -> None:
-    """An hour of cycles stays, events of seconds: hours are simulated by setting the clock on."""
+def test_memory_does_not_grow() -> None:
+    """An hour of cycles stays: hours are simulated by setting the clock on."""
     (chain,) = own_watch().chains
-    hops = pl.DataFrame(schema=["traversal", "hop", "communication_ns", "computation_ns"])
-    hops = hops.cast(pl.UInt32())
+    names = ["traversal", "hop", "communication_ns", "computation_ns"]
+    hops = pl.DataFrame(schema=dict.fromkeys(names, pl.UInt32))
     minute = pl.DataFrame({"start": range(0, 60 * SECOND, SECOND // 10)}).with_columns(
-        pl.lit(5_000_000).alias("latency_ns"),
-        pl.lit(5_000_000).alias("place_ns"),
+        latency_ns=pl.lit(5_000_000),
+        place_ns=pl.lit(5_000_000),
         late=False,
         complete=True,
         traversal=pl.int_range(pl.len(), dtype=pl.UInt32()),
@@ -334,17 +323,12 @@ def test_memory_does_not_grow(tmp_path: Path) -> None:
 
 
 def test_the_command_shows_and_streams(tmp_path: Path) -> None:
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with running(400) as process:
         words = [sys.executable, "-m", "chainshaper", "watch", "--chain", CHAIN, "--longest"]
         words += ["200ms", "--every", "500ms"]
-        streaming = subprocess.Popen(
-            [*words, "--json", "--recorder", str(tmp_path)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert streaming.stdout is not None
-        objects = [json.loads(streaming.stdout.readline()) for _ in range(3)]
+        streaming = subprocess.Popen([*words, "--json", "--recorder", str(tmp_path)], **pipes)
+        objects = [json.loads(known(streaming.stdout).readline()) for _ in range(3)]
         streaming.send_signal(signal.SIGQUIT)
         wait_for(lambda: any(tmp_path.glob("watch-*/recording.json")), "the flight recorder")
         streaming.send_signal(signal.SIGINT)
@@ -360,8 +344,7 @@ def test_the_command_shows_and_streams(tmp_path: Path) -> None:
         )
         (tmp_path / "broken").mkdir()
         words += ["--budget", str(tmp_path / "budget.yaml"), "--recorder", str(tmp_path / "broken")]
-        pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-        shown = subprocess.Popen(words, **pipes)  # type: ignore[call-overload]
+        shown = subprocess.Popen(words, **pipes)
         wait_for(lambda: any((tmp_path / "broken").glob("watch-*/recording.json")), "what broke")
         time.sleep(1)  # a look or two
         shown.send_signal(signal.SIGINT)
@@ -432,6 +415,14 @@ def test_the_command_that_fails_and_names_that_never_run(
     assert "/ended (/other) has not run yet" in notes[1]
 
 
+def seen_with(figures: LatencyStatistics, at_ns: int = 0, hops: tuple[Hop, ...] = ()) -> Seen:
+    """A look at one chain, which has the same figures over all spans."""
+    counted = {"complete": figures.count, "late": figures.late or 0, "incomplete": 0, "unclear": 0}
+    spans = dict.fromkeys(SPANS, figures)
+    chain = ChainNow(CHAIN, spans, 20.0, hops, (), 0.0, None, 0, counted, problem=None)
+    return Seen(at_ns, {1: "/first"}, 0, (chain,))
+
+
 def test_a_limit_that_breaks_for_ever_does_not_fill_the_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -444,10 +435,7 @@ def test_a_limit_that_breaks_for_ever_does_not_fill_the_disk(
     judged = runs._judging(load_budget(tmp_path / "budget.yaml"), own_watch(), tmp_path)
     for look in range(8):
         minute = latency_statistics(np.array([5, 25 if look % 2 else 6]) * 1_000_000)
-        spans = dict.fromkeys(SPANS, minute)
-        counted = {"complete": 2, "late": 0, "incomplete": 0, "unclear": 0}
-        chain = ChainNow(CHAIN, spans, 20.0, (), (), 0.0, None, 0, counted, problem=None)
-        assert bool(judged(Seen(look * SECOND, {1: "/first"}, 0, (chain,)))) == bool(look % 2)
+        assert bool(judged(seen_with(minute, look * SECOND))) == bool(look % 2)
     assert [len(reasons) for reasons in written] == [1, 1]
     said = capsys.readouterr().err
     assert said.count("2 recordings are there") == 1
@@ -474,10 +462,7 @@ def test_metrics_are_the_figures_that_are_shown() -> None:
         Hop("/first", "/ebpf1", 0.0, 2e6, (0, 2)),
         Hop("/second", "/ebpf2", 1e6, 3e6, (1, 3)),
     )
-    counted = {"complete": hour.count, "late": 1, "incomplete": 0, "unclear": 0}
-    spans = dict.fromkeys(SPANS, hour)
-    chain = ChainNow(CHAIN, spans, 20.0, hops, (), 0.0, None, 0, counted, problem=None)
-    seen = Seen(at_ns=0, processes={1: "/first"}, lost=0, chains=(chain,))
+    seen = seen_with(hour, 0, hops)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
@@ -490,16 +475,17 @@ def test_metrics_are_the_figures_that_are_shown() -> None:
                 pass
             text = urlopen(f"http://127.0.0.1:{port}/metrics").read().decode()
         server.shutdown()
-    families = {one.name: one for one in text_string_to_metric_families(text)}
+    families = {one.name: one.samples for one in text_string_to_metric_families(text)}
     found = {
         (one.labels["span"], one.labels["statistic"]): one.value
-        for one in families["chainshaper_chain_latency_seconds"].samples
+        for one in families["chainshaper_chain_latency_seconds"]
     }
     assert found["hour", "max"] == known(hour.max_ns) / SECOND
     assert found["hour", "p50"] == hour.percentiles_ns["50"] / SECOND
-    cycles = families["chainshaper_chain_cycles"].samples
-    assert {one.labels["outcome"]: one.value for one in cycles} == counted
-    assert len(families["chainshaper_hop_time_seconds"].samples) == 4
+    cycles = families["chainshaper_chain_cycles"]
+    counted = {one.labels["outcome"]: one.value for one in cycles}
+    assert counted == seen.chains[0].counted
+    assert len(families["chainshaper_hop_time_seconds"]) == 4
     request = ExportMetricsServiceRequest.FromString(Collector.received[-1])
     (metrics,) = request.resource_metrics[0].scope_metrics
     sent = {

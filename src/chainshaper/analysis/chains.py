@@ -18,7 +18,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import SequenceMatcher
 from heapq import heappop, heappush
-from itertools import count as counting
 from itertools import pairwise
 from pathlib import Path
 from typing import TypeAlias, TypeVar
@@ -37,7 +36,7 @@ from chainshaper.values.plan_choices import STANDBY
 from chainshaper.values.yaml_file import PlainData, compose, read_text
 
 HANDFUL = 5  # so many names or paths a message lists
-STEPS = 100_000  # for short paths where there are cycles, about 1 µs each
+STEPS = 30_000  # for short paths where there are cycles, about 5 µs each
 SEARCHES = 100  # backwards, for all paths then, about 1 ms each
 CLOSE = 0.6  # likeness (0 to 1) from which a name is worth mentioning
 WORSE = 0.15  # how much less alike than the best one a name may be
@@ -421,22 +420,23 @@ class _Search:
         one that is there soonest.
         """
         found: list[GraphPath] = []
-        met, number = 0, counting()
+        met = step = 0
         waiting: list[tuple[int, int, int, GraphPath, State]]
-        waiting = [(self.distance[root], 0, next(number), (), root) for root in self.roots]
-        for _ in range(STEPS):
-            if not waiting:
-                return found, met, True
+        waiting = [(self.distance[root], 0, n, (), root) for n, root in enumerate(self.roots)]
+        while waiting:
             _, _, _, before, state = heappop(waiting)
             path = (*before, state[0])
             if state in self.ends and self._returns(path):
                 met += 1
                 found += [path] * (len(found) < limit)
             for after in self.successors[state]:
+                if step == STEPS:
+                    return found, met, False
+                step += 1
                 if after[0] not in path:
                     length = len(path) + self.distance[after]
-                    heappush(waiting, (length, -len(path), next(number), path, after))
-        return found, met, False
+                    heappush(waiting, (length, -len(path), step, path, after))
+        return found, met, True
 
     def counted(self, weights: Mapping[int, float]) -> tuple[int, GraphPath, float]:
         """Number of paths, the heaviest of them, and its weight (the sum over its callbacks).

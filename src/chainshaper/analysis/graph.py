@@ -26,8 +26,7 @@ import numpy as np
 import polars as pl
 
 from chainshaper.analysis.flow import DataFlow, data_flow
-from chainshaper.analysis.matching import latest_before
-from chainshaper.analysis.objects import named_nodes
+from chainshaper.analysis.objects import endpoints
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Node
 
@@ -172,11 +171,8 @@ class ApplicationDescription:
 
 def services(tables: events.EventTables) -> pl.DataFrame:
     """All services: ``service, role, node, pid``, one row per server and client."""
-    nodes = named_nodes(tables).rename({"handle": "node_handle", "valid_from": "created"})
-    found = []
-    for role, name in (("server", "rcl_service_init"), ("client", "rcl_client_init")):
-        ends = events.table(tables, name)
-        joined = latest_before(ends, nodes, ["pid", "node_handle"], "time", "created")
-        found.append(joined.select("node", "pid", service="service_name", role=pl.lit(role)))
+    roles = {"service": "server", "client": "client"}
+    ends = endpoints(tables).filter(pl.col("role").is_in([*roles]))
     columns = ["service", "role", "node", "pid"]
-    return pl.concat(found).select(columns).unique().sort(columns)
+    ends = ends.with_columns(pl.col("role").replace(roles), service="topic")
+    return ends.select(columns).unique().sort(columns)

@@ -15,6 +15,8 @@ from chainshaper.analysis.matching import first_after, latest_before, nearest
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_SERVICES, REQUEST, RESPONSE
 
+_CALL = ("request", "response")
+
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),
     "pid": pl.Int32(),
@@ -62,16 +64,21 @@ class Objects:
 
 def resolve_objects(tables: events.EventTables) -> Objects:
     """Find all objects of a recording. Cost is linear in the number of events."""
-    nodes = named_nodes(tables)
-    publishers = _endpoints(tables, nodes, "publisher")
-    subscriptions = _endpoints(tables, nodes, "subscription")
+    nodes, ends = named_nodes(tables), endpoints(tables)
+    publishers, subscriptions = (_carrying(tables, ends, k) for k in ("publisher", "subscription"))
     found = [
         _subscription_callbacks(tables, subscriptions),
         _timer_callbacks(tables, nodes),
-        _service_callbacks(tables, nodes, subscriptions),
+        _service_callbacks(tables, ends, subscriptions),
     ]
     registered = _with_symbols(tables, pl.concat(found, how="diagonal_relaxed"))
-    clients = _client_callbacks(tables, nodes, subscriptions)
+    # No version of rclcpp says when the callbacks of clients run.
+    clients = (
+        ends.filter(role="client")
+        .drop("role", "rmw_handle")
+        .with_columns(end="handle", kind=pl.lit("client"), observed=pl.lit(False))
+    )
+    clients = _listening(clients, subscriptions, RESPONSE)
     listening = pl.concat([registered, clients], how="diagonal_relaxed")
     others = [
         _unregistered(tables, registered),
@@ -113,29 +120,35 @@ def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFr
     return found.with_columns(pl.col("node").fill_null(later["node"]))
 
 
-def _endpoints(tables: events.EventTables, nodes: pl.DataFrame, kind: str) -> pl.DataFrame:
-    rmw = f"rmw_{kind}_handle"
-    names = {f"{kind}_handle": "handle", rmw: "rmw_handle", "time": "valid_from"}
-    created = events.table(tables, f"rcl_{kind}_init").rename(names | {"topic_name": "topic"})
-    columns = ["pid", "node_handle", *names.values(), "topic"]
-    ends = [created, *(_service_ends(tables, role, kind) for role in ("client", "service"))]
-    created = pl.concat(one.select(columns) for one in ends).with_row_index(kind)
-    columns = [kind, "pid", "handle", "rmw_handle", "valid_from", "node", "topic"]
-    return _with_node(created, nodes, "valid_from").select(columns)
+def endpoints(tables: events.EventTables) -> pl.DataFrame:
+    """Publishers, subscriptions, clients and services by ``role``, with the columns of the first;
+    the ``topic`` of the last two is the service's name.
+    """
+    found = []
+    for role in ("publisher", "subscription", "client", "service"):
+        name = "topic_name" if role in ("publisher", "subscription") else "service_name"
+        handles = {"handle": f"{role}_handle", "rmw_handle": f"rmw_{role}_handle"}
+        found.append(
+            events.table(tables, f"rcl_{role}_init").select(
+                "pid", "node_handle", **handles, role=pl.lit(role), valid_from="time", topic=name
+            )
+        )
+    ends = _with_node(pl.concat(found), named_nodes(tables), "valid_from")
+    return ends.drop("node_handle", "node_from")
 
 
-def _service_ends(tables: events.EventTables, role: str, kind: str) -> pl.DataFrame:
-    """Clients or servers whose calls were seen, as publishers or subscriptions of messages."""
-    sends, takes = ("request", "response") if role == "client" else ("response", "request")
-    calls = [events.table(tables, f"rmw_{one}") for one in (f"send_{sends}", f"take_{takes}")]
-    handle = f"rmw_{role}_handle"
-    seen = pl.concat(one.select("pid", rmw_handle=handle) for one in calls).unique()
-    created = events.table(tables, f"rcl_{role}_init").select(
-        "pid", "node_handle", handle=f"{role}_handle", rmw_handle=handle, valid_from="time",
-        topic=pl.col("service_name") + f":{sends if kind == 'publisher' else takes}",
-    )  # fmt: skip
-    own = pl.col("topic").str.extract("([^/:]*):").is_in(INTERNAL_SERVICES)
-    return created.filter(~own).join(seen, on=["pid", "rmw_handle"], how="semi")
+def _carrying(tables: events.EventTables, ends: pl.DataFrame, kind: str) -> pl.DataFrame:
+    """All publishers or subscriptions; clients and servers whose calls were seen count as such."""
+    found = [ends.filter(role=kind)]
+    internal = pl.col("topic").str.extract("([^/]*)$").is_in(INTERNAL_SERVICES)
+    for role, sends, takes in (("client", *_CALL), ("service", *_CALL[::-1])):
+        calls = [events.table(tables, f"rmw_{one}") for one in (f"send_{sends}", f"take_{takes}")]
+        seen = pl.concat(one.select("pid", rmw_handle=f"rmw_{role}_handle") for one in calls)
+        own = ends.filter(~internal, role=role)
+        own = own.join(seen.unique(), on=["pid", "rmw_handle"], how="semi", maintain_order="left")
+        message = f":{sends if kind == 'publisher' else takes}"
+        found.append(own.with_columns(pl.col("topic") + message))
+    return pl.concat(found).drop("role").with_row_index(kind)
 
 
 def _added(tables: events.EventTables, kind: str, owner: str) -> pl.DataFrame:
@@ -187,31 +200,13 @@ def _timer_callbacks(tables: events.EventTables, nodes: pl.DataFrame) -> pl.Data
 
 
 def _service_callbacks(
-    tables: events.EventTables, nodes: pl.DataFrame, subscriptions: pl.DataFrame
+    tables: events.EventTables, ends: pl.DataFrame, subscriptions: pl.DataFrame
 ) -> pl.DataFrame:
-    service = ["pid", "service_handle"]
-    created = events.table(tables, "rcl_service_init")
-    created = created.select(*service, "node_handle", topic="service_name", created="time")
-    added = _added(tables, "service", "service_handle").with_columns(kind=pl.lit("service"))
-    joined = latest_before(added, created, service, "valid_from", "created").drop("created")
-    joined = _with_node(joined, nodes, "valid_from")
-    return _listening(joined.rename({"service_handle": "end"}), subscriptions, REQUEST)
-
-
-def _client_callbacks(
-    tables: events.EventTables, nodes: pl.DataFrame, subscriptions: pl.DataFrame
-) -> pl.DataFrame:
-    """Clients of services: they exist, but no version of rclcpp says when their callback runs."""
-    created = events.table(tables, "rcl_client_init").select(
-        *("pid", "node_handle"),
-        handle="client_handle",
-        end="client_handle",
-        valid_from="time",
-        topic="service_name",
-        kind=pl.lit("client"),
-        observed=pl.lit(False),
-    )
-    return _listening(_with_node(created, nodes, "valid_from"), subscriptions, RESPONSE)
+    added = _added(tables, "service", "service_handle").rename({"service_handle": "end"})
+    created = ends.filter(role="service")
+    created = created.select("pid", "node", "topic", end="handle", made="valid_from")
+    joined = latest_before(added, created, ["pid", "end"], "valid_from", "made")
+    return _listening(joined.with_columns(kind=pl.lit("service")), subscriptions, REQUEST)
 
 
 def _listening(ends: pl.DataFrame, subscriptions: pl.DataFrame, to: str) -> pl.DataFrame:

@@ -13,6 +13,7 @@ several of one name, which the viewer shows as one. Numbers of fields and enumer
 
 import io
 import json
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
@@ -85,9 +86,10 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
     it cannot be written; nothing is left behind.
     """
     path = new_file(path, ENDINGS)
-    measured = source if isinstance(source, Measurement) else None
+    analysis, plan = None, None
     recording = source.recording if isinstance(source, Measurement) else source
-    analysis, plan = (measured.analysis, measured.plan) if measured else (None, None)
+    if isinstance(source, Measurement):
+        analysis, plan = source.analysis, source.plan
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     timeline = timeline_of(recording, flow, analysis, plan)
     tracks = _thread_tracks(recording, flow, timeline)
@@ -156,9 +158,9 @@ _JSON_TYPES = {
 
 
 def _thread_tracks(recording: Recording, flow: DataFlow, timeline: Timeline) -> list[Track]:
-    rows: dict[Thread, list[list[Slice]]] = {}
+    rows = defaultdict[Thread, list[list[Slice]]](list)
     for thread, one in chain(_callbacks(flow, timeline), _messages(flow)):
-        rows.setdefault(thread, []).append([one])
+        rows[thread].append([one])
     known = timeline.threads.select("pid", "tid", "nodes", "about").iter_rows()
     nodes = {(pid, tid): (names, about) for pid, tid, names, about in known}
     comms = {(thread.pid, thread.tid): thread.comm for thread in recording.info.threads}
@@ -278,21 +280,18 @@ def encode_trace(tracks: Sequence[Track], clock_offset_ns: int) -> Iterator[byte
 
 def _lanes(families: Sequence[Sequence[Slice]]) -> list[list[Slice]]:
     """Families over as few lanes as they need so that those of a lane do not overlap partly."""
-    lanes: list[list[Slice]] = []
-    open_until: list[list[int]] = []  # per lane the ends of what is open, outermost first
+    lanes: list[tuple[list[Slice], list[int]]] = []  # and the ends of what is open, outermost first
     for family in sorted(families, key=lambda f: (f[0].start, -f[0].last)):
         start, end = family[0].start, family[0].last
-        for ends in open_until:
+        for _, ends in lanes:
             while ends and ends[-1] <= start:
                 ends.pop()
-        fits = (not ends or (end <= ends[-1] and len(family) == 1) for ends in open_until)
-        number = next((number for number, fit in enumerate(fits) if fit), len(lanes))
-        if number == len(lanes):
-            lanes.append([])
-            open_until.append([])
-        lanes[number].extend(family)
-        open_until[number].append(end)
-    return lanes or [[]]
+        fitting = (one for one in lanes if not one[1] or (end <= one[1][-1] and len(family) == 1))
+        if (lane := next(fitting, None)) is None:
+            lanes.append(lane := ([], []))
+        lane[0].extend(family)
+        lane[1].append(end)
+    return [slices for slices, _ in lanes] or [[]]
 
 
 def _events(uuid: int, lane: list[Slice]) -> Iterator[bytes]:
@@ -307,8 +306,8 @@ def _events(uuid: int, lane: list[Slice]) -> Iterator[bytes]:
         begin = [_integer(9, INSTANT if one.end is None else BEGIN), _integer(11, uuid)]
         begin.append(_text(23, one.name))
         begin += [_argument(*item) for item in one.arguments.items() if item[1] is not None]
-        begin += [_fixed64(47, flow) for flow in one.flows]
-        begin += [_fixed64(48, flow) for flow in one.ends_flows]
+        for number, flows in ((47, one.flows), (48, one.ends_flows)):
+            begin += [_varint(number << 3 | FIXED64) + flow.to_bytes(8, "little") for flow in flows]
         yield _packet(_integer(8, one.start) + _message(11, b"".join(begin)))
     while open_until:
         yield _packet(_integer(8, open_until.pop()) + end)
@@ -338,17 +337,10 @@ def _integer(number: int, value: int) -> bytes:
     return _varint(number << 3 | VARINT) + _varint(value & 0xFFFF_FFFF_FFFF_FFFF)
 
 
-def _fixed64(number: int, value: int) -> bytes:
-    return _varint(number << 3 | FIXED64) + value.to_bytes(8, "little")
-
-
 def _varint(value: int) -> bytes:
     """Seven bits a byte, the lowest first; the eighth says that more follow."""
-    if value <= 0x7F:
-        return value.to_bytes(1, "little")
     encoded = bytearray()
     while value > 0x7F:
         encoded.append(value & 0x7F | 0x80)
         value >>= 7
-    encoded.append(value)
-    return bytes(encoded)
+    return bytes((*encoded, value))

@@ -105,19 +105,16 @@ def timeline_of(
         pl.DataFrame(slots, schema=_SLOTS, orient="row"), how="cross", maintain_order="left_right"
     )
     stalls = events.table(recording.events, "machine_stall", ["cpu"])
+    at = pl.col("origin")
     return Timeline(
         threads=_threads(recording, flow, slices, analysis),
         slices=slices,
         holds=holds,
         origins=origins,
         slots=opened.select(
-            *("traversal", "server", "slot"),
-            start=pl.col("origin") + pl.col("opens"),
-            end=pl.col("origin") + pl.col("closes"),
+            "traversal", "server", "slot", start=at + pl.col("opens"), end=at + pl.col("closes")
         ),
-        stalls=stalls.select(
-            core=pl.col("cpu"), start=pl.col("time"), end=pl.col("time") + pl.col("duration")
-        ),
+        stalls=stalls.select(core="cpu", start="time", end=pl.col("time") + pl.col("duration")),
     )
 
 
@@ -287,8 +284,8 @@ def _chosen(traversals: pl.DataFrame, worst_ns: Sequence[int]) -> dict[str, int]
     """The longest, median and shortest undisturbed cycle, of all complete if all are disturbed; and
     that for which the recording was written, which the page shows first.
     """
-    worst = traversals.filter(pl.col("start").is_in(worst_ns))["traversal"].head(1)
-    first = {} if worst.is_empty() else {"first": int(worst[0])}
+    worst = traversals.filter(pl.col("start").is_in(worst_ns))["traversal"]
+    first = {"first": int(worst[0])} if len(worst) else {}
     complete = traversals.filter("complete")
     calm = complete.filter(~pl.col("disturbed"))
     ordered = (calm if calm.height else complete).sort("latency_ns", maintain_order=True)
