@@ -145,18 +145,6 @@ def test_arrows_lead_from_publications_to_the_callbacks_that_read_them(tmp_path:
     ]
 
 
-def test_a_live_run_loses_nothing_on_the_way(shaped: Recording, tmp_path: Path) -> None:
-    measured = measure_latency(shaped)
-    trace = _exported(measured, tmp_path)
-    _same_counts(shaped, trace)
-    complete = measured.analysis.traversals.filter("complete")
-    cycles = [one for one in trace.slices("Chain") if one[0].startswith("cycle")]
-    latencies = [end - start for _, start, end, _ in cycles]
-    assert latencies == complete["latency_ns"].to_list()
-    stalls = trace.slices("Stalls of the machine")
-    assert len(stalls) == shaped.events["machine_stall"].height
-
-
 @pytest.mark.parametrize("name", ["jazzy_chain_fastrtps_async", "humble_sync"])
 def test_real_traces_lose_nothing_on_the_way(name: str, tmp_path: Path) -> None:
     recording = open_source(reference_folder(name) / "trace")
@@ -164,9 +152,18 @@ def test_real_traces_lose_nothing_on_the_way(name: str, tmp_path: Path) -> None:
 
 
 def test_incomplete_cycles_are_marked_where_they_began(tmp_path: Path) -> None:
-    trace = _exported(measure_latency(known_run(tmp_path / "known", untaken=(1,))), tmp_path)
+    recording = known_run(tmp_path / "known", untaken=(1,))
+    trace = _exported(measure_latency(recording), tmp_path)
     marks = [(time, name) for _, time, kind, name, _ in trace.events if kind == INSTANT]
     assert (PERIOD_NS + MS, "cycle 1 incomplete: lost") in marks
+    (cycle,) = (event for *_, name, event in trace.events if name == "cycle 0")
+    values = {one.name: one.int_value for one in cycle.debug_annotations}
+    assert values["latency_ns"] == LATENCY_NS
+    snapshot = trace.whole.packet[0].clock_snapshot.clocks
+    clocks = {clock.clock_id: clock.timestamp for clock in snapshot}
+    builtin = SCHEMA.BuiltinClock.Value
+    wall = clocks[builtin("BUILTIN_CLOCK_REALTIME")] - clocks[builtin("BUILTIN_CLOCK_BOOTTIME")]
+    assert wall == recording.info.clock_offset_ns
 
 
 intervals = st.lists(
@@ -198,34 +195,20 @@ def test_names_and_arguments_arrive_as_they_are(name: str, number: int, truth: b
     assert (third.name, third.string_value) == ("text", name)
 
 
-def test_cycles_have_their_latency_and_clocks_their_offset(tmp_path: Path) -> None:
-    recording = known_run(tmp_path / "known", cycles=2)
-    trace = _exported(measure_latency(recording), tmp_path)
-    (cycle,) = (event for *_, name, event in trace.events if name == "cycle 0")
-    values = {one.name: one.int_value for one in cycle.debug_annotations}
-    assert values["latency_ns"] == LATENCY_NS
-    snapshot = trace.whole.packet[0].clock_snapshot.clocks
-    clocks = {clock.clock_id: clock.timestamp for clock in snapshot}
-    builtin = SCHEMA.BuiltinClock.Value
-    wall = clocks[builtin("BUILTIN_CLOCK_REALTIME")] - clocks[builtin("BUILTIN_CLOCK_BOOTTIME")]
-    assert wall == recording.info.clock_offset_ns
-
-
 def test_the_command_writes_it_and_never_over_another(tmp_path: Path) -> None:
-    known = known_run(tmp_path / "known")
-    file = tmp_path / "trace.pftrace"
+    known, file = known_run(tmp_path / "known"), tmp_path / "trace.pftrace"
     finished = called("export", "--perfetto", known.path, "-o", file)
     assert (finished.code, finished.out) == (0, f"{file}\n")
     written = file.read_bytes()
     assert [name for name, *_ in _Trace(written).slices("Chain") if "cycle" in name]
-    again = refused(2, "export", "--perfetto", known.path, "-o", file)
-    assert "exists already and is not overwritten" in again
+    for words, output, said in (
+        (["--perfetto"], "trace.pftrace", "exists already and is not overwritten"),
+        ([], "x.pftrace", "add --perfetto"),
+        (["--perfetto"], "trace.json", "ends in .pftrace or .perfetto-trace"),
+        (["--perfetto"], "no/t.pftrace", "no such folder to write t.pftrace into"),
+    ):
+        assert said in refused(2, "export", *words, known.path, "-o", tmp_path / output)
     assert file.read_bytes() == written
-    assert "add --perfetto" in refused(2, "export", known.path, "-o", tmp_path / "x.pftrace")
-    wrong = refused(2, "export", "--perfetto", known.path, "-o", tmp_path / "trace.json")
-    assert "ends in .pftrace or .perfetto-trace" in wrong
-    absent = refused(2, "export", "--perfetto", known.path, "-o", tmp_path / "no" / "t.pftrace")
-    assert "no such folder to write t.pftrace into" in absent
 
 
 def test_mcap_has_every_callback_and_every_cycle(tmp_path: Path) -> None:
@@ -259,9 +242,8 @@ def test_mcap_has_every_callback_and_every_cycle(tmp_path: Path) -> None:
 
 
 def test_a_recording_without_a_chain_is_exported_without_one(tmp_path: Path) -> None:
-    known = known_run(tmp_path / "known", chain=None)
-    finished = called("export", "--perfetto", known.path, "-o", tmp_path / "t.pftrace")
-    assert finished.code == 0
-    trace = _Trace((tmp_path / "t.pftrace").read_bytes())
+    known, file = known_run(tmp_path / "known", chain=None), tmp_path / "t.pftrace"
+    assert called("export", "--perfetto", known.path, "-o", file).code == 0
+    trace = _Trace(file.read_bytes())
     assert trace.slices("Chain") == []
     _same_counts(known, trace)
