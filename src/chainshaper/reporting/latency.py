@@ -15,7 +15,6 @@ from chainshaper.reporting.tables import (
     YES_NO,
     Column,
     ResultTable,
-    count,
     counted,
     counts,
     figures,
@@ -238,40 +237,39 @@ def verdict(one: Measurement) -> tuple[bool | None, str]:
     judged, statistics, name = one.prediction, one.analysis.statistics, one.recording.path.name
     if judged is None or one.plan is None:
         return None, f"{name}: no plan was in force, so nothing was promised"
-    left_out = statistics.disturbed
-    aside = f"; without {left_out} of {statistics.count} cycles, disturbed by the machine"
-    aside = aside if left_out else ""
+    aside = f"; without {statistics.disturbed} of {statistics.count} cycles, disturbed by the"
+    aside = f"{aside} machine" if statistics.disturbed else ""
     if judged.broken:
         return False, f"{name}: promise broken: {'; '.join(judged.broken)}{aside}"
     if judged.mean.measured_ns is None:
         return None, f"{name}: no undisturbed cycle to judge the promise by{aside}"
-    late, of_all = "", judged.late_of_all
-    if of_all is not None:
-        late = f", {of_all} of {judged.cycles} outputs late"
-    jitter = f"jitter {ms(judged.jitter.measured_ns)} ms"
+    of_all, jitter = judged.late_of_all, f"jitter {ms(judged.jitter.measured_ns)} ms"
+    late = "" if of_all is None else f", {of_all} of {judged.cycles} outputs late"
     return True, f"{name}: promise met: {jitter}{late} ({expected_text(one.plan)}){aside}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
     """What happened to cycles, a cell for each measurement."""
-    rows: dict[str, list[str]] = {}
+    columns = []
     for one in measurements:
         statistics, info = one.analysis.statistics, one.recording.info
-        watched = one.longest_stall_ns is not None
-        for title, cell in (
-            ("complete", str(statistics.count)),
-            ("disturbed by the machine", str(statistics.disturbed) if watched else "not watched"),
-            ("incomplete", counts(one.analysis.incomplete)),
-            ("too late for their slot", counts(one.overruns, "not gated")),
-            ("next cycle hit", next_cycles(one.outcomes) if one.outcomes else ABSENT),
-            ("arrived during their slot", count(one.into_open_slots, "not gated")),
-            ("messages lost at the gate", counts(one.dropped, "not gated")),
-            ("begun without publishing", str(one.analysis.silent)),
-            ("longest stall of the machine [ms]", ms(one.longest_stall_ns)),
-            ("lost while recording", str(sum(info.lost.values()))),
-            ("real-time scheduling", YES_NO.get(info.realtime, ABSENT)),
-        ):
-            rows.setdefault(title, []).append(cell)
+        watched, open_slots = one.longest_stall_ns is not None, one.into_open_slots
+        columns.append(
+            {
+                "complete": str(statistics.count),
+                "disturbed by the machine": str(statistics.disturbed) if watched else "not watched",
+                "incomplete": counts(one.analysis.incomplete),
+                "too late for their slot": counts(one.overruns, "not gated"),
+                "next cycle hit": next_cycles(one.outcomes) if one.outcomes else ABSENT,
+                "arrived during their slot": "not gated" if open_slots is None else str(open_slots),
+                "messages lost at the gate": counts(one.dropped, "not gated"),
+                "begun without publishing": str(one.analysis.silent),
+                "longest stall of the machine [ms]": ms(one.longest_stall_ns),
+                "lost while recording": str(sum(info.lost.values())),
+                "real-time scheduling": YES_NO.get(info.realtime, ABSENT),
+            }
+        )
+    rows = {title: [own[title] for own in columns] for title in columns[0]}
     moves = [moves_in(one.analysis) for one in measurements]
     if any(moves):
         rows["slots followed latencies"] = [moves_text(own) if own else ABSENT for own in moves]
@@ -294,7 +292,8 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
         return f"{said}; differs from the prediction: {'; '.join(judged.broken)}."
     holds = {one.holds for one in (judged.mean, judged.max, judged.jitter)}
     verdict = "not judged" if holds == {None} else "as predicted"
-    return f"{said}; {verdict}, {count(judged.late_of_all)} of {judged.cycles:,} late."
+    late = ABSENT if judged.late_of_all is None else judged.late_of_all
+    return f"{said}; {verdict}, {late} of {judged.cycles:,} late."
 
 
 def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ()) -> ResultTable:
@@ -306,7 +305,7 @@ def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ())
     for chain in comparisons:
         found = [one.analysis for one in chain.measurements]
         times = (getattr(one.undisturbed, field) for field in fields.values() for one in found)
-        table.add(chain.chain, *map(ms, times), *(count(one.statistics.late) for one in found))
+        table.add(chain.chain, *map(ms, times), *(one.statistics.late for one in found))
     return table
 
 
@@ -392,10 +391,10 @@ def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
         columns.append(Column("share", footer=percent(share)))
     table = ResultTable("Where it goes, hop by hop [ms]", columns)
     for row in frame.iter_rows(named=True):
-        cells = [f"{row['callback']} → {row['topic']}", str(row["count"])]
+        cells: list[str] = []
         for part in PARTS:
             cells += [*min_mean_max(row[f"{part}_ns"]), percent(row[f"{part}_share"])]
-        table.add(*cells)
+        table.add(f"{row['callback']} → {row['topic']}", row["count"], *cells)
     return table
 
 
@@ -403,10 +402,9 @@ def incomplete_table(names: Sequence[str], measurements: Sequence[Measurement]) 
     """Why cycles have no latency, with the first cycles' numbers; no row where all have one."""
     table = ResultTable("", [*words("", "reason", "at"), *figures("cycles", "numbers")])
     for name, measurement in zip(names, measurements, strict=True):
-        broken = measurement.analysis.traversals.filter(pl.col("reason").is_not_null())
+        broken = measurement.analysis.traversals.drop_nulls("reason")
         grouped = broken.group_by("reason", "broken_at", maintain_order=True).agg("traversal")
         for reason, topic, numbers in grouped.iter_rows():
             first = ", ".join(map(str, numbers[:5])) + (", …" if len(numbers) > 5 else "")
-            what = f"{reason}: {REASONS[reason]}"
-            table.add(name, what, topic or ABSENT, str(len(numbers)), first)
+            table.add(name, f"{reason}: {REASONS[reason]}", topic, len(numbers), first)
     return table

@@ -22,7 +22,6 @@ from chainshaper.reporting.tables import (
     YES_NO,
     Column,
     ResultTable,
-    count,
     counted,
     figures,
     listed,
@@ -128,16 +127,16 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
     for name in measured:
         columns += figures(*(f"{name}\n{figure}" for figure in ("min", "mean", "max")))
     table = ResultTable("Callbacks [ms]", columns)
-    rows = statistics.to_dicts()
-    triggers = [f"{r['kind']} {trigger_text(r['topic'], r['period_ns'])}".rstrip() for r in rows]
-    keys = [(row["pid"], row["node"], own) for own, row in zip(triggers, rows, strict=True)]
-    alike = Counter(keys)
-    for key, trigger, row in zip(keys, triggers, rows, strict=True):
-        symbol = short_symbol(row["symbol"])
+    rows = []
+    for row in statistics.to_dicts():
+        trigger = f"{row['kind']} {trigger_text(row['topic'], row['period_ns'])}".rstrip()
+        rows.append(((row["pid"], row["node"], trigger), row))
+    alike = Counter(key for key, _ in rows)
+    for key, row in rows:
+        symbol, trigger = short_symbol(row["symbol"]), key[2]
         shown = f"{trigger} ({symbol})" if symbol and alike[key] > 1 else trigger
         times = (cell for name in measured for cell in min_mean_max(row[f"{name}_ns"]))
-        cells = (row["node"] or "", shown, symbol, listed(row["tids"]), str(row["count"]))
-        table.add(*cells, *times)
+        table.add(row["node"] or "", shown, symbol, listed(row["tids"]), row["count"], *times)
     return table
 
 
@@ -210,16 +209,11 @@ def threads_table(allocation: Allocation) -> ResultTable:
         known_by, names = [found.known_by or "-"], [name for _, name in found.callbacks]
         if first and found.nodes:
             known_by.append(f"node: {found.nodes_known_by or None}")
-        table.add(
-            "" if same_nodes else ", ".join(found.nodes) or UNKNOWN,
-            str(thread.pid) if first else "",
-            str(thread.tid),
-            thread.comm,
-            f"DDS {thread.kind}" if thread.role == "dds" else ", ".join((thread.role, *names)),
-            scheduling_text(thread.policy, thread.priority),
-            core_ranges(thread.cores),
-            "; ".join(known_by),
-        )
+        role = f"DDS {thread.kind}" if thread.role == "dds" else ", ".join((thread.role, *names))
+        scheduling = scheduling_text(thread.policy, thread.priority), core_ranges(thread.cores)
+        nodes = "" if same_nodes else ", ".join(found.nodes) or UNKNOWN
+        who = thread.pid if first else "", thread.tid, thread.comm
+        table.add(nodes, *who, role, *scheduling, "; ".join(known_by))
         above = found
     return table
 
@@ -276,8 +270,9 @@ def stall_table(meter: StallMeterInfo, stalls: pl.DataFrame) -> ResultTable:
     table = ResultTable("", [*words(""), *figures(*titles)])
     for row in stall_rows(meter, stalls):
         times = ms(row["total_ns"]), ms(row["longest_ns"] or None)
-        usual = f"{row['median_wakeup_ns'] / 1e3:.0f}"
-        table.add(f"core {row['core']}", str(row["count"]), *times, usual)
+        table.add(
+            f"core {row['core']}", row["count"], *times, f"{row['median_wakeup_ns'] / 1e3:.0f}"
+        )
     return table
 
 
@@ -355,8 +350,8 @@ def recorded_thread_table(threads: Sequence[ThreadInfo]) -> ResultTable:
     columns = [*words("node", "thread", "role"), *figures("pid", "tid")]
     table = ResultTable("", [*columns, *words("scheduling"), *figures("cores")])
     for one in sorted(threads, key=lambda thread: (thread.node, thread.tid)):
-        where = str(one.pid), str(one.tid), f"{one.policy} {one.priority}"
-        table.add(one.node, one.comm, one.role, *where, listed(one.cores))
+        scheduling = f"{one.policy} {one.priority}", listed(one.cores)
+        table.add(one.node, one.comm, one.role, one.pid, one.tid, *scheduling)
     return table
 
 
@@ -364,14 +359,13 @@ def plan_table(plan: Plan) -> ResultTable:
     """Servers and slots of a plan."""
     columns = [*words("server"), *figures("core", "priority"), *words("slots", "threads")]
     table = ResultTable(f"Plan for {plan.chain.spec or 'a chain'} [ms]", columns)
-    for server in plan.servers:
+    for one in plan.servers:
         threads = []
-        for thread in server.threads:
+        for thread in one.threads:
             publishes = thread.role == "publisher"
             what = "publisher" if publishes else ", ".join(thread.callbacks)
             threads.append(f"{thread.node} ({what})" if what else thread.node)
-        where = str(server.core), str(server.priority)
-        table.add(server.name, *where, slots_ms(*server.slots), ", ".join(threads))
+        table.add(one.name, one.core, one.priority, slots_ms(*one.slots), ", ".join(threads))
     offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
     table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_text(plan)}"
     return table
@@ -434,13 +428,13 @@ def servers_table(state: RunState) -> ResultTable:
             table.caption += f"; the chain's start has drifted by {state.drift_ns / 1e6:+.3f} ms"
         for move in {one.chain: one for one in state.moves}.values():
             table.caption += f"; {move.text}"
-    for server in state.servers:
-        more = len(server.slots) - MOST_SLOTS  # of several chains, over the hyper-period
-        slots = " ".join(map(slot_text, server.slots[:MOST_SLOTS]))
+    for one in state.servers:
+        more = len(one.slots) - MOST_SLOTS  # of several chains, over the hyper-period
+        slots = " ".join(map(slot_text, one.slots[:MOST_SLOTS]))
         slots += f" and {more} more" if more > 0 else ""
-        cells = [server.name, str(server.core), str(server.priority), slots]
-        cells += [listed(server.threads) or "none", server.kept_by]
-        table.add(*cells, *_counted(server).values())
+        threads = listed(one.threads) or "none"
+        about = one.name, one.core, one.priority, slots, threads, one.kept_by
+        table.add(*about, *_counted(one).values())
     return table
 
 
@@ -449,8 +443,7 @@ def run_line(state: RunState) -> str:
     parts = []
     for server in state.servers:
         known = [f"{key} {value}" for key, value in _counted(server).items() if value != "-"]
-        if known:
-            parts.append(f"{server.name}: {', '.join(known)}")
+        parts += [f"{server.name}: {', '.join(known)}"] if known else []
     return "; ".join(parts) or f"in force with {state.back_end}"
 
 
@@ -496,10 +489,9 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
         names = ("cycles", "min", "p50", "p99", "max", "jitter", "late", "incomplete")
         table = ResultTable(title, [*words("last [ms]"), *figures(*names)], one.problem)
         for span, own in one.spans.items():
-            percentiles = (ms(own.percentiles_ns.get(which)) for which in ("50", "99"))
-            late = count(own.late)
-            values = (ms(own.min_ns), *percentiles, ms(own.max_ns), ms(own.jitter_ns), late)
-            table.add(span, str(own.count), *values, str(own.incomplete))
+            middle = (own.percentiles_ns.get(which) for which in ("50", "99"))
+            times = map(ms, (own.min_ns, *middle, own.max_ns, own.jitter_ns))
+            table.add(span, own.count, *times, own.late, own.incomplete)
         tables.append(table)
         if one.hops:
             hops = ResultTable("", [*words("node", "topic"), *figures("waits", "computes")])
@@ -520,21 +512,18 @@ def fleet_table(judged: "Sequence[Sequence[Judged]]") -> ResultTable:
     rows = [(own, [one for one in own if not one.met]) for own in judged if own]
     for own, broken in sorted(rows, key=lambda row: -len(row[1])):
         first = broken[0].text if broken else ""
-        table.add(own[0].recording, str(len(own)), str(len(broken)), first)
+        table.add(own[0].recording, len(own), len(broken), first)
     return table
 
 
 def broken_table(broken: "Sequence[Judged]") -> ResultTable:
     """Limits of a budget that are broken, and why."""
-    names = ("recording", "where", "limit")
-    title = "Limits that are broken"
-    table = ResultTable(title, [*words(*names), *figures("budget", "found"), *words("because")])
+    columns = [*words("recording", "where", "limit"), *figures("budget", "found")]
+    table = ResultTable("Limits that are broken", [*columns, *words("because")])
     for one in broken:
-        limit, found = (
-            ABSENT if value is None else percent(value) if one.what == "missing" else ms(value)
-            for value in (one.limit, one.found)
-        )
-        table.add(one.recording, one.where, one.what, limit, found, one.because or "")
+        shown = percent if one.what == "missing" else ms
+        values = shown(one.limit), shown(one.found)
+        table.add(one.recording, one.where, one.what, *values, one.because or "")
     return table
 
 
@@ -548,8 +537,8 @@ def changes_table(changes: Iterable[WantedScheduling]) -> ResultTable:
         if wanted.priority is not None:
             scheduling = scheduling_text(POLICIES[wanted.policy], wanted.priority)
         cores = listed(wanted.cores) if wanted.cores else "as they are"
-        cells = [", ".join(one.thread.nodes), str(thread.pid), str(thread.tid), thread.comm]
-        table.add(*cells, thread.role, one.server or "", scheduling, cores, one.reason)
+        about = ", ".join(one.thread.nodes), thread.pid, thread.tid, thread.comm, thread.role
+        table.add(*about, one.server or "", scheduling, cores, one.reason)
     return table
 
 
@@ -559,10 +548,7 @@ def sweep_table(frame: pl.DataFrame) -> ResultTable:
     names = [name.removesuffix("_ns") for name in (*axes, *SWEEP_FIGURES.values())]
     table = ResultTable("Simulated end-to-end latency [ms]", figures(*names))
     for row in frame.head(MOST_ROWS).to_dicts():
-        found = [
-            ms(row[name]) if row[name] is None or name.endswith("_ns") else str(row[name])
-            for name in SWEEP_FIGURES
-        ]
+        found = [ms(row[n]) if n.endswith("_ns") else row[n] for n in SWEEP_FIGURES]
         if row["error"] is not None:
             found = ["failed", *([""] * (len(found) - 1))]
         table.add(*(sweep_value(name, row[name]) for name in axes), *found)

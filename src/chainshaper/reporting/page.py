@@ -303,7 +303,7 @@ def _overruns(part: _Part) -> str:
     columns = [*words("policy"), *figures("late", "discarded", "next cycle hit")]
     outcomes = ResultTable("", columns)
     for policy, one in measurement.outcomes.items():
-        outcomes.add(policy, str(one.late), str(one.discarded), next_cycles({policy: one}))
+        outcomes.add(policy, one.late, one.discarded, next_cycles({policy: one}))
     about += outcomes.html() if outcomes.rows else ""
     latencies = measurement.analysis.traversals.select("traversal", "latency_ns")
     late = part.timeline.holds.filter(pl.col("overrun").is_not_null()).join(
@@ -315,7 +315,7 @@ def _overruns(part: _Part) -> str:
     table = ResultTable("", [*columns, *figures("latency [ms]")])
     shown = late.select("traversal", "arrival", "origin", "overrun", "latency_ns").head(LISTED)
     for cycle, arrival, origin, done, latency in shown.iter_rows():
-        table.add(str(cycle), ms(arrival - origin), done, ms(latency))
+        table.add(cycle, ms(arrival - origin), done, ms(latency))
     rest = f"The first {LISTED} of {late.height} are listed." if late.height > LISTED else ""
     return about + table.html() + _paragraph(rest)
 

@@ -62,9 +62,11 @@ class ResultTable:
     caption: str | None = None
     rows: list[_Row] = field(default_factory=list)
 
-    def add(self, *cells: Cell, detail: bool = False) -> None:
-        """A row: a cell per column."""
-        self.rows.append(_Row(cells, detail))
+    def add(self, *cells: Cell | int | None, detail: bool = False) -> None:
+        """A row: a cell per column. What is not known (None) has a dash."""
+        known = (ABSENT if one is None else one for one in cells)
+        texts = tuple(one if isinstance(one, Text) else str(one) for one in known)
+        self.rows.append(_Row(texts, detail))
 
     def group(self, title: str, *, detail: bool = False) -> None:
         """A title over the rows that follow."""
@@ -109,14 +111,15 @@ class ResultTable:
 
     def _table(self) -> RichTable:
         used = [number for number, column in enumerate(self.columns) if not column.detail]
+        columns = [self.columns[number] for number in used]
         table = RichTable(
             title=plain(self.title, "table.title"),
             caption=plain(self.caption, "table.caption"),
             title_justify="left",
-            show_header=any(column.title for column in self.columns),
-            show_footer=any(column.footer for column in self.columns),
+            show_header=any(column.title for column in columns),
+            show_footer=any(column.footer for column in columns),
         )
-        for title, left, footer, _ in (self.columns[number] for number in used):
+        for title, left, footer, _ in columns:
             justify, overflow = ("left", "fold") if left else ("right", "ellipsis")
             table.add_column(plain(title), plain(footer), justify=justify, overflow=overflow)  # type: ignore[arg-type]
         indent = ""
@@ -161,14 +164,11 @@ class ResultTable:
         if row.title:
             width = len(self.columns)
             return f'<tr class="group"><th scope="colgroup" colspan="{width}">{first}</th></tr>'
-        cells = "".join(
-            f"<td{_kind(column.words)}{self._titled(column)}>{cell}</td>"
-            for column, cell in zip(self.columns[1:], others, strict=True)
-        )
+        cells = ""
+        for column, cell in zip(self.columns[1:], others, strict=True):
+            titled = f' data-title="{escape(column.title)}"' if self._wide else ""
+            cells += f"<td{_kind(column.words)}{titled}>{cell}</td>"
         return f'<tr><th scope="row">{first}</th>{cells}</tr>'
-
-    def _titled(self, column: Column) -> str:
-        return f' data-title="{escape(column.title)}"' if self._wide else ""
 
 
 def _kind(words: bool) -> str:
@@ -183,11 +183,6 @@ def plain(text: Any, style: str = "") -> Any:
 def ms(nanoseconds: float | None) -> str:
     """Milliseconds, where there are any."""
     return ABSENT if nanoseconds is None else milliseconds(nanoseconds)
-
-
-def count(number: int | None, absent: str = ABSENT) -> str:
-    """A number, where it is known."""
-    return absent if number is None else str(number)
 
 
 def counted(number: int, what: str) -> str:
