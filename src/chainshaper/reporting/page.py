@@ -104,8 +104,11 @@ def report_page(
     )
     blocks, drawn = [], []
     for number, chain in enumerate(chains):
-        named = zip(names, chain.measurements, strict=True)
-        parts = [_part(name, one, flows[id(one.recording)]) for name, one in named]
+        parts = []
+        for name, one in zip(names, chain.measurements, strict=True):
+            flow = flows[id(one.recording)]
+            timeline = timeline_of(one.recording, flow, one.analysis, one.plan)
+            parts.append(_Part(name, one, flow, timeline))
         data = _drawn(parts, cycles, number)
         places = _tables(parts, data["n"], several) | _beside_charts(parts, data["recordings"])
         blocks.append(Template(of_each).substitute(places, n=data["n"]))
@@ -128,10 +131,6 @@ def report_page(
         script=script,
         digest=digest,
     )
-
-
-def _part(name: str, one: Measurement, flow: DataFlow) -> _Part:
-    return _Part(name, one, flow, timeline_of(one.recording, flow, one.analysis, one.plan))
 
 
 def _plans_of(parts: Sequence[_Part]) -> dict[str, Plan]:
@@ -381,7 +380,7 @@ def latency_range(recordings: Sequence[dict[str, Any]]) -> tuple[float, float]:
     """The range of undisturbed latencies and slots, with a little air."""
     ends = [end for one in recordings for slot in one["slots"] for end in slot]
     for histogram in (one["histogram"] for one in recordings if one["histogram"]["bin"]):
-        first, *_, last = histogram["bin"][0], histogram["bin"][-1]
+        first, last = histogram["bin"][0], histogram["bin"][-1]
         ends += [first * histogram["width"], (last + 1) * histogram["width"]]
     if not ends:
         return 0, 1e6
@@ -412,11 +411,10 @@ def _hop_bars(parts: Sequence[_Part]) -> dict[str, Any]:
 def _slot_bars(plan: Plan) -> dict[str, Any]:
     """The servers' slots over one cycle, a row per server."""
     rows = []
-    for server in plan.servers:
-        look = "series-1" if server.slots == publish_slots(plan) else "slot"
-        texts = [f"{server.name}\n{slots_ms(slot)} ms" for slot in server.slots]
-        bars = [(*slot, look, 1, text) for slot, text in zip(server.slots, texts, strict=True)]
-        rows.append((f"{server.name}: core {server.core}, priority {server.priority}", bars))
+    for one in plan.servers:
+        look = "series-1" if one.slots == publish_slots(plan) else "slot"
+        bars = [(*slot, look, 1, f"{one.name}\n{slots_ms(slot)} ms") for slot in one.slots]
+        rows.append((f"{one.name}: core {one.core}, priority {one.priority}", bars))
     return {"label": "in the cycle", "length": plan.cycle_ns, "zoom": "x", "rows": rows}
 
 
@@ -432,8 +430,8 @@ def latency_points(traversals: pl.DataFrame, zero: int, limit: int = POINTS) -> 
         stretch = (pl.int_range(pl.len()) * stretches // pl.len()).alias("stretch")
         rows = complete.select("disturbed", "latency_ns", stretch).with_row_index("row")
         latency, groups = pl.col("latency_ns"), rows.group_by("stretch", "disturbed")
-        ends = ("row", latency.arg_min()), ("row", latency.arg_max())
-        extremes = [groups.agg(pl.col(row).get(place))[row] for row, place in ends]
+        places = (latency.arg_min(), latency.arg_max())
+        extremes = [groups.agg(pl.col("row").get(place))["row"] for place in places]
         sample = pl.arange(0, complete.height, -(-2 * complete.height // limit), eager=True)
         drawn = complete[pl.concat([*extremes, sample.cast(pl.UInt32)]).unique().sort()]
     broken = traversals.filter(~pl.col("complete"))["start"] - zero
