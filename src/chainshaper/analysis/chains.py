@@ -457,28 +457,22 @@ class _Search:
     def _counted_in(
         self, order: Mapping[Vertex, int], weights: Mapping[int, float]
     ) -> tuple[int, GraphPath, float]:
-        best: dict[State, tuple[int, float, State | None]] = {}
+        best: dict[State, tuple[int, GraphPath, float]] = {}
         for state in sorted(self.successors, key=lambda s: (order[s[0]], -s[1])):
             vertex = state[0]
             own = weights.get(vertex, 0.0) if isinstance(vertex, int) else 0.0
-            count, weight, chosen = (1, 0.0, None) if state in self.ends else (0, -1.0, None)
+            count, weight = (1, 0.0) if state in self.ends else (0, -1.0)
+            onward: GraphPath = ()
             for after in self.successors[state]:
                 if after in best and order[after[0]] < order[vertex]:
-                    paths, below, _ = best[after]
+                    paths, path, below = best[after]
                     count += paths
                     if paths and below > weight:
-                        weight, chosen = below, after
-            best[state] = (count, own + weight, chosen)
-        roots = [root for root in self.roots if best[root][0]]
-        if not roots:
-            return 0, (), 0.0
-        first = max(roots, key=lambda root: best[root][1])
-        heaviest: list[Vertex] = []
-        at: State | None = first
-        while at is not None:
-            heaviest.append(at[0])
-            at = best[at][2]
-        return sum(best[root][0] for root in roots), tuple(heaviest), best[first][1]
+                        onward, weight = path, below
+            best[state] = (count, (vertex, *onward), own + weight)
+        found = [best[root] for root in self.roots if best[root][0]]
+        _, heaviest, weight = max(found, key=lambda one: one[2], default=(0, (), 0.0))
+        return sum(count for count, _, _ in found), heaviest, weight
 
 
 def _distances(successors: Mapping[State, tuple[State, ...]], ends: set[State]) -> dict[State, int]:

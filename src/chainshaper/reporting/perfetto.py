@@ -216,20 +216,19 @@ def _messages(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
 
 def _chain_track(analysis: LatencyAnalysis) -> Track:
     """Traversals, each with the computation of its hops inside; incomplete ones as instants."""
-    nodes = {callback.id: callback.node for callback in analysis.graph.callbacks}
-    hops: dict[int, list[Slice]] = {}
+    path, hops = analysis.graph.path(analysis.chain), defaultdict[int, list[Slice]](list)
     for row in analysis.hops.drop_nulls("publish").sort("traversal", "hop").iter_rows(named=True):
-        name = f"{nodes[row['callback_id']]} → {row['topic']}"
+        name = f"{path[row['hop']].node} → {row['topic']}"
         arguments = {"communication_ns": row["communication_ns"], "via": row["via"]}
         hop = Slice(row["start"], row["publish"], name, arguments)
-        hops.setdefault(row["traversal"], []).append(hop)
+        hops[row["traversal"]].append(hop)
     families = []
     for row in analysis.traversals.iter_rows(named=True):
         number = row["traversal"]
         if row["complete"]:
             arguments = {key: row[key] for key in ("latency_ns", "disturbed", "reception_ns")}
             whole = Slice(row["start"], row["end"], f"cycle {number}", arguments)
-            families.append([whole, *hops.get(number, ())])
+            families.append([whole, *hops[number]])
         else:
             what = f"cycle {number} incomplete: {row['reason']}"
             families.append([Slice(row["start"], None, what, {"topic": row["broken_at"]})])
@@ -238,7 +237,7 @@ def _chain_track(analysis: LatencyAnalysis) -> Track:
 
 def _gate_tracks(analysis: LatencyAnalysis, timeline: Timeline) -> Iterator[Track]:
     """What the shaping nodes retained, from arrival until they let it go (or gave it up)."""
-    nodes = {callback.id: callback.node for callback in analysis.graph.callbacks}
+    path = analysis.graph.path(analysis.chain)
     for (hop,), rows in timeline.holds.group_by("hop", maintain_order=True):
         families = []
         for row in rows.iter_rows(named=True):
@@ -247,7 +246,7 @@ def _gate_tracks(analysis: LatencyAnalysis, timeline: Timeline) -> Iterator[Trac
             arguments |= {"behind_plan_ns": late, "overrun": row["overrun"]}
             name = "in the gate" if row["overrun"] is None else f"overran: {row['overrun']}"
             families.append([Slice(row["arrival"], row["let_go"], name, arguments)])
-        yield Track("Gate", nodes[analysis.chain.callbacks[hop]], families)
+        yield Track("Gate", path[hop].node, families)
 
 
 def encode_trace(tracks: Sequence[Track], clock_offset_ns: int) -> Iterator[bytes]:
