@@ -323,8 +323,8 @@ def test_files_that_are_no_caret_architecture(tmp_path: Path, text: str) -> None
 def test_two_callbacks_on_one_topic_do_not_synchronise_it_with_itself() -> None:
     """Of two subscriptions of a node to one topic only one publishes: there is one path."""
     story = Story()
-    source, worker = story.node("/source", 1), story.node("/worker", 2)
-    timer, big = story.timer(source), story.publisher(source, "/big")
+    timer, big = story.source("/source", 1, "/big")
+    worker = story.node("/worker", 2)
     works, logs = story.subscription(worker, "/big"), story.subscription(worker, "/big")
     out = story.publisher(worker, "/out")
     story.runs(timer, 1_000, 1_200, writes=((big, 1_100),))
@@ -333,4 +333,4 @@ def test_two_callbacks_on_one_topic_do_not_synchronise_it_with_itself() -> None:
     graph = application_graph(story.tables())
     chain = find_chain(graph, "/big../out")
     assert chain.topics == ("/big", "/out")
-    assert graph.callbacks[chain.callbacks[1]].publishes == ("/out",)
+    assert graph.path(chain)[1].publishes == ("/out",)

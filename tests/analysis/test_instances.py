@@ -39,26 +39,6 @@ def test_overlapping_instances_of_processes_and_threads() -> None:
     assert pairs(story) == [(11, 10, 30), (2, 11, 40), (12, 12, 20)]
 
 
-@pytest.mark.parametrize(
-    ("happenings", "expected"),
-    [
-        # An end whose start was before the recording; a lost end; one that is still running.
-        ("e5 s10 s30 e40 s50", [(1, 10, None), (1, 30, 40), (1, 50, None)]),
-        # As a saturated simulation has them: every end is the next start.
-        ("s0 e10 s10 e20 s20 e30", [(1, 0, 10), (1, 10, 20), (1, 20, 30)]),
-        ("s10 e10 s20 e20", [(1, 10, 10), (1, 20, 20)]),  # they take no time
-    ],
-)
-def test_lost_events_and_equal_times(
-    happenings: str, expected: list[tuple[int, int, int | None]]
-) -> None:
-    story = Story()
-    timer = one_timer(story)
-    for one in happenings.split():
-        (story.start if one[0] == "s" else story.end)(timer, int(one[1:]))
-    assert pairs(story) == expected
-
-
 Happenings = list[tuple[int, int, int]]
 
 

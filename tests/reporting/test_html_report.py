@@ -44,7 +44,8 @@ class _Reader(HTMLParser):
         self.scripts: list[str] = []
         self.addresses: list[str] = []
         self.text: list[str] = []
-        self._section, self._cell, self._script = "header", False, False
+        self._section = "header"
+        self._into: list[str] | None = None  # whose last text goes on
         self.feed(page)
 
     @property
@@ -52,34 +53,26 @@ class _Reader(HTMLParser):
         return json.loads(self.scripts[0])[0]
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.addresses += [
-            value or "" for name, value in attrs if name in ("src", "href", "action")
-        ]
-        assert not [name for name, _ in attrs if name.startswith("on")], "a handler as an attribute"
+        about = dict(attrs)
+        self.addresses += [about[name] or "" for name in ("src", "href", "action") if name in about]
+        assert not [name for name in about if name.startswith("on")], "a handler as an attribute"
         if tag == "section":
-            self._section = dict(attrs)["id"] or ""
+            self._section = about["id"] or ""
         elif tag == "tr":
             self.rows.setdefault(self._section, []).append([])
-        elif tag in ("td", "th"):
-            self._cell = True
-            self.rows[self._section][-1].append("")
-        elif tag == "script":
-            self._script = True
-            self.scripts.append("")
+        elif tag in ("td", "th", "script"):
+            self._into = self.scripts if tag == "script" else self.rows[self._section][-1]
+            self._into.append("")
 
     def handle_endtag(self, tag: str) -> None:
-        if tag in ("td", "th"):
-            self._cell = False
-        elif tag == "script":
-            self._script = False
+        if tag in ("td", "th", "script"):
+            self._into = None
 
     def handle_data(self, data: str) -> None:
-        if self._script:
-            self.scripts[-1] += data
-        elif self._cell:
-            self.rows[self._section][-1][-1] += data
-        else:
+        if self._into is None:
             self.text.append(data)
+        else:
+            self._into[-1] += data
 
 
 def _report(*measurements: Measurement) -> _Reader:

@@ -358,10 +358,8 @@ class _Search:
         return self.wrong(f"{way}; from there the data gets as far as {_some(stops)}")
 
     def listed(self, limit: int) -> tuple[tuple[GraphPath, ...], bool, int]:
-        """Up to ``limit`` paths, whether they are all, and how many were met on the way.
-
-        Where there are cycles, the shortest ones come first.
-        """
+        """Up to ``limit`` paths (with cycles the shortest ones), whether they are all, and how many
+        were met on the way."""
         shortest, met = list[GraphPath](), 0
         if self.cyclic:
             shortest, met, complete = self._shortest(limit)
@@ -372,11 +370,8 @@ class _Search:
         return paths[:limit], complete, max(met, len(paths))
 
     def _depth_first(self, limit: int) -> tuple[list[GraphPath], bool]:
-        """Up to ``limit`` paths, and whether that is all.
-
-        Where there are cycles, every step goes where an end can still be reached without meeting
-        the path again.
-        """
+        """Up to ``limit`` paths, and whether that is all. Where there are cycles, every step goes
+        where an end can still be reached without meeting the path again."""
         found: list[GraphPath] = []
         searches = 0
         stack: list[tuple[GraphPath, State]] = [((), root) for root in reversed(self.roots)]
@@ -416,8 +411,7 @@ class _Search:
     def _shortest(self, limit: int) -> tuple[list[GraphPath], int, bool]:
         """The shortest paths: up to ``limit`` of them, how many were met, whether that is all.
 
-        Best first: the path goes on whose nearest end would make it the shortest, of several the
-        one that is there soonest.
+        Best first: the path goes on whose nearest end would make it the shortest.
         """
         found: list[GraphPath] = []
         met = step = 0
@@ -443,8 +437,8 @@ class _Search:
 
         Paths on which a response goes to another node than the request's count as well. If
         ``cyclic``, of those that never step back in one order of the vertices: that of a
-        depth-first search which goes to the nearest ends first, or, where more paths agree with
-        it, last. The latter's paths are longer, and there are more of them as a rule.
+        depth-first search which goes to the nearest ends first or, if more paths agree with it,
+        last.
         """
         orders = [self.order]
         if self.cyclic:

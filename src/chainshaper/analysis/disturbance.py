@@ -124,9 +124,7 @@ def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
 
 def _cycles_behind(cycle_ns: int | None) -> pl.Expr:
     """How long before the gate's cycle the one began in which the chain did: whole cycles (ns).
-
-    A chain may begin a little before its cycle does, by a tenth of it at most.
-    """
+    A chain may begin a little before its cycle does, by a tenth of it at most."""
     if cycle_ns is None:
         return pl.lit(0, dtype=pl.Int64)
     before = pl.col("origin") - pl.col("start") - cycle_ns // 10

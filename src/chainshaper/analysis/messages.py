@@ -296,11 +296,8 @@ def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFra
 
 
 def _enqueued(tables: events.EventTables, published: pl.DataFrame) -> pl.DataFrame:
-    """Every enqueue into a ring buffer: ``pid, buffer, index, enqueued, stored, overwrites``.
-
-    ``stored`` is the publication that was put there, ``overwrites`` whether the buffer was full,
-    so that its oldest message, which lay in this place, was lost.
-    """
+    """Every enqueue into a ring buffer: ``pid, buffer, index, enqueued, stored, overwrites``: the
+    publication that was put there, and whether the message that lay in this place was lost."""
     handed = published.drop_nulls("intra_time").select(
         "pid", "tid", "intra_time", stored="publication"
     )

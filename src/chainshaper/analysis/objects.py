@@ -109,11 +109,8 @@ def named_nodes(tables: events.EventTables) -> pl.DataFrame:
 
 
 def _with_node(objects: pl.DataFrame, nodes: pl.DataFrame, at: str) -> pl.DataFrame:
-    """Add ``node`` from ``node_handle`` at time ``at``.
-
-    Before Iron a node's /rosout publisher is created just before `rcl_node_init`: what has no
-    node before it belongs to the next one with that handle.
-    """
+    """Add ``node`` from ``node_handle`` at time ``at``. Before Iron a node's /rosout publisher is
+    created just before `rcl_node_init`: it belongs to the next node with that handle."""
     of_node = nodes.select("pid", "node", node_handle="handle", node_from="valid_from")
     found = latest_before(objects, of_node, ["pid", "node_handle"], at, "node_from")
     later = first_after(objects, of_node, ["pid", "node_handle"], at, "node_from")
@@ -260,10 +257,8 @@ def _callbackless(
 
 
 def _timers_of_python(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
-    """Timers that are called, but have no callback in the trace: rclpy.
-
-    No event says whose they are: it is taken to be the node that their process created last before.
-    """
+    """Timers that are called, but have no callback in the trace: rclpy. No event says whose they
+    are: it is taken to be the node that their process created last before."""
     timer = ["pid", "timer_handle"]
     called = events.table(tables, "rcl_timer_call").select(timer).unique()
     created = events.table(tables, "rcl_timer_init").join(called, on=timer, how="semi")

@@ -213,10 +213,8 @@ def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataF
 def _unless_active(
     flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback
 ) -> pl.DataFrame:
-    """Say so of traversals that stopped at this hop because its lifecycle node was not active.
-
-    They stop in the node, also where its subscription did not even exist.
-    """
+    """Say so of traversals that stopped at this hop because its lifecycle node was not active: in
+    the node, also where its subscription did not even exist."""
     changes = flow.objects.activity.filter(pid=callback.pid, node=callback.node)
     stopped = pl.col("reason").is_in(["not published", "lost", "not taken", "not executed"])
     stopped &= pl.col("broken_hop") == hop

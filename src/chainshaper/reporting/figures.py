@@ -183,10 +183,7 @@ def _new_figure(panels: int = 1) -> tuple[Any, Any]:
 
 
 def _save_figure(figure: Any, path: str | Path) -> Path:
-    """Write a figure, as its file's ending says, whole or not at all.
-
-    Raises OperationError: it cannot be written.
-    """
+    """Write a figure, as its file's ending says. Raises OperationError: it cannot be written."""
     from matplotlib.text import Text
 
     for text in figure.findobj(Text):

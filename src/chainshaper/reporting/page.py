@@ -180,10 +180,8 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
 
 
 def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str]:
-    """What a chain's tables say, by the places that the template has for them.
-
-    Of ``several`` chains each has a heading, and the first has the callbacks of all.
-    """
+    """What a chain's tables say, by the places that the template has for them. Of ``several``
+    chains each has a heading, and the first has the callbacks of all."""
     names = [one.name for one in parts]
     measurements = [one.measurement for one in parts]
     compared = Comparison(measurements[0].analysis.chain.spec, tuple(measurements))

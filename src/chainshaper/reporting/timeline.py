@@ -138,11 +138,8 @@ def _threads(
 
 
 def _origins(analysis: LatencyAnalysis | None, plan: Plan | None) -> pl.DataFrame:
-    """The gate says from when it counted; else the chain's stamp, or where cycles seem to start.
-
-    Cycles of which the recording says nothing are taken to start as
-    :mod:`chainshaper.analysis.disturbance` takes them.
-    """
+    """The gate says from when it counted; else the chain's stamp, or where cycles seem to start
+    (:mod:`chainshaper.analysis.disturbance`)."""
     if analysis is None or plan is None:
         return pl.DataFrame(schema=_ORIGINS)
     decided = analysis.decided.select("traversal", decided="origin")
@@ -253,10 +250,8 @@ def _bars(
 def _cycles(
     traversals: pl.DataFrame, hops: pl.DataFrame, slots: pl.DataFrame, zero: int
 ) -> Iterator[dict[str, Any]]:
-    """Each cycle in the page; its hops ``[row, take, start, publish, end]`` count from its start.
-
-    ``length`` is the time that it takes on the timeline, with its servers' slots.
-    """
+    """Each cycle in the page; its hops ``[row, take, start, publish, end]`` count from its start,
+    and ``length`` is the time that it takes on the timeline, with its servers' slots."""
     closes = dict(slots.group_by("traversal").agg(pl.col("end").max()).iter_rows())
     hops_of: dict[int, list[list[int | None]]] = {}
     for traversal, _, *hop in hops.iter_rows():

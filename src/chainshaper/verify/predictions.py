@@ -240,11 +240,8 @@ def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:
 
 
 def _outputs(slots: Sequence[Slot], analysis: LatencyAnalysis, judged: str) -> pl.DataFrame:
-    """Undisturbed complete traversals: ``judged_ns, place_ns, slot, mode, late``.
-
-    The slot is that which the gate released the message in; without a gate's events the last that
-    had started when the output came.
-    """
+    """Undisturbed complete traversals: ``judged_ns, place_ns, slot, mode, late``. The slot is that
+    which the gate released the message in, else the last that had started as the output came."""
     decided = analysis.decided.select("traversal", "slot", "mode", gated=True)
     started = [(pl.col("place_ns") >= start).cast(pl.Int32) for start, _ in slots]
     return analysis.calm.join(decided, on="traversal", how="left").select(
