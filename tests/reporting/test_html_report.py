@@ -17,12 +17,7 @@ from hypothesis import strategies as st
 from known import known as known_value
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 
-from chainshaper import (
-    compare_recordings,
-    hop_breakdown,
-    measure_latency,
-    save_plan,
-)
+from chainshaper import compare_recordings, hop_breakdown, measure_latency, save_plan
 from chainshaper.reporting.latency import headline
 from chainshaper.reporting.page import (
     distinct_names,
@@ -108,10 +103,7 @@ def page(known: Recording) -> _Reader:
             ["band 1", "[30.000, 31.000)", "30.020", "3 of 3 inside", "0.000", "100.0%", "100.0%"],
         ),
         ("stalls", ["core 1", "1", "2.000", "2.000", "30"]),
-        (
-            "callbacks",
-            ["/second", "subscription /t1", "", "2", "3", "10.001", "10.001", "10.001"],
-        ),
+        ("callbacks", ["/second", "subscription /t1", "", "2", "3", "10.001", "10.001", "10.001"]),
         ("plan-0", ["output", "1", "1", "[30.000, 31.000)", "/chainshaper_t2"]),
         ("conditions", ["host", "robot"]),
         ("conditions", ["RMW", "rmw_cyclonedds_cpp"]),

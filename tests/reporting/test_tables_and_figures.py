@@ -45,11 +45,7 @@ def comparison(tmp_path: Path, unshaped: Recording, shaped: Recording) -> Compar
 
 def test_brackets_are_shown_and_not_taken_for_markup(comparison: Comparison, plan: Plan) -> None:
     text = _text(comparison_table(comparison))
-    for words in (
-        "End-to-end latency of /t1../t3 [ms]",
-        "before [bold]",
-        "slots [21.000, 22.000)",
-    ):
+    for words in ("End-to-end latency of /t1../t3 [ms]", "before [bold]", "slots [21.000, 22.000)"):
         assert words in text
     assert "[21.000, 22.000)" in _text(plan_table(plan))
     values = comparison_json(comparison)

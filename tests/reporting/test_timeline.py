@@ -13,14 +13,7 @@ from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 from chainshaper import data_flow, measure_latency
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
-from chainshaper.reporting.timeline import (
-    BARS,
-    CYCLES,
-    KINDS,
-    Timeline,
-    timeline_data,
-    timeline_of,
-)
+from chainshaper.reporting.timeline import BARS, CYCLES, KINDS, Timeline, timeline_data, timeline_of
 from chainshaper.values.recording import Recording
 
 

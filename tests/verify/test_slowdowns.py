@@ -65,14 +65,7 @@ def slow(samples: list[Sample], before: list[Sample]) -> dict[str, Compared]:
 
 @pytest.mark.parametrize(
     "wishes",
-    [
-        {},
-        {"inputs": None},
-        {"lost": 37},
-        {"whole": 1.05},
-        {"whole": 0.93},
-        {"count": 240},
-    ],
+    [{}, {"inputs": None}, {"lost": 37}, {"whole": 1.05}, {"whole": 0.93}, {"count": 240}],
     ids=str,
 )
 def test_three_percent_in_one_callback_are_found(wishes: dict[str, Any]) -> None:

@@ -30,12 +30,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from traced_program import built
 
 from chainshaper import plan_recording
-from chainshaper.analysis import (
-    LatencyStatistics,
-    analyse_latency,
-    data_flow,
-    latency_statistics,
-)
+from chainshaper.analysis import LatencyStatistics, analyse_latency, data_flow, latency_statistics
 from chainshaper.cli import runs
 from chainshaper.gate import decision
 from chainshaper.planning import publish_slots
@@ -445,10 +440,7 @@ class Collector(BaseHTTPRequestHandler):
 
 def test_metrics_are_the_figures_that_are_shown() -> None:
     hour = latency_statistics(np.arange(5, 25) * 1_000_000, late=1)
-    hops = (
-        Hop("/first", "/ebpf1", 0.0, 2e6, (0, 2)),
-        Hop("/second", "/ebpf2", 1e6, 3e6, (1, 3)),
-    )
+    hops = (Hop("/first", "/ebpf1", 0.0, 2e6, (0, 2)), Hop("/second", "/ebpf2", 1e6, 3e6, (1, 3)))
     seen = seen_with(hour, 0, hops)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -419,10 +419,7 @@ def _with_assumed_writers(
     assumed = published.drop(columns).join(own, on=key, maintain_order="left")
     assumed = assumed.with_row_index("instance", offset=instances.height)
     more = assumed.select(
-        *(*columns, "pid", "tid"),
-        start="time",
-        intra_process=pl.lit(False),
-        assumed=pl.lit(True),
+        *(*columns, "pid", "tid"), start="time", intra_process=pl.lit(False), assumed=pl.lit(True)
     )
     published = published.with_columns(
         pl.coalesce(column, by_number(assumed, "publication", column, published.height))

@@ -397,8 +397,7 @@ def junit_report(judged: "Sequence[Judged | Compared]") -> str:
 
 
 def markdown_report(
-    judged: "Sequence[Judged | Compared]",
-    words: tuple[str, str, str] = ("limits", "broken", "met"),
+    judged: "Sequence[Judged | Compared]", words: tuple[str, str, str] = ("limits", "broken", "met")
 ) -> str:
     """GitHub-flavoured Markdown for a pull request: what breaks, and how many limits are met.
 

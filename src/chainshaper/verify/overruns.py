@@ -74,10 +74,7 @@ def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -
 
 
 def overruns_in(
-    recording: Recording,
-    plan: Plan | None,
-    analysis: LatencyAnalysis,
-    decided: pl.DataFrame | None,
+    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis, decided: pl.DataFrame | None
 ) -> dict[str, int] | None:
     """How many outputs overran, per policy that was applied to them; None: nothing was gated.
 

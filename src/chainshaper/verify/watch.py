@@ -57,12 +57,7 @@ from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
-from chainshaper.values.recording import (
-    InForceInfo,
-    Recording,
-    refuse_existing,
-    write_recording,
-)
+from chainshaper.values.recording import InForceInfo, Recording, refuse_existing, write_recording
 from chainshaper.verify.measure import PARTS
 from chainshaper.verify.predictions import due_of
 
