@@ -182,36 +182,29 @@ def _arrows(flow: DataFlow, end: str) -> dict[int, list[int]]:
 def _callbacks(flow: DataFlow, timeline: Timeline) -> Iterator[tuple[Thread, Slice]]:
     callbacks = {callback.id: callback for callback in graph_of(flow).callbacks}
     arrows = _arrows(flow, "instance")
-    for row in timeline.slices.iter_rows(named=True):
-        callback, instance = callbacks[row["callback_id"]], row["instance"]
-        arguments = {
-            "function": callback.symbol,
-            "instance": instance,
-            "execution_ns": row["execution_ns"],
-            "end": None if row["ended"] else "not recorded",
-        }
-        ending = arrows.get(instance, ())
-        one = Slice(row["start"], row["end"], callback.label, arguments, ends_flows=ending)
-        yield (row["pid"], row["tid"]), one
+    columns = ("pid", "tid", "callback_id", "instance", "start", "end", "ended", "execution_ns")
+    rows = timeline.slices.select(columns).iter_rows()
+    for pid, tid, number, instance, start, end, ended, used in rows:
+        one, arrived = callbacks[number], arrows.get(instance, ())
+        arguments = {"function": one.symbol, "instance": instance, "execution_ns": used}
+        arguments["end"] = None if ended else "not recorded"
+        yield (pid, tid), Slice(start, end, one.label, arguments, ends_flows=arrived)
 
 
 def _messages(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
     """Publications; takes whose message no callback got: its arrow ends at the take; and sends."""
     arrows = _arrows(flow, "publication")
-    for row in flow.publications.iter_rows(named=True):
-        flows = arrows.get(row["publication"], ())
-        arguments = {"publication": row["publication"], "source_timestamp": row["source_timestamp"]}
-        arguments["taken_by"] = len(flows)
-        one = Slice(row["time"], None, f"publish {row['topic']}", arguments, flows=flows)
-        yield (row["pid"], row["tid"]), one
-    unread = flow.takes.filter(pl.col("publication").is_not_null() & pl.col("instance").is_null())
-    for row in unread.iter_rows(named=True):
-        one = Slice(row["time"], None, f"take {row['topic']}", ends_flows=[row["take"] + 1])
-        yield (row["pid"], row["tid"]), one
+    columns = ("pid", "tid", "time", "topic", "publication", "source_timestamp")
+    for pid, tid, time, topic, number, stamp in flow.publications.select(columns).iter_rows():
+        flows = arrows.get(number, ())
+        arguments = {"publication": number, "source_timestamp": stamp, "taken_by": len(flows)}
+        yield (pid, tid), Slice(time, None, f"publish {topic}", arguments, flows=flows)
+    unread = flow.takes.drop_nulls("publication").filter(pl.col("instance").is_null())
+    for pid, tid, time, topic, take in unread.select(*columns[:4], "take").iter_rows():
+        yield (pid, tid), Slice(time, None, f"take {topic}", ends_flows=[take + 1])
     for row in events.table(flow.events, "asynchronous_send").iter_rows(named=True):
-        end = row["time"] + (row["duration"] or 0)
-        one = Slice(row["time"], end, row["outcome"], {"source_timestamp": row["timestamp"]})
-        yield (row["pid"], row["tid"]), one
+        end, about = row["time"] + (row["duration"] or 0), {"source_timestamp": row["timestamp"]}
+        yield (row["pid"], row["tid"]), Slice(row["time"], end, row["outcome"], about)
 
 
 def _chain_track(analysis: LatencyAnalysis) -> Track:
@@ -220,18 +213,16 @@ def _chain_track(analysis: LatencyAnalysis) -> Track:
     for row in analysis.hops.drop_nulls("publish").sort("traversal", "hop").iter_rows(named=True):
         name = f"{path[row['hop']].node} → {row['topic']}"
         arguments = {"communication_ns": row["communication_ns"], "via": row["via"]}
-        hop = Slice(row["start"], row["publish"], name, arguments)
-        hops[row["traversal"]].append(hop)
+        hops[row["traversal"]].append(Slice(row["start"], row["publish"], name, arguments))
     families = []
     for row in analysis.traversals.iter_rows(named=True):
-        number = row["traversal"]
+        name, start, end = f"cycle {row['traversal']}", row["start"], row["end"]
         if row["complete"]:
             arguments = {key: row[key] for key in ("latency_ns", "disturbed", "reception_ns")}
-            whole = Slice(row["start"], row["end"], f"cycle {number}", arguments)
-            families.append([whole, *hops[number]])
+            families.append([Slice(start, end, name, arguments), *hops[row["traversal"]]])
         else:
-            what = f"cycle {number} incomplete: {row['reason']}"
-            families.append([Slice(row["start"], None, what, {"topic": row["broken_at"]})])
+            about = {"topic": row["broken_at"]}
+            families.append([Slice(start, None, f"{name} incomplete: {row['reason']}", about)])
     return Track("Chain", analysis.chain.spec, families)
 
 
