@@ -3,15 +3,12 @@
 from dataclasses import replace
 from typing import Any
 
-import polars as pl
 import pytest
 from story import OFFSET, Story
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.analysis.disturbance import Due
 from chainshaper.analysis.flow import left_when_taken
-from chainshaper.analysis.messages import gate_decisions
-from chainshaper.values.recording import Recording
 
 PERIOD = 1_000
 
@@ -170,20 +167,6 @@ def test_of_equal_stamps_the_decision_is_meant_that_was_made_there() -> None:
     arrivals = dict(found.releases.select("traversal", "arrival").rows())
     starts = dict(found.hops.filter(found.hops["hop"] == 1).select("traversal", "start").rows())
     assert arrivals == starts
-
-
-def test_a_shaping_node_that_knows_no_handles_is_told_by_its_process(
-    simulated_shaped: Recording,
-) -> None:
-    """What a node in ROS 2 notes of itself: the same rows, but for the handle."""
-    events, offset = simulated_shaped.events, simulated_shaped.info.clock_offset_ns
-    nameless = events["gate_release"].with_columns(callback=pl.lit(None, pl.UInt64))
-    without, objects = {**events, "gate_release": nameless}, data_flow(events, offset).objects
-    one, other = (gate_decisions(tables, objects) for tables in (events, without))
-    assert one.height == nameless.height > 0
-    assert one.drop("callback").equals(other.drop("callback"))
-    known, found = (analyse_latency(tables, "/t1../t3", offset) for tables in (events, without))
-    assert known.traversals.equals(found.traversals)
 
 
 # -- when asynchronous messages left, and what was withheld --

@@ -25,7 +25,6 @@ from chainshaper.reporting.latency import comparison_json, comparison_table
 from chainshaper.reporting.overviews import plan_table
 from chainshaper.reporting.tables import ResultTable
 from chainshaper.values.recording import InForceInfo, Recording
-from chainshaper.verify.measure import Comparison
 
 
 def _text(table: ResultTable) -> str:
@@ -35,15 +34,12 @@ def _text(table: ResultTable) -> str:
     return console.file.getvalue()
 
 
-@pytest.fixture
-def comparison(tmp_path: Path, unshaped: Recording, shaped: Recording) -> Comparison:
+def test_brackets_are_shown_and_not_taken_for_markup(
+    tmp_path: Path, simulated: Recording, simulated_shaped: Recording, plan: Plan
+) -> None:
     """Before and after, the first in a folder whose name looks like Rich's markup."""
-    odd = tmp_path / "before [bold]"
-    shutil.copytree(unshaped.path, odd)
-    return compare_recordings([odd, shaped])
-
-
-def test_brackets_are_shown_and_not_taken_for_markup(comparison: Comparison, plan: Plan) -> None:
+    odd = shutil.copytree(simulated.path, tmp_path / "before [bold]")
+    comparison = compare_recordings([odd, simulated_shaped])
     text = _text(comparison_table(comparison))
     for words in ("End-to-end latency of /t1../t3 [ms]", "before [bold]", "slots [21.000, 22.000)"):
         assert words in text
