@@ -2,7 +2,7 @@
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -17,7 +17,16 @@ from hypothesis import strategies as st
 from known import known as known_value
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 
-from chainshaper import compare_recordings, hop_breakdown, measure_latency, save_plan
+from chainshaper import (
+    compare_recordings,
+    draw_distribution,
+    draw_latency,
+    export_perfetto,
+    hop_breakdown,
+    measure_latency,
+    save_plan,
+    write_report,
+)
 from chainshaper.reporting.latency import headline
 from chainshaper.reporting.page import (
     distinct_names,
@@ -26,6 +35,7 @@ from chainshaper.reporting.page import (
     report_page,
 )
 from chainshaper.values.durations import milliseconds
+from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement
 
@@ -294,6 +304,25 @@ def test_the_command_writes_the_report_and_never_over_another(
     assert called("report", bare.path, "-o", tmp_path / "r.html", "--plan", plan).code == 0
     data = _Reader((tmp_path / "r.html").read_text()).data
     assert data["recordings"][0]["slots"] == [[30 * MS, 31 * MS]]
+
+
+@pytest.mark.parametrize(
+    ("name", "write"),
+    [
+        *(("report.html", write_report), ("latency.png", draw_latency)),
+        *(
+            ("cdf.png", draw_distribution),
+            ("t.pftrace", lambda one, at: export_perfetto(one[0], at)),
+        ),
+    ],
+)
+def test_a_file_on_a_full_disk_leaves_nothing(
+    name: str, write: Callable[[list[Measurement], Path], Path], known: Recording, full_disk: Path
+) -> None:
+    path = full_disk / name
+    with pytest.raises(OperationError, match=f"{path}: the file cannot be written.*No space"):
+        write([measure_latency(known)], path)
+    assert [file.name for file in full_disk.iterdir()] == ["filling"]
 
 
 def _traversals(latencies: Sequence[int | None], disturbed: Sequence[bool]) -> pl.DataFrame:

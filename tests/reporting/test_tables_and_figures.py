@@ -9,7 +9,7 @@ from typing import Any
 import matplotlib as mpl
 import pytest
 from command_line import called, json_of
-from known_run import MS, PERIOD_NS, known_plan, known_run
+from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 from rich.console import Console
 
 from chainshaper import (
@@ -80,6 +80,19 @@ def test_what_no_plan_governed_is_left_out(
         assert "left out" in shown
         compared = called("compare", recording.path, recording.path).out
         assert "known: left out" in " ".join(compared.split())
+
+
+def test_over_all_cycles_late_outputs_maximum_and_jitter_are_shown(tmp_path: Path) -> None:
+    """The last output arrives at the end of its slot, and leaves at once."""
+    recording = known_run(tmp_path / "known", cycles=2, overran=(1,))
+    longest = 31 * MS
+    values = json_of("latency", recording.path)
+    assert (values["late"], values["max_all_ns"]) == (1, longest)
+    assert values["jitter_all_ns"] == longest - LATENCY_NS
+    assert values["undisturbed"]["late"] == 1
+    shown = called("compare", recording.path, recording.path).out
+    assert "came late" in shown
+    assert "1 of 2" in shown
 
 
 def test_a_recording_from_before_says_nothing_and_is_read_whole(tmp_path: Path) -> None:
