@@ -94,7 +94,7 @@ def read_records(folder: Path) -> tuple[str, dict[int, list[EventRecord]]]:
     """
     trace = open_trace(folder)
     text, _ = read_metadata_text(trace.folders[0].path / "metadata")
-    (stream,) = trace.folders[0].declared.streams.values()
+    (stream,) = trace.folders[0].streams.values()
     fields = {e.name: e.fields.fields if e.fields else () for e in stream.events.values()}
     names = {"pid": "vpid", "tid": "vtid", "procname": "procname"}  # as `ros2 trace` asks for
     records: dict[int, list[EventRecord]] = {}

@@ -32,7 +32,7 @@ from chainshaper.sources.lttng import LttngSession
 session = LttngSession(pathlib.Path(sys.argv[1]), ["x"], ())
 try:
     session.start()
-    print(session._lttng.home, flush=True)
+    print(session.home, flush=True)
     input()
     session.stop()
 finally:
@@ -196,7 +196,7 @@ def test_a_daemon_that_dies_is_a_failure_in_words(node: Path, tmp_path: Path) ->
     try:
         session.start()
         assert session.failure() is None
-        daemon = session._lttng.daemon if session._lttng else None
+        daemon = session.daemon
         if daemon is None:
             pytest.skip("a session daemon of another program runs here, which is not ours to kill")
         daemon.send_signal(signal.SIGKILL)

@@ -5,8 +5,8 @@ import pytest
 
 from chainshaper.sources.system import distribution_of, rmw_of_gids, rmw_of_threads
 
-OLD_PUBLISH = {"rmw_publish": {"message": 0}}
-NEW_PUBLISH = {"rmw_publish": {"message": 0, "timestamp": 0}}
+OLD_PUBLISH = {"rmw_publish": {"message"}}
+NEW_PUBLISH = {"rmw_publish": {"message", "timestamp"}}
 
 
 @pytest.mark.parametrize(
@@ -28,21 +28,21 @@ def test_versions_of_tracetools(version: str, distribution: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("fields", "distribution"),
+    ("fields", "gid_length", "distribution"),
     [
-        ({}, None),
-        (OLD_PUBLISH, None),
-        ({**OLD_PUBLISH, "rclcpp_executor_execute": {}}, "humble"),
-        ({**OLD_PUBLISH, "rclcpp_intra_publish": {}, "rclcpp_ring_buffer_enqueue": {}}, "iron"),
-        (NEW_PUBLISH, None),
-        ({**NEW_PUBLISH, "rmw_publisher_init": {"gid": 24}}, "jazzy"),
-        ({**NEW_PUBLISH, "rmw_publisher_init": {"gid": 16}}, "kilted"),
+        ({}, 0, None),
+        (OLD_PUBLISH, 24, None),
+        ({**OLD_PUBLISH, "rclcpp_executor_execute": {}}, 24, "humble"),
+        ({**OLD_PUBLISH, "rclcpp_intra_publish": {}, "rclcpp_ring_buffer_enqueue": {}}, 24, "iron"),
+        (NEW_PUBLISH, 0, None),
+        (NEW_PUBLISH, 24, "jazzy"),
+        (NEW_PUBLISH, 16, "kilted"),
     ],
 )
 def test_fields_without_a_version(
-    fields: dict[str, dict[str, int]], distribution: str | None
+    fields: dict[str, set[str]], gid_length: int, distribution: str | None
 ) -> None:
-    assert distribution_of({}, fields) == distribution
+    assert distribution_of({}, fields, gid_length) == distribution
 
 
 def test_caret_says_the_distribution_itself() -> None:

@@ -4,7 +4,7 @@ Upstream: changelogs of tracetools; https://www.dds-foundation.org/dds-rtps-vend
 """
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -60,12 +60,14 @@ def own_pid_namespace() -> int:
     return Path("/proc/self/ns/pid").stat().st_ino
 
 
-def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]) -> str | None:
+def distribution_of(
+    tables: EventTables, fields: Mapping[str, Collection[str]], gid_length: int = 0
+) -> str | None:
     """The ROS 2 distribution as `ROS_DISTRO` has it (``jazzy``), None if nothing tells.
 
     CARET's `caret_init` says it, or `rcl_init` by the version of tracetools. Else the declared
-    events' ``fields``, with the length of arrays: `rmw_publish` has a source timestamp since Jazzy,
-    a gid 16 bytes instead of 24 since Kilted, intra-process events came with Iron.
+    events' ``fields``: `rmw_publish` has a source timestamp since Jazzy, a gid 16 bytes instead of
+    24 since Kilted, intra-process events came with Iron.
     """
     said = _first(tables, "caret_init", "distribution")
     if said is not None:
@@ -75,15 +77,13 @@ def distribution_of(tables: EventTables, fields: Mapping[str, Mapping[str, int]]
         version = int(found[1]), int(found[2])
         return next((name for name, below in _RELEASES.items() if version < below), _LATER)
     if "timestamp" in fields.get("rmw_publish", ()):
-        length = fields.get("rmw_publisher_init", {}).get("gid", 0)
-        return {24: "jazzy", 16: "kilted"}.get(length)
+        return {24: "jazzy", 16: "kilted"}.get(gid_length)
     if fields.keys() >= {"rmw_publish", "rclcpp_intra_publish", "rclcpp_ring_buffer_enqueue"}:
         return "iron"
     return "humble" if fields.keys() >= {"rmw_publish", "rclcpp_executor_execute"} else None
 
 
 def _first(tables: EventTables, event: str, field: str) -> str | None:
-    """The first value of an event's field, if it is known."""
     frame = tables.get(event, pl.DataFrame())
     found = frame[field].head(1).drop_nulls() if field in frame.columns else ()
     return next(map(str, found), None)

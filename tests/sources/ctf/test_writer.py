@@ -45,7 +45,7 @@ def test_round_trip(tmp_path: Path, options: dict[str, Any]) -> None:
 def test_kernel_traces(tmp_path: Path, header: str, aligned: bool) -> None:
     make_trace(tmp_path / "kernel", kernel=True, header=header, aligned=aligned)
     trace, frames = assert_equal_to_babeltrace(tmp_path, kernel=True)
-    assert trace.folders[0].declared.env["domain"] == "kernel"
+    assert trace.folders[0].env["domain"] == "kernel"
     assert {"prev_comm", "pid", "tid", "cpu"} <= set(frames["sched_switch"].columns)
     assert "payload.tid" in frames["sched_wakeup"].columns
 

@@ -42,43 +42,24 @@ def word_at(base, at, mapped):
 
 
 @compiled(inline=True)
-def digest_text(base, at, limit, mapped):
-    """Length, hash and last word (zeros behind it) of a text that ends at a NUL or ``limit``."""
+def digest_characters(op, base, at, limit, mapped):
+    """Length, hash and last word (zeros behind it) of what ends at ``limit``, a text at a NUL."""
     digest, word, place, zeros = tb.FACTOR, tb.U0, at, tb.U0
-    while zeros == tb.U0:
+    is_text = get(op, tb.O_FLAGS) != 0
+    while zeros == tb.U0 and (is_text or place < limit):
         word = word_at(base, place, mapped)
         if place + 8 > limit:  # what lies behind the limit counts as NUL
             word &= (tb.U1 << np.uint64(8 * (limit - place))) - tb.U1
-        zeros = (word - tb.ONES) & ~word & tb.HIGHS
-        if zeros != tb.U0:
-            # The first NUL is the lowest marked byte; what lies behind it does not count.
-            word &= ((zeros & (tb.U0 - zeros)) >> np.uint64(7)) - tb.U1
+        if is_text:
+            zeros = (word - tb.ONES) & ~word & tb.HIGHS
+            if zeros != tb.U0:
+                # The first NUL is the lowest marked byte; what lies behind it does not count.
+                word &= ((zeros & (tb.U0 - zeros)) >> np.uint64(7)) - tb.U1
         digest = (digest ^ word) * tb.FACTOR
         digest ^= digest >> tb.U29
         place += 8
-    return place - 8 - at + (trailing_zeros(zeros) >> 3), digest, word
-
-
-@compiled(inline=True)
-def digest_bytes(base, at, count, mapped):
-    """The same of so many bytes of any value."""
-    digest, word, place, limit = tb.FACTOR, tb.U0, at, at + count
-    while place < limit:
-        word = word_at(base, place, mapped)
-        if place + 8 > limit:
-            word &= (tb.U1 << np.uint64(8 * (limit - place))) - tb.U1
-        digest = (digest ^ word) * tb.FACTOR
-        digest ^= digest >> tb.U29
-        place += 8
-    return count, digest, word
-
-
-@compiled(inline=True)
-def digest_characters(op, base, at, count, mapped):
-    """The same of an array: a text, or bytes."""
-    if get(op, tb.O_FLAGS) != 0:
-        return digest_text(base, at, at + count, mapped)
-    return digest_bytes(base, at, count, mapped)
+    length = place - 8 + (trailing_zeros(zeros) >> 3) - at if is_text else limit - at
+    return length, digest, word
 
 
 @compiled(inline=True)
@@ -161,7 +142,6 @@ def bits_at(base, position, size, big, mapped):
 
 @compiled(inline=True)
 def store(column, width, row, value):
-    """Write the low bytes of a value to a row of a column."""
     if width == 8:
         store_long(column + 8 * row, value)
     elif width == 4:
@@ -174,7 +154,6 @@ def store(column, width, row, value):
 
 @compiled(inline=True)
 def keep(op, value, row):
-    """Write a value to its slot's row, if it has a slot."""
     if get(op, tb.O_ADDRESS) != 0:
         store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, value)
 
@@ -219,25 +198,24 @@ def run_number(machine, op, base, mapped, position, regs, row):
 @compiled(inline=True)
 def run_text(machine, op, base, mapped, end, position, regs, row):
     """Read a string or a text array; returns the position behind it or a failure."""
-    at = position >> 3
-    if get(op, tb.O_CODE) == tb.TEXT:
-        length, digest, word = digest_text(base, at, end >> 3, mapped)
-        if at + length >= end >> 3:
-            return np.int64(tb.UNTERMINATED)
-        following = (at + length + 1) << 3
-    else:
+    at, limit, is_open = position >> 3, end >> 3, get(op, tb.O_CODE) == tb.TEXT
+    if not is_open:
         register = get(op, tb.O_REGISTER)
         count = get(op, tb.O_COUNT) if register < 0 else get(regs, register)
         if count < 0 or count > (end - position) >> 3:
             return np.int64(tb.BAD_LENGTH)
-        length, digest, word = digest_characters(op, base, at, count, mapped)
-        following = (at + count) << 3
+        limit = at + count
+    length, digest, word = digest_characters(op, base, at, limit, mapped)
+    if is_open:
+        if at + length >= limit:
+            return np.int64(tb.UNTERMINATED)
+        limit = at + length + 1
     if get(op, tb.O_ADDRESS) != 0:
         code = intern(machine, base + at, length, digest, word)
         if code < 0:
             return np.int64(tb.FULL_DICTIONARY)
         keep(op, np.uint64(code), row)
-    return following
+    return limit << 3
 
 
 @compiled()

@@ -17,7 +17,6 @@ A_ALL = tb.A_ROW * tb.AHEAD
 
 @compiled(inline=True)
 def nanoseconds(cycles, frequency):
-    """Clock cycles in ns, rounded down."""
     if frequency == tb.BILLION:
         return cycles
     count, rate = np.uint64(cycles), np.uint64(frequency)

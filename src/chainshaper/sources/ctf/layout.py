@@ -14,7 +14,8 @@ code in a dictionary of all that are different.
 
 from __future__ import annotations
 
-from collections.abc import Container, Sequence
+import struct
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 from uuid import UUID
@@ -93,7 +94,7 @@ A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
     O_CODE,
     O_ALIGN,  # bits
     O_SIZE,  # bits; of one element for SKIP_MANY
-    O_FLAGS,  # 1 signed, 2 big-endian, 4 advances the clock; 1 for CHARACTERS that end at a NUL
+    O_FLAGS,  # 1 signed, 2 big-endian, 4 advances the clock; 1: a text, which ends at a NUL
     O_ADDRESS,  # where row 0 of the slot lies, 0 for no slot
     O_WIDTH,  # bytes per row of the slot
     O_REGISTER,  # written by NUMBER, the length or tag for others; -1 for none
@@ -124,9 +125,10 @@ ENDLESS = 1 << 40
 """More elements than any packet has, even of no bits; times what one costs it is still a number."""
 
 # Why a run ended early.
-OVER_BUDGET = -8
-FULL_TABLE, FULL_DICTIONARY, UNKNOWN_EVENT = -7, -6, -5
-UNTERMINATED, BAD_LENGTH, NO_OPTION, TRUNCATED = -4, -3, -2, -1
+(
+    OVER_BUDGET, FULL_TABLE, FULL_DICTIONARY, UNKNOWN_EVENT, UNTERMINATED, BAD_LENGTH, NO_OPTION,
+    TRUNCATED,
+) = range(-8, 0)
 
 # How a scan for packets ended, and what was wrong where.
 DONE, FULL, BAD_MAGIC, BAD_UUID, BAD_STREAM, BAD_SIZE, BAD_HEADER, CUT, COSTLY = range(9)
@@ -165,42 +167,27 @@ class LayoutError(ValueError):
     """Types that cannot be laid out: an unresolved length or tag, too deep a nesting."""
 
 
-@dataclass(frozen=True)
-class Table:
-    """Where the events of one name and one shape go: ``time``, ``cpu`` where known, ``columns``.
-
-    ``counter`` is the number of its row counter.
-    """
+class Table(NamedTuple):
+    """Where the events of one name and one shape go: ``time``, ``cpu`` where known, ``columns``."""
 
     name: str
     columns: tuple[tuple[str, tsdl.Type], ...]
     has_cpu: bool
-    counter: int = field(compare=False)
 
     def slot_types(self) -> list[np.dtype[Any]]:
         """What each column's slot has: integers, or codes in the dictionary."""
-        return [_slot_type(kind) for _, kind in self.columns]
+        return [
+            np.dtype(f"{'i' if kind.signed else 'u'}{1 << ((kind.size + 7 >> 3) - 1).bit_length()}")
+            if isinstance(kind, tsdl.IntegerType)
+            else np.dtype("u4")
+            for _, kind in self.columns
+        ]
 
 
-def _slot_type(kind: tsdl.Type) -> np.dtype[Any]:
-    if not isinstance(kind, tsdl.IntegerType):
-        return np.dtype("u4")
-    width = 1 << ((kind.size + 7 >> 3) - 1).bit_length()
-    return np.dtype(f"{'i' if kind.signed else 'u'}{width}")
-
-
-class Wanted(NamedTuple):
-    """Events that get a table, and those of them without their procname.
-
-    pid and tid always are wanted.
-    """
-
-    names: frozenset[str] = frozenset()
-    nameless: frozenset[str] = frozenset()
-
-
-_Scope = tuple[str, tsdl.StructType | None, Container[str]]
-"""A dynamic scope, its structure, and the TSDL names of the fields in it that get columns."""
+_Scopes = Mapping[str, tsdl.StructType | None]
+"""Dynamic scopes (``stream.event.context``, …) and their structures."""
+_Named = Mapping[tuple[str, str], str]
+"""Scope and field (as in TSDL) → the column that it gets."""
 
 
 class Event(NamedTuple):
@@ -208,10 +195,10 @@ class Event(NamedTuple):
 
     name: str
     row: list[int]
-    table: Table | None
     stream: int
     header: _Writer
-    scopes: list[_Scope]
+    scopes: _Scopes
+    named: _Named
 
 
 @dataclass
@@ -219,7 +206,8 @@ class Layout:
     """Tables for the kernels, and what their rows mean.
 
     ``folders`` has the rows of each folder's stream classes (first, end), ``steps`` counts the
-    types that were laid out, ``labels`` has the ranges of enumerations by label.
+    types that were laid out, ``labels`` has the ranges of enumerations by label; the rows of
+    ``tables`` are counted in this order.
     """
 
     operations: list[list[int]] = field(default_factory=list)
@@ -248,7 +236,7 @@ class Layout:
         writing = [{O_ADDRESS: address, O_WIDTH: width} for address, width in slots]
         for event in self.tables[table]:
             row, writer = event.row, event.header.following(writing)
-            start, stop = row[E_FILL], row[E_FILL_STOP] = writer.run(event.scopes)
+            start, stop = row[E_FILL], row[E_FILL_STOP] = writer.run(event.scopes, event.named)
             row[E_TIME], row[E_CPU] = time, cpu
             constant = row[E_ALIGN] >= 8 and row[E_SIZE] > 0
             row[E_CONSTANT] = int(constant and self._note_offsets(start, stop))
@@ -270,15 +258,21 @@ class Layout:
         return len(rows) + sum(row[O_LEAST] for row in rows if row[O_CODE] == SWITCH)
 
 
-def lay_out(folders: Sequence[tsdl.CtfFolder], wanted: Wanted) -> Layout:
-    """Lay out every stream and event class. Raises `CtfError` for types that cannot be read."""
+def lay_out(traces: Sequence[tsdl.TraceClass], wanted: Mapping[str, bool]) -> Layout:
+    """Lay out every stream and event class. Raises `CtfError` for types that cannot be read.
+
+    Events that are ``wanted`` get a table with pid and tid, and the procname where that is true.
+    """
     layout = Layout()
-    for folder in folders:
+    for trace in traces:
         first = len(layout.streams)
         try:
-            _add_folder(layout, folder.declared, wanted)
+            header = _Writer(layout, trace.byte_order == "be", trace.referenced)
+            in_header = header.run({"trace.packet.header": trace.packet_header}, {})
+            for stream in trace.streams.values():
+                _add_stream(layout, trace, stream, header.following(fixed=True), in_header, wanted)
         except LayoutError as error:
-            file = folder.path / "metadata"
+            file = trace.path / "metadata"
             raise tsdl.CtfError(file, None, str(error), "the trace cannot be read") from None
         layout.folders.append((first, len(layout.streams)))
     return layout
@@ -314,9 +308,9 @@ class _Writer:
     """Writes the operations of types that follow each other.
 
     ``slots`` are the columns of operations that write to one each; without them events are only
-    stepped over. ``roots`` maps a dynamic scope (``stream.event.context``, …) to the numbers read
-    there so far; a number whose name is ``referenced`` gets a register, ``registers`` the next one.
-    In headers (``fixed``) the numbers of REGISTERS have those.
+    stepped over. ``roots`` maps a dynamic scope to the numbers read there so far; a number whose
+    name is ``referenced`` gets a register, ``registers`` the next one. In headers (``fixed``) the
+    numbers of REGISTERS have those.
     """
 
     layout: Layout
@@ -330,26 +324,25 @@ class _Writer:
 
     def following(self, slots: Sequence[dict[int, int]] = (), fixed: bool = False) -> _Writer:
         """A writer for what follows in one of several places."""
-        roots = dict(self.roots)
-        return replace(self, roots=roots, slots=slots, fixed=fixed)
+        return replace(self, roots=dict(self.roots), slots=slots, fixed=fixed)
 
-    def run(self, scopes: Sequence[_Scope]) -> tuple[int, int]:
+    def run(self, scopes: _Scopes, named: _Named) -> tuple[int, int]:
         """Lay out scopes: their first operation and the one after the last."""
         self.start = len(self.layout.operations)
         slots = iter(self.slots)
-        for scope, kind, wanted in scopes:
+        for scope, kind in scopes.items():
             frame = self.roots[scope] = _Frame()
             if kind is not None:
                 self._skip(kind.align, 0)
-            for member in kind.fields if kind is not None else ():
-                place = _Place((frame,), next(slots, {}) if member.name in wanted else {})
-                match member.type if self.fixed and member.name == "uuid" else None:
+            for name, member in kind.fields if kind is not None else ():
+                place = _Place((frame,), next(slots, {}) if (scope, name) in named else {})
+                match member if self.fixed and name == "uuid" else None:
                     case tsdl.ArrayType(tsdl.IntegerType(8, 8), 16):
                         half = tsdl.IntegerType(64, 8, byte_order="le")
-                        for name in ("uuid_low", "uuid_high"):
-                            self._number(name, half, place)
+                        self._number("uuid_low", half, place)
+                        self._number("uuid_high", half, place)
                     case _:
-                        self._type(member.name, member.type, place)
+                        self._type(name, member, place)
         self.layout.registers = max(self.layout.registers, self.registers)
         return self.start, len(self.layout.operations)
 
@@ -359,11 +352,8 @@ class _Writer:
         if len(at.frames) > _DEEPEST or self.layout.steps > _MOST_STEPS:
             raise LayoutError(f"{name}: types nested too deeply")
         match kind:
-            case tsdl.FloatType():
-                self._skip(kind.align, kind.size)
-                return kind.size
             case tsdl.StringType():
-                self._row(TEXT, {O_ALIGN: 8, **at.slot})
+                self._row(TEXT, {O_ALIGN: 8, O_FLAGS: 1, **at.slot})
                 return 8
             case tsdl.StructType():
                 frame = at.frames[-1][name] = _Frame()
@@ -389,10 +379,11 @@ class _Writer:
             self._skip(kind.align, kind.size)
             return kind.size
         flags = kind.signed + 2 * big + 4 * clock
+        # Whether its bytes are the same in a packet and in its slot.
+        alike = kind.align >= 8 and kind.size in {8, 16, 32, 64} and (kind.size == 8 or not big)
+        code = MOVE if alike and not clock and register < 0 else NUMBER
         columns = {O_ALIGN: kind.align, O_SIZE: kind.size, O_FLAGS: flags, O_REGISTER: register}
-        row = self._row(NUMBER, columns | at.slot)
-        if _is_moved(row):
-            row[O_CODE] = MOVE
+        self._row(code, columns | at.slot)
         return kind.size
 
     def _array(self, name: str, kind: tsdl.ArrayType, at: _Place) -> int:
@@ -409,13 +400,10 @@ class _Writer:
         least = self._type(f"{name}[]", kind.element, at.inside({}))
         only = rows[first] if len(rows) == first + 1 else loop
         even = only[O_CODE] == SKIP and only[O_SIZE] % only[O_ALIGN] == 0
-        if even and only[O_SIZE] == 0:  # an array of empty structures
-            del rows[first - 1 :]
-            self._skip(tsdl.alignment(kind), 0)
-        elif even and register < 0:
+        if even and (register < 0 or only[O_SIZE] == 0):  # 0: an array of empty structures
             del rows[first - 1 :]
             self._skip(max(tsdl.alignment(kind), only[O_ALIGN]), only[O_SIZE] * count)
-        elif even and only[O_SIZE] > 0:
+        elif even:
             loop[O_CODE], loop[O_SIZE] = SKIP_MANY, only[O_SIZE]
             del rows[first:]
         else:
@@ -427,26 +415,25 @@ class _Writer:
     def _variant(self, name: str, kind: tsdl.VariantType, at: _Place) -> int:
         if kind.tag is None:
             raise LayoutError(f"variant {name!r} has no tag")
-        rows, tag = self.layout.operations, self._referred(kind.tag, at)
+        rows, ranges, tag = self.layout.operations, self.layout.ranges, self._referred(kind.tag, at)
+        first, by_label = len(ranges), self._ranges_by_label(tag)
+        for number, option in enumerate(kind.options):
+            for label in dict.fromkeys((option.name, option.name.removeprefix("_"))):
+                ranges += [[low, high, number] for low, high in by_label.get(label, ())]
+        own = ranges[first:]
+        self.layout.steps += len(own)
         columns = {O_REGISTER: tag.register, O_FLAGS: int(tag.signed)}
-        switch = self._row(SWITCH, {**columns, O_COUNT: len(self.layout.ranges)})
-        by_label, targets = self._ranges_by_label(tag), []
-        for option in kind.options:
-            labels = dict.fromkeys((option.name, option.name.removeprefix("_")))
-            ends = [pair for label in labels for pair in by_label.get(label, ())]
-            targets.append([[low, high, 0] for low, high in ends])
-            self.layout.ranges += targets[-1]
-        switch[O_LEAST] = sum(map(len, targets))
-        self.layout.steps += switch[O_LEAST]
+        self._row(SWITCH, {**columns, O_COUNT: first, O_LEAST: len(own)})
         frame = at.frames[-1][name] = _Frame()
-        jumps, least = [], []
-        for option, ranges in zip(kind.options, targets, strict=True):
-            for one in ranges:
-                one[2] = len(rows)
+        begins, jumps, least = [], [], []
+        for option in kind.options:
+            begins.append(len(rows))
             least.append(self._type(option.name, option.type, at.inside(frame)))
             jumps.append(self._row(JUMP, {}))
         for jump in jumps:
             jump[O_TARGET] = len(rows)
+        for one in own:
+            one[2] = begins[one[2]]
         return min(least, default=0)
 
     def _ranges_by_label(self, tag: _Number) -> dict[str, list[tuple[int, int]]]:
@@ -478,8 +465,7 @@ class _Writer:
 
     def _row(self, code: int, columns: dict[int, int]) -> list[int]:
         row = [0] * OPERATION_COLUMNS
-        row[O_CODE], row[O_ALIGN], row[O_REGISTER] = code, 1, -1
-        for column, value in columns.items():
+        for column, value in {O_CODE: code, O_ALIGN: 1, O_REGISTER: -1, **columns}.items():
             row[column] = value
         self.layout.operations.append(row)
         return row
@@ -487,131 +473,109 @@ class _Writer:
     def _skip(self, align: int, size: int) -> None:
         """Skip ``size`` bits, in one operation with what is skipped before where that is alike."""
         rows, size = self.layout.operations, min(size, _ENDLESS_BITS)
-        if len(rows) > self.start and rows[-1][O_CODE] == SKIP:
-            last = rows[-1]
-            if last[O_SIZE] == 0 or (align <= last[O_ALIGN] and last[O_SIZE] % align == 0):
-                last[O_ALIGN] = max(last[O_ALIGN], align)
-                last[O_SIZE] = min(last[O_SIZE] + size, _ENDLESS_BITS)
-                return
-        self._row(SKIP, {O_ALIGN: align, O_SIZE: size})
-
-
-def _is_moved(row: list[int]) -> bool:
-    """Whether the bytes of a NUMBER are the same in a packet and in its slot."""
-    alike = row[O_ALIGN] >= 8 and row[O_SIZE] in {8, 16, 32, 64}
-    plain = not row[O_FLAGS] & 4 and (row[O_SIZE] == 8 or not row[O_FLAGS] & 2)
-    return alike and plain and row[O_ADDRESS] != 0 and row[O_REGISTER] < 0
+        last = rows[-1] if len(rows) > self.start else [TEXT]
+        if last[O_CODE] == SKIP and (
+            last[O_SIZE] == 0 or (align <= last[O_ALIGN] and last[O_SIZE] % align == 0)
+        ):
+            last[O_ALIGN] = max(last[O_ALIGN], align)
+            last[O_SIZE] = min(last[O_SIZE] + size, _ENDLESS_BITS)
+        else:
+            self._row(SKIP, {O_ALIGN: align, O_SIZE: size})
 
 
 # Stream and event classes
 
 
-def _add_folder(layout: Layout, trace: tsdl.TraceClass, wanted: Wanted) -> None:
-    header = _Writer(layout, trace.byte_order == "be", trace.referenced)
-    in_header = header.run([("trace.packet.header", trace.packet_header, ())])
-    for stream in trace.streams.values():
-        event = header.following(fixed=True)
-        in_context = event.run([("stream.packet.context", stream.packet_context, ())])
-        in_event = event.run([("stream.event.header", stream.event_header, ())])
-        row = [0] * STREAM_COLUMNS
-        row[S_ID : S_EVENT_STOP + 1] = [stream.id, *in_header, *in_context, *in_event]
-        row[S_ALIGN : S_CLOCK_BITS + 1] = _quick_header(stream.event_header, event.big)
-        row[S_FREQUENCY] = _frequency(stream, trace)
-        row[S_COST] = P_ROW + layout.cost(*in_header) + layout.cost(*in_context)
-        for scope in ("trace.packet.header", "stream.packet.context"):
-            for number in event.roots[scope].values():
-                if isinstance(number, _Number) and 0 <= number.register < len(REGISTERS):
-                    row[S_KNOWN] |= 1 << number.register
-        if trace.uuid is None:
-            row[S_KNOWN] &= ~(1 << R_UUID_LOW)
-        else:
-            row[S_UUID_LOW], row[S_UUID_HIGH] = _uuid_words(trace.uuid)
-        ids: dict[int, int] = {}
-        for declared in stream.events.values():
-            ids[declared.id] = len(layout.events)
-            kernel = trace.env.get("domain") == "kernel"
-            scopes, columns = _columns(stream, declared, kernel, wanted)
-            added = _add_event(layout, event, declared.name, scopes, columns, row, wanted)
-            added[E_COST] += layout.cost(*in_event)
-        row[S_ID_FIRST : S_DEFAULT + 1] = _id_table(layout, ids)
-        layout.streams.append(row)
-
-
-def _add_event(
+def _add_stream(
     layout: Layout,
+    trace: tsdl.TraceClass,
+    stream: tsdl.StreamClass,
     header: _Writer,
-    name: str,
-    scopes: list[_Scope],
-    columns: list[tuple[str, tsdl.Type]],
-    stream: list[int],
-    wanted: Wanted,
-) -> list[int]:
-    """Lay out an event class; its row. A wanted one goes to the table of its shape."""
-    writer, row, table = header.following(), [0] * EVENT_COLUMNS, None
-    start, stop = row[E_WALK], row[E_WALK_STOP] = writer.run(scopes)
-    row[E_COUNTER], row[E_COST] = -1, layout.cost(start, stop)
-    if name in wanted.names:
-        has_cpu = bool(stream[S_KNOWN] >> R_CPU & 1)
-        table = Table(name, tuple(columns), has_cpu, len(layout.tables))
-        if table in layout.tables:
-            table = layout.tables[table][0].table or table
-        else:
-            layout.tables[table] = []
-        row[E_COUNTER] = table.counter
-        row[E_COST] += 8 + 4 * has_cpu + sum(one.itemsize for one in table.slot_types())
-    if stop == start + 1 and layout.operations[start][O_CODE] == SKIP:
-        row[E_ALIGN], row[E_SIZE] = layout.operations[start][O_ALIGN : O_SIZE + 1]
-    layout.events.append(Event(name, row, table, len(layout.streams), header, scopes))
-    if table is not None:
-        layout.tables[table].append(layout.events[-1])
-    return row
+    in_header: tuple[int, int],
+    wanted: Mapping[str, bool],
+) -> None:
+    in_context = header.run({"stream.packet.context": stream.packet_context}, {})
+    in_event = header.run({"stream.event.header": stream.event_header}, {})
+    row = [0] * STREAM_COLUMNS
+    row[S_ID : S_EVENT_STOP + 1] = [stream.id, *in_header, *in_context, *in_event]
+    row[S_ALIGN : S_CLOCK_BITS + 1] = _quick_header(stream.event_header, header.big)
+    row[S_FREQUENCY] = _frequency(stream, trace)
+    row[S_COST] = P_ROW + layout.cost(*in_header) + layout.cost(*in_context)
+    for scope in ("trace.packet.header", "stream.packet.context"):
+        for number in header.roots[scope].values():
+            if isinstance(number, _Number) and 0 <= number.register < len(REGISTERS):
+                row[S_KNOWN] |= 1 << number.register
+    if trace.uuid is None:
+        row[S_KNOWN] &= ~(1 << R_UUID_LOW)
+    else:
+        try:
+            row[S_UUID_LOW], row[S_UUID_HIGH] = struct.unpack("<qq", UUID(trace.uuid).bytes)
+        except ValueError:
+            raise LayoutError(f"trace uuid {trace.uuid!r} is none") from None
+    has_cpu, kernel = bool(row[S_KNOWN] >> R_CPU & 1), trace.env.get("domain") == "kernel"
+    ids = {}
+    for event in stream.events.values():
+        ids[event.id] = len(layout.events)
+        scopes = {
+            "stream.event.context": stream.event_context,
+            "event.context": event.context,
+            "event.fields": event.fields,
+        }
+        named, columns = _columns(scopes, kernel, wanted.get(event.name))
+        own = Event(event.name, [0] * EVENT_COLUMNS, len(layout.streams), header, scopes, named)
+        layout.events.append(own)
+        start, stop = own.row[E_WALK], own.row[E_WALK_STOP] = header.following().run(scopes, {})
+        if stop == start + 1 and layout.operations[start][O_CODE] == SKIP:
+            own.row[E_ALIGN], own.row[E_SIZE] = layout.operations[start][O_ALIGN : O_SIZE + 1]
+        own.row[E_COUNTER], own.row[E_COST] = -1, layout.cost(start, stop) + layout.cost(*in_event)
+        if event.name in wanted:
+            table = Table(event.name, columns, has_cpu)
+            alike = layout.tables.setdefault(table, [])
+            own.row[E_COUNTER] = alike[0].row[E_COUNTER] if alike else len(layout.tables) - 1
+            own.row[E_COST] += 8 + 4 * has_cpu + sum(one.itemsize for one in table.slot_types())
+            alike.append(own)
+    row[S_ID_FIRST : S_DEFAULT + 1] = _id_table(layout, ids)
+    layout.streams.append(row)
 
 
 def _columns(
-    stream: tsdl.StreamClass, event: tsdl.EventClass, kernel: bool, asked: Wanted
-) -> tuple[list[_Scope], list[tuple[str, tsdl.Type]]]:
-    """The scopes of an event behind its header, and its columns by their final names.
+    scopes: _Scopes, kernel: bool, procname: bool | None
+) -> tuple[_Named, tuple[tuple[str, tsdl.Type], ...]]:
+    """The fields of an event behind its header that get columns, and the columns in their order.
 
+    There are none where ``procname``, whether that is one of them, is None.
     A kernel trace's pid and tid are of the initial namespace; user space traces have ``vpid`` and
     ``vtid`` of the process's only.
     """
-    scopes = {
-        "stream.event.context": stream.event_context,
-        "event.context": event.context,
-        "event.fields": event.fields,
-    }
+    if procname is None:
+        return {}, ()
     members = {
-        scope: [one for one in kind.fields if _has_column(one.type)] if kind is not None else []
+        (scope, member.name): member.type
         for scope, kind in scopes.items()
+        for member in (kind.fields if kind is not None else ())
+        if _has_column(member.type)
     }
-    wanted: dict[str, dict[str, str]] = {scope: {} for scope in scopes}  # field → column
-    if event.name in asked.names:
-        present: dict[str, tuple[str, str]] = {}
-        for scope in ("stream.event.context", "event.context"):
-            for member in members[scope]:
-                present.setdefault(tsdl.field_name(member.name), (scope, member.name))
-        for column in ("pid", "tid", *(["procname"] if event.name not in asked.nameless else [])):
-            names = (column, f"v{column}") if kernel else (f"v{column}", column)
-            if found := next((present[name] for name in names if name in present), None):
-                wanted[found[0]][found[1]] = column
-        taken = {"time", "cpu", "pid", "tid", "procname"}
-        for member in members["event.fields"]:
-            name = tsdl.field_name(member.name)
+    present: dict[str, tuple[str, str]] = {}
+    for place in members:
+        if place[0] != "event.fields":
+            present.setdefault(tsdl.field_name(place[1]), place)
+    named: dict[tuple[str, str], str] = {}
+    for column in ("pid", "tid", "procname") if procname else ("pid", "tid"):
+        names = (column, f"v{column}") if kernel else (f"v{column}", column)
+        if found := next((present[name] for name in names if name in present), None):
+            named[found] = column
+    taken = {"time", "cpu", "pid", "tid", "procname"}
+    for place in members:
+        if place[0] == "event.fields":
+            name = tsdl.field_name(place[1])
             while name in taken:
                 name = f"payload.{name}"
             taken.add(name)
-            wanted["event.fields"][member.name] = name
-    columns = [
-        (wanted[scope][member.name], member.type)
-        for scope, own in members.items()
-        for member in own
-        if member.name in wanted[scope]
-    ]
-    return [(scope, kind, wanted[scope]) for scope, kind in scopes.items()], columns
+            named[place] = name
+    return named, tuple((named[place], kind) for place, kind in members.items() if place in named)
 
 
 def _has_column(kind: tsdl.Type) -> bool:
-    """Whether a table can have such a field: a number, a text, or an array of bytes."""
     match kind:
         case tsdl.IntegerType() | tsdl.StringType() | tsdl.ArrayType(tsdl.IntegerType(8, 8)):
             return True
@@ -636,25 +600,22 @@ def _quick_header(header: tsdl.StructType | None, big: bool) -> list[int]:
     """
     match header:
         case tsdl.StructType(
-            fields=(
-                tsdl.Field("id", tsdl.IntegerType(signed=False) as number),
-                tsdl.Field(_, tsdl.VariantType("id", options)),
-            )
-        ) if not big:
-            last = (1 << number.size) - 1
-            wanted = {"compact": (0, last - 1), "extended": (last, last)}
-            compact = next((o.type for o in options if o.name == "compact"), None)
-            match compact:
-                case tsdl.StructType(
-                    fields=(tsdl.Field(_, tsdl.IntegerType(signed=False, clock=str()) as clock),)
-                ):
-                    align, inner = header.align, compact.align
-                    shift = -(-number.size // inner) * inner
-                    quick = {m.label: (m.low, m.high) for m in number.mappings} == wanted
-                    quick &= "be" not in (number.byte_order, clock.byte_order)
-                    quick &= clock.size <= 63 and shift + clock.size <= 64
-                    if quick and align >= max(8, inner):
-                        return [align, number.size, shift, clock.size]
+            [
+                ("id", tsdl.IntegerType(signed=False) as number),
+                (
+                    _,
+                    tsdl.VariantType("id", [("compact", tsdl.StructType([(_, clock)], inner)), *_]),
+                ),
+            ],
+            align,
+        ) if isinstance(clock, tsdl.IntegerType) and clock.clock is not None and not big:
+            last, shift = (1 << number.size) - 1, -(-number.size // inner) * inner
+            ranges = {m.label: (m.low, m.high) for m in number.mappings}
+            quick = ranges == {"compact": (0, last - 1), "extended": (last, last)}
+            quick &= "be" not in (number.byte_order, clock.byte_order) and not clock.signed
+            quick &= clock.size <= 63 and shift + clock.size <= 64
+            if quick and align >= max(8, inner):
+                return [align, number.size, shift, clock.size]
     return [0, 0, 0, 0]
 
 
@@ -675,11 +636,3 @@ def _frequency(stream: tsdl.StreamClass, trace: tsdl.TraceClass) -> int:
             raise LayoutError(f"stream {stream.id} is mapped to the undeclared clock {name!r}")
     names += list(trace.clocks)
     return trace.clocks[names[0]].frequency if names else BILLION
-
-
-def _uuid_words(text: str) -> tuple[int, int]:
-    try:
-        low, high = np.frombuffer(UUID(text).bytes, "<i8")
-        return int(low), int(high)
-    except ValueError:
-        raise LayoutError(f"trace uuid {text!r} is none") from None

@@ -1,9 +1,8 @@
 """Counting events and reading them into data frames.
 
 Pass 1 (`_File.walk`) steps over every event, counts, and finds where each span of time begins in
-each file. Pass 2 (`_fill`) merges the streams of one span by time and writes the wanted events
-straight to their rows. Spans run on several threads; with many of them only a part of a large trace
-is in memory at once.
+each file. Pass 2 (`_fill`) merges the streams of one span by time and writes the wanted events to
+their rows. Spans run on several threads; of a large trace only some are in memory at once.
 """
 
 # ruff: noqa: PLR0917 - the parts of one pass
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf import tsdl
-from chainshaper.sources.ctf.layout import Layout, Table, Wanted, lay_out
+from chainshaper.sources.ctf.layout import Layout, Table, lay_out
 from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scratch
 from chainshaper.values.compiled import kernel
 
@@ -61,13 +60,9 @@ def count_events(
 
     Raises `CtfError` where a file is gone.
     """
-    layout = lay_out(trace.folders, Wanted())
+    layout = lay_out(trace.folders, {})
     files = _walked(trace.streams, layout, np.zeros(0, np.int64), threads)
-    return _counts(trace, layout, files), _warnings(files)
-
-
-def _warnings(files: "Sequence[_File]") -> tuple[str, ...]:
-    return tuple(warning for file in files for warning in file.warnings())
+    return _counts(trace, layout, files), tuple(_warnings(files))
 
 
 def read_events(
@@ -85,29 +80,27 @@ def read_events(
     of the stream files, and in one file as recorded. Columns:
 
     * ``time``: Int64, ns on the trace's own clock (CLOCK_MONOTONIC for LTTng), its offset not
-      added; ``cpu``: Int32; ``pid``, ``tid``: integers as recorded (``vpid``, ``vtid`` in user
-      space, ``pid``, ``tid`` in the kernel); null where the trace has none.
+      added; ``cpu``: Int32; ``pid``, ``tid``: integers as recorded; null where the trace has none.
     * ``procname``: Categorical, where recorded; not for the events that are ``nameless``, since
       reading it is most of the work for an event without other texts.
     * the payload under its own names without LTTng's leading underscore; a field called like
       one of the above is ``payload.<name>``. Integers keep their width and sign, enumerations
       their integer; strings and text arrays are String (bytes that are not UTF-8 as ``\\xNN``),
-      arrays and sequences of bytes List of UInt8. No event table has a field of another kind:
-      these are passed over.
+      arrays and sequences of bytes List of UInt8. Fields of other kinds are passed over.
 
     Events that cannot be read end their packet; the result's ``warnings`` say which and why.
     ``progress`` gets the share that is done, from 0 to 1.
     Raises `CtfError` where a file is gone or changes while it is read.
     """
-    asked = frozenset(trace.event_names if names is None else names)
-    layout = lay_out(trace.folders, Wanted(asked, frozenset(nameless)))
-    rows = {event.stream for event in layout.events if event.table is not None}
+    asked = trace.event_names if names is None else names
+    layout = lay_out(trace.folders, {name: name not in nameless for name in asked})
+    rows = {event.stream for event in layout.events if event.row[tb.E_COUNTER] >= 0}
     used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, tb.P_STREAM].tolist())]
     borders = _span_borders(used, layout, threads or _cores())
     files = _walked(used, layout, borders, threads, lambda share: progress(share / 3))
     columns = [
-        _Columns(layout, table, sum(int(file.reached[-1][table.counter]) for file in files))
-        for table in layout.tables
+        _Columns(layout, number, table, sum(int(file.reached[-1][number]) for file in files))
+        for number, table in enumerate(layout.tables)
     ]
     texts = _filled(
         files, layout, len(borders) + 1, columns, threads, lambda n: progress((1 + 2 * n) / 3)
@@ -118,7 +111,7 @@ def read_events(
         reason = f"events of one name have fields of types that do not fit together: {error}"
         folder = trace.folders[0].path
         raise tsdl.CtfError(folder, None, reason, "read its folders one by one") from None
-    events.warnings = _warnings(files)
+    events.warnings = tuple(_warnings(files))
     events.counts = _counts(trace, layout, files)
     events.unread = tuple(stream for stream in trace.streams if stream not in used)
     return events
@@ -170,16 +163,19 @@ class _File:
         self.reached = np.vstack([np.zeros_like(scratch.rows), marks[:, 3:]])
         self.unsorted = bool(scratch.state[tb.X_UNSORTED])
 
-    def warnings(self) -> Iterator[str]:
-        """What cannot be read, packet by packet, the first ones of very many."""
-        damaged = self.packets[self.packets[:, tb.P_ERROR] < 0]
-        unread = "the rest of this packet is not read"
+
+def _warnings(files: Sequence[_File]) -> Iterator[str]:
+    """What cannot be read, packet by packet, the first ones of very many."""
+    for file in files:
+        damaged = file.packets[file.packets[:, tb.P_ERROR] < 0]
         for packet in damaged[:_MOST_WARNINGS]:
             place = int(packet[tb.P_BYTE] + (packet[tb.P_ERROR_AT] >> 3))
             reason = _FAILURES[int(packet[tb.P_ERROR])]
-            yield str(tsdl.CtfError(self.path, place, reason, unread))
+            yield str(
+                tsdl.CtfError(file.path, place, reason, "the rest of this packet is not read")
+            )
         if len(damaged) > _MOST_WARNINGS:
-            yield f"{self.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
+            yield f"{file.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
 
 
 def _walked(
@@ -189,7 +185,6 @@ def _walked(
     threads: int | None,
     progress: _Progress = lambda _: None,
 ) -> list[_File]:
-    """Pass 1 over all streams."""
     files, done = [_File(stream) for stream in streams], 0
     size = sum(file.map.size for file in files)
     with ThreadPoolExecutor(threads or _cores()) as pool:
@@ -287,7 +282,6 @@ def _fill(span: int, files: list[_File], packets: NDArray[np.int64], layout: Lay
 
 
 def _span_files(span: int, files: list[_File]) -> NDArray[np.int64]:
-    """The kernels' table of files for one span."""
     table = np.zeros((len(files), tb.FILE_COLUMNS), np.int64)
     first = 0
     for row, file in zip(table, files, strict=True):
@@ -313,10 +307,10 @@ class _Columns:
     third of all work.
     """
 
-    def __init__(self, layout: Layout, table: Table, rows: int) -> None:
-        self.table, self.rows = table, rows
+    def __init__(self, layout: Layout, number: int, table: Table, rows: int) -> None:
+        self.number, self.table, self.rows = number, table, rows
         wanted: list[tuple[int, np.dtype[Any]]] = [(rows, np.dtype("i8"))]
-        wanted.append((rows * table.has_cpu, np.dtype("i4")))
+        wanted += [(rows * table.has_cpu, np.dtype("i4"))]
         wanted += [(rows, kind) for kind in table.slot_types()]
         # Columns side by side must not begin alike in their pages, or they would compete for
         # the same few lines of the processor's cache.
@@ -334,7 +328,7 @@ class _Columns:
         self, before: NDArray[np.int64], after: NDArray[np.int64], codes: NDArray[np.uint32]
     ) -> None:
         """Replace one span's own codes of strings by those of the whole."""
-        span = slice(before[self.table.counter], after[self.table.counter])
+        span = slice(before[self.number], after[self.number])
         for (_, kind), array in zip(self.table.columns, self.slots, strict=True):
             if not isinstance(kind, tsdl.IntegerType):
                 array[span] = codes[array[span]]

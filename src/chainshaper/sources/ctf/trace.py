@@ -4,7 +4,7 @@ import ctypes
 import mmap
 import struct
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import layout as tb
-from chainshaper.sources.ctf.layout import Layout, Wanted, lay_out
-from chainshaper.sources.ctf.tsdl import CtfError, CtfFolder, TraceClass, TsdlError, parse_tsdl
+from chainshaper.sources.ctf.layout import Layout, lay_out
+from chainshaper.sources.ctf.tsdl import CtfError, TraceClass, TsdlError, parse_tsdl
 from chainshaper.values.compiled import kernel
 
 _scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
@@ -46,7 +46,7 @@ class CtfTrace:
     ``lost_packets`` are what the tracer says that it dropped.
     """
 
-    folders: tuple[CtfFolder, ...]
+    folders: tuple[TraceClass, ...]
     streams: tuple[CtfStream, ...]
     event_names: tuple[str, ...]
     clock_offset_ns: int
@@ -61,8 +61,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     Reads metadata and packet headers only. Raises `CtfError` where a path holds no trace or
     metadata cannot be understood; stream files with damage give ``warnings`` instead.
     """
-    folders = [CtfFolder(path, read_metadata(path / "metadata")) for path in _find(paths)]
-    layout = lay_out(folders, Wanted())
+    folders = [read_metadata(path / "metadata") for path in _find(paths)]
+    layout = lay_out(folders, {})
     first = folders[0].clock
     warnings = [
         f"{one.path}: clock {one.clock.name!r} is not the clock of {folders[0].path};"
@@ -83,28 +83,22 @@ def open_trace(*paths: Path | str) -> CtfTrace:
                 kind, instance = table[0, [tb.P_STREAM, tb.P_INSTANCE]].tolist()
                 name = path if instance < 0 else instance
                 groups.setdefault((kind, name), []).append(streams[-1])
-    all_discarded = all_lost = 0
-    for group in groups.values():
-        discarded, lost = _losses(group)
-        all_discarded, all_lost = all_discarded + discarded, all_lost + lost
+    losses = [(group[0].path, *_losses(group)) for group in groups.values()]
+    for path, discarded, lost in losses:
         if discarded:
-            warnings.append(
-                f"{group[0].path}: the tracer discarded {discarded} events of this stream"
-                " (record with more or larger sub-buffers)"
-            )
+            what = f"the tracer discarded {discarded} events of this stream"
+            warnings.append(f"{path}: {what} (record with more or larger sub-buffers)")
         if lost:
-            warnings.append(
-                f"{group[0].path}: {lost} packets of this stream are missing"
-                " (overwritten, or not copied with the trace)"
-            )
-    classes = [s for folder in folders for s in folder.declared.streams.values()]
+            what = f"{lost} packets of this stream are missing"
+            warnings.append(f"{path}: {what} (overwritten, or not copied with the trace)")
+    classes = [s for folder in folders for s in folder.streams.values()]
     return CtfTrace(
         folders=tuple(folders),
         streams=tuple(streams),
         event_names=tuple(sorted({e.name for s in classes for e in s.events.values()})),
         clock_offset_ns=first.offset_ns,
-        discarded_events=all_discarded,
-        lost_packets=all_lost,
+        discarded_events=sum(discarded for _, discarded, _ in losses),
+        lost_packets=sum(lost for *_, lost in losses),
         warnings=tuple(warnings),
     )
 
@@ -191,12 +185,10 @@ class Scratch:
         self.grow()
 
     def strings(self) -> list[bytes]:
-        """The strings in the dictionary, by code."""
         entries = self.entries[: self.state[tb.X_STRINGS]].tolist()
         return [ctypes.string_at(address, length) for address, length, _, _ in entries]
 
     def grow(self) -> None:
-        """Give the dictionary four times its places."""
         room = max(512, 4 * len(self.entries))
         self.entries = np.concatenate([self.entries, np.zeros((room - len(self.entries), 4), "i8")])
         # One place more than used: places are read eight bytes at a time.
@@ -242,15 +234,11 @@ def read_metadata(path: Path) -> TraceClass:
     """Read and parse a metadata file; raises `CtfError` naming the file and the byte offset."""
     text, pieces = read_metadata_text(path)
     try:
-        return parse_tsdl(text)
+        return replace(parse_tsdl(text), path=path.parent)
     except TsdlError as error:
-        character, reason = error.args
-        raise CtfError(
-            path,
-            _in_file(len(text[:character].encode()), pieces),
-            f"metadata cannot be understood: {reason}",
-            "record again, or report this with the file",
-        ) from None
+        place, why = _in_file(len(text[: error.args[0]].encode()), pieces), error.args[1]
+        remedy = "record again, or report this with the file"
+        raise CtfError(path, place, f"metadata cannot be understood: {why}", remedy) from None
 
 
 def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
@@ -279,7 +267,6 @@ def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
 
 
 def _in_file(position: int, pieces: list[tuple[int, int]]) -> int:
-    """Where a byte of the text lies in the file."""
     start, offset = next(p for p in reversed(pieces) if p[0] <= position)
     return offset + position - start
 

@@ -1,7 +1,7 @@
 """What a trace's metadata says, from its text in TSDL (CTF 1.8, sections 4 and 7, appendix C).
 
-Types and classes are immutable plain data. Names stay as TSDL writes them, with LTTng's leading
-underscore; `field_name` gives the name that users see. Sizes and alignments are in bits.
+Names stay as TSDL writes them, with LTTng's leading underscore; `field_name` gives the name that
+users see. Sizes and alignments are in bits.
 """
 
 from __future__ import annotations
@@ -12,18 +12,18 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal, NamedTuple, NoReturn, TypeVar
+from typing import Any, Literal, NamedTuple, NoReturn, TypeVar
 
 from chainshaper.values.errors import InputError
 
-ByteOrder = Literal["native", "le", "be"]
+_T = TypeVar("_T")
 
 
 class CtfError(InputError):
     """A trace that cannot be read: which file or folder, where in it (bytes), why, what to do."""
 
     def __init__(self, path: Path | str, offset: int | None, reason: str, remedy: str = "") -> None:
-        self.path, self.offset, self.reason = Path(path), offset, reason
+        self.path, self.offset = Path(path), offset
         place = f"{path}" if offset is None else f"{path}, byte {offset}"
         super().__init__(f"{place}: {reason}" + (f" ({remedy})" if remedy else ""))
 
@@ -51,18 +51,10 @@ class IntegerType:
     size: int
     align: int
     signed: bool = False
-    byte_order: ByteOrder = "native"
+    byte_order: Literal["native", "le", "be"] = "native"
     encoded: bool = False  # as UTF-8 or ASCII
     clock: str | None = None
     mappings: tuple[EnumMapping, ...] = field(default=(), compare=False)
-
-
-@dataclass(frozen=True, slots=True)
-class FloatType:
-    """``floating_point { … }`` (section 4.1.7), IEEE 754 of 32 or 64 bits."""
-
-    size: int
-    align: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,17 +70,17 @@ class ArrayType:
     length: int | str
 
 
-@dataclass(frozen=True, slots=True)
-class Field:
-    """A named member of a structure or option of a variant."""
-
+class Field(NamedTuple):
     name: str
     type: Type
 
 
 @dataclass(frozen=True, slots=True)
 class StructType:
-    """``struct { … } align(n)`` (section 4.2.1); ``align`` is at least ``n`` and each field's."""
+    """``struct { … } align(n)`` (section 4.2.1); ``align`` is at least ``n`` and each field's.
+
+    ``floating_point`` (4.1.7) is a structure of one integer: of neither there is a column.
+    """
 
     fields: tuple[Field, ...] = ()
     align: int = 1
@@ -102,7 +94,7 @@ class VariantType:
     options: tuple[Field, ...]
 
 
-Type = IntegerType | FloatType | StringType | ArrayType | StructType | VariantType
+Type = IntegerType | StringType | ArrayType | StructType | VariantType
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,12 +125,12 @@ class StreamClass:
     packet_context: StructType | None = None
     event_header: StructType | None = None
     event_context: StructType | None = None
-    events: Mapping[int, EventClass] = field(default_factory=dict)
+    events: dict[int, EventClass] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class TraceClass:
-    """Everything one ``metadata`` file declares.
+    """Everything one ``metadata`` file declares, and the folder that it is in.
 
     ``referenced`` are the names of the fields that lengths and tags refer to.
     """
@@ -150,23 +142,17 @@ class TraceClass:
     clocks: Mapping[str, Clock]
     streams: Mapping[int, StreamClass]
     referenced: frozenset[str]
-
-
-@dataclass(frozen=True)
-class CtfFolder:
-    """A folder with a ``metadata`` file: what it declares, and its clock (1 GHz without one)."""
-
-    path: Path
-    declared: TraceClass = field(repr=False)
+    path: Path = Path()
 
     @property
     def clock(self) -> Clock:
-        return next(iter(self.declared.clocks.values()), Clock("none"))
+        """The trace's clock, of 1 GHz where there is none."""
+        return next(iter(self.clocks.values()), Clock("none"))
 
 
 def field_name(name: str) -> str:
     """The name users see: TSDL's without one leading underscore, as babeltrace2 shows it."""
-    return name[1:] if name.startswith("_") and len(name) > 1 else name
+    return name.removeprefix("_") or name
 
 
 def alignment(kind: Type) -> int:
@@ -174,11 +160,9 @@ def alignment(kind: Type) -> int:
     match kind:
         case ArrayType(element):
             return alignment(element)
-        case StringType():
-            return 8
-        case VariantType():
-            return 1
-    return kind.align
+        case IntegerType(align=align) | StructType(align=align):
+            return align
+    return 8 if isinstance(kind, StringType) else 1
 
 
 def is_text(kind: Type) -> bool:
@@ -223,27 +207,28 @@ def _tokens(text: str) -> list[Token]:
     tokens: list[Token] = []
     for match in _TOKEN.finditer(text):
         kind, found, offset = str(match.lastgroup), match.group(), match.start()
-        if kind == "space":
-            continue
         if len(tokens) > _MOST_TOKENS:
             raise TsdlError(offset, f"more than {_MOST_TOKENS} tokens")
-        if kind == "wrong":
-            reason = f"unexpected character {found!r}"
-            if found in "\"'":
-                reason = "unterminated string"
-            elif text.startswith("/*", offset):
-                reason = "unterminated comment"
-            raise TsdlError(offset, reason)
-        if kind == "string":
-            found = _unescape(found[found.index('"') + 1 : -1])
-        elif kind == "character":
-            kind, found = "integer", str(ord(_unescape(found[1:-1])[:1]))
-        elif kind == "integer":
-            if len(found) > 80:
-                raise TsdlError(offset, "integer out of range")
-            digits = found.rstrip("uUlL")
-            octal = digits[0] == "0" and re.fullmatch("0[0-7]+", digits)
-            found = str(int(digits, 8 if octal else 10 if digits.isdecimal() else 0))
+        match kind:
+            case "space":
+                continue
+            case "wrong":
+                reason = f"unexpected character {found!r}"
+                if found in "\"'":
+                    reason = "unterminated string"
+                elif text.startswith("/*", offset):
+                    reason = "unterminated comment"
+                raise TsdlError(offset, reason)
+            case "string":
+                found = _unescape(found[found.index('"') + 1 : -1])
+            case "character":
+                kind, found = "integer", str(ord(_unescape(found[1:-1])[:1]))
+            case "integer":
+                if len(found) > 80:
+                    raise TsdlError(offset, "integer out of range")
+                digits = found.rstrip("uUlL")
+                octal = digits[0] == "0" and re.fullmatch("0[0-7]+", digits)
+                found = str(int(digits, 8 if octal else 10 if digits.isdecimal() else 0))
         tokens.append(Token(kind, found, offset))
     return [*tokens, Token("end", "", len(text))]
 
@@ -255,85 +240,87 @@ def _unescape(text: str) -> str:
             return _ESCAPES.get(other, other)
         return chr(int(hexadecimal, 16) if hexadecimal else int(octal, 8) & 0xFF)
 
-    return _ESCAPE.sub(value, text) if "\\" in text else text
+    return _ESCAPE.sub(value, text)
 
 
-# Attributes of blocks and basic types
+# Blocks and basic types
 
-Attributes = dict[str, tuple[int | str | Type, int]]
-"""Name → value and its character offset."""
-_T = TypeVar("_T")
-_ORDERS: dict[int | str, ByteOrder] = {"le": "le", "be": "be", "network": "be", "native": "native"}
-_SIGNED: dict[int | str, bool] = {
-    **dict.fromkeys((0, "false", "FALSE"), False),
-    **dict.fromkeys((1, "true", "TRUE"), True),
+_CHOICES: dict[str, dict[int | str, Any]] = {  # of what each may be, what is meant without it first
+    "byte_order": {"native": "native", "le": "le", "be": "be", "network": "be"},
+    "signed": {0: False, "false": False, "FALSE": False, 1: True, "true": True, "TRUE": True},
+    "encoding": {"none": False, "utf8": True, "ascii": True},
 }
-_ENCODED: dict[int | str, bool] = {"none": False, "utf8": True, "ascii": True}
 
 
-def _typed(values: Attributes, name: str, wanted: type[_T], what: str) -> _T | None:
-    value, offset = values.get(name, (None, 0))
-    if value is not None and not isinstance(value, wanted):
-        found = repr(value) if isinstance(value, int | str) else "a type"
-        raise TsdlError(offset, f"{name} must be {what}, not {found}")
-    return value
+class _Block(dict[str, tuple[int | str | Type, int]]):
+    """``{ name = value; name := type; … }``: values with their offsets, and the block's own."""
+
+    offset = 0
+
+    def typed(self, name: str, wanted: type[_T], what: str) -> _T | None:
+        """A value of a type, None where there is none; TsdlError where it is another."""
+        value, offset = self.get(name, (None, 0))
+        if value is not None and not isinstance(value, wanted):
+            found = repr(value) if isinstance(value, int | str) else "a type"
+            raise TsdlError(offset, f"{name} must be {what}, not {found}")
+        return value
+
+    def struct(self, name: str) -> StructType | None:
+        return self.typed(name, StructType, "a structure")
+
+    def number(self, name: str, default: int = 0) -> int:
+        found = self.typed(name, int, "an integer")
+        return default if found is None else found
+
+    def identifier(self, name: str, default: int = 0) -> int:
+        found = self.number(name, default)
+        if not 0 <= found < 1 << 63:
+            raise TsdlError(self[name][1], f"{name} must be an unsigned integer, not {found}")
+        return found
+
+    def text(self, name: str) -> str | None:
+        value = self.get(name, (None, 0))[0]
+        return value if isinstance(value, str) else None
+
+    def choice(self, name: str) -> Any:
+        choices = _CHOICES[name]
+        value, offset = self.get(name, (next(iter(choices)), 0))
+        if isinstance(value, str) and name == "encoding":
+            value = re.sub("[-_]", "", value.lower())
+        if not isinstance(value, int | str) or value not in choices:
+            known = ", ".join(map(str, choices))
+            raise TsdlError(offset, f"unknown {name.replace('_', ' ')} {value!r}: none of {known}")
+        return choices[value]
+
+    def alignment(self, default: int) -> int:
+        return _checked_alignment(self.number("align", default), self.offset)
+
+    def integer_type(self) -> IntegerType:
+        size = self.number("size")
+        if not 0 < size <= 64:
+            raise TsdlError(self.offset, f"integer of {size} bits; 1 to 64 are supported")
+        target, place = self.get("map", (None, 0))
+        clock = re.fullmatch(r"clock\.([^.]*)\.value", str(target))
+        if target is not None and clock is None:
+            raise TsdlError(place, f"map must be clock.NAME.value, not {target!r}")
+        align, order = self.alignment(1 if size % 8 else 8), self.choice("byte_order")
+        signed, encoded = self.choice("signed"), self.choice("encoding")
+        return IntegerType(size, align, signed, order, encoded, clock and clock[1])
+
+    def float_type(self) -> StructType:
+        exponent, mantissa = self.number("exp_dig"), self.number("mant_dig")
+        if (exponent, mantissa) not in ((8, 24), (11, 53)):
+            given = f"floating point of {exponent} + {mantissa} bits"
+            raise TsdlError(self.offset, f"{given}; IEEE 32 or 64 supported")
+        self.choice("byte_order")
+        align = self.alignment(8)
+        return StructType((Field("bits", IntegerType(exponent + mantissa, align)),), align)
 
 
-def _number(values: Attributes, name: str, default: int) -> int:
-    found = _typed(values, name, int, "an integer")
-    return default if found is None else found
-
-
-def _identifier(values: Attributes, name: str, default: int = 0) -> int:
-    found = _typed(values, name, int, "an unsigned integer")
-    if found is not None and not 0 <= found < 1 << 63:
-        raise TsdlError(values[name][1], f"{name} must be an unsigned integer, not {found}")
-    return default if found is None else found
-
-
-def _one_of(choices: Mapping[int | str, _T], values: Attributes, name: str, default: _T) -> _T:
-    if name not in values:
-        return default
-    value, offset = values[name]
-    if isinstance(value, str) and name == "encoding":
-        value = re.sub("[-_]", "", value.lower())
-    if not isinstance(value, int | str) or value not in choices:
-        known = ", ".join(map(str, choices))
-        raise TsdlError(offset, f"unknown {name.replace('_', ' ')} {value!r}: none of {known}")
-    return choices[value]
-
-
-def _alignment(align: int, offset: int) -> int:
+def _checked_alignment(align: int, offset: int) -> int:
     if not 0 < align <= 1 << 20 or align & (align - 1):
         raise TsdlError(offset, f"alignment {align} is not a power of two")
     return align
-
-
-def _integer_type(values: Attributes, offset: int) -> IntegerType:
-    size = _number(values, "size", 0)
-    if not 0 < size <= 64:
-        raise TsdlError(offset, f"integer of {size} bits; 1 to 64 are supported")
-    target, place = values.get("map", (None, 0))
-    clock = re.fullmatch(r"clock\.([^.]*)\.value", str(target))
-    if target is not None and clock is None:
-        raise TsdlError(place, f"map must be clock.NAME.value, not {target!r}")
-    return IntegerType(
-        size=size,
-        align=_alignment(_number(values, "align", 1 if size % 8 else 8), offset),
-        signed=_one_of(_SIGNED, values, "signed", False),
-        byte_order=_one_of(_ORDERS, values, "byte_order", "native"),
-        encoded=_one_of(_ENCODED, values, "encoding", False),
-        clock=clock and clock[1],
-    )
-
-
-def _float_type(values: Attributes, offset: int) -> FloatType:
-    exponent, mantissa = _number(values, "exp_dig", 0), _number(values, "mant_dig", 0)
-    if (exponent, mantissa) not in ((8, 24), (11, 53)):
-        given = f"floating point of {exponent} + {mantissa} bits"
-        raise TsdlError(offset, f"{given}; IEEE 32 or 64 supported")
-    _one_of(_ORDERS, values, "byte_order", "native")
-    return FloatType(exponent + mantissa, _alignment(_number(values, "align", 8), offset))
 
 
 # Grammar
@@ -372,7 +359,6 @@ class _Parser:
             self.fail(f"expected {text!r}, found {self.token.text!r}")
 
     def take(self, kind: str) -> str:
-        """Step over a token of a kind and return its text, or fail."""
         token = self.token
         if token.kind != kind:
             self.fail(f"expected a {kind}, found {token.text!r}")
@@ -380,7 +366,7 @@ class _Parser:
         return token.text
 
     @contextmanager
-    def block(self) -> Iterator[None]:
+    def braces(self) -> Iterator[None]:
         """Braces with a type scope of their own; nesting is bounded against hostile files."""
         self.expect("{")
         if len(self.scope.maps) > _DEEPEST:
@@ -391,14 +377,12 @@ class _Parser:
         self.expect("}")
 
     def path(self) -> str:
-        """A dotted path such as ``packet.header`` or ``clock.monotonic.value``."""
         parts = [self.take("word")]
         while self.accept(".") or self.accept("->"):
             parts.append(self.take("word"))
         return ".".join(parts)
 
     def reference(self) -> str:
-        """The path of a length or tag."""
         path = self.path()
         self.referenced.add(path.rpartition(".")[2])
         return path
@@ -411,18 +395,17 @@ class _Parser:
         return sign * int(self.take("integer"))
 
     def value(self) -> int | str:
-        """The right-hand side of ``name = value``: integer, string or path."""
+        text = ""
         if self.token.kind == "string":
-            text = ""
             while self.token.kind == "string":
                 text += self.take("string")
             return text
         return self.path() if self.token.kind == "word" else self.integer()
 
-    def attributes(self) -> Attributes:
-        """``{ name = value; name := type; … }`` with types declared in between."""
-        found: Attributes = {}
-        with self.block():
+    def block(self) -> _Block:
+        found = _Block()
+        found.offset = self.tokens[self.position - 1].offset
+        with self.braces():
             while not self.at("}"):
                 if self.declaration():
                     continue
@@ -441,41 +424,33 @@ class _Parser:
         """A type specifier; ``declares`` says that a declarator's name follows it."""
         while self.accept("const"):
             pass
-        word, offset = self.token.text, self.token.offset
         if self.token.kind != "word":
-            self.fail(f"expected a type, found {word!r}")
-        braced = self.tokens[self.position + 1].text == "{"
+            self.fail(f"expected a type, found {self.token.text!r}")
+        start, word = self.position, self.token.text
+        self.position += 1
         match word:
             case "struct" | "variant" | "enum":
-                self.position += 1
                 return self._compound(word)
             case "string":
-                self.position += 1
-                _one_of(_ENCODED, self.attributes() if braced else {}, "encoding", True)
+                if self.at("{"):
+                    self.block().choice("encoding")
                 return StringType()
-            case "integer" if braced:
-                self.position += 1
-                return _integer_type(self.attributes(), offset)
-            case "floating_point" if braced:
-                self.position += 1
-                return _float_type(self.attributes(), offset)
-        return self._alias(declares)
-
-    def _alias(self, declares: bool) -> Type:
-        start = self.position
-        words: list[str] = []
-        while self.token.kind == "word" or (self.at("*") and words):
+            case "integer" if self.at("{"):
+                return self.block().integer_type()
+            case "floating_point" if self.at("{"):
+                return self.block().float_type()
+        words = [word]
+        while self.token.kind == "word" or self.at("*"):
             words.append(self.token.text)
             self.position += 1
         if declares and len(words) > 1:
             words.pop()
             self.position -= 1
         name = " ".join(word for word in words if word != "const")
-        found = self.scope.get(name)
-        if found is None:
+        if name not in self.scope:
             self.position = start
             self.fail(f"unknown type {name!r}")
-        return found
+        return self.scope[name]
 
     def _compound(self, keyword: str) -> Type:
         """What follows ``struct``, ``variant`` or ``enum``: a name, a body, or both."""
@@ -487,11 +462,11 @@ class _Parser:
             self.expect(">")
         if keyword == "enum" and self.accept(":"):
             container = self.type(declares=False)
-        kind: Type | None
+        kind: Type
         if not self.at("{"):
-            kind = self.scope.get(name) if name else None
-            if kind is None:
+            if name not in self.scope:
                 self.fail(f"unknown type {name!r}" if name else "expected '{'")
+            kind = self.scope[name]
         else:
             if keyword == "struct":
                 kind = self._struct()
@@ -507,13 +482,13 @@ class _Parser:
         fields, align = self._fields(), 1
         if self.accept("align"):
             self.expect("(")
-            align = _alignment(self.integer(), self.token.offset)
+            align = _checked_alignment(self.integer(), self.token.offset)
             self.expect(")")
         return StructType(fields, max([align, *(alignment(f.type) for f in fields)]))
 
     def _fields(self) -> tuple[Field, ...]:
         fields: list[Field] = []
-        with self.block():
+        with self.braces():
             while not self.at("}"):
                 if not self.declaration():
                     fields.extend(self._declarators(self.type(declares=True)))
@@ -603,7 +578,7 @@ def parse_tsdl(text: str) -> TraceClass:
     something undeclared, or declares something twice.
     """
     parser = _Parser(_tokens(text))
-    found: dict[str, list[tuple[Attributes, int]]]
+    found: dict[str, list[_Block]]
     found = {name: [] for name in ("trace", "env", "clock", "callsite", "stream", "event")}
     while parser.token.kind != "end":
         if parser.declaration():
@@ -611,23 +586,22 @@ def parse_tsdl(text: str) -> TraceClass:
         offset, keyword = parser.token.offset, parser.take("word")
         if keyword not in found:
             raise TsdlError(offset, f"unknown block {keyword!r}")
-        found[keyword].append((parser.attributes(), offset))
+        found[keyword].append(parser.block())
         parser.expect(";")
     if not found["trace"]:
         raise TsdlError(0, "no trace block")
-    if len(found["trace"]) > 1:
-        raise TsdlError(found["trace"][1][1], "a second trace block")
-    trace = found["trace"][0][0]
-    byte_order = trace.get("byte_order", (None, 0))[0]
-    if byte_order not in ("le", "be", "network"):
-        raise TsdlError(0, f"trace byte_order must be le or be, not {byte_order!r}")
-    environment = {n: v for values, _ in found["env"] for n, (v, _) in values.items()}
-    clocks = [_clock(values, offset) for values, offset in found["clock"]]
-    uuid = trace.get("uuid", (None, 0))[0]
+    trace, *others = found["trace"]
+    if others:
+        raise TsdlError(others[0].offset, "a second trace block")
+    order = trace.text("byte_order")
+    if order not in ("le", "be", "network"):
+        raise TsdlError(0, f"trace byte_order must be le or be, not {order!r}")
+    environment = {n: v for block in found["env"] for n, (v, _) in block.items()}
+    clocks = map(_clock, found["clock"])
     return TraceClass(
-        byte_order="le" if byte_order == "le" else "be",
-        uuid=uuid if isinstance(uuid, str) else None,
-        packet_header=_typed(trace, "packet.header", StructType, "a structure"),
+        byte_order="le" if order == "le" else "be",
+        uuid=trace.text("uuid"),
+        packet_header=trace.struct("packet.header"),
         env={name: value for name, value in environment.items() if isinstance(value, int | str)},
         clocks={clock.name: clock for clock in clocks},
         streams=_streams(found["stream"], found["event"]),
@@ -635,42 +609,38 @@ def parse_tsdl(text: str) -> TraceClass:
     )
 
 
-def _clock(values: Attributes, offset: int) -> Clock:
-    name = values.get("name", (None, 0))[0]
-    frequency = _number(values, "freq", 1_000_000_000)
-    if not isinstance(name, str):
-        raise TsdlError(offset, "clock without a name")
+def _clock(block: _Block) -> Clock:
+    name, frequency = block.text("name"), block.number("freq", 1_000_000_000)
+    if name is None:
+        raise TsdlError(block.offset, "clock without a name")
     if not 0 < frequency <= 10**10:
-        raise TsdlError(offset, f"clock frequency of {frequency} Hz; up to 10 GHz supported")
-    seconds, cycles = _number(values, "offset_s", 0), _number(values, "offset", 0)
+        raise TsdlError(block.offset, f"clock frequency of {frequency} Hz; up to 10 GHz supported")
+    seconds, cycles = block.number("offset_s"), block.number("offset")
     offset_ns = seconds * 1_000_000_000 + cycles * 1_000_000_000 // frequency
-    return Clock(name, frequency, offset_ns, str(values["uuid"][0]) if "uuid" in values else None)
+    return Clock(name, frequency, offset_ns, block.text("uuid"))
 
 
-def _streams(
-    blocks: list[tuple[Attributes, int]], event_blocks: list[tuple[Attributes, int]]
-) -> dict[int, StreamClass]:
+def _streams(blocks: list[_Block], events: list[_Block]) -> dict[int, StreamClass]:
     streams: dict[int, StreamClass] = {}
-    for values, offset in blocks:
-        identifier = _identifier(values, "id")
+    for block in blocks:
+        identifier = block.identifier("id")
         if identifier in streams:
-            raise TsdlError(offset, f"stream {identifier} declared twice")
+            raise TsdlError(block.offset, f"stream {identifier} declared twice")
         names = ("packet.context", "event.header", "event.context")
-        packet, header, context = (_typed(values, s, StructType, "a structure") for s in names)
+        packet, header, context = map(block.struct, names)
         streams[identifier] = StreamClass(identifier, packet, header, context)
     streams = streams or {0: StreamClass(0)}
     only = next(iter(streams)) if len(streams) == 1 else 0
-    events: dict[int, dict[int, EventClass]] = {identifier: {} for identifier in streams}
-    for values, offset in event_blocks:
-        name, identifier = values.get("name", (None, 0))[0], _identifier(values, "id")
-        if not isinstance(name, str):
-            raise TsdlError(offset, "event without a name")
-        target = _identifier(values, "stream_id", only)
-        if target not in streams:
-            raise TsdlError(offset, f"event {name!r} of undeclared stream {target}")
-        if identifier in events[target]:
-            raise TsdlError(offset, f"event {name!r}: id {identifier} declared twice")
-        scopes = ("context", "fields")
-        context, fields = (_typed(values, s, StructType, "a structure") for s in scopes)
-        events[target][identifier] = EventClass(identifier, name, context, fields)
-    return {number: replace(stream, events=events[number]) for number, stream in streams.items()}
+    for block in events:
+        name, identifier = block.text("name"), block.identifier("id")
+        if name is None:
+            raise TsdlError(block.offset, "event without a name")
+        stream = streams.get(block.identifier("stream_id", only))
+        if stream is None:
+            undeclared = f"of undeclared stream {block.identifier('stream_id', only)}"
+            raise TsdlError(block.offset, f"event {name!r} {undeclared}")
+        if identifier in stream.events:
+            raise TsdlError(block.offset, f"event {name!r}: id {identifier} declared twice")
+        own = EventClass(identifier, name, block.struct("context"), block.struct("fields"))
+        stream.events[identifier] = own
+    return streams

@@ -65,25 +65,20 @@ class EbpfTracer:
         pids: Sequence[int],
         users: Collection[int] | None = None,
     ) -> None:
-        self._script, self._events, self._said = (
-            folder.absolute() / name for name in ("events.bt", "events.txt", "bpftrace.log")
-        )
-        self._attached = not command
-        self._pids = tuple(pids)
+        files = ("events.bt", "events.txt", "bpftrace.log")
+        self._script, self._events, self._said = map(folder.absolute().joinpath, files)
+        self._attached, self._pids = not command, tuple(pids)
         self._users = run_users() if users is None else users
         self._open: dict[Path, int] = {}
         self._points: tuple[tp.TracePoint, ...] = ()
         self._bpftrace: subprocess.Popen[bytes] | None = None
-        self._began_ns = 0
         self._ended_ns: int | None = None
-        self._ahead_ns = 0
-        self._clock_offset_ns = 0
+        self._began_ns = self._ahead_ns = self._clock_offset_ns = 0
         self._notes: list[str] = []
         self._printed: tp.Printed | None = None
         self._functions: dict[tuple[int, int], str] = {}
 
     def start(self) -> Mapping[str, str]:
-        """Find the libraries, write the script, and wait until its probes are in place."""
         _check_privileges()
         if not is_installed("bpftrace"):
             raise PlatformError(
@@ -91,7 +86,6 @@ class EbpfTracer:
                 "bpftrace`; 0.17 or later), or record with `--source lttng`"
             )
         self._points = tp.trace_points(self._libraries())
-        traced = self._traced()
         for file in dict.fromkeys(point.file for point in self._points):
             try:
                 self._open[file] = open_regular(file)
@@ -100,8 +94,8 @@ class EbpfTracer:
         # A path is text that whoever owns a folder chooses, and what it leads to may change.
         ours = Path(f"/proc/{os.getpid()}/fd")
         points = [replace(one, file=ours / str(self._open[one.file])) for one in self._points]
-        script = tp.bpftrace_script(points, traced, users=self._users, attached=self._attached)
-        self._script.write_text(script)
+        limits = {"traced": self._traced(), "users": self._users}
+        self._script.write_text(tp.bpftrace_script(points, attached=self._attached, **limits))
         self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
         with self._events.open("wb") as printed, self._said.open("wb") as said:
             printed.write(tp.HEADER.encode())
@@ -120,13 +114,10 @@ class EbpfTracer:
         return {}
 
     def failure(self) -> str | None:
-        """Look whether bpftrace is there."""
-        if self._bpftrace is None or self._bpftrace.poll() is None:
-            return None
-        return f"bpftrace ended with code {self._bpftrace.returncode}: {self._complaint()}"
+        code = None if self._bpftrace is None else self._bpftrace.poll()
+        return code if code is None else f"bpftrace ended with code {code}: {self._complaint()}"
 
     def stop(self) -> None:
-        """Have bpftrace remove its probes and write down what it has."""
         if self._bpftrace is None or self._ended_ns is not None:
             return
         self._ended_ns = time.monotonic_ns()
@@ -144,8 +135,7 @@ class EbpfTracer:
         except subprocess.TimeoutExpired:
             late = f"bpftrace (process {self._bpftrace.pid}) did not end within {_STOP_S:.0f} s"
             self._notes.append(f"{late} and was killed: the last events are missing.")
-            self._bpftrace.kill()
-            self._bpftrace.wait()
+            self._kill()
         with suppress(OSError, pl.exceptions.PolarsError):  # `recording` says what is wrong
             self._printed = tp.read_printed(self._events, self._points, self._ahead_ns)
             # As long as the application runs: its memory tells.
@@ -154,16 +144,18 @@ class EbpfTracer:
                 one for one in callbacks if self._pids or user_of(one[0]) in self._users
             )
 
-    def remove(self) -> None:
-        """End bpftrace if it still runs; the kernel removes its probes with it."""
+    def _kill(self) -> None:
+        """The kernel removes its probes with it."""
         if self._bpftrace is not None and self._bpftrace.poll() is None:
             self._bpftrace.kill()
             self._bpftrace.wait()
+
+    def remove(self) -> None:
+        self._kill()
         while self._open:
             os.close(self._open.popitem()[1])
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
-        """The events that bpftrace printed, and what is known of a system that ran already."""
         try:
             printed = self._printed or tp.read_printed(self._events, self._points, self._ahead_ns)
             lost = lost_events(self._events, self._said)
@@ -172,8 +164,8 @@ class EbpfTracer:
             raise OperationError(f"{self._events}: {unread}: {error}") from error
         ended = self._ended_ns or time.monotonic_ns()
         in_place = pl.col("time").is_between(self._began_ns, ended)  # all probes, that is
-        whole = {name: table.filter(in_place) for name, table in printed.tables.items()}
-        tables: EventTables = {name: table for name, table in whole.items() if table.height}
+        whole = ((name, table.filter(in_place)) for name, table in printed.tables.items())
+        tables: EventTables = {name: table for name, table in whole if table.height}
         notes = [*self._notes, *self._about(tables, printed, lost)]
         if self._attached:
             tables, found = with_found_objects(tables, printed.handles, self._began_ns)
@@ -190,7 +182,6 @@ class EbpfTracer:
         return tables, info_of("ebpf", tables, versions, commands, lost, **facts)
 
     def _libraries(self) -> tuple[tp.TracingLibrary, ...]:
-        """The libraries to set probes on; at least one that exports trace points."""
         libraries = self._mapped() if self._attached else tp.installed_libraries(os.environ)
         if not libraries:
             raise PlatformError(
@@ -206,7 +197,6 @@ class EbpfTracer:
         return libraries
 
     def _mapped(self) -> tuple[tp.TracingLibrary, ...]:
-        """The libraries that the processes to attach to have mapped; at least one."""
         parent_of = parents()
         family = descendants(parent_of, *self._pids)
         mapped = tp.mapped_libraries(
@@ -264,7 +254,6 @@ class EbpfTracer:
         return "; ".join(wrong or lines[-1:]).replace("ERROR: ", "") or "it does not say why"
 
     def _about(self, tables: EventTables, printed: tp.Printed, lost: int) -> Iterator[str]:
-        """What a reader of the tables must know."""
         if not tables:
             libraries = dict.fromkeys(str(point.file) for point in self._points)
             yield f"no event was traced: nothing that ran has called {', '.join(libraries)}."
@@ -301,7 +290,6 @@ def _in_the_background(parent_pid: int) -> None:
 
 
 def _callbacks(tables: EventTables) -> Iterator[tuple[int, int]]:
-    """Processes and handles of all callbacks that were added or started."""
     for name in (*ADDED, "callback_start"):
         yield from events.table(tables, name).select("pid", "callback").unique().iter_rows()
 
@@ -320,12 +308,5 @@ def _check_privileges() -> None:
 
 
 def _boot_time_ahead() -> int:
-    """CLOCK_BOOTTIME minus CLOCK_MONOTONIC in ns (the narrowest of several brackets counts)."""
-    brackets = []
-    for _ in range(10):
-        before = time.monotonic_ns()
-        boot_time = time.clock_gettime_ns(time.CLOCK_BOOTTIME)
-        after = time.monotonic_ns()
-        brackets.append((after - before, boot_time - (before + after) // 2))
-    _, ahead = min(brackets)
+    ahead = clock_offset(time.CLOCK_BOOTTIME)
     return ahead if ahead > _SHORTEST_SUSPENSION_NS else 0

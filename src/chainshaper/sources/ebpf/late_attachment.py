@@ -118,7 +118,6 @@ def _of(handles: pl.DataFrame, event: str, column: str, known: pl.DataFrame) -> 
 
 
 def _threads_rows(*marks: pl.DataFrame) -> pl.DataFrame:
-    """Rows of several events by time: what one thread did follows each other."""
     return pl.concat(marks, how="diagonal").sort("time", maintain_order=True)
 
 

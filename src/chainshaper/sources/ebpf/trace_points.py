@@ -7,7 +7,7 @@ numbers, separated by tabs and in no order:
     code  time  pid  tid  cpu  value 0 … value 9  [prev_comm  next_comm]
 
 * The code says which of the trace points it is, :data:`FIRST_POINT` being the first one.
-* A number or a flag is one value, a gid two: its first 16 bytes, those that mean anything.
+* Each value stands at its argument's place, a gid at two: its first 16 bytes, the others are zeros.
 * A text is printed as the aligned eight-byte words it lies in, in lines of its own
   (:data:`TEXT_CODE`): 16 × the argument's place + the line's number, how many bytes before the text
   the first word begins, and eight words. So a name may contain anything, unlike with `str()`.
@@ -27,13 +27,15 @@ import ctypes
 import os
 import re
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias
 
+import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from chainshaper.sources.ebpf.functions import exported_functions, mapped_regions, read_regular
 from chainshaper.values import events
@@ -93,28 +95,15 @@ class TracingLibrary:
 
     @property
     def handles_at_rmw(self) -> bool:
-        """Whether `rmw_publish` of this version names its publisher."""
         return self.major >= 8
 
 
-@dataclass(frozen=True)
-class Argument:
+class Argument(NamedTuple):
     """A function's argument that becomes a column; ``place`` counts from 0."""
 
     column: str
     place: int
     kind: _Kind
-
-    @property
-    def values(self) -> tuple[str, ...]:
-        """How bpftrace gets the values that are printed in the event's own line."""
-        given = f"arg{self.place}"
-        return {
-            "number": (given,),
-            "flag": (f"{given} & 0xff",),  # the upper bytes of a register with a bool are undefined
-            "gid": (f"*(uint64 *){given}", f"*(uint64 *)({given} + 8)"),
-            "text": (),
-        }[self.kind]
 
 
 @dataclass(frozen=True)
@@ -127,14 +116,14 @@ class TracePoint:
 
     @property
     def arguments(self) -> tuple[Argument, ...]:
-        columns: tuple[str | None, ...] = tuple(events.FIELDS[self.event])
+        types = events.FIELDS[self.event]
+        columns: tuple[str | None, ...] = tuple(types)
         if self.event == "rcl_init":  # the version is the library's own, from its `package.xml`
             columns = ("context_handle",)
         elif self.event == "rclcpp_publish":  # the publisher's address, mostly null, comes first
             columns = (None, "message")
         elif self.event == "rmw_publish" and not self.tracing_library.handles_at_rmw:
             columns = ("message",)
-        types = events.FIELDS[self.event]
         return tuple(
             Argument(column, place, _KINDS.get(types[column].base_type(), "number"))
             for place, column in enumerate(columns)
@@ -274,10 +263,16 @@ def _statements(point: TracePoint, code: int, attached: bool) -> Iterator[str]:
     yield "$now = nsecs;"
     came = _printf(SWITCH_CODE, ["tid"], "\\t" * 4 + "%d")
     yield f"if (@running[tid] == 0) {{ @running[tid] = 1; {came} }}"
-    yield _printf(code, [value for argument in point.arguments for value in argument.values])
-    for argument in point.arguments:
-        if argument.kind == "text":
-            yield from _text(f"arg{argument.place}", argument.place)
+    values: dict[int, str] = {}
+    for _, place, kind in point.arguments:
+        if kind == "gid":
+            values |= {place: f"*(uint64 *)arg{place}", place + 1: f"*(uint64 *)(arg{place} + 8)"}
+        elif kind != "text":
+            values[place] = f"arg{place}"
+    yield _printf(code, [values.get(place, "0") for place in range(max(values, default=-1) + 1)])
+    for _, place, kind in point.arguments:
+        if kind == "text":
+            yield from _text(f"arg{place}", place)
     if attached and point.handle is not None:
         yield f"$handle = {point.handle};"
         yield "if (@named[pid, $handle] == 0) {"
@@ -306,6 +301,40 @@ def _text(address: str, place: int) -> Iterator[str]:
     yield "  $word = $word + 64;"
     yield "  $line = $line + 1;"
     yield "}"
+
+
+def event_table(
+    point: TracePoint,
+    arguments: Iterable[Argument],
+    common: pl.DataFrame,
+    values: NDArray[np.uint64],
+    texts: Callable[[int], Any],
+) -> pl.DataFrame:
+    """The table of one trace point's events in order of time, the ``common`` columns in front.
+
+    ``values`` has a row of registers for each event, a gid in two of them; ``texts`` gives those of
+    a place.
+    """
+    columns: dict[str, Any] = {}
+    for column, place, kind in arguments:
+        if kind == "text":
+            columns[column] = pl.Series(texts(place), dtype=pl.String)
+        elif kind == "gid":
+            gids = np.ascontiguousarray(values[:, place : place + 2])
+            columns[column] = pl.Series(gids.view(np.uint8)).cast(pl.List(pl.UInt8))
+        else:  # the upper bytes of a register with a bool are undefined
+            register = np.ascontiguousarray(values[:, place])
+            columns[column] = pl.Series(register & 0xFF if kind == "flag" else register)
+    frame = common.with_columns(**columns)
+    if point.event == "rcl_init":
+        frame = frame.with_columns(version=pl.lit(point.tracing_library.version, pl.String))
+    types = {n: t for n, t in events.column_types(point.event).items() if n in frame.columns}
+    return frame.select(
+        pl.col(n).reinterpret(signed=True)
+        if t == pl.Int64() and frame.schema[n] == pl.UInt64()
+        else pl.col(n).cast(t)
+        for n, t in types.items()
+    ).sort("time", maintain_order=True)
 
 
 @dataclass(frozen=True)
@@ -347,11 +376,19 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
     for code, point in enumerate(points, FIRST_POINT):
         rows = lines.filter(code=code)
         if rows.height:
-            parts.setdefault(point.event, []).append(_table(rows, point, texts))
+
+            def said(place: int, rows: pl.DataFrame = rows) -> pl.Series:
+                own = texts.filter(place=place)
+                return rows.join(own, on=["time", "tid"], how="left", maintain_order="left")["text"]
+
+            values = rows.select(VALUES).fill_null(0).to_numpy().view(np.uint64)
+            table = event_table(point, point.arguments, rows.select(CODE[1:]), values, said)
+            parts.setdefault(point.event, []).append(table)
     switches = lines.filter(code=SWITCH_CODE)
     if switches.height:
-        columns = dict(zip(VALUES, _SWITCH, strict=False))
-        parts["sched_switch"] = [_typed(switches.rename(columns), "sched_switch")]
+        switches = switches.rename(dict(zip(VALUES, _SWITCH, strict=False)))
+        types = events.column_types("sched_switch")
+        parts["sched_switch"] = [switches.select(pl.col(n).cast(t) for n, t in types.items())]
     tables = {
         event: pl.concat(tables, how="diagonal").sort("time", maintain_order=True)
         for event, tables in parts.items()
@@ -390,29 +427,3 @@ def _texts(lines: pl.DataFrame) -> pl.DataFrame:
         schema={**dict.fromkeys(key[:3], pl.Int64), "text": pl.String, "cut": pl.Boolean},
         orient="row",
     )
-
-
-def _table(rows: pl.DataFrame, point: TracePoint, texts: pl.DataFrame) -> pl.DataFrame:
-    """The table of one trace point's rows."""
-    values = iter(VALUES)
-    for argument in point.arguments:
-        column = argument.column
-        if argument.kind == "text":
-            text = pl.col("text").alias(column)
-            own = texts.filter(place=argument.place).select("time", "tid", text)
-            rows = rows.join(own, on=["time", "tid"], how="left")
-        elif argument.kind == "gid":
-            words = rows.select(next(values), next(values)).to_numpy().astype("<i8")
-            gids = [list(one.tobytes()) for one in words]
-            rows = rows.with_columns(pl.Series(column, gids, dtype=pl.List(pl.UInt8)))
-        else:
-            rows = rows.with_columns(pl.col(next(values)).alias(column))
-    if point.event == "rcl_init":
-        rows = rows.with_columns(version=pl.lit(point.tracing_library.version, dtype=pl.String))
-    return _typed(rows, point.event)
-
-
-def _typed(rows: pl.DataFrame, event: str) -> pl.DataFrame:
-    """The event's columns that there are, with their types."""
-    types = {**events.COMMON_COLUMNS, **events.FIELDS[event]}
-    return rows.select(pl.col(name).cast(kind) for name, kind in types.items() if name in rows)

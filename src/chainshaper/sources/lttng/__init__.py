@@ -2,10 +2,10 @@
 
 A root daemon that runs already, which we may use as root or in the group `tracing`, traces
 everybody's processes, and the kernel: we add a session to it, and leave out of the tables what
-other applications did. Otherwise we start a daemon and end it afterwards. It listens in a home
-directory of our own, the command's `LTTNG_HOME`, so it traces the command alone. Root's run
-directory is always /var/run/lttng, so root's daemon and clients have one of ours mounted there, in
-mount namespaces of their own. Where root may not mount, there can be one recording at a time.
+other applications did. Otherwise we start a daemon that listens in a home directory of our own, the
+command's `LTTNG_HOME`, so it traces the command alone. Root's run directory is always
+/var/run/lttng, so root's daemon and clients have one of ours mounted there, in mount namespaces of
+their own. Where root may not mount, there can be one recording at a time.
 
 If we are killed, the kernel ends a daemon of ours; a shell that waits for our end destroys our
 sessions in another's daemon and removes the home directory.
@@ -25,6 +25,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import polars as pl
@@ -38,7 +39,7 @@ from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
 
-EVENTS = ("ros2:*", "ros2_caret:*", "dds:*")
+EVENTS = "ros2:*,ros2_caret:*,dds:*"
 """Everything that `tracetools` of any distribution, CARET, and a traced Cyclone DDS emit."""
 MARK = "CHAINSHAPER_RECORDING"
 """In the environment of the command, and of everything that it starts."""
@@ -68,136 +69,12 @@ rm -rf "$LTTNG_HOME"
 """
 
 
-class Lttng:
-    """A connection to the session daemon that traces our applications, or to one of our own.
-
-    ``home`` is a directory of our own, whose unique name sessions are called after. ``daemon`` is
-    the daemon's process where we have started it. Raises PlatformError, OperationError.
-    """
-
-    def __init__(self) -> None:
-        if not is_installed("lttng"):
-            raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
-        # Sockets lie in it, whose paths may have 108 characters only: not beside the recording.
-        self.home = Path(tempfile.mkdtemp(prefix="chainshaper-lttng-"))
-        self.daemon: subprocess.Popen[bytes] | None = None
-        self._environment = {**tool_environment(), "LTTNG_HOME": str(self.home)}
-        self._inside: tuple[str, ...] = ()  # what commands begin with that see its run directory
-        self._afterwards = subprocess.Popen(  # clears up when we are gone
-            ["sh", "-c", _AFTERWARDS, self.home.name],
-            env=self._environment,
-            stdin=subprocess.PIPE,  # ends with us, however that happens
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            start_new_session=True,
-        )
-        try:
-            found = self._answers()
-            if not found or _hears_one_command_only():
-                self._start_daemon(found)
-        except BaseException:
-            self.close()
-            raise
-
-    def ask(self, *arguments: str) -> ElementTree.Element:
-        """The answer of `lttng ARGUMENTS`. Raises OperationError: it fails; in its own words."""
-        what = f"`{shlex.join(('lttng', *arguments))}`"
-        try:
-            run = subprocess.run(
-                [*self._inside, "lttng", "--no-sessiond", "--mi", "xml", *arguments],
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                errors="replace",
-                timeout=_ANSWER_S,
-                check=False,
-                start_new_session=True,  # Ctrl-C is ours to react to
-            )
-            if run.returncode == 0:
-                return ElementTree.fromstring(run.stdout)  # noqa: S314 - LTTng's own, no stranger's
-        except (OSError, subprocess.TimeoutExpired) as error:
-            raise OperationError(f"{what} does not answer: {error}") from None
-        except ElementTree.ParseError as error:
-            raise OperationError(f"{what} answers no XML: {error}") from None
-        said = _last_line(run.stderr).removeprefix("Error: ")
-        raise OperationError(f"{what} failed: {said or f'exit code {run.returncode}'}")
-
-    def _answers(self) -> bool:
-        """Whether a session daemon does."""
-        with suppress(OperationError):
-            self.ask("list")
-            return True
-        return False
-
-    def _start_daemon(self, another: bool) -> None:
-        """Start a daemon of ours, with a run directory of its own if there is ``another``."""
-        if os.getuid() == 0:  # all other users' is in the home directory anyway
-            (self.home / "run").mkdir()
-            inside = (*_APART, str(self.home / "run"))
-            with suppress(OSError):  # no `unshare` here
-                trial, environment = [*inside, "true"], self._environment
-                run = subprocess.run(trial, env=environment, capture_output=True, check=False)
-                self._inside = inside if run.returncode == 0 else ()
-        if another and not self._inside:
-            raise PlatformError(
-                "another recording runs, and LTTng makes one at a time where root may not mount: "
-                "wait for its end, or permit mounting (Docker: `--privileged`)"
-            )
-        if not is_installed("lttng-sessiond"):
-            missing = "no LTTng session daemon runs, and `lttng-sessiond` is not there"
-            raise PlatformError(f"{missing}: {_PACKAGES}")
-        said, folder = self.home / "daemon.log", self.home / ".lttng"
-        folder.mkdir()
-        for version in range(5, 20):  # applications look for one with their ABI's version
-            (folder / f"lttng-ust-sock-{version}").symlink_to("applications")
-        sockets = f"--apps-sock={folder / 'applications'}"
-        with said.open("wb") as log:
-            self.daemon = subprocess.Popen(
-                [*self._inside, "lttng-sessiond", "--quiet", sockets],
-                env=self._environment,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                # It ends in order, with its consumers, should we be killed.
-                preexec_fn=partial(signalled_with_parent, os.getpid(), signal.SIGINT),  # noqa: PLW1509 - one call
-            )
-        deadline = time.monotonic() + _START_S
-        while not self._answers():
-            if self.daemon.poll() is not None or time.monotonic() > deadline:
-                reason = _last_line(said.read_text(errors="replace")) or "it says nothing"
-                raise OperationError(f"the LTTng session daemon does not start: {reason}")
-            time.sleep(0.05)
-
-    def close(self) -> None:
-        """End the daemon if it is ours, and remove the home directory; harmless when repeated."""
-        if self.daemon is not None:
-            self.daemon.terminate()
-            try:
-                self.daemon.wait(_START_S)
-            except subprocess.TimeoutExpired:
-                self.daemon.kill()
-                self.daemon.wait()
-        self._afterwards.communicate()
-
-
-def _hears_one_command_only() -> bool:
-    """Whether the root daemon that runs is another recording's: no other application finds it."""
-    with suppress(OSError, ValueError):
-        pid = int((_RUN_DIRECTORY / "lttng-sessiond.pid").read_text())
-        return b"--apps-sock=" in read_proc(f"/proc/{pid}/cmdline")
-    return False
-
-
-def _last_line(text: str) -> str:
-    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
-
-
 class LttngSession:
     """Records with LTTng: a :class:`~chainshaper.sources.Tracer`.
 
-    ``buffer`` is the size of the ring buffer of each core in bytes (:func:`buffer_size`).
+    ``buffer`` is the size of the ring buffer of each core in bytes (:func:`buffer_size`), ``home``
+    a directory of our own, after whose unique name sessions are called, ``daemon`` the session
+    daemon where we have started it.
     """
 
     def __init__(
@@ -213,20 +90,35 @@ class LttngSession:
                 "LTTng does not trace processes that run already: give the COMMAND that starts "
                 "the application behind `--`, or attach with `--source ebpf`"
             )
-        self._folder = folder
-        self._buffer = buffer_size(wanted=buffer)
+        self._folder, self._buffer = folder, buffer_size(wanted=buffer)
         self._users = run_users() if users is None else users
-        self._lttng: Lttng | None = None
+        self.home = Path()
+        self.daemon: subprocess.Popen[bytes] | None = None
+        self._environment: Mapping[str, str] = {}
+        self._inside: tuple[str, ...] = ()  # what commands begin with that see its run directory
+        self._afterwards: subprocess.Popen[bytes] | None = None  # clears up when we are gone
         self._kernel = False
         self._strangers: set[int] = set()
         self._sessions: list[str] = []
         self._notes: list[str] = []
 
     def start(self) -> Mapping[str, str]:
-        """Have a session daemon, and a session that is on."""
-        self._lttng = lttng = Lttng()
+        if not is_installed("lttng"):
+            raise PlatformError(f"the command `lttng` is not there: {_PACKAGES}")
+        # Sockets lie in it, whose paths may have 108 characters only: not beside the recording.
+        self.home = Path(tempfile.mkdtemp(prefix="chainshaper-lttng-"))
+        self._environment = {**tool_environment(), "LTTNG_HOME": str(self.home)}
+        self._afterwards = subprocess.Popen(
+            ["sh", "-c", _AFTERWARDS, self.home.name],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            **{**self._apart(), "stdin": subprocess.PIPE},  # ends with us, however that happens
+        )
+        found = self._answers()
+        if not found or _hears_one_command_only():
+            self._start_daemon(found)
         try:
-            lttng.ask("list", "--kernel")
+            self._ask("list", "--kernel")
             self._kernel = True
         except OperationError as error:
             reason = str(error).partition("failed: ")[2]
@@ -235,28 +127,27 @@ class LttngSession:
                 "needs its kernel modules (`apt-get install lttng-modules-dkms`), and root or the "
                 "group `tracing`; `--source ebpf` needs root only."
             )
-        lttng.ask("start", self._new_session(lttng))
+        self._ask("start", self._new_session())
         # A process that starts waits that long (ms) for the session daemon, which may be busy.
         environment = {"LTTNG_UST_REGISTER_TIMEOUT": "30000", MARK: self._sessions[0]}
-        if lttng.daemon is not None:
-            environment["LTTNG_HOME"] = str(lttng.home)
+        if self.daemon is not None:
+            environment["LTTNG_HOME"] = str(self.home)
         return environment
 
     def failure(self) -> str | None:
         """Look whether the daemon is there and the session loses nothing; enlarge the buffers."""
-        if self._lttng is None:
+        if not self._sessions:
             return None
-        self._look_for_strangers(self._lttng)
+        self._look_for_strangers()
         try:
-            answer = self._lttng.ask("list", self._sessions[-1])
+            answer = self._ask("list", self._sessions[-1])
             kinds = ("discarded_events", "lost_packets")
             counts = [one.text for kind in kinds for one in answer.iterfind(f".//{{*}}{kind}")]
             if sum(int(count or 0) for count in counts):
-                self._enlarge(self._lttng)
+                self._enlarge()
         except OperationError as error:
-            daemon = self._lttng.daemon
-            if daemon is not None and daemon.poll() is not None:
-                return f"the LTTng session daemon ended with code {daemon.returncode}"
+            if self.daemon is not None and self.daemon.poll() is not None:
+                return f"the LTTng session daemon ended with code {self.daemon.returncode}"
             return str(error)
         return None
 
@@ -265,25 +156,30 @@ class LttngSession:
 
         What is there already stays of use where that fails, so it is noted.
         """
-        if self._lttng is not None and self._sessions:
-            self._look_for_strangers(self._lttng)
+        if self._sessions:
+            self._look_for_strangers()
             try:
-                self._lttng.ask("stop", self._sessions[-1])
+                self._ask("stop", self._sessions[-1])
             except OperationError as error:
                 self._notes.append(f"the last events may be missing: {error}.")
 
     def remove(self) -> None:
-        """Destroy the sessions, and end the daemon if it is ours."""
-        if self._lttng is None:
+        if self._afterwards is None:
             return
         for name in self._sessions:
             with suppress(OperationError):
-                self._lttng.ask("destroy", name)
-        self._lttng.close()
-        self._lttng = None
+                self._ask("destroy", name)
+        if self.daemon is not None:
+            self.daemon.terminate()
+            try:
+                self.daemon.wait(_START_S)
+            except subprocess.TimeoutExpired:
+                self.daemon.kill()
+                self.daemon.wait()
+        self._afterwards.communicate()
+        self._afterwards = None
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
-        """The trace that was written."""
         tables: EventTables = {}
         if any(self._folder.rglob("metadata")):
             from chainshaper.sources.lttng.trace import open_lttng_trace
@@ -305,62 +201,138 @@ class LttngSession:
             notes.append(f"{lost} events were lost: buffers were too small. {remedy}")
         return tables, info.model_copy(update={"notes": tuple(notes)})
 
-    def _look_for_strangers(self, lttng: Lttng) -> None:
+    def _apart(self) -> dict[str, Any]:
+        """How commands run: in a session of their own, since Ctrl-C is ours to react to."""
+        return {"env": self._environment, "stdin": subprocess.DEVNULL, "start_new_session": True}
+
+    def _ask(self, *arguments: str) -> ElementTree.Element:
+        """The answer of `lttng ARGUMENTS`. Raises OperationError: it fails; in its own words."""
+        command = [*self._inside, "lttng", "--no-sessiond", "--mi", "xml", *arguments]
+        options = {**self._apart(), "capture_output": True, "timeout": _ANSWER_S}
+        what = f"`{shlex.join(('lttng', *arguments))}`"
+        try:
+            run = subprocess.run(command, text=True, errors="replace", check=False, **options)
+            if run.returncode == 0:
+                return ElementTree.fromstring(run.stdout)  # noqa: S314 - LTTng's own, no stranger's
+        except (OSError, subprocess.TimeoutExpired) as error:
+            raise OperationError(f"{what} does not answer: {error}") from None
+        except ElementTree.ParseError as error:
+            raise OperationError(f"{what} answers no XML: {error}") from None
+        said = _last_line(run.stderr).removeprefix("Error: ")
+        raise OperationError(f"{what} failed: {said or f'exit code {run.returncode}'}")
+
+    def _answers(self) -> bool:
+        with suppress(OperationError):
+            self._ask("list")
+            return True
+        return False
+
+    def _start_daemon(self, another: bool) -> None:
+        """Start a daemon of ours, with a run directory of its own if there is ``another``."""
+        if os.getuid() == 0:  # all other users' is in the home directory anyway
+            (self.home / "run").mkdir()
+            inside = (*_APART, str(self.home / "run"))
+            with suppress(OSError, subprocess.CalledProcessError):  # no `unshare` here
+                trial = {**self._apart(), "capture_output": True}
+                subprocess.run([*inside, "true"], check=True, **trial)
+                self._inside = inside
+        if another and not self._inside:
+            raise PlatformError(
+                "another recording runs, and LTTng makes one at a time where root may not mount: "
+                "wait for its end, or permit mounting (Docker: `--privileged`)"
+            )
+        if not is_installed("lttng-sessiond"):
+            missing = "no LTTng session daemon runs, and `lttng-sessiond` is not there"
+            raise PlatformError(f"{missing}: {_PACKAGES}")
+        said, sockets = self.home / "daemon.log", self.home / ".lttng"
+        sockets.mkdir()
+        for version in range(5, 20):  # applications look for one with their ABI's version
+            (sockets / f"lttng-ust-sock-{version}").symlink_to("applications")
+        applications = f"--apps-sock={sockets / 'applications'}"
+        with said.open("wb") as log:
+            self.daemon = subprocess.Popen(
+                [*self._inside, "lttng-sessiond", "--quiet", applications],
+                stdout=log,
+                stderr=log,
+                # It ends in order, with its consumers, should we be killed.
+                preexec_fn=partial(signalled_with_parent, os.getpid(), signal.SIGINT),  # noqa: PLW1509 - one call
+                **self._apart(),
+            )
+        deadline = time.monotonic() + _START_S
+        while not self._answers():
+            if self.daemon.poll() is not None or time.monotonic() > deadline:
+                reason = _last_line(said.read_text(errors="replace")) or "it says nothing"
+                raise OperationError(f"the LTTng session daemon does not start: {reason}")
+            time.sleep(0.05)
+
+    def _look_for_strangers(self) -> None:
         """Note who else runs, if the daemon is not ours and so hears every application.
 
         The command's is what descends from us, or has our mark, as with a parent that is gone.
         """
-        if lttng.daemon is None:
+        if self.daemon is None:
             parent_of, mark = parents(), f"{MARK}={self._sessions[0]}"
             unrelated = parent_of.keys() - descendants(parent_of, os.getpid())
             others = {pid for pid in unrelated if not _is_marked(pid, mark, self._users)}
             self._strangers = (self._strangers | others) - (parent_of.keys() - others)
 
-    def _new_session(self, lttng: Lttng) -> str:
+    def _new_session(self) -> str:
         """Prepare a session with buffers of the present size; its name."""
         number = len(self._sessions) + 1
-        name = f"{lttng.home.name}-{number}"
-        answer = lttng.ask("version")
+        name = f"{self.home.name}-{number}"
+        answer = self._ask("version")
         version = [int(answer.findtext(f".//{{*}}{part}") or 0) for part in ("major", "minor")]
         # LTTng 2.15 began to write CTF 2, which no analysis reads yet.
         old_format = ("--trace-format=ctf-1.8",) if version >= [2, 15] else ()
         output = self._folder.absolute() / f"session-{number}"
-        lttng.ask("create", name, f"--output={output}", *old_format)
+        self._ask("create", name, f"--output={output}", *old_format)
         self._sessions.append(name)
         size = f"--subbuf-size={self._buffer // _SUB_BUFFERS}"
         # The application need not wake the consumer, which looks every 200 ms.
         channel: tuple[str, ...] = (size, f"--num-subbuf={_SUB_BUFFERS}", f"--session={name}")
         channel += ("--discard", "--switch-timer=0", "--read-timer=200000", "events")
         of_channel = (f"--session={name}", "--channel=events")
-        lttng.ask("enable-channel", "--userspace", "--buffers-uid", *channel)
-        lttng.ask("enable-event", "--userspace", *of_channel, ",".join(EVENTS))
+        self._ask("enable-channel", "--userspace", "--buffers-uid", *channel)
+        self._ask("enable-event", "--userspace", *of_channel, EVENTS)
         contexts = ("--type=procname", "--type=vpid", "--type=vtid")
-        lttng.ask("add-context", "--userspace", *of_channel, *contexts)
+        self._ask("add-context", "--userspace", *of_channel, *contexts)
         if self._kernel:
-            lttng.ask("enable-channel", "--kernel", *channel)
-            lttng.ask("enable-event", "--kernel", *of_channel, "sched_switch")
+            self._ask("enable-channel", "--kernel", *channel)
+            self._ask("enable-event", "--kernel", *of_channel, "sched_switch")
         return name
 
-    def _enlarge(self, lttng: Lttng) -> None:
+    def _enlarge(self) -> None:
         """Go on in a session with larger buffers, if there is room: one that runs gets none."""
         before, larger = self._buffer, buffer_size(wanted=self._buffer * _ENLARGED_BY)
         if larger <= before:
             return
         former, self._buffer = self._sessions[-1], larger
         try:
-            successor = self._new_session(lttng)
+            successor = self._new_session()
         except OperationError:
             self._sessions.sort(key=former.__eq__)  # the last one is that which runs
             raise
         stopped = time.monotonic_ns()
-        lttng.ask("stop", former, "--no-wait")
-        lttng.ask("start", successor)
+        self._ask("stop", former, "--no-wait")
+        self._ask("start", successor)
         gap = time.monotonic_ns() - stopped
-        lttng.ask("destroy", former)  # once all of it is on disk
+        self._ask("destroy", former)  # once all of it is on disk
         self._notes.append(
             f"events were lost, so the buffers were enlarged from {before >> 10} KiB to "
             f"{larger >> 10} KiB a core; nothing was recorded for {duration_text(round(gap, -6))}."
         )
+
+
+def _hears_one_command_only() -> bool:
+    """Whether the root daemon that runs is another recording's: no other application finds it."""
+    with suppress(OSError, ValueError):
+        pid = int((_RUN_DIRECTORY / "lttng-sessiond.pid").read_text())
+        return b"--apps-sock=" in read_proc(f"/proc/{pid}/cmdline")
+    return False
+
+
+def _last_line(text: str) -> str:
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
 
 
 def buffer_size(
@@ -388,7 +360,6 @@ def _is_marked(pid: int, mark: str, users: Collection[int]) -> bool:
 def _without_processes(
     strangers: Collection[int], tables: EventTables, info: RecordingInfo
 ) -> tuple[EventTables, RecordingInfo]:
-    """The events without those of processes that are none of the command's."""
     traced = (frame["pid"].drop_nulls().unique() for frame in tables.values())
     foreign = sorted({pid for pids in traced for pid in pids} & set(strangers))
     if not foreign:

@@ -4,7 +4,7 @@ Events lose their provider (``ros2:callback_start`` → ``callback_start``) and 
 types of :mod:`chainshaper.values.events`. A field that a trace does not declare, or of a kind that
 no cast brings right, becomes a column of nulls; a note says so unless a distribution is like that.
 
-Tables are decoded in groups that are used together: one pass over a trace costs nearly the same for
+Tables are decoded in groups that are used together: a pass over a trace costs nearly the same for
 one table as for twenty. Containers number their processes independently: folders of several hosts
 are read host by host, and of one host (`--network host` has its name) path by path; where two use
 the same number, the later one's are moved (:data:`NEXT_HOST`). CARET emits the events of an
@@ -72,14 +72,13 @@ def open_lttng_trace(
                 "boot): their times cannot be compared; give the folders of one recording"
             )
     tables = TraceTables(_by_host(trace, paths), progress, overview)
-    creation = tables.creation()
-    hosts = sorted({_fact(folder.declared.env, "hostname") for folder in trace.folders})
-    kernels = (_fact(folder.declared.env, "kernel_release") for folder in trace.folders)
+    creation, hosts = tables.creation(), {_fact(folder, "hostname") for folder in trace.folders}
+    kernels = (_fact(folder, "kernel_release") for folder in trace.folders)
     info = RecordingInfo(
         source="lttng",
-        host=", ".join(host for host in hosts if host),
-        kernel=next((release for release in kernels if release), "unknown"),
-        distribution=distribution_of(creation, tables.field_lengths()),
+        host=", ".join(sorted(host for host in hosts if host)),
+        kernel=next(filter(None, kernels), "unknown"),
+        distribution=distribution_of(creation, tables.fields, tables.gid_length()),
         rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
         clock_offset_ns=trace.clock_offset_ns,
         processes=processes_of(creation, tables.commands()),
@@ -89,20 +88,19 @@ def open_lttng_trace(
     return Recording(Path(paths[0]), info, tables)
 
 
-def _fact(environment: Mapping[str, object], name: str) -> str:
-    return str(environment.get(name) or "")
+def _fact(folder: ctf.TraceClass, name: str) -> str:
+    return str(folder.env.get(name) or "")
 
 
 class TraceTables(Mapping[str, pl.DataFrame]):
     """The event tables of an open trace that happened, decoded at first use.
 
-    ``counts`` are the events per full name, provider included.
+    ``counts`` are the events per full name, provider included; ``fields`` what is declared of each.
     """
 
     def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress, overview: bool) -> None:
-        self._hosts, trace = hosts, next(iter(hosts.values()))
-        self._fields = _declared_fields(trace)
-        self._progress = progress
+        self._hosts, self._progress, trace = hosts, progress, next(iter(hosts.values()))
+        self.fields = _declared_fields(trace)
         self._read: dict[str, pl.DataFrame] = {}
         self._decoding = Lock()  # the analysis asks for tables from two threads
         self._sources: dict[str, list[str]] = {}
@@ -132,19 +130,15 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         return {pid: self._names.get(pid, "") for pid in pids}
 
     def thread_names(self) -> set[str]:
-        """Names of threads that the tracer recorded, the kernel's view included."""
         switches = events.table(self, "sched_switch", ["next_comm"])
         return {*self._names.values(), *switches["next_comm"].unique().drop_nulls()}
 
-    def field_lengths(self) -> dict[str, dict[str, int]]:
-        """Event → its declared fields, with the length of those that are arrays (0: no array)."""
-        return {
-            name: {
-                f: t.length if isinstance(t, ctf.ArrayType) and isinstance(t.length, int) else 0
-                for f, t in fields.items()
-            }
-            for name, fields in self._fields.items()
-        }
+    def gid_length(self) -> int:
+        """How long a publisher's gid is declared to be."""
+        match self.fields.get("rmw_publisher_init", {}).get("gid"):
+            case ctf.ArrayType(length=int(length)):
+                return length
+        return 0
 
     def __getitem__(self, name: str) -> pl.DataFrame:
         if name not in self:
@@ -169,22 +163,20 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def notes(self) -> Iterator[str]:
         """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
         yield from self.warnings
-        for name in sorted(set(self) & self._fields.keys()):
+        for name in sorted(set(self) & self.fields.keys()):
             missing = [
                 field
                 for field, kind in events.FIELDS[name].items()
                 if field not in events.VERSION_FIELDS.get(name, ())
-                and not events.castable(_decoded_type(self._fields[name].get(field)), kind)
+                and not events.castable(_decoded_type(self.fields[name].get(field)), kind)
             ]
             if missing:
                 fields = f"no usable field {', '.join(missing)}"
                 yield f"the trace's {name} has {fields}: what depends on it cannot be known."
         for host, by in self._moved.items():
             if by:
-                yield (
-                    f"processes and threads of host {host} have {by} added to their numbers, which "
-                    "another host's processes have as well."
-                )
+                moved = f"processes and threads of host {host} have {by} added to their numbers"
+                yield f"{moved}, which another host's processes have as well."
         if self._anonymous:
             yield (
                 f"{self._anonymous} events say no process or thread and cannot be used: record "
@@ -194,18 +186,18 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     def _decode(self, group: frozenset[str]) -> None:
         parts: dict[str, list[pl.DataFrame]] = {}
         wanted = [full for name in group for full in self._sources.get(name, ())]
-        first, nameless = not self.counts, not self._names
+        nameless = [full for full in wanted if table_name(full) not in CREATION]
+        first, unnamed = not self.counts, not self._names
         for place, (host, trace) in enumerate(self._hosts.items()):
-            self._report(place, 0.0)
-            found = read_events(
-                trace,
-                wanted,
-                nameless=[full for full in wanted if table_name(full) not in CREATION],
-                progress=lambda share, place=place: self._report(place, share),  # type: ignore[misc]
-            )
+
+            def report(share: float, place: int = place) -> None:
+                self._progress((place + share) / len(self._hosts), "decoding events")
+
+            report(0.0)
+            found = read_events(trace, wanted, nameless=nameless, progress=report)
             if first:
                 self._take_stock(host, trace, found)
-            if nameless:
+            if unnamed:
                 self._note_names(host, trace, found)
             for name in group:
                 for full in self._sources.get(name, ()):
@@ -221,9 +213,6 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 table = pl.concat(tables, how="diagonal_relaxed").sort("time", maintain_order=True)
                 table = table.unique(maintain_order=True) if table.height else table
             self._read[name] = table
-
-    def _report(self, place: int, share: float) -> None:
-        self._progress((place + share) / len(self._hosts), "decoding events")
 
     def _take_stock(self, host: str, trace: CtfTrace, found: Events) -> None:
         """Count all events, also of unwanted streams; move numbers that another host has, too."""
@@ -250,8 +239,8 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
 def _by_host(trace: CtfTrace, paths: Sequence[str | Path]) -> dict[str, CtfTrace]:
     """The trace in parts, one per traced host, or path of one; the first has foreign kernels'."""
-    hosts = [_fact(folder.declared.env, "hostname") for folder in trace.folders]
-    kernel = [folder.declared.env.get("domain") == "kernel" for folder in trace.folders]
+    hosts = [_fact(folder, "hostname") for folder in trace.folders]
+    kernel = [folder.env.get("domain") == "kernel" for folder in trace.folders]
     given = [next(p for p in paths if f.path.is_relative_to(p)) for f in trace.folders]
     user = {(h, p) for h, p, k in zip(hosts, given, kernel, strict=True) if not k}
     several = {host for host, count in Counter(host for host, _ in user).items() if count > 1}
@@ -293,13 +282,12 @@ def table_name(event: str) -> str | None:
 def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:
     """Table → the fields that the trace declares for its event."""
     declared: dict[str, dict[str, ctf.Type]] = {}
-    for folder in trace.folders:
-        for stream in folder.declared.streams.values():
-            for event in stream.events.values():
-                if (name := table_name(event.name)) is not None:
-                    fields = event.fields.fields if event.fields is not None else ()
-                    types = {ctf.field_name(one.name): one.type for one in fields}
-                    declared.setdefault(name, {}).update(types)
+    streams = [stream for folder in trace.folders for stream in folder.streams.values()]
+    for event in (event for stream in streams for event in stream.events.values()):
+        if (name := table_name(event.name)) is not None:
+            fields = event.fields.fields if event.fields is not None else ()
+            types = {ctf.field_name(one.name): one.type for one in fields}
+            declared.setdefault(name, {}).update(types)
     return declared
 
 

@@ -1,11 +1,8 @@
 """Tracing by a library that `LD_PRELOAD` puts in front of ROS 2: no root, no daemon, no module.
 
-`preload.c` is that library. It sends us the memory of its process with the process's first event,
-over a socket whose name is in no file system; that of a process that runs already is in `/proc`. A
-thread reads all memories ten times a second, also what a process wrote that was killed in between.
-
-Nothing is locked: a reader copies what is new in a ring, then looks again how much has been
-written: what may have been overwritten meanwhile is thrown away and counted as lost.
+`preload.c` is that library. It sends us the memory of its process with the process's first event;
+that of a process that runs already is in `/proc`. A thread reads all memories ten times a second,
+also what a process wrote that was killed in between.
 """
 
 import fcntl
@@ -36,7 +33,13 @@ from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import descendants, run_users
 from chainshaper.linux.threads import innermost_id, list_threads, parents, read_proc
-from chainshaper.sources.ebpf.trace_points import Argument, TracePoint, TracingLibrary, version_of
+from chainshaper.sources.ebpf.trace_points import (
+    Argument,
+    TracePoint,
+    TracingLibrary,
+    event_table,
+    version_of,
+)
 from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -51,11 +54,12 @@ RECORD = np.dtype(
 )
 """`struct record`: one event, or a part of a text."""
 
+_COUNTS = ("magic", "format", "pid", "rings", "ring_records", "object_records")
 _HEADER = np.dtype(
     [
-        *((name, "<u4") for name in ("magic", "format", "pid", "rings")),
-        *((name, "<u4") for name in ("ring_records", "object_records")),
-        *((name, "<u8") for name in ("objects", "dropped")),
+        *((name, "<u4") for name in _COUNTS),
+        ("objects", "<u8"),
+        ("dropped", "<u8"),
         ("unused", "<u8", 3),
     ]
 )
@@ -66,8 +70,11 @@ _TEXT_BYTES, _PLACES = 40, 16
 _LARGEST = 1 << 30
 _F_GET_SEALS, _F_SEAL_SHRINK = 1034, 2  # linux/fcntl.h
 _THREAD_TIME = 2  # the value of callback_start and callback_end that is no argument
-_CALL = {"rmw_client_handle": 0, "rmw_service_handle": 0, "request": 1, "response": 1}
-_CALL |= {"client_gid": 2, "sequence_number": 4, "source_timestamp": 5}  # places of CALL's values
+_CALL: dict[str, tuple[int, Literal["number", "gid"]]] = {  # where the values of a CALL are
+    **{"rmw_client_handle": (0, "number"), "rmw_service_handle": (0, "number")},
+    **{"request": (1, "number"), "response": (1, "number"), "client_gid": (2, "gid")},
+    **{"sequence_number": (4, "number"), "source_timestamp": (5, "number")},
+}
 
 _NAME = re.compile(r"^  (?:EVENT|CREATION|CALL)\((\w+)", re.MULTILINE)
 
@@ -81,34 +88,32 @@ def event_names() -> tuple[str, ...]:
 class TracedProcess:
     """The memory of one process; ``lost`` counts what was overwritten.
 
-    ``pid`` is the process's number here, ``inner_pid`` what it calls itself in its container.
+    Nothing is locked: a reader copies what is new in a ring, then looks again how much has been
+    written, and counts as lost what may have been overwritten meanwhile. ``pid`` is the process's
+    number here, ``inner_pid`` what it calls itself in its container.
 
     Raises InputError: the descriptor is of no such memory, or of one that may shrink.
     """
 
     def __init__(self, descriptor: int, pid: int = 0) -> None:
-        size = os.fstat(descriptor).st_size
-        try:
-            is_sealed = fcntl.fcntl(descriptor, _F_GET_SEALS) & _F_SEAL_SHRINK
-        except OSError:  # no memfd
-            is_sealed = 0
-        if not is_sealed or not _HEADER.itemsize <= size <= _LARGEST:
+        size, seals = os.fstat(descriptor).st_size, 0
+        with suppress(OSError):  # no memfd
+            seals = fcntl.fcntl(descriptor, _F_GET_SEALS)
+        if not seals & _F_SEAL_SHRINK or not _HEADER.itemsize <= size <= _LARGEST:
             raise InputError("what was sent is no memory of a traced process")
         memory = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
-        self.header: NDArray[Any] = np.frombuffer(memory, _HEADER, count=1)
-        one = {name: int(self.header[name][0]) for name in _HEADER.names[:6]}  # type: ignore[index]
-        rings, records, objects = one["rings"], one["ring_records"], one["object_records"]
-        of_rings = _HEADER.itemsize + rings * _RING.itemsize
-        wanted = of_rings + (objects + rings * records) * RECORD.itemsize
-        if (one["magic"], one["format"]) != (_MAGIC, _FORMAT) or size < wanted or not records:
+        self.header: NDArray[Any] = np.frombuffer(memory, _HEADER, 1)
+        magic, form, self.inner_pid, rings, records, objects, *_ = self.header[0].tolist()
+        of_objects = _HEADER.itemsize + rings * _RING.itemsize
+        of_records = of_objects + objects * RECORD.itemsize
+        is_short = not records or size < of_records + rings * records * RECORD.itemsize
+        if (magic, form) != (_MAGIC, _FORMAT) or is_short:
             raise InputError("what was sent is the memory of another version of chainshaper")
-        self.inner_pid = one["pid"]
         self.pid = pid or self.inner_pid
         self._tids: dict[int, int] = {}
-        self._rings = np.frombuffer(memory, _RING, count=rings, offset=_HEADER.itemsize)
-        self._objects = np.frombuffer(memory, RECORD, count=objects, offset=of_rings)
-        behind = of_rings + objects * RECORD.itemsize
-        self._records = np.frombuffer(memory, RECORD, count=rings * records, offset=behind)
+        self._rings = np.frombuffer(memory, _RING, rings, _HEADER.itemsize)
+        self._objects = np.frombuffer(memory, RECORD, objects, of_objects)
+        self._records = np.frombuffer(memory, RECORD, rings * records, of_records)
         self._records = self._records.reshape(rings, records)
         self._read = np.zeros(rings, np.uint64)
         self.lost = 0
@@ -189,13 +194,12 @@ def event_tables(
 def joined_tables(parts: Iterable[Mapping[str, pl.DataFrame]]) -> dict[str, pl.DataFrame]:
     """The tables of several processes as those of one application, in order of time."""
     found: dict[str, list[pl.DataFrame]] = {}
-    for tables in parts:
-        for name, table in tables.items():
-            found.setdefault(name, []).append(table)
-    joined = {name: pl.concat(own, how="diagonal") for name, own in found.items()}
+    for name, table in (pair for tables in parts for pair in tables.items()):
+        found.setdefault(name, []).append(table)
+    joined = ((name, pl.concat(own, how="diagonal")) for name, own in found.items())
     return {
         name: one if one["time"].is_sorted() else one.sort("time", maintain_order=True)
-        for name, one in joined.items()
+        for name, one in joined
     }
 
 
@@ -210,45 +214,21 @@ def _tables(
     for number, name in enumerate(event_names(), _FIRST_EVENT):
         places = np.flatnonzero(records["event"] == number) if name in names else np.array([])
         if places.size:
-            own = records.take(places)  # ten times as fast as by index
-            said = [texts.get(int(place), {}) for place in places] if texts else []
+
+            def said(place: int, events: NDArray[np.int64] = places) -> list[str | None]:
+                return [texts.get(event, {}).get(place) for event in events.tolist()]
+
+            own, point = records.take(places), TracePoint(name, library.path, library)
             common = {one: np.ascontiguousarray(own[one]) for one in ("time", "tid", "cpu")}
-            columns = _columns(TracePoint(name, library.path, library), own, said)
-            frame = pl.DataFrame({**common, "pid": pids[places], **dict(columns)})
-            types = {n: t for n, t in events.column_types(name).items() if n in frame.columns}
-            signed = (
-                pl.col(n).reinterpret(signed=True) if t == pl.Int64() else pl.col(n).cast(t)
-                for n, t in types.items()
-            )
-            tables[name] = frame.select(signed).sort("time", maintain_order=True)
+            arguments = point.arguments
+            if "sequence_number" in events.FIELDS[name]:
+                known = [column for column in events.column_types(name) if column in _CALL]
+                arguments = tuple(Argument(column, *_CALL[column]) for column in known)
+            elif "thread_time" in events.column_types(name):
+                arguments += (Argument("thread_time", _THREAD_TIME, "number"),)
+            frame = pl.DataFrame({**common, "pid": pids[places]})
+            tables[name] = event_table(point, arguments, frame, own["values"], said)
     return tables
-
-
-def _columns(
-    point: TracePoint, records: NDArray[Any], texts: Sequence[Mapping[int, str]]
-) -> Iterator[tuple[str, Any]]:
-    values = records["values"]
-    arguments = point.arguments
-    if "sequence_number" in events.FIELDS[point.event]:
-        arguments = tuple(
-            Argument(column, _CALL[column], "gid" if column == "client_gid" else "number")
-            for column in events.column_types(point.event)
-            if column in _CALL
-        )
-    for argument in arguments:
-        if argument.kind == "text":
-            yield argument.column, [one.get(argument.place) for one in texts]
-        elif argument.kind == "gid":
-            gids = np.ascontiguousarray(values[:, argument.place : argument.place + 2])
-            yield argument.column, pl.Series(gids.view(np.uint8)).cast(pl.List(pl.UInt8))
-        elif argument.kind == "flag":
-            yield argument.column, values[:, argument.place] & 0xFF
-        else:
-            yield argument.column, np.ascontiguousarray(values[:, argument.place])
-    if point.event == "rcl_init":
-        yield "version", [point.tracing_library.version] * records.size
-    if point.event in ("callback_start", "callback_end"):
-        yield "thread_time", np.ascontiguousarray(values[:, _THREAD_TIME])
 
 
 VARIABLE = "CHAINSHAPER_TRACE"
@@ -274,21 +254,17 @@ def compile_library(
 
     Raises PlatformError: there is no compiler, or it fails.
     """
-    (needs, without), package = options, {"cc": "gcc", "c++": "g++"}[compiler]
+    needs, without = options
     path = shutil.which(compiler, path=tool_environment()["PATH"])
     if path is None:
+        package = {"cc": "gcc", "c++": "g++"}[compiler]
         raise PlatformError(
             f"`{needs}` needs a compiler ({compiler}), and there is none: install one (Debian and "
             f"Ubuntu: `apt-get install {package} libc6-dev`), or choose `{without}`"
         )
     library = library.absolute()
-    done = subprocess.run(
-        [path, "-o", str(library), *words],
-        env=tool_environment(),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    command, environment = [path, "-o", str(library), *words], tool_environment()
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         last = "; ".join(done.stderr.splitlines()[-2:])
         raise PlatformError(f"{path} cannot compile {library.name}: {last}; see `{path} -v`")
@@ -307,23 +283,21 @@ def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -
 
     Raises PlatformError: what ``build`` raises, or others may write to the cache.
     """
-    content = "\0".join([*sources, platform.machine()]).encode()
-    digest = hashlib.sha256(content).hexdigest()[:16]
-    cache = own_cache()
-    library = cache / f"preload-{digest}" / name
+    content, cache = "\0".join([*sources, platform.machine()]).encode(), own_cache()
+    library = cache / f"preload-{hashlib.sha256(content).hexdigest()[:16]}" / name
     existing = next(place for place in (cache, *cache.parents) if place.exists())
     if (reason := why_distrusted(existing)) is not None:
         raise PlatformError(f"no library is built in {cache}: {reason}; {_REMEDY}")
     if not library.exists():
         try:
-            library.parent.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=library.parent.parent) as folder:
+            cache.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryDirectory(dir=cache) as folder:
                 built = build(Path(folder))
                 library.parent.mkdir(exist_ok=True)
                 built.replace(library)  # whole, also where two of us build at once
         except OSError as error:
-            why = f"{library} cannot be written ({error.strerror})"
-            raise PlatformError(f"{why}: {_REMEDY}") from error
+            why = f"{library} cannot be written ({error.strerror}): {_REMEDY}"
+            raise PlatformError(why) from error
     if (reason := why_distrusted(library)) is not None:
         raise PlatformError(f"{library} is not loaded into nodes: {reason}; {_REMEDY}")
     return library
@@ -347,19 +321,18 @@ _MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
 
 def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
     """Processes of some users that have the library in front, but for those that are ``known``."""
-    for process in Path("/proc").iterdir():
-        if not process.name.isdigit() or int(process.name) in known:
-            continue
+    running = (int(name) for name in os.listdir("/proc") if name.isdigit())  # noqa: PTH208
+    for pid in {*running}.difference(known):
         with suppress(OSError):  # it has ended, or may not be looked into
-            if process.stat().st_uid not in users:
+            if Path(f"/proc/{pid}").stat().st_uid not in users:
                 continue
-            own = innermost_id(read_proc(f"{process}/status"))
-            for descriptor in (process / "fd").iterdir():
+            own = innermost_id(read_proc(f"/proc/{pid}/status"))
+            for descriptor in Path(f"/proc/{pid}/fd").iterdir():
                 if _MEMORY.match(str(descriptor.readlink())):
                     with suppress(InputError), descriptor.open("rb") as file:
-                        memory = TracedProcess(file.fileno(), int(process.name))
+                        memory = TracedProcess(file.fileno(), pid)
                         if memory.inner_pid == own:  # else it is one that reads it, as we do
-                            yield int(process.name), memory
+                            yield pid, memory
                             break
 
 
@@ -406,22 +379,18 @@ class PreloadTracer:
         return {"LD_PRELOAD": preloading(library), VARIABLE: name}
 
     def failure(self) -> str | None:
-        """Why events are no longer read."""
         return self._failure
 
     def stop(self) -> None:
-        """Read what has been written until now."""
         self._over.set()
         if self._reader.ident is not None:
             self._reader.join()
 
     def remove(self) -> None:
-        """Close the socket; the memories are gone with the last process that has them."""
         self.stop()
         self._socket.close()
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
-        """The tables of all processes together."""
         if not self._processes:
             raise OperationError(
                 "no process has loaded the tracing library: is tracing compiled into this ROS 2 "
@@ -440,11 +409,11 @@ class PreloadTracer:
             parts += (created, event_tables(records, pids, library))
         tables = joined_tables(parts)
         lost = sum(process.lost + process.dropped for process in self._processes)
-        notes = [] if self._failure is None else [f"{self._failure}."]
+        notes = [f"{self._failure}."] if self._failure else []
         if lost:
             notes.append(f"{lost} events were lost: recording did not run often enough for them.")
-        facts: dict[str, Any] = {"pid_namespace": own_pid_namespace(), "notes": tuple(notes)}
-        facts["clock_offset_ns"] = self._clock_offset_ns
+        facts = {"clock_offset_ns": self._clock_offset_ns, "notes": tuple(notes)}
+        facts |= {"pid_namespace": own_pid_namespace()}
         return tables, info_of("preload", tables, versions, self._names, lost, **facts)
 
     def _file(self, place: int) -> Path:

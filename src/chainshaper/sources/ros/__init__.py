@@ -71,7 +71,6 @@ class Script:
     said: int
 
     def is_over(self) -> bool:
-        """Look whether it has ended."""
         return self.process.poll() is not None
 
     def end(self, within_s: float = 0.0) -> tuple[str, str | None]:
@@ -123,7 +122,6 @@ def environment_of(pid: int) -> Environment:
 
 
 def own_environment() -> Environment:
-    """The environment that we were started with ourselves."""
     return Environment(dict(os.environ), os.geteuid())
 
 

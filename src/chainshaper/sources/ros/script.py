@@ -52,7 +52,6 @@ def node_named(name: str) -> "Iterator[tuple[Any, Any]]":
 
 
 def publish_diagnostics(descriptor: int) -> None:
-    """Publish what is read as `diagnostic_msgs/DiagnosticArray`."""
     messages = importlib.import_module("diagnostic_msgs.msg")
     kind = messages.DiagnosticStatus
     with node_named(WATCHER) as (_, node), open(descriptor) as lines:
@@ -74,7 +73,6 @@ def publish_diagnostics(descriptor: int) -> None:
 
 
 def print_graph(patience: float = 10.0) -> None:
-    """Print the graph once it is known."""
     with node_named(SNAPSHOT) as (_, node):
         begun = quiet_since = time.monotonic()
         known = -1
@@ -104,7 +102,6 @@ def endpoints(node: Any) -> list[dict[str, Any]]:
 
 
 def as_json(topic: str, kind: str, info: Any) -> dict[str, Any]:
-    """An endpoint as the recording's `EndpointInfo` has it."""
     qos = info.qos_profile
     found = {
         "node": info.node_namespace.rstrip("/") + "/" + info.node_name,
@@ -126,7 +123,6 @@ def as_json(topic: str, kind: str, info: Any) -> dict[str, Any]:
 
 
 def set_parameter(name: str, value: str, *nodes: str) -> None:
-    """Call the service ``set_parameters`` of all nodes at once."""
     with node_named(SETTER) as (rclpy, node):
         service: Any = importlib.import_module("rcl_interfaces.srv").SetParameters
         parameter: Any = importlib.import_module("rclpy.parameter").Parameter
