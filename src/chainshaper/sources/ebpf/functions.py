@@ -1,7 +1,7 @@
 """Functions: those that a library exports, and those that a process's callbacks are.
 
-With uprobes no event says which function a callback is. But a callback's handle is an address, and
-what stands around it tells (64 bits, GCC's library):
+With uprobes no event says which function a callback is, but what stands around the address that is
+its handle (64 bits, GCC's library):
 
 * that of a timer is a member of `rclcpp::WallTimer<F, …>` or `GenericTimer<F, …>`, which begins
   with the address of its class's table, which leads to the class's name, stripped or not;
@@ -54,15 +54,14 @@ def read_regular(path: Path, longest: int = _LONGEST_FILE) -> bytes:
 
 def exported_functions(path: Path) -> frozenset[str]:
     """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
-    try:
+    with suppress(*_NO_ELF):
         return frozenset(name for _, name in _functions(read_regular(path), (_DYNSYM,)))
-    except _NO_ELF:
-        return frozenset()
+    return frozenset()
 
 
 def function_offsets(path: Path) -> dict[int, str]:
     """Where functions begin in a file, in bytes, and their names; also of those not exported."""
-    try:
+    with suppress(*_NO_ELF):
         content = read_regular(path)
         loaded = [s[2:6] for s in _entries(content, 32, 54, "IIQQQQQQ") if s[0] == _LOAD]
         return {
@@ -71,8 +70,7 @@ def function_offsets(path: Path) -> dict[int, str]:
             for offset, memory, _, size in loaded
             if memory <= address < memory + size
         }
-    except _NO_ELF:
-        return {}
+    return {}
 
 
 def _entries(content: bytes, at: int, count_at: int, layout: str) -> Iterator[tuple[int, ...]]:

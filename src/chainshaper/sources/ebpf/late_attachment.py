@@ -1,9 +1,8 @@
 """Who exists in an application that ran before tracing began, as far as it can be found out.
 
 Objects say who they are when they are created. For those created before, the same tables are filled
-with what is known otherwise (`docs/record_ebpf.md`). What is not certain is left open. Handles are
-the real ones where events carry them, else other addresses of the same object; nodes are numbered
-from 1.
+with what is known otherwise (`docs/record_ebpf.md`); what is not certain is left open. Handles are
+the real ones where events carry them, else other addresses of the object; nodes count from 1.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -57,15 +56,13 @@ def with_found_objects(
     )
     timers = _timers(starts.join(readers, on=_CALLBACK, how="anti"))
     handle = pl.col("rmw_subscription_handle").alias("subscription_handle")
-    object_ = pl.col("callback").alias("subscription")
-    timer = pl.col("callback").alias("timer_handle")
+    readers = readers.with_columns(handle, subscription="callback")
+    timers = timers.with_columns(timer_handle="callback")
     found = {
         "rcl_publisher_init": publishers,
         "rcl_subscription_init": subscriptions.with_columns(handle),
-        "rclcpp_subscription_init": readers.select("pid", handle, object_),
-        "rclcpp_subscription_callback_added": readers.select("pid", object_, "callback"),
-        "rcl_timer_init": timers.select("pid", timer, "period"),
-        "rclcpp_timer_callback_added": timers.select("pid", timer, "callback"),
+        **dict.fromkeys(("rclcpp_subscription_init", ADDED[0]), readers),
+        **dict.fromkeys(("rcl_timer_init", ADDED[1]), timers),
     }
     if not any(rows.height for rows in found.values()):
         return tables, ()
@@ -102,9 +99,8 @@ def added_rows(
     added = {}
     for name, found in rows.items():
         if found.height:
-            time = pl.col("time") if "time" in found.columns else pl.lit(None, pl.Int64)
-            new = found.with_columns(time=time.fill_null(began_ns), tid=pl.col("pid"))
-            known = events.table(tables, name)
+            new, known = events.table({name: found}, name, ["time"]), events.table(tables, name)
+            new = new.with_columns(pl.col("time").fill_null(began_ns), tid="pid")
             both = pl.concat([new, known], how="diagonal").select(known.columns)
             added[name] = both.sort("time", maintain_order=True)
     return added
@@ -157,13 +153,9 @@ def _unregistered_starts(tables: events.EventTables) -> pl.DataFrame:
         starts.select(*_THREAD, "callback", "is_intra_process"),
         events.table(tables, "callback_end").select(*_THREAD),
     ).with_columns(taken=pl.col("handle").shift(1).over("pid", "tid"))
-    registered = [events.table(tables, name).select(_CALLBACK) for name in ADDED]
-    return (
-        rows.drop_nulls("callback")
-        .filter(pl.col("is_intra_process").fill_null(0) == 0)
-        .join(pl.concat(registered), on=_CALLBACK, how="anti")
-        .select("time", *_CALLBACK, "taken")
-    )
+    rows = rows.drop_nulls("callback").filter(pl.col("is_intra_process").fill_null(0) == 0)
+    registered = pl.concat(events.table(tables, name).select(_CALLBACK) for name in ADDED)
+    return rows.join(registered, on=_CALLBACK, how="anti").select("time", *_CALLBACK, "taken")
 
 
 def _timers(starts: pl.DataFrame) -> pl.DataFrame:
@@ -171,18 +163,13 @@ def _timers(starts: pl.DataFrame) -> pl.DataFrame:
     gaps = starts.sort("time").with_columns(gap=pl.col("time").diff().over(_CALLBACK))
     usual = pl.col("gap").median()
     regular = (pl.col("gap") - usual).abs() <= _REGULAR * usual
+    taken, period = pl.col("taken").count(), (usual / _PERIOD_GRID_NS).round() * _PERIOD_GRID_NS
+    is_timer = (pl.len() >= _FEWEST_STARTS) & (taken <= (1 - _NEARLY_ALWAYS) * pl.len())
     found = gaps.group_by(_CALLBACK).agg(
-        pl.len().alias("starts"),
-        pl.col("taken").count().alias("taken"),
-        regular.mean().alias("share"),
-        usual.alias("period"),
+        is_timer=is_timer & (regular.mean() >= _MOSTLY),
+        period=pl.when(period > 0).then(period).otherwise(usual).cast(pl.Int64),
     )
-    period = (pl.col("period") / _PERIOD_GRID_NS).round() * _PERIOD_GRID_NS
-    return found.filter(
-        (pl.col("starts") >= _FEWEST_STARTS)
-        & (pl.col("taken") <= (1 - _NEARLY_ALWAYS) * pl.col("starts"))
-        & (pl.col("share") >= _MOSTLY)
-    ).select(*_CALLBACK, period=pl.when(period > 0).then(period).otherwise("period").cast(pl.Int64))
+    return found.filter("is_timer").drop("is_timer")
 
 
 def with_found_nodes(
@@ -218,12 +205,13 @@ def with_found_nodes(
         if any(found):
             node = pl.col("node_handle").fill_null(pl.Series(found, dtype=pl.UInt64))
             changed[f"rcl_{kind}_init"] = rows.with_columns(node)
-    parts = [(*key, number, *key[1].rsplit("/", 1)) for key, number in numbers.items()]
-    types = {"pid": pl.Int32, "node": pl.String, "node_handle": pl.UInt64}
+    parts = [
+        (pid, number, node.rpartition("/")[0] or "/", node.rpartition("/")[2])
+        for (pid, node), number in numbers.items()
+    ]
+    types = {"pid": pl.Int32, "node_handle": pl.UInt64}
     types |= {"namespace": pl.String, "node_name": pl.String}
-    nodes = pl.DataFrame(parts, schema=types, orient="row").with_columns(
-        pl.col("namespace").replace("", "/")
-    )
+    nodes = pl.DataFrame(parts, schema=types, orient="row")
     new = {"rcl_node_init": nodes, "rclcpp_timer_link_node": _timer_links(changed, nodes)}
     changed |= added_rows(changed, new, min(nameless["time"]))
     names = processes_of(changed, info.processes)
@@ -263,19 +251,17 @@ def _owners(
 
 def _timer_links(tables: events.EventTables, nodes: pl.DataFrame) -> pl.DataFrame:
     """``pid, timer_handle, node_handle`` of timers that no event links to one of the ``nodes``."""
-    timers = events.table(tables, "rclcpp_timer_callback_added").join(
-        events.table(tables, "rclcpp_timer_link_node"), on=["pid", "timer_handle"], how="anti"
-    )
+    timers, linked = (events.table(tables, name) for name in (ADDED[1], "rclcpp_timer_link_node"))
+    timers = timers.join(linked, on=["pid", "timer_handle"], how="anti")
     alone = nodes.select("pid", alone="node_handle").unique("pid", keep="none")
     started = events.table(tables, "callback_start")
     ended = events.table(tables, "callback_end").with_columns(callback=pl.lit(0, pl.UInt64))
     published = events.table(tables, "rcl_publish").select(*_THREAD, "publisher_handle")
     created = events.table(tables, "rcl_publisher_init")
     owners = created.select("pid", "publisher_handle", "node_handle").drop_nulls()
+    called = [marks.select(*_THREAD, "callback") for marks in (started, ended)]
     publishing = (  # whose publishers callbacks use, mostly
-        _threads_rows(
-            started.select(*_THREAD, "callback"), ended.select(*_THREAD, "callback"), published
-        )
+        _threads_rows(*called, published)
         .with_columns(pl.col("callback").forward_fill().over("pid", "tid"))
         .drop_nulls(["publisher_handle", "callback"])
         .filter(pl.col("callback") != 0)

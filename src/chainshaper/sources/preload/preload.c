@@ -12,9 +12,9 @@
 //   first event, and gives it back as it ends. `written` counts: who reads sees what it has missed.
 // * Nothing waits, nothing is allocated behind a thread's first event. What finds no room is counted.
 //
-// Times are ns of CLOCK_MONOTONIC, values are a function's arguments as they are in registers (of a
-// bool the lowest byte counts). Texts follow their event in records of their own. Calls of services
-// have trace points from Kilted on only: we see them as librcl calls rmw.
+// Times are ns of CLOCK_MONOTONIC, values a function's arguments as they are in registers (of a bool
+// the lowest byte counts). Calls of services have trace points from Kilted on only: we see them as
+// librcl calls rmw.
 //
 // Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1: all arguments are
 // integers or pointers, at most five, so that any of its versions can be called, and answered, alike.
@@ -192,8 +192,7 @@ static void *next_one(const char *name) {
   return rcl ? dlsym(rcl, name) : found;
 }
 
-static void append(uint16_t event, const uint64_t *values, const void *const *texts,
-                   const unsigned *places, unsigned count);
+static void append(uint16_t event, const uint64_t *values, unsigned texts);
 
 static bool make_memory(void) {
   descriptor = memfd_create(NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING);
@@ -244,10 +243,8 @@ static bool is_ready(void) {
       Dl_info behind;
       void *function = next_one("ros_trace_callback_start");
       own.tid = (uint32_t)syscall(SYS_gettid);
-      if (function && dladdr(function, &behind) && behind.dli_fname) {
-        const void *path = behind.dli_fname;
-        append(LIBRARY, (uint64_t[6]){0}, &path, (unsigned[]){0}, 1);
-      }
+      if (function && dladdr(function, &behind) && behind.dli_fname)
+        append(LIBRARY, (uint64_t[6]){(uintptr_t)behind.dli_fname}, 1);
       const char *reader = getenv("CHAINSHAPER_TRACE");
       if (reader) send_memory(reader);
     }
@@ -291,17 +288,15 @@ static inline __attribute__((always_inline)) void write_record(
   atomic_store_explicit(&own.ring->written, number + 1, memory_order_release);
 }
 
-static unsigned records_of(size_t length) { return 1 + (unsigned)(length / TEXT_BYTES); }
-
-// An event of creation and its texts, one behind the other, so that no other one is between them.
-static void append(uint16_t event, const uint64_t *values, const void *const *texts,
-                   const unsigned *places, unsigned count) {
+// An event of creation and its texts (places as bits), one behind the other, nothing between them.
+static void append(uint16_t event, const uint64_t *values, unsigned texts) {
   struct memory *all = memory;
-  size_t length[2] = {0, 0};
+  size_t length[5];
   unsigned wanted = 1;
-  for (unsigned text = 0; text < count; text++) {
-    length[text] = texts[text] ? strnlen(texts[text], LONGEST_TEXT) : 0;
-    wanted += records_of(length[text]);
+  for (unsigned place = 0; place < 5; place++) {
+    const char *text = (const char *)(uintptr_t)(texts >> place & 1 ? values[place] : 0);
+    length[place] = text ? strnlen(text, LONGEST_TEXT) : 0;
+    if (texts >> place & 1) wanted += 1 + (unsigned)(length[place] / TEXT_BYTES);
   }
   uint64_t at = atomic_fetch_add(&all->objects, wanted);
   if (at + wanted > OBJECT_RECORDS) {
@@ -312,35 +307,25 @@ static void append(uint16_t event, const uint64_t *values, const void *const *te
   struct record *record = &all->object[at];
   memcpy(record->values, values, sizeof record->values);
   stamp(record, time);
-  for (unsigned text = 0; text < count; text++) {
-    const char *from = texts[text];
-    size_t left = length[text];
-    for (unsigned part = records_of(left); part > 0; part--) {
-      size_t here = left < TEXT_BYTES ? left : TEXT_BYTES;
+  for (unsigned place = 0; place < 5; place++)
+    for (size_t done = 0; texts >> place & 1 && done <= length[place]; done += TEXT_BYTES) {
+      size_t left = length[place] - done;
       struct record *next = ++record;
-      next->values[0] = 16 * length[text] + places[text];
-      if (here) memcpy(&next->values[1], from, here);
+      next->values[0] = 16 * length[place] + place;
+      if (left)
+        memcpy(&next->values[1], (const char *)(uintptr_t)values[place] + done,
+               left < TEXT_BYTES ? left : TEXT_BYTES);
       stamp(next, time);
       atomic_store_explicit(&next->event, TEXT, memory_order_release);
-      from += here;
-      left -= here;
     }
-  }
   atomic_store_explicit(&all->object[at].event, event, memory_order_release);
 }
 
 static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *values) {
-  const void *pointers[2];
-  unsigned places[2], count = 0;
   if (!own.tid) own.tid = (uint32_t)syscall(SYS_gettid);
   if (!is_ready()) return;
-  for (unsigned place = 0; place < 5; place++)
-    if (texts >> place & 1) {
-      places[count] = place;
-      pointers[count++] = (const void *)(uintptr_t)values[place];
-    }
   if (gid && values[gid]) memcpy(&values[gid], (const void *)(uintptr_t)values[gid], 16);
-  append(event, values, pointers, places, count);
+  append(event, values, texts);
 }
 
 #define BIT(place) (1u << (place))
@@ -442,9 +427,8 @@ struct service_info {
 
 static void write_call(uint16_t event, uint64_t time, const void *handle, const void *message,
                        const struct request_id *id, int64_t sent) {
-  uint64_t values[6] = {(uintptr_t)handle, (uintptr_t)message, 0, 0, (uint64_t)id->number,
-                        (uint64_t)sent};
-  memcpy(&values[2], id->writer, sizeof id->writer);
+  uint64_t values[6] = {(uintptr_t)handle, (uintptr_t)message, [5] = (uint64_t)sent};
+  memcpy(&values[2], id, sizeof *id);
   write_record(event, time, 6, values, false);
 }
 
@@ -492,12 +476,10 @@ int rmw_take_with_info(const void *subscription, void *message, bool *taken, int
 }
 
 // Functions of rcl, of which ros2_tracing has no event. Since Jazzy the one may call the other.
-typedef int (*timer_function)(uint64_t timer, uint64_t information);
 #define TIMER_CALL(name) \
   int name(uint64_t timer, uint64_t information) { \
-    static _Atomic(timer_function) behind; \
+    BEHIND(name, uint64_t, uint64_t); \
     bool outer = !own.calls_timer; \
-    if (!behind) behind = (timer_function)next_one(#name); \
     own.calls_timer = true; \
     int result = behind(timer, information); \
     if (!outer) return result; \
