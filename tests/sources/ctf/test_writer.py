@@ -17,7 +17,7 @@ from made import START, USER_CONTEXT, USER_EVENTS, make_trace, records
 from reference import actual_rows, assert_equal_to_babeltrace, lean
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
-from chainshaper.sources.ctf.layout import AHEAD
+from chainshaper.sources.ctf.layout import BATCH
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 
 
@@ -176,7 +176,7 @@ def test_every_event_is_where_a_sort_by_time_and_file_puts_it(
     declared = parse_tsdl(lttng_metadata(EVENTS, {}))
     for file in range(streams):
         time, found = 1 << 40, []
-        for _ in range(chance.choice([0, 1, AHEAD, AHEAD + 1, 5 * AHEAD])):
+        for _ in range(chance.choice([0, 1, BATCH, BATCH + 1, 5 * BATCH])):
             time += chance.choice([0, 0, 1, 3])
             name = chance.choice(["ros2:number"] * 30 + ["ros2:text"])
             payload = {"place": len(made)} | ({"text": "x"} if name == "ros2:text" else {})

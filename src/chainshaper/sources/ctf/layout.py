@@ -28,22 +28,18 @@ from chainshaper.sources.ctf import tsdl
 # fmt: off
 # A table's columns stand together, with what they hold behind them.
 # The machine. RANGES of variants' tags: low, high, operation to go on with. ROWS are the row
-# counters of the tables (COUNTERS of them), CAPS how far each may go. SLOTS is the dictionary's
-# hash table, int32, MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per event class a
-# count and BATCH pairs (address, row).
+# counters of the tables, CAPS how far each may go. SLOTS is the dictionary's hash table, int32,
+# MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per event class a count and BATCH
+# pairs (address, row).
 (
     M_OPS, M_RANGES, M_STATE, M_ROWS, M_CAPS, M_SLOTS, M_MASK, M_ENTRIES, M_ROOM,
-    M_STREAMS, M_EVENTS, M_IDS, M_COUNTERS, M_BATCHES, MACHINE_WORDS,
-) = range(15)
+    M_STREAMS, M_EVENTS, M_IDS, M_BATCHES, MACHINE_WORDS,
+) = range(14)
 
 BATCH = 128
-AHEAD = 64
-"""Events of one file that are read ahead."""
-NEVER = (1 << 63) - 2
-"""Later than all times; one more is still a number."""
 
 # The state: what a run reads and advances. BUDGET is what may still be spent (see `BUDGET`).
-X_CLOCK, X_STRINGS, X_UNSORTED, X_LATEST, X_BUDGET, X_STACK = range(6)
+X_CLOCK, X_STRINGS, X_BUDGET, X_STACK = range(4)
 STATE_WORDS = X_STACK + 16
 
 # Packets, in order of the file: BYTE its offset there, END the end of the content and ERROR_AT in
@@ -73,22 +69,6 @@ STATE_WORDS = X_STACK + 16
     E_TIME, E_CPU, E_CONSTANT, E_COST, EVENT_COLUMNS,
 ) = range(12)
 
-# Stream files, for one span of time: its first packet and the position in it, -1 for the packet's
-# first event; where it ends, LAST_POSITION -1 for before the packet's first event.
-(
-    F_BASE, F_SIZE, F_PACKET, F_POSITION, F_CLOCK, F_LAST_PACKET, F_LAST_POSITION, FILE_COLUMNS,
-) = range(8)
-
-# Cursors, one per stream file; PLACE of the next event among the COUNT that were read ahead, CPU
-# of the packet.
-(
-    C_PACKET, C_POSITION, C_END, C_CLOCK, C_PLACE, C_COUNT, C_CPU, CURSOR_COLUMNS,
-) = range(8)
-
-# Events that were read ahead; the address is that of what follows the header, 0 where the length
-# is not known before.
-A_TIME, A_EVENT, A_ADDRESS, AHEAD_COLUMNS = range(4)
-
 # Operations. Rows are two cache lines, and a shift away from each other.
 (
     O_CODE,
@@ -111,7 +91,6 @@ SKIP, NUMBER, MOVE, TEXT, CHARACTERS, SKIP_MANY, LOOP, AGAIN, SWITCH, JUMP = ran
 
 # Bytes per row.
 P_ROW, S_ROW, E_ROW = 8 * PACKET_COLUMNS, 8 * STREAM_COLUMNS, 8 * EVENT_COLUMNS
-F_ROW, C_ROW, A_ROW = 8 * FILE_COLUMNS, 8 * CURSOR_COLUMNS, 8 * AHEAD_COLUMNS
 O_ROW, B_ROW = 8 * OPERATION_COLUMNS, 8 * (1 + 2 * BATCH)
 
 BUDGET = 64

@@ -1,8 +1,8 @@
 """Counting events and reading them into data frames.
 
-Pass 1 (`_File.walk`) steps over every event, counts, and finds where each span of time begins in
-each file. Pass 2 (`_fill`) merges the streams of one span by time and writes the wanted events to
-their rows. Spans run on several threads; of a large trace only some are in memory at once.
+Pass 1 (`_File.walk`) steps over every event of a file and counts, so that each has its row. Pass 2
+(`_fill`) writes the wanted events of a chunk of a file to their rows, which are sorted in the end.
+Chunks run on several threads; of a large trace only some are in memory at once.
 """
 
 # ruff: noqa: PLR0917 - the parts of one pass
@@ -10,7 +10,7 @@ their rows. Spans run on several threads; of a large trace only some are in memo
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
@@ -37,7 +37,6 @@ _FAILURES = {
     tb.UNKNOWN_EVENT: "an event id that the metadata does not declare",
     tb.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory than its size"
     f" warrants ({tb.BUDGET} times)",
-    tb.FULL_TABLE: "more events than were counted",
 }
 _Progress = Callable[[float], None]
 
@@ -61,7 +60,7 @@ def count_events(
     Raises `CtfError` where a file is gone.
     """
     layout = lay_out(trace.folders, {})
-    files = _walked(trace.streams, layout, np.zeros(0, np.int64), threads)
+    files = _walked(trace.streams, layout, threads)
     return _counts(trace, layout, files), tuple(_warnings(files))
 
 
@@ -96,17 +95,17 @@ def read_events(
     layout = lay_out(trace.folders, {name: name not in nameless for name in asked})
     rows = {event.stream for event in layout.events if event.row[tb.E_COUNTER] >= 0}
     used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, tb.P_STREAM].tolist())]
-    borders = _span_borders(used, layout, threads or _cores())
-    files = _walked(used, layout, borders, threads, lambda share: progress(share / 3))
+    files = _walked(used, layout, threads, lambda share: progress(share / 3))
+    ends = np.cumsum([file.rows for file in files], axis=0)
     columns = [
-        _Columns(layout, number, table, sum(int(file.reached[-1][number]) for file in files))
+        _Columns(layout, number, table, int(ends[-1][number]) if files else 0)
         for number, table in enumerate(layout.tables)
     ]
     texts = _filled(
-        files, layout, len(borders) + 1, columns, threads, lambda n: progress((1 + 2 * n) / 3)
+        files, layout, ends, columns, threads, lambda share: progress((1 + 2 * share) / 3)
     )
     try:
-        events = Events(_frames(columns, texts, any(file.unsorted for file in files)))
+        events = Events(_frames(columns, texts))
     except pl.exceptions.PolarsError as error:
         reason = f"events of one name have fields of types that do not fit together: {error}"
         folder = trace.folders[0].path
@@ -124,44 +123,46 @@ def _cores() -> int:
 # Pass 1
 
 
+class _Chunk(NamedTuple):
+    """Packets [first, last) of a file, clock and rows of the tables before them, rows behind."""
+
+    first: int
+    last: int
+    clock: int
+    before: NDArray[np.int64]
+    after: NDArray[np.int64]
+
+
 class _File:
     """A stream file that is being read, and what pass 1 finds in it.
 
-    ``counts`` per event class; ``marks`` (spans - 1, 3) where each span but the first begins:
-    packet, bit position, clock; ``reached`` (spans + 1, counters) the rows before each span and
-    before the end; ``unsorted``: time went back.
+    ``counts`` are per event class, ``rows`` per table.
     """
 
     def __init__(self, stream: CtfStream) -> None:
-        self.path = stream.path
-        self.packets = stream.table.copy()
+        self.path, self.packets = stream.path, stream.table.copy()
         self.map = MappedFile(stream.path)
-        self.counts: NDArray[np.int64] = np.zeros(0, np.int64)
-        self.marks = self.reached = np.zeros((0, 0), np.int64)
-        self.unsorted = False
+        self.counts = self.rows = np.zeros(0, np.int64)
+        self.chunks: list[_Chunk] = []
 
-    def walk(self, layout: Layout, borders: NDArray[np.int64], lean: bool) -> None:
+    def walk(self, layout: Layout, chunk_bytes: int, lean: bool) -> None:
         """Step over all events, and shorten packets to what can be read; ``lean`` on memory."""
         scratch, packets = Scratch(layout), self.packets
         self.counts = np.zeros(max(len(layout.events), 1), np.int64)
-        marks = np.zeros((len(borders) + 1, 3 + len(scratch.rows)), np.int64)
-        scratch.state[tb.X_LATEST] = -(1 << 62)
-        border = first = 0
+        first = 0
         while first < len(packets):
-            limit = packets[first, tb.P_BYTE] + _CHUNK_BYTES
+            limit = packets[first, tb.P_BYTE] + chunk_bytes
             last = max(int(np.searchsorted(packets[:, tb.P_BYTE], limit)), first + 1)
-            border = _walk_events(
+            clock, before = int(scratch.state[tb.X_CLOCK]), scratch.rows.copy()
+            _walk_events(
                 scratch.address, scratch.registers.ctypes.data, self.map.address, self.map.size,
-                packets.ctypes.data, first, last, self.counts.ctypes.data, borders.ctypes.data,
-                border, len(borders), marks.ctypes.data,
+                packets.ctypes.data, first, last, self.counts.ctypes.data,
             )  # fmt: skip
+            self.chunks.append(_Chunk(first, last, clock, before, scratch.rows.copy()))
             if lean:
                 self.map.forget(packets[first:last])
             first = last
-        marks[border:, 0], marks[border:, 1], marks[border:, 3:] = len(packets), -1, scratch.rows
-        self.marks = marks[:-1, :3]
-        self.reached = np.vstack([np.zeros_like(scratch.rows), marks[:, 3:]])
-        self.unsorted = bool(scratch.state[tb.X_UNSORTED])
+        self.rows = scratch.rows
 
 
 def _warnings(files: Sequence[_File]) -> Iterator[str]:
@@ -181,15 +182,15 @@ def _warnings(files: Sequence[_File]) -> Iterator[str]:
 def _walked(
     streams: Sequence[CtfStream],
     layout: Layout,
-    borders: NDArray[np.int64],
     threads: int | None,
     progress: _Progress = lambda _: None,
 ) -> list[_File]:
     files, done = [_File(stream) for stream in streams], 0
-    size = sum(file.map.size for file in files)
-    with ThreadPoolExecutor(threads or _cores()) as pool:
+    size, workers = sum(file.map.size for file in files), threads or _cores()
+    chunk = min(_CHUNK_BYTES, max(_SMALL_BYTES, size // workers))
+    with ThreadPoolExecutor(workers) as pool:
         # Read twice, a trace that fits into memory had better stay there in between.
-        steps = pool.map(lambda file: file.walk(layout, borders, size > _LARGE_BYTES), files)
+        steps = pool.map(lambda file: file.walk(layout, chunk, size > _LARGE_BYTES), files)
         for file, _ in zip(files, steps, strict=True):
             done += file.map.size
             progress(done / max(size, 1))
@@ -204,97 +205,58 @@ def _counts(trace: CtfTrace, layout: Layout, files: list[_File]) -> dict[str, in
     return counts
 
 
-def _span_borders(streams: list[CtfStream], layout: Layout, threads: int) -> NDArray[np.int64]:
-    """Instants (ns) that cut the streams into spans of about equal size in bytes."""
-    table = np.concatenate(
-        [np.zeros((0, tb.PACKET_COLUMNS), np.int64), *(s.table for s in streams)]
-    )
-    total = int(table[:, tb.P_BYTES].sum())
-    spans = max(-(-total // _CHUNK_BYTES), threads) if total > _SMALL_BYTES else 1
-    rates = {layout.streams[row][tb.S_FREQUENCY] for row in np.unique(table[:, tb.P_STREAM])}
-    if spans <= 1 or rates != {tb.BILLION} or any(s.table[0, tb.P_BEGIN] < 0 for s in streams):
-        return np.zeros(0, np.int64)
-    table = table[np.argsort(table[:, tb.P_BEGIN], kind="stable")]
-    reached = np.cumsum(table[:, tb.P_BYTES])
-    places = np.searchsorted(reached, total * np.arange(1, spans) / spans)
-    return np.unique(table[np.minimum(places, len(table) - 1), tb.P_BEGIN])
-
-
 # Pass 2
 
 
 def _filled(
     files: list[_File],
     layout: Layout,
-    spans: int,
+    ends: NDArray[np.int64],
     columns: list["_Columns"],
     threads: int | None,
     progress: _Progress,
 ) -> list[bytes]:
-    """Pass 2 over all spans; returns the texts and bytes that slots then have codes of."""
-    if not files:
-        return []
-    packets = np.concatenate([file.packets for file in files])
+    """Pass 2 over all chunks; returns the texts and bytes that slots then have codes of.
+
+    ``ends`` are the tables' rows behind those of each file.
+    """
+    chunks = [
+        (file, one._replace(before=end - file.rows + one.before, after=end - file.rows + one.after))
+        for file, end in zip(files, ends, strict=True)
+        for one in file.chunks
+    ]
     codes: dict[bytes, int] = {}
     with ThreadPoolExecutor(threads or _cores()) as pool:
-        found = pool.map(lambda span: _fill(span, files, packets, layout), range(spans))
-        for span, strings in enumerate(found):
+        found = pool.map(lambda one: _fill(one[0], one[1], layout), chunks)
+        for done, ((_, chunk), strings) in enumerate(zip(chunks, found, strict=True), 1):
             own = [codes.setdefault(string, len(codes)) for string in strings]
             if own != list(range(len(own))):
-                before, after = (sum(f.reached[end] for f in files) for end in (span, span + 1))
                 for table in columns:
-                    table.recode(before, after, np.array(own, np.uint32))
-            progress((span + 1) / spans)
+                    table.recode(chunk, np.array(own, np.uint32))
+            progress(done / len(chunks))
     return list(codes)
 
 
-def _fill(span: int, files: list[_File], packets: NDArray[np.int64], layout: Layout) -> list[bytes]:
-    """Pass 2 over one span of ``packets``, those of all files; the strings of its text slots."""
-    table, count = _span_files(span, files), len(files)
-    scratch = Scratch(layout, count)
-    scratch.rows[:] = sum(file.reached[span] for file in files)
-    scratch.caps[:] = sum(file.reached[span + 1] for file in files)
-    cursors = np.zeros((count, tb.CURSOR_COLUMNS), np.int64)
-    cursors[:, tb.C_PACKET] = table[:, tb.F_PACKET] - 1
-    ahead = np.zeros((count * tb.AHEAD, tb.AHEAD_COLUMNS), np.int64)
-    leaves = 1 << (count - 1).bit_length()
-    tree = np.full((2 * leaves, 2), tb.NEVER, np.int64)
-    tree[leaves : leaves + count] = [(-(1 << 63), file) for file in range(count)]
-    for node in range(leaves - 1, 0, -1):
-        tree[node] = tree[2 * node]
+def _fill(file: _File, chunk: _Chunk, layout: Layout) -> list[bytes]:
+    """Pass 2 over one chunk; the strings of its text slots."""
+    scratch = Scratch(layout)
+    scratch.caps[:] = chunk.after
     status = tb.FULL_DICTIONARY
     while status == tb.FULL_DICTIONARY:
+        scratch.rows[:], scratch.batches[:, 0] = chunk.before, 0
+        scratch.state[tb.X_CLOCK] = chunk.clock
         status = _fill_columns(
-            scratch.address, table.ctypes.data, cursors.ctypes.data, ahead.ctypes.data,
-            tree.ctypes.data, leaves, packets.ctypes.data, scratch.registers.ctypes.data,
-            layout.registers, len(layout.events),
+            scratch.address, scratch.registers.ctypes.data, file.map.address, file.map.size,
+            file.packets.ctypes.data, chunk.first, chunk.last, len(layout.events),
         )  # fmt: skip
         if status == tb.FULL_DICTIONARY:
             scratch.grow()
-    if status < 0:
-        reason = f"{_FAILURES[status]}: the files changed while they were read"
-        raise tsdl.CtfError(files[0].path.parent, None, reason, "stop the recording first")
+    if status < 0 or (scratch.rows != scratch.caps).any():
+        reason = "it has not the events that were counted: it changed while it was read"
+        raise tsdl.CtfError(file.path, None, reason, "stop the recording first")
     strings = scratch.strings()
-    for file, (first, last) in zip(files, table[:, [tb.F_PACKET, tb.F_LAST_PACKET]], strict=True):
-        if first < last:  # this span was the last to read these
-            file.map.forget(packets[first:last])
+    file.map.forget(file.packets[chunk.first : chunk.last])
     return strings
-
-
-def _span_files(span: int, files: list[_File]) -> NDArray[np.int64]:
-    table = np.zeros((len(files), tb.FILE_COLUMNS), np.int64)
-    first = 0
-    for row, file in zip(table, files, strict=True):
-        begin, end = (0, -1, 0), (len(file.packets), -1, 0)
-        if span:
-            begin = file.marks[span - 1]
-        if span < len(file.marks):
-            end = file.marks[span]
-        row[tb.F_BASE], row[tb.F_SIZE] = file.map.address, file.map.size
-        row[tb.F_PACKET], row[tb.F_POSITION], row[tb.F_CLOCK] = first + begin[0], *begin[1:]
-        row[tb.F_LAST_PACKET], row[tb.F_LAST_POSITION] = first + end[0], end[1]
-        first += len(file.packets)
-    return table
 
 
 # Columns
@@ -324,30 +286,35 @@ class _Columns:
         slots = [(array.ctypes.data, array.itemsize) for array in self.slots]
         layout.attach(table, self.time.ctypes.data, cpu, slots)
 
-    def recode(
-        self, before: NDArray[np.int64], after: NDArray[np.int64], codes: NDArray[np.uint32]
-    ) -> None:
-        """Replace one span's own codes of strings by those of the whole."""
-        span = slice(before[self.number], after[self.number])
+    def recode(self, chunk: _Chunk, codes: NDArray[np.uint32]) -> None:
+        """Replace one chunk's own codes of strings by those of the whole."""
+        rows = slice(chunk.before[self.number], chunk.after[self.number])
         for (_, kind), array in zip(self.table.columns, self.slots, strict=True):
             if not isinstance(kind, tsdl.IntegerType):
-                array[span] = codes[array[span]]
+                array[rows] = codes[array[rows]]
 
     def frame(self, known: list[bytes], strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
-        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts."""
-        found = {"time": pl.Series("time", self.time)}
+        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts.
+
+        Rows stand file by file, each in order of time but for clocks that went back.
+        """
+        order: NDArray[np.int64] | slice = slice(None)
+        if (self.time[1:] < self.time[:-1]).any():
+            order = np.argsort(self.time, kind="stable")
+        found = {"time": pl.Series("time", self.time[order])}
         if self.table.has_cpu:
-            found["cpu"] = pl.Series("cpu", self.cpu)
+            found["cpu"] = pl.Series("cpu", self.cpu[order])
         for (name, kind), slot in zip(self.table.columns, self.slots, strict=True):
+            values = slot[order]
             if tsdl.is_text(kind):
                 texts = categories if name == "procname" else strings
-                found[name] = texts.gather(pl.Series(slot)).alias(name)
+                found[name] = texts.gather(pl.Series(values)).alias(name)
             elif isinstance(kind, tsdl.ArrayType):
-                codes, places = np.unique(slot, return_inverse=True)
+                codes, places = np.unique(values, return_inverse=True)
                 lists = [list(known[code]) for code in codes]
                 found[name] = pl.Series(name, lists, pl.List(pl.UInt8)).gather(places)
             else:
-                found[name] = pl.Series(name, slot)
+                found[name] = pl.Series(name, values)
         for name in ("cpu", "pid", "tid"):
             if name not in found:
                 found[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, self.rows)
@@ -364,7 +331,7 @@ def _memory(size: int) -> NDArray[np.uint8]:
     return memory[first : first + size]
 
 
-def _frames(columns: list[_Columns], known: list[bytes], unsorted: bool) -> dict[str, pl.DataFrame]:
+def _frames(columns: list[_Columns], known: list[bytes]) -> dict[str, pl.DataFrame]:
     texts = [text.decode(errors="backslashreplace") for text in known]
     strings = pl.Series("", texts or [""], dtype=pl.String)
     categories = strings.cast(pl.Categorical)
@@ -376,7 +343,7 @@ def _frames(columns: list[_Columns], known: list[bytes], unsorted: bool) -> dict
     frames: dict[str, pl.DataFrame] = {}
     for name in sorted(parts):
         frame = pl.concat(parts[name], how="diagonal_relaxed", rechunk=True)
-        if unsorted or len(parts[name]) > 1:
+        if len(parts[name]) > 1:
             frame = frame.sort("time", maintain_order=True)
         frames[name] = frame.with_columns(pl.col("time").set_sorted())
     return frames

@@ -163,23 +163,18 @@ class MappedFile:
 class Scratch:
     """The tables that kernels work with in one thread, and the ``address`` of that of addresses."""
 
-    def __init__(self, layout: Layout, files: int = 1) -> None:
+    def __init__(self, layout: Layout) -> None:
         counters = max(len(layout.tables), 1)
         self.state = np.zeros(tb.STATE_WORDS, np.int64)
         self.state[tb.X_BUDGET] = 1 << 62
         self.rows = np.zeros(counters, np.int64)
         self.caps = np.full(counters, 1 << 62, np.int64)
-        self.registers = np.zeros((files, layout.registers), np.int64)
-        self._tables = {
-            **layout.arrays(),
-            tb.M_STATE: self.state,
-            tb.M_ROWS: self.rows,
-            tb.M_CAPS: self.caps,
-            tb.M_BATCHES: np.zeros((len(layout.events), 1 + 2 * tb.BATCH), np.int64),
-        }
+        self.registers = np.zeros(layout.registers, np.int64)
+        self.batches = np.zeros((len(layout.events), 1 + 2 * tb.BATCH), np.int64)
+        self._tables = {**layout.arrays(), tb.M_STATE: self.state, tb.M_ROWS: self.rows}
+        self._tables |= {tb.M_CAPS: self.caps, tb.M_BATCHES: self.batches}
         self._words = np.zeros(tb.MACHINE_WORDS, np.int64)
         self._words[list(self._tables)] = [table.ctypes.data for table in self._tables.values()]
-        self._words[tb.M_COUNTERS] = counters
         self.address = int(self._words.ctypes.data)
         self.entries = np.zeros((0, 4), np.int64)
         self.grow()

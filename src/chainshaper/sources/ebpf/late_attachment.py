@@ -209,8 +209,8 @@ def with_found_nodes(
         (pid, number, node.rpartition("/")[0] or "/", node.rpartition("/")[2])
         for (pid, node), number in numbers.items()
     ]
-    types = {"pid": pl.Int32, "node_handle": pl.UInt64}
-    types |= {"namespace": pl.String, "node_name": pl.String}
+    columns, known = events.column_types("rcl_node_init"), ("pid", "node_handle", "namespace")
+    types = {name: columns[name] for name in (*known, "node_name")}
     nodes = pl.DataFrame(parts, schema=types, orient="row")
     new = {"rcl_node_init": nodes, "rclcpp_timer_link_node": _timer_links(changed, nodes)}
     changed |= added_rows(changed, new, min(nameless["time"]))
