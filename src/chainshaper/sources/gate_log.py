@@ -24,7 +24,7 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
     file, or it is no shaping node's log.
     """
     path = Path(path)
-    table = pl.concat([_read_part(part) for part in _parts(path) or [path]])
+    table = pl.concat(map(_read_part, _parts(path) or [path]))
     return table.with_columns(gate=pl.lit(path.stem)).sort("time", maintain_order=True)
 
 
@@ -95,10 +95,8 @@ def with_gate_logs(
     if removed:
         notes.append(f"{removed} {rows} were removed to make room for newer ones.")
     if unwritten:
-        notes.append(
-            f"{unwritten} {rows} could not be written: what became of those messages is not known. "
-            "See to room on the disk."
-        )
+        unknown = "what became of those messages is not known. See to room on the disk."
+        notes.append(f"{unwritten} {rows} could not be written: {unknown}")
     releases = releases.filter(pl.col("origin") >= since_ns, pl.col("time") < until_ns)
     seen = releases.filter(pl.col("stalled") >= STALL_NS).select(
         "pid", "tid", "cpu", time="release", duration="stalled"

@@ -1,8 +1,7 @@
 """From a trace's metadata to the tables that the compiled kernels read.
 
 Tables are of int64, a row per thing. A kernel gets the address of the one whose words (``M_…``) are
-the addresses of the others: Numba counts references to arrays at every call, at several times the
-cost of reading an event.
+the addresses of the others: to count references to arrays would cost more than to read an event.
 
 `lay_out` turns the types of all events into operations. Runs of fixed size that are not asked for
 become one SKIP, so that an event that is not wanted costs one addition. Values of a column go to
@@ -26,7 +25,6 @@ from numpy.typing import NDArray
 from chainshaper.sources.ctf import tsdl
 
 # fmt: off
-# A table's columns stand together, with what they hold behind them.
 # The machine. RANGES of variants' tags: low, high, operation to go on with. ROWS are the row
 # counters of the tables, CAPS how far each may go. SLOTS is the dictionary's hash table, int32,
 # MASK + 1 of them; ENTRIES are its ROOM strings. BATCHES has per event class a count and BATCH
@@ -96,10 +94,8 @@ O_ROW, B_ROW = 8 * OPERATION_COLUMNS, 8 * (1 + 2 * BATCH)
 BUDGET = 64
 """What decoding may cost for each byte of a packet, and finding packets for each byte of a file.
 
-An operation costs 1, a byte of a column as well: with fields of no bits, a few bytes of a packet
-could else fill the memory.
+An operation costs 1, a byte of a column as well: fields of no bits could else fill the memory.
 """
-
 ENDLESS = 1 << 40
 """More elements than any packet has, even of no bits; times what one costs it is still a number."""
 
@@ -112,17 +108,16 @@ ENDLESS = 1 << 40
 # How a scan for packets ended, and what was wrong where.
 DONE, FULL, BAD_MAGIC, BAD_UUID, BAD_STREAM, BAD_SIZE, BAD_HEADER, CUT, COSTLY = range(9)
 
-REGISTERS = {
-    name: number
-    for number, name in enumerate((
-        "id", "magic", "stream_id", "stream_instance_id", "timestamp_begin", "timestamp_end",
-        "packet_seq_num", "events_discarded", "cpu_id", "content_size", "packet_size",
-        "uuid_low", "uuid_high",
-    ))
-}
+REGISTERS = dict(zip((
+    "id", "magic", "stream_id", "stream_instance_id", "timestamp_begin", "timestamp_end",
+    "packet_seq_num", "events_discarded", "cpu_id", "content_size", "packet_size",
+    "uuid_low", "uuid_high",
+), range(13), strict=True))
 """The numbers that the decoder itself needs, by their TSDL name in packet header and context."""
-R_ID, R_MAGIC, R_STREAM, R_INSTANCE, R_BEGIN, R_END, R_SEQUENCE, R_DISCARDED, R_CPU = range(9)
-R_CONTENT, R_PACKET, R_UUID_LOW, R_UUID_HIGH = range(9, 13)
+(
+    R_ID, R_MAGIC, R_STREAM, R_INSTANCE, R_BEGIN, R_END, R_SEQUENCE, R_DISCARDED, R_CPU,
+    R_CONTENT, R_PACKET, R_UUID_LOW, R_UUID_HIGH,
+) = range(13)
 
 MAGIC = 0xC1FC1FC1
 BILLION = 1_000_000_000
@@ -265,7 +260,7 @@ class _Number(NamedTuple):
 
     register: int
     signed: bool
-    mappings: tuple[tsdl.EnumMapping, ...]
+    mappings: tuple[tuple[str, int, int], ...]
 
 
 _Frame = dict[str, "_Number | _Frame"]
@@ -589,8 +584,8 @@ def _quick_header(header: tsdl.StructType | None, big: bool) -> list[int]:
             align,
         ) if isinstance(clock, tsdl.IntegerType) and clock.clock is not None and not big:
             last, shift = (1 << number.size) - 1, -(-number.size // inner) * inner
-            ranges = {m.label: (m.low, m.high) for m in number.mappings}
-            quick = ranges == {"compact": (0, last - 1), "extended": (last, last)}
+            ranges = {("compact", 0, last - 1), ("extended", last, last)}
+            quick = ranges == {*number.mappings}
             quick &= "be" not in (number.byte_order, clock.byte_order) and not clock.signed
             quick &= clock.size <= 63 and shift + clock.size <= 64
             if quick and align >= max(8, inner):

@@ -6,7 +6,6 @@ import struct
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -106,14 +105,13 @@ def open_trace(*paths: Path | str) -> CtfTrace:
 def _find(paths: Iterable[Path | str]) -> Iterable[Path]:
     found: dict[Path, Path] = {}
     for path in map(Path, paths):
+        here = sorted(p.parent for p in path.rglob("metadata") if p.is_file())
         if not path.exists():
             raise CtfError(path, None, "no such file or folder")
-        here = sorted(p.parent for p in path.rglob("metadata") if p.is_file())
         if not here:
             reason = "no CTF trace: no file named metadata in it"
             raise CtfError(path, None, reason, "give a trace's folder")
-        for folder in here:
-            found.setdefault(folder.resolve(), folder)
+        found = {folder.resolve(): folder for folder in here} | found
     if not found:
         raise CtfError(".", None, "no trace given")
     return found.values()
@@ -270,11 +268,11 @@ def _unpacked(path: Path, data: bytes, order: str) -> tuple[bytes, list[tuple[in
     header = struct.Struct(order + "I16sIIIBBBBB")
     text, pieces, offset = bytearray(), [], 0
     while offset < len(data):
-        if offset + header.size > len(data):
+        begin = offset + header.size
+        if begin > len(data):
             raise CtfError(path, offset, "metadata packet header cut short", "file is truncated")
-        found: tuple[Any, ...] = header.unpack_from(data, offset)
-        magic, _, _, content, size, compression, encryption, *_ = found
-        begin, end = offset + header.size, offset + content // 8
+        magic, _, _, content, size, compression, encryption, *_ = header.unpack_from(data, offset)
+        end = offset + content // 8
         if magic != METADATA_MAGIC:
             raise CtfError(path, offset, f"metadata packet begins with 0x{magic:08X}")
         if compression or encryption:

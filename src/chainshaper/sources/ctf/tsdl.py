@@ -32,20 +32,12 @@ class TsdlError(ValueError):
     """Metadata that is no TSDL; ``args`` are the character offset and the reason."""
 
 
-class EnumMapping(NamedTuple):
-    """One label of an enumeration and the closed range of values that carry it."""
-
-    label: str
-    low: int
-    high: int
-
-
 @dataclass(frozen=True, slots=True)
 class IntegerType:
-    """``integer { … }`` (section 4.1.5), or ``enum`` (4.1.8) with ``mappings``, which may overlap.
+    """``integer { … }`` (section 4.1.5), or ``enum`` (4.1.8).
 
-    ``clock`` is the name of the clock it is mapped to. Other labels make no other type: values
-    lie alike.
+    ``clock`` is the name of the clock it is mapped to; ``mappings`` are labels and closed ranges of
+    values (low, high), which may overlap. Other labels make no other type: values lie alike.
     """
 
     size: int
@@ -54,7 +46,7 @@ class IntegerType:
     byte_order: Literal["native", "le", "be"] = "native"
     encoded: bool = False  # as UTF-8 or ASCII
     clock: str | None = None
-    mappings: tuple[EnumMapping, ...] = field(default=(), compare=False)
+    mappings: tuple[tuple[str, int, int], ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -523,7 +515,7 @@ class _Parser:
     def _enum(self, container: Type | None) -> IntegerType:
         if not isinstance(container, IntegerType):
             self.fail("an enumeration needs an integer type")
-        mappings: list[EnumMapping] = []
+        mappings: list[tuple[str, int, int]] = []
         following = 0
         self.expect("{")
         while not self.at("}"):
@@ -535,7 +527,7 @@ class _Parser:
                     high = self.integer()
             if high < low:
                 self.fail(f"range {low} ... {high} of {label!r} is empty")
-            mappings.append(EnumMapping(label, low, high))
+            mappings.append((label, low, high))
             following = high + 1
             if not self.accept(","):
                 break
