@@ -44,12 +44,11 @@ _Progress = Callable[[float], None]
 class Events(dict[str, pl.DataFrame]):
     """Frames by event name; ``warnings`` say what could not be read.
 
-    ``counts`` are of all events in the streams that were read; ``unread`` are the other streams.
+    ``counts`` are of all events in the streams that were read, zeros included.
     """
 
     warnings: tuple[str, ...] = ()
     counts: dict[str, int]
-    unread: tuple[CtfStream, ...] = ()
 
 
 def count_events(
@@ -59,9 +58,8 @@ def count_events(
 
     Raises `CtfError` where a file is gone.
     """
-    layout = lay_out(trace.folders, {})
-    files = _walked(trace.streams, layout, threads)
-    return _counts(trace, layout, files), tuple(_warnings(files))
+    found = read_events(trace, (), threads=threads, counted=True)
+    return found.counts, found.warnings
 
 
 def read_events(
@@ -69,6 +67,7 @@ def read_events(
     names: Collection[str] | None = None,
     *,
     nameless: Collection[str] = (),
+    counted: bool = False,
     threads: int | None = None,
     progress: _Progress = lambda _: None,
 ) -> Events:
@@ -87,14 +86,19 @@ def read_events(
       their integer; strings and text arrays are String (bytes that are not UTF-8 as ``\\xNN``),
       arrays and sequences of bytes List of UInt8. Fields of other kinds are passed over.
 
-    Events that cannot be read end their packet; the result's ``warnings`` say which and why.
-    ``progress`` gets the share that is done, from 0 to 1.
+    Events that cannot be read end their packet; the result's ``warnings`` say which and why. All
+    are to be ``counted``, or those of streams without ``names`` need not be. ``progress`` gets the
+    share that is done, from 0 to 1.
     Raises `CtfError` where a file is gone or changes while it is read.
     """
     asked = trace.event_names if names is None else names
     layout = lay_out(trace.folders, {name: name not in nameless for name in asked})
     rows = {event.stream for event in layout.events if event.row[tb.E_COUNTER] >= 0}
-    used = [s for s in trace.streams if not rows.isdisjoint(s.table[:, tb.P_STREAM].tolist())]
+    used = [
+        stream
+        for stream in trace.streams
+        if counted or not rows.isdisjoint(stream.table[:, tb.P_STREAM].tolist())
+    ]
     files = _walked(used, layout, threads, lambda share: progress(share / 3))
     ends = np.cumsum([file.rows for file in files], axis=0)
     columns = [
@@ -111,8 +115,10 @@ def read_events(
         folder = trace.folders[0].path
         raise tsdl.CtfError(folder, None, reason, "read its folders one by one") from None
     events.warnings = tuple(_warnings(files))
-    events.counts = _counts(trace, layout, files)
-    events.unread = tuple(stream for stream in trace.streams if stream not in used)
+    events.counts = dict.fromkeys(trace.event_names, 0)
+    for file in files:
+        for event, number in zip(layout.events, file.counts.tolist(), strict=False):
+            events.counts[event.name] += number
     return events
 
 
@@ -197,14 +203,6 @@ def _walked(
     return files
 
 
-def _counts(trace: CtfTrace, layout: Layout, files: list[_File]) -> dict[str, int]:
-    counts = dict.fromkeys(trace.event_names, 0)
-    for file in files:
-        for event, number in zip(layout.events, file.counts.tolist(), strict=False):
-            counts[event.name] += number
-    return counts
-
-
 # Pass 2
 
 
@@ -224,6 +222,7 @@ def _filled(
         (file, one._replace(before=end - file.rows + one.before, after=end - file.rows + one.after))
         for file, end in zip(files, ends, strict=True)
         for one in file.chunks
+        if (one.after > one.before).any()
     ]
     codes: dict[bytes, int] = {}
     with ThreadPoolExecutor(threads or _cores()) as pool:

@@ -20,7 +20,7 @@ from typing import TypeAlias
 
 import polars as pl
 
-from chainshaper.sources.ctf import CtfTrace, Events, count_events, open_trace, read_events
+from chainshaper.sources.ctf import CtfTrace, Events, open_trace, read_events
 from chainshaper.sources.ctf import tsdl as ctf
 from chainshaper.sources.system import (
     NEXT_HOST,
@@ -194,9 +194,9 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 self._progress((place + share) / len(self._hosts), "decoding events")
 
             report(0.0)
-            found = read_events(trace, wanted, nameless=nameless, progress=report)
+            found = read_events(trace, wanted, nameless=nameless, counted=first, progress=report)
             if first:
-                self._take_stock(host, trace, found)
+                self._take_stock(host, found)
             if unnamed:
                 self._note_names(host, trace, found)
             for name in group:
@@ -214,12 +214,11 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 table = table.unique(maintain_order=True) if table.height else table
             self._read[name] = table
 
-    def _take_stock(self, host: str, trace: CtfTrace, found: Events) -> None:
-        """Count all events, also of unwanted streams; move numbers that another host has, too."""
-        others, unread = count_events(replace(trace, streams=found.unread))
+    def _take_stock(self, host: str, found: Events) -> None:
+        """Count all events; move numbers that another host has, too."""
         for name, count in found.counts.items():
-            self.counts[name] = self.counts.get(name, 0) + count + others.get(name, 0)
-        self.warnings += found.warnings + unread
+            self.counts[name] = self.counts.get(name, 0) + count
+        self.warnings += found.warnings
         self._moved[host] = 0
         if len(self._hosts) > 1:
             known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
