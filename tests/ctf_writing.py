@@ -217,7 +217,7 @@ def _event_header(header: StructType, number: int, time: int, clock: int) -> Map
             IntegerType(mappings=mappings),
             VariantType(_, [Field(_, StructType([Field(_, stamp)])), *_]),
         ]:
-            last = max(m.low for m in mappings)
+            last = max(low for _, low, _ in mappings)
             # A compact stamp can tell of less than one turn of its bits since the event before.
             if number < last and 0 <= time - clock < 1 << stamp.size:  # type: ignore[union-attr]
                 return {"id": number, "v": ("compact", {"timestamp": time})}
