@@ -60,18 +60,20 @@ def test_what_is_no_log_is_refused(log: Path, text: str | None, words: str) -> N
         read_gate_log(log)
 
 
-def test_only_cycles_of_the_recording_itself_count(log: Path) -> None:
+def test_only_cycles_of_the_recording_itself_count_and_absent_logs_are_named(log: Path) -> None:
     """The node was there before the plan was in force, and goes on when tracing has ended."""
-    gone = log.with_name("gone.csv")
+    gone, empty = log.with_name("gone.csv"), log.with_name("empty.csv")
+    empty.touch()  # as a full disk leaves it
+    log.with_name("gate.csv.1").touch()
     cycles = (
         f"{cycle + 60},7,8,1,,{cycle + 10},{cycle},{cycle + 60},2,0,cycle,,,,\n"
         for cycle in range(1000, 1500, 100)
     )
     log.write_text(HEADER + "".join(cycles))
-    tables, missing = with_gate_logs({}, [log, gone], since_ns=1050, until_ns=1360)
+    tables, notes = with_gate_logs({}, [log, gone, empty], since_ns=1050, until_ns=1360)
     assert tables["gate_release"]["origin"].to_list() == [1100, 1200]
-    (note,) = missing
-    assert f"{gone} is not there" in note
+    for absent, note in zip((gone, empty), notes, strict=True):
+        assert f"{absent} is not there: it has let nothing through" in note
 
 
 def test_stalls_that_a_gate_saw_are_the_machines(log: Path) -> None:
@@ -98,13 +100,3 @@ def test_gates_of_one_process_count_their_rows_for_themselves(tmp_path: Path) ->
     ]
     (note,) = notes
     assert note.startswith("1 rows of shaping nodes' logs could not be written")
-
-
-def test_a_log_that_a_full_disk_left_empty_costs_no_other(log: Path) -> None:
-    log.write_text(HEADER + EARLY)
-    empty = log.with_name("empty.csv")
-    empty.touch()
-    log.with_name("gate.csv.1").touch()
-    tables, (note,) = with_gate_logs({}, [empty, log], since_ns=0, until_ns=2000)
-    assert tables["gate_release"].height == 1
-    assert f"{empty} is not there: it has let nothing through" in note

@@ -27,12 +27,8 @@ def tables_of(rows: Iterable[tuple[str, Mapping[str, Any]]]) -> dict[str, pl.Dat
     found: dict[str, list[dict[str, Any]]] = {}
     for name, values in rows:
         found.setdefault(name, []).append({"pid": PID, "tid": THREAD, **values})
-    return {
-        name: pl.DataFrame(values, schema={**events.COMMON_COLUMNS, **events.FIELDS[name]}).sort(
-            "time"
-        )
-        for name, values in found.items()
-    }
+    schemas = {name: events.empty(name).schema for name in found}
+    return {name: pl.DataFrame(own, schemas[name]).sort("time") for name, own in found.items()}
 
 
 def instance(
@@ -95,10 +91,9 @@ def test_topics_callbacks_and_periods_of_a_chain_are_found() -> None:
     assert flow.publications.height == 20
     assert flow.takes["publication"].to_list() == list(range(0, 20, 2))
     assert flow.publications["callback_id"].null_count() == 0
-    publishers = tables["rcl_publisher_init"].select(
-        "publisher_handle", "rmw_publisher_handle", "topic_name"
-    )
-    assert sorted(publishers.iter_rows()) == [(0x101, 0x100, "/a"), (0x201, 0x200, "/b")]
+    columns = ("publisher_handle", "rmw_publisher_handle", "topic_name")
+    publishers = sorted(tables["rcl_publisher_init"].select(columns).iter_rows())
+    assert publishers == [(0x101, 0x100, "/a"), (0x201, 0x200, "/b")]
     assert "publishers (2) and subscriptions (1)" in notes[0]
     assert "timers (1)" in notes[0]
 
@@ -111,11 +106,11 @@ def test_what_was_seen_being_created_is_left_as_it_is() -> None:
         ]
     )
     tables, _ = with_found_objects({**chain(), **created}, CHAIN_HANDLES, began_ns=0)
-    topics = dict(
-        tables["rcl_publisher_init"].select("rmw_publisher_handle", "topic_name").iter_rows()
-    )
-    assert topics == {0x100: "/x", 0x200: "/b"}
+    publishers = tables["rcl_publisher_init"].select("rmw_publisher_handle", "topic_name")
+    assert dict(publishers.iter_rows()) == {0x100: "/x", 0x200: "/b"}
     assert tables["rclcpp_timer_callback_added"].height == 1
+    known = tables_of([("rcl_publisher_init", {"time": 0, "node_handle": 1, "topic_name": "/x"})])
+    assert with_found_nodes(known, INFO, (), ()) == (known, INFO)
 
 
 def test_functions_belong_to_callbacks_from_when_these_were_added() -> None:
@@ -211,8 +206,3 @@ def test_what_is_not_certain_stays_open_and_is_said() -> None:
     nothing, info = with_found_nodes(tables, INFO, (), [container(("program",))])
     assert nodes_of(nothing) == dict.fromkeys((TIMER, READER), f"unknown (process {PID})")
     assert "/a, /b" in info.notes[0]
-
-
-def test_a_recording_whose_nodes_were_seen_is_returned_as_it_is() -> None:
-    created = tables_of([("rcl_publisher_init", {"time": 0, "node_handle": 1, "topic_name": "/x"})])
-    assert with_found_nodes(created, INFO, (), ()) == (created, INFO)

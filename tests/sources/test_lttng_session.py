@@ -11,10 +11,10 @@ import time
 import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
+from known import known
 from lttng_node import required_node
 from processes import children_of, marked_processes, wait_for
 
@@ -109,9 +109,7 @@ def test_every_event_comes_with_its_fields_and_nothing_is_left(
 ) -> None:
     """And an independent decoder counts the same events."""
     session = LttngSession(tmp_path, ["x"], ())
-    with (
-        tempfile.TemporaryDirectory() as homes
-    ):  # others record beside us; sockets' paths are short
+    with tempfile.TemporaryDirectory() as homes:  # others record beside us; its path is short
         monkeypatch.setattr(tempfile, "tempdir", homes)
         pid, tables, info = result(session, node, "flood", "50", "0")
         session.remove()  # once more does no harm
@@ -208,17 +206,12 @@ def test_a_daemon_that_dies_is_a_failure_in_words(node: Path, tmp_path: Path) ->
         session.remove()
 
 
-@pytest.mark.parametrize(("command", "pids"), [((), ()), ((), (1,)), (("x",), (1,))])
-def test_attaching_is_refused(
-    tmp_path: Path, command: tuple[str, ...], pids: tuple[int, ...]
-) -> None:
-    with pytest.raises(InputError, match="attach with `--source ebpf`"):
-        LttngSession(tmp_path, command, pids)
-
-
-def test_without_lttng_the_package_and_the_other_source_are_named(
+def test_attaching_is_refused_and_without_lttng_package_and_other_source_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    for command, pids in ((), ()), ((), (1,)), (("x",), (1,)):
+        with pytest.raises(InputError, match="attach with `--source ebpf`"):
+            LttngSession(tmp_path, command, pids)
     monkeypatch.setenv("PATH", str(tmp_path))
     session = LttngSession(tmp_path, ["x"], ())
     with pytest.raises(PlatformError, match=r"`lttng` is not there: install .*lttng-tools.*ebpf"):
@@ -254,29 +247,17 @@ def callbacks(session: LttngSession) -> dict[int, int]:
     return dict(tables["callback_start"].group_by("pid").len().iter_rows())
 
 
-@dataclass(frozen=True)
 class Another:
     """A process that records at the same time until it has to end."""
 
-    process: "subprocess.Popen[str]"
-    mark: str
-    home: Path
-
-    @classmethod
-    def start(cls, folder: Path, *prefix: str) -> "Another":
+    def __init__(self, folder: Path, *prefix: str) -> None:
         """Start it, and return when it records or has failed to."""
         folder.mkdir()
-        mark = uuid.uuid4().hex
-        process = subprocess.Popen(
-            [*prefix, sys.executable, "-c", ANOTHER, folder],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-            env={**os.environ, "MARK": mark},
-        )
-        assert process.stdout is not None
-        return cls(process, f"MARK={mark}", Path(process.stdout.readline().strip()))
+        mark, command = uuid.uuid4().hex, [*prefix, sys.executable, "-c", ANOTHER, folder]
+        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        environment = {**os.environ, "MARK": mark}
+        self.process = subprocess.Popen(command, **pipes, text=True, env=environment)
+        self.mark, self.home = f"MARK={mark}", Path(known(self.process.stdout).readline().strip())
 
     def end(self) -> str:
         """Have it end, with all that it started; its last words."""
@@ -294,7 +275,7 @@ def test_recordings_at_once_hear_their_own_command_only_and_one_that_is_killed_l
         with recorded(first) as environment:
             of_first = {run(node, environment, 100): 100}
             another = later.enter_context(recorded(second))
-            killed = Another.start(tmp_path / "killed")
+            killed = Another(tmp_path / "killed")
             assert killed.home.is_dir()
             assert "lttng-sessiond" in marked_processes(killed.mark).values()
             of_second = {run(node, another, 200): 200}
@@ -307,24 +288,20 @@ def test_recordings_at_once_hear_their_own_command_only_and_one_that_is_killed_l
     assert not killed.home.exists()
 
 
-def test_a_daemon_that_a_user_starts_meanwhile_and_ours_do_not_meet(
+def test_a_users_daemon_is_as_it_was_when_one_is_killed_and_does_not_meet_ours(
     node: Path, tmp_path: Path
 ) -> None:
-    ours = session_in(tmp_path / "ours")
-    with recorded(ours) as environment, users_daemon(tmp_path) as users:
-        assert not set(ours._sessions) & set(sessions(users))
-        pid = run(node, environment, 100)
-    assert callbacks(ours) == {pid: 100}
-
-
-def test_one_that_is_killed_leaves_a_users_daemon_as_it_was(node: Path, tmp_path: Path) -> None:
-    lasting = session_in(tmp_path / "lasting")
+    before, lasting = (session_in(tmp_path / name) for name in ("before", "lasting"))
+    with recorded(before) as environment, users_daemon(tmp_path) as users:
+        assert not set(before._sessions) & set(sessions(users))
+        alone = run(node, environment, 100)
+    assert callbacks(before) == {alone: 100}
     with users_daemon(tmp_path) as users:
         lttng(users, "create", "mine", f"--output={tmp_path / 'mine'}")
         try:
-            before, names = lttng(users, "list", "mine").stdout, sessions(users)
+            mine, names = lttng(users, "list", "mine").stdout, sessions(users)
             with recorded(lasting) as environment:
-                killed = Another.start(tmp_path / "killed")
+                killed = Another(tmp_path / "killed")
                 assert len(sessions(users)) == len(names) + 2
                 killed.process.kill()
                 killed.end()
@@ -332,7 +309,7 @@ def test_one_that_is_killed_leaves_a_users_daemon_as_it_was(node: Path, tmp_path
                 pid = run(node, environment, 100)
             assert callbacks(lasting) == {pid: 100}
             assert sessions(users) == names
-            assert lttng(users, "list", "mine").stdout == before
+            assert lttng(users, "list", "mine").stdout == mine
         finally:
             lttng(users, "destroy", "mine")
 
@@ -343,8 +320,8 @@ def test_where_root_may_not_mount_a_second_recording_is_refused_and_the_first_go
 ) -> None:
     if os.geteuid() != 0 or shutil.which("setpriv") is None:
         pytest.skip("only root can give up the privilege to mount, with setpriv")
-    first = Another.start(tmp_path / "first", *UNPRIVILEGED)
-    refused = Another.start(tmp_path / "second", *UNPRIVILEGED)
+    first = Another(tmp_path / "first", *UNPRIVILEGED)
+    refused = Another(tmp_path / "second", *UNPRIVILEGED)
     assert "PlatformError: another recording runs" in refused.end()
     third = session_in(tmp_path / "third")
     with recorded(third) as environment:  # which may mount

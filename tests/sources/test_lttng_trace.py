@@ -1,6 +1,7 @@
 """LTTng traces as recordings: stories written as a tracer would have, and opened again."""
 
 import os
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -71,27 +72,16 @@ def test_tables_come_back_as_they_were_written(tmp_path: Path) -> None:
     assert recording.info.clock_offset_ns == OFFSET
     assert recording.info.host == "example"
     assert recording.info.processes == {10: "/a", 11: "/b"}
-
-
-def test_babeltrace_reads_what_was_written(tmp_path: Path) -> None:
-    trace = written(tmp_path / "trace", chain_story())
-    counts: dict[str, int] = {}
-    for name, *_ in babeltrace(trace)["events"]:
-        counts[name] = counts.get(name, 0) + 1
-    assert json_of("info", trace)["events"] == dict(sorted(counts.items()))
-
-
-def test_latency_through_the_whole_path(tmp_path: Path) -> None:
-    trace = written(tmp_path / "trace", chain_story())
-    found = json_of("latency", trace, "--chain", "/x../y", "--instances")
-    assert (found["count"], found["incomplete"]) == (5, 0)
-    assert (found["min_ns"], found["max_ns"]) == (300, 300)
+    counts = Counter(name for name, *_ in babeltrace(tmp_path / "trace")["events"])
+    assert json_of("info", tmp_path / "trace")["events"] == dict(sorted(counts.items()))
+    found = json_of("latency", tmp_path / "trace", "--chain", "/x../y", "--instances")
+    assert (found["count"], found["incomplete"], found["min_ns"], found["max_ns"]) == (
+        5,
+        0,
+        300,
+        300,
+    )
     assert found["instances"][0]["start_ns"] == START + 1000 + OFFSET
-    assert [hop["communication_ns"] for hop in found["hops"]] == [
-        None,
-        {"min": 100, "mean": 100.0, "max": 100},
-    ]
-    assert found["communication_share"] == pytest.approx(1 / 3)
 
 
 def test_folders_of_processes_are_merged_by_time(tmp_path: Path) -> None:
@@ -124,17 +114,10 @@ def test_execution_times_from_a_kernel_trace_beside_user_space(tmp_path: Path) -
     alone = open_source(trace / "ust")
     statistics = callback_statistics(data_flow(alone.events))
     assert statistics["execution_ns"].null_count() == 2
-
-
-def test_damage_to_the_kernels_part_is_said_though_it_is_read_late(tmp_path: Path) -> None:
-    story = chain_story(cycles=3)
-    switch(story, {900: (0, 10), 1160: (10, 11)})
-    trace = written(tmp_path / "trace", story)
     (stream,) = (one for one in (trace / "kernel").iterdir() if one.name != "metadata")
     os.truncate(stream, stream.stat().st_size - 10)
-    recording = open_source(trace)
-    assert len(recording.events["callback_start"])
-    assert any(str(stream) in note for note in recording.info.notes)
+    notes = open_source(trace).info.notes
+    assert any(str(stream) in note for note in notes), "said though it is read late"
 
 
 def test_what_the_tracer_dropped_is_in_every_result(tmp_path: Path) -> None:
@@ -152,6 +135,8 @@ def test_what_the_tracer_dropped_is_in_every_result(tmp_path: Path) -> None:
     assert said in called("callbacks", trace, "--json").err, "its array has no place for it"
     assert "lost while recording" in called("compare", trace, trace, "--chain", "/x../y").out
     assert json_of("info", recording)["lost"] == lost
+    said = refused(2, "graph", trace, "-o", tmp_path / "graph.png")
+    assert "ends in .svg or .dot or .json" in said
 
 
 def test_tracing_started_after_the_application(tmp_path: Path) -> None:
@@ -166,22 +151,6 @@ def test_tracing_started_after_the_application(tmp_path: Path) -> None:
     assert {row["kind"] for row in json_of("callbacks", trace)} == {"unknown"}
     assert "tracing started after the application" in called("callbacks", trace).err
     assert "tracing has to start before" in refused(2, "latency", trace, "--chain", "/x../y")
-
-
-def test_components_share_a_process(tmp_path: Path) -> None:
-    story = Story()
-    first, second = story.node("/container/a", 10), story.node("/container/b", 10)
-    timer, reader = story.timer(first), story.subscription(second, "/x")
-    x = story.publisher(first, "/x")
-    story.runs(timer, 1000, 1100, writes=((x, 1050),), tid=11)
-    story.runs(reader, 1200, 1300, reads=1050, tid=12)
-    trace = written(tmp_path / "trace", story)
-    assert json_of("info", trace)["processes"] == {"10": "/container/a, /container/b"}
-    rows = json_of("callbacks", trace)
-    assert {(row["node"], *row["tids"]) for row in rows} == {
-        ("/container/a", 11),
-        ("/container/b", 12),
-    }
 
 
 def test_carets_events_of_the_start_are_put_where_they_happened(tmp_path: Path) -> None:
@@ -201,30 +170,18 @@ def test_carets_events_of_the_start_are_put_where_they_happened(tmp_path: Path) 
     assert analyse_latency(recording, "/x../y").statistics.count == 5
 
 
-def test_traces_of_different_clocks_are_not_mixed(tmp_path: Path) -> None:
+def test_traces_of_different_clocks_or_without_our_events_are_refused(tmp_path: Path) -> None:
     written(tmp_path / "traces" / "one", chain_story())
     text = lttng_metadata({"ros2:rcl_take": {"message": "x64"}})
-    text = text.replace("d499e0ca", "00000000")
-    write_trace(tmp_path / "traces" / "two", text, {})
+    write_trace(tmp_path / "traces" / "two", text.replace("d499e0ca", "00000000"), {})
     with pytest.raises(InputError, match=r"two was taken by another clock than .*one"):
         open_source(tmp_path / "traces")
-
-
-def test_a_trace_without_ros_events_cannot_be_converted(tmp_path: Path) -> None:
-    text = lttng_metadata({"other:event": {"value": "u32"}})
-    write_trace(tmp_path / "trace", text, {})
-    said = refused(2, "convert", tmp_path / "trace", "-o", tmp_path / "recording")
+    one_event(tmp_path / "mine", "mine:callback_start", {"callback": "x64"}, {"callback": 1})
+    assert len(open_source(tmp_path / "mine").events) == 0, "another provider's of the same name"
+    assert json_of("info", tmp_path / "mine")["events"] == {"mine:callback_start": 1}
+    said = refused(2, "convert", tmp_path / "mine", "-o", tmp_path / "recording")
     assert "no event in it is one that chainshaper knows" in said
     assert not (tmp_path / "recording").exists()
-
-
-def test_a_graph_is_written_where_it_can_be(tmp_path: Path) -> None:
-    trace, picture = written(tmp_path / "trace", chain_story()), tmp_path / "graph.svg"
-    picture.write_text("mine")
-    assert "exists already and is not overwritten" in refused(2, "graph", trace, "-o", picture)
-    other = refused(2, "graph", trace, "-o", picture.with_suffix(".png"))
-    assert "ends in .svg or .dot or .json" in other
-    assert picture.read_text() == "mine"
 
 
 def one_event(folder: Path, name: str, kinds: dict[str, str], payload: dict[str, Any]) -> None:
@@ -232,13 +189,6 @@ def one_event(folder: Path, name: str, kinds: dict[str, str], payload: dict[str,
     text = lttng_metadata({name: kinds}, {"vpid": "s32", "vtid": "s32"})
     event = EventRecord(name, START, payload, {"vpid": 10, "vtid": 10})
     write_packet(folder, text, [event])
-
-
-def test_another_providers_events_of_the_same_name_are_not_ours(tmp_path: Path) -> None:
-    one_event(tmp_path / "trace", "mine:callback_start", {"callback": "x64"}, {"callback": 1})
-    recording = open_source(tmp_path / "trace")
-    assert len(recording.events) == 0
-    assert json_of("info", tmp_path / "trace")["events"] == {"mine:callback_start": 1}
 
 
 @pytest.mark.parametrize(
@@ -291,52 +241,27 @@ def test_what_a_conversion_leaves_behind_is_said(tmp_path: Path) -> None:
         assert sum("left out" in note for note in again["notes"]) == 1
 
 
-def container(folder: Path, host: str, names: tuple[str, str], shift: int) -> None:
-    """A container's own trace: its processes are 10 and 11, as in every other container."""
-    tables = {
-        name: frame.with_columns(
-            pl.col(column) + shift
-            for column in ("time", "timestamp", "source_timestamp")
-            if column in frame.columns
-        )
-        for name, frame in shifted(chain_story(names=names)).items()
-    }
-    write_lttng_trace(folder, tables, clock_offset_ns=OFFSET, host=host)
-
-
-def test_containers_with_the_same_process_numbers_are_told_apart(tmp_path: Path) -> None:
-    container(tmp_path / "trace" / "one", "one", ("a", "b"), 0)
-    container(tmp_path / "trace" / "two", "two", ("c", "d"), 120)
-    recording = open_source(tmp_path / "trace")
+@pytest.mark.parametrize("hosts", [("one", "two"), ("host", "host")])
+def test_containers_with_the_same_process_numbers_are_told_apart(
+    tmp_path: Path, hosts: tuple[str, str]
+) -> None:
+    """Their processes are 10 and 11; of one host name, as with `--network host`, by folders."""
+    for folder, host, names, by in zip(("1", "2"), hosts, ("ab", "cd"), (0, 120), strict=True):
+        tables = shifted(chain_story(names=(names[0], names[1])), START + by)
+        write_lttng_trace(tmp_path / folder, tables, clock_offset_ns=OFFSET, host=host)
+    recording = open_source(tmp_path / "1", tmp_path / "2")
     moved = NEXT_HOST + 10
-    assert recording.info.host == "one, two"
+    assert recording.info.host == ", ".join(dict.fromkeys(hosts))
     assert recording.info.processes == {10: "/a", 11: "/b", moved: "/c", moved + 1: "/d"}
-    assert [note for note in recording.info.notes if "host two" in note]
+    of_later = "host two" if hosts[1] == "two" else f"host in {tmp_path / '2'}"
+    assert any(f"{of_later} have" in note for note in recording.info.notes)
     graph = application_graph(recording.events)
-    assert {(c.node, c.pid) for c in graph.callbacks} == {
-        ("/a", 10),
-        ("/b", 11),
-        ("/c", moved),
-        ("/d", moved + 1),
+    assert {(one.node, one.pid) for one in graph.callbacks} == {
+        *(("/a", 10), ("/b", 11), ("/c", moved), ("/d", moved + 1))
     }
     for chain in ("/a../b../y", "/c../d../y"):
         figures = analyse_latency(recording, chain).statistics
         assert (figures.count, figures.min_ns, figures.max_ns) == (5, 300, 300)
-    together = json_of("info", tmp_path / "trace")["events"]
-    alone = json_of("info", tmp_path / "trace" / "one")["events"]
-    assert together == {name: 2 * count for name, count in alone.items()}
-
-
-def test_containers_with_the_hosts_own_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
-    container(tmp_path / "one", "host", ("a", "b"), 0)
-    container(tmp_path / "two", "host", ("c", "d"), 120)
-    recording = open_source(tmp_path / "one", tmp_path / "two")
-    moved = NEXT_HOST + 10
-    assert recording.info.host == "host"
-    assert recording.info.processes == {10: "/a", 11: "/b", moved: "/c", moved + 1: "/d"}
-    assert [note for note in recording.info.notes if f"host in {tmp_path / 'two'} have" in note]
-    for chain in ("/a../b../y", "/c../d../y"):
-        assert analyse_latency(recording, chain).statistics.count == 5
 
 
 def test_hosts_with_different_process_numbers_keep_them(tmp_path: Path) -> None:
@@ -359,27 +284,6 @@ def test_threads_of_a_container_are_not_the_kernels_of_the_same_numbers(tmp_path
     assert [row["execution_ns"] for row in rows] == [None, None]
 
 
-def test_services_and_their_clients(tmp_path: Path) -> None:
-    """A client asks twice; the server's callback runs twice. The client's own is not traced."""
-    story = Story()
-    server = story.service(story.node("/server", 10), "/add")
-    story.client(story.node("/client", 11), "/add")
-    for now in (1000, 2000):
-        story.runs(server, now, now + 70)
-    trace = written(tmp_path / "trace", story)
-    (row,) = json_of("callbacks", trace)
-    assert (row["node"], row["kind"], row["topic"]) == ("/server", "service", "/add")
-    assert (row["count"], row["response_ns"]["max"]) == (2, 70)
-    graph = json_of("graph", trace)
-    assert [(c["node"], c["kind"], c["topic"]) for c in graph["callbacks"]] == [
-        ("/server", "service", "/add"),
-        ("/client", "client", "/add"),
-    ]
-    (service,) = graph["services"]
-    assert (service["servers"], service["clients"]) == (["/server"], ["/client"])
-    assert graph["notes"] == [], "a client is no Python subscription"
-
-
 def test_without_rcl_init_the_fields_tell_the_distribution(tmp_path: Path) -> None:
     story = chain_story()
     story.event("rmw_publisher_init", 0, 10, rmw_publisher_handle=1, gid=[1, 16, *[0] * 14])
@@ -388,25 +292,6 @@ def test_without_rcl_init_the_fields_tell_the_distribution(tmp_path: Path) -> No
     assert "ros2:rcl_init" not in info["events"]
     assert (info["distribution"], info["rmw"]) == ("kilted", "rmw_cyclonedds_cpp")
     assert json_of("latency", trace, "--chain", "/x../y")["count"] == 5
-
-
-def test_a_callback_in_several_threads_of_one_executor(tmp_path: Path) -> None:
-    """Both threads take a message before either starts the callback; 2 overtakes 1."""
-    story = Story()
-    source, worker = story.node("/source", 10), story.node("/worker", 11)
-    timer, reader = story.timer(source), story.subscription(worker, "/x")
-    x, y = story.publisher(source, "/x"), story.publisher(worker, "/y")
-    story.runs(timer, 1000, 1020, writes=((x, 1010),))
-    story.runs(timer, 1100, 1120, writes=((x, 1110),))
-    story.take(reader, 1200, sent=1010, tid=21)
-    story.take(reader, 1201, sent=1110, tid=22)
-    for thread, start, sent, end in ((22, 1202, 1250, 1300), (21, 1203, 1350, 1400)):
-        story.start(reader, start, thread)
-        story.publish(y, sent, thread)
-        story.end(reader, end, thread)
-    found = json_of("latency", written(tmp_path / "trace", story), "--chain", "/x../y",
-                    "--instances")  # fmt: skip
-    assert [one["latency_ns"] for one in found["instances"]] == [350, 150]
 
 
 def test_messages_within_a_process_that_no_event_shows(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ def rows_of(folder: Any) -> Any:
     return rows, [*trace.warnings, *frames.warnings]
 
 
-def test_no_trace_there(tmp_path: Path) -> None:
+def test_what_is_no_ctf_1_8_trace_is_named_with_its_remedy(tmp_path: Path) -> None:
     for paths, reason in (
         ([tmp_path / "absent"], "no such file"),
         ([tmp_path], "no file named metadata"),
@@ -41,6 +41,12 @@ def test_no_trace_there(tmp_path: Path) -> None:
         with pytest.raises(CtfError, match=reason) as caught:
             open_trace(*paths)
         assert caught.value.path == (paths[0] if paths else Path())
+    (tmp_path / "metadata").write_bytes(b'\x1e{"type": "preamble", "version": 2}\n')
+    with pytest.raises(CtfError, match=r"CTF 2 .* --trace-format=ctf-1\.8"):
+        open_trace(tmp_path)
+    text = PLAIN.format(order="le", fields="struct { " + "const " * 50_000 + "u8 x; }")
+    (tmp_path / "metadata").write_text(text)
+    assert open_trace(tmp_path).event_names == ("e",), "words repeated without end are read"
 
 
 @pytest.mark.parametrize(("text", "place", "reason"), [
@@ -101,35 +107,6 @@ def test_types_that_cannot_be_laid_out_are_refused_at_once(
     with pytest.raises(CtfError, match=reason):
         open_trace(tmp_path)
     assert time.monotonic() - started < 60
-
-
-def test_metadata_of_ctf_2_is_named_with_its_remedy(tmp_path: Path) -> None:
-    (tmp_path / "metadata").write_bytes(b'\x1e{"type": "preamble", "version": 2}\n')
-    with pytest.raises(CtfError, match=r"CTF 2 .* --trace-format=ctf-1\.8"):
-        open_trace(tmp_path)
-
-
-def test_words_repeated_without_end_are_read(tmp_path: Path) -> None:
-    text = PLAIN.format(order="le", fields="struct { " + "const " * 50_000 + "u8 x; }")
-    (tmp_path / "metadata").write_text(text)
-    assert open_trace(tmp_path).event_names == ("e",)
-
-
-def test_files_cut_short_keep_their_first_events(tmp_path: Path) -> None:
-    make_trace(tmp_path / "whole", streams=1)
-    whole, _ = rows_of(tmp_path / "whole")
-    data = (tmp_path / "whole/channel_0").read_bytes()
-    kept = []
-    for number, cut in enumerate([*range(0, len(data), 293), len(data) - 40]):
-        folder = tmp_path / str(number)
-        shutil.copytree(tmp_path / "whole", folder)
-        (folder / "channel_0").write_bytes(data[:cut])
-        rows, warnings = rows_of(folder)
-        assert set(rows) <= set(whole)
-        assert all(str(folder / "channel_0") in warning for warning in warnings)
-        kept.append(len(rows))
-    assert kept == sorted(kept)
-    assert kept[-1] >= len(whole) - 2
 
 
 def damaged(

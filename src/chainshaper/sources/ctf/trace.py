@@ -111,7 +111,8 @@ def _find(paths: Iterable[Path | str]) -> Iterable[Path]:
         if not here:
             reason = "no CTF trace: no file named metadata in it"
             raise CtfError(path, None, reason, "give a trace's folder")
-        found = {folder.resolve(): folder for folder in here} | found
+        for folder in here:
+            found.setdefault(folder.resolve(), folder)
     if not found:
         raise CtfError(".", None, "no trace given")
     return found.values()
