@@ -12,7 +12,6 @@ from threading import Event, Thread
 import numpy as np
 import polars as pl
 import pytest
-from command_line import called, json_of
 from containers import in_container
 from small_chain import small_chain
 
@@ -81,20 +80,6 @@ def cut(table: pl.DataFrame) -> pl.DataFrame:
     return table.with_columns(
         pl.col(name).list.head(length) for name, length in LENGTHS.items() if name in table.columns
     )
-
-
-@pytest.mark.ros2
-@pytest.mark.timeout(300)
-def test_the_command_shows_latencies_and_execution_times(launch: list[str], tmp_path: Path) -> None:
-    recording = tmp_path / "recording"
-    made = called(
-        *("record", "--source", "preload", "-o", recording, "--duration", f"{SECONDS}s", "--"),
-        *launch,
-    )
-    assert made.code == 0, made.err
-    callbacks = json_of("callbacks", recording, "--json")
-    assert all(one["execution_ns"]["mean"] > 0 for one in callbacks if one["count"])
-    assert json_of("latency", recording, "--chain", "/t1../t3")["count"] > 10
 
 
 @pytest.mark.ros2

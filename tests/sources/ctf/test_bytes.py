@@ -134,69 +134,6 @@ def test_what_babeltrace_shows_otherwise(tmp_path: Path) -> None:
     assert row["s"] == "a\\xffb", "bytes that are no UTF-8 are shown"
 
 
-HEADER_27 = """/* CTF 1.8 */
-typealias integer {{ size = 8; align = 8; }} := uint8_t;
-typealias integer {{ size = 16; align = 8; }} := uint16_t;
-typealias integer {{ size = 32; align = 8; }} := uint32_t;
-typealias integer {{ size = 64; align = 8; }} := uint64_t;
-typealias integer {{ size = 5; align = 1; }} := uint5_t;
-clock {{ name = c; freq = 1000000000; }};
-typealias integer {{ size = {bits}; align = {align}; map = clock.c.value; }} := low_t;
-typealias integer {{ size = 64; align = 8; map = clock.c.value; }} := stamp_t;
-trace {{ major = 1; minor = 8; byte_order = le; packet.header := struct {{ uint32_t magic; }}; }};
-stream {{
-    event.header := struct {{
-        enum : {container} {{ compact = 0 ... {last}, extended = {all} }} id;
-        variant <id> {{
-            struct {{ low_t timestamp; }} compact;
-            struct {{ uint32_t id; stamp_t timestamp; }} extended;
-        }} v;
-    }} align(8);
-    packet.context := struct {{
-        stamp_t timestamp_begin; stamp_t timestamp_end;
-        uint32_t content_size; uint32_t packet_size;
-    }};
-}};
-event {{ name = "e"; id = 1; fields := struct {{ uint8_t n; }}; }};
-event {{ name = "far"; id = 70000; fields := struct {{ uint8_t n; }}; }};
-"""
-SMALL = {"bits": 27, "align": 1, "container": "uint5_t", "last": 30, "all": 31}
-LARGE = {"bits": 32, "align": 8, "container": "uint16_t", "last": 65534, "all": 65535}
-
-
-def packet(kind: Any, begin: Any, end: Any, events: Any) -> Any:
-    """A packet; events are (low bits of the stamp, n) or (stamp, n, id) for extended ones."""
-    body = b""
-    for low, number, *identifier in events:
-        if identifier:
-            all_ones = b"\x1f" if kind is SMALL else b"\xff\xff"
-            body += all_ones + struct.pack("<IQ", identifier[0], low)
-        elif kind is SMALL:
-            body += struct.pack("<I", 1 | low << 5)
-        else:
-            body += struct.pack("<HI", 1, low)
-        body += bytes([number])
-    size = 28 + len(body)
-    return struct.pack("<IQQII", 0xC1FC1FC1, begin, end, 8 * size, 8 * size + 24) + body + b"pad"
-
-
-@pytest.mark.parametrize("kind", [SMALL, LARGE], ids=["27 bits", "32 bits"])
-def test_time_stamps_wrap_and_follow_packets(tmp_path: Path, kind: Any) -> None:
-    turn = 1 << kind["bits"]
-    begin = 7 * turn + turn - 10
-    data = packet(kind, begin, 10 * turn, [(turn - 10, 0), (turn - 1, 1), (0, 2), (5, 3), (4, 4)])
-    later = [(100, 5), (33 * turn, 6, 1), (40 * turn + 9, 7, 70000)]
-    data += packet(kind, 20 * turn + 100, 41 * turn, later)
-    (tmp_path / "metadata").write_text(HEADER_27.format(**kind))
-    (tmp_path / "stream").write_bytes(data)
-    frames = read_events(open_trace(tmp_path))
-    expected = [begin, begin + 9, 8 * turn, 8 * turn + 5, 9 * turn + 4, 20 * turn + 100, 33 * turn]
-    assert frames["e"]["time"].to_list() == expected
-    assert frames["e"]["n"].to_list() == list(range(7))
-    assert frames["far"].select("time", "n").rows() == [(40 * turn + 9, 7)]
-    assert_equal_to_babeltrace(tmp_path)
-
-
 def test_lengths_and_tags_from_every_scope(tmp_path: Path) -> None:
     (tmp_path / "metadata").write_text("""/* CTF 1.8 */
         typealias integer { size = 8; align = 8; } := u8;

@@ -107,19 +107,6 @@ def intern(machine, place, length, digest, word):
 
 
 @compiled()
-def rehash(machine, count):
-    """Fill the zeroed hash table with the first ``count`` entries; returns their number."""
-    slots, mask = get(machine, tb.M_SLOTS), get(machine, tb.M_MASK)
-    entries = get(machine, tb.M_ENTRIES)
-    for code in range(count):
-        place = np.int64(np.uint64(get(entries + 32 * code, 2)) >> tb.U32) & mask
-        while slot_at(slots, place) != 0:
-            place = (place + 1) & mask
-        store_word(slots + 4 * place, np.uint64(code + 1))
-    return count
-
-
-@compiled()
 def bits_at(base, position, size, big, mapped):
     """An unsigned integer of ``size`` bits at any bit, as uint64 (section 4.1.5)."""
     at = position >> 3
@@ -262,7 +249,7 @@ def move_batch(machine, event, batch):
     loaded. Returns 0 or FULL_DICTIONARY, after which all is to be done again.
     """
     count, ops, size = get(batch, 0), get(machine, tb.M_OPS), get(event, tb.E_SIZE) >> 3
-    first, last = get(event, tb.E_FILL), get(event, tb.E_FILL_STOP)
+    first, last = get(event, tb.E_WALK), get(event, tb.E_WALK_STOP)
     for op in range(ops + (first << 7), ops + (last << 7), tb.O_ROW):
         code, column, offset = get(op, tb.O_CODE), get(op, tb.O_ADDRESS), get(op, tb.O_OFFSET)
         if code == tb.SKIP:
@@ -305,9 +292,10 @@ def execute(machine, owner, column, base, mapped, end, position, regs, row):
             position += get(op, tb.O_SIZE)
             if position > end:
                 return np.int64(tb.TRUNCATED)
-            if code == tb.MOVE and place + 8 <= mapped:
-                store(get(op, tb.O_ADDRESS), get(op, tb.O_WIDTH), row, load_word(base + place))
-            elif code != tb.SKIP:
+            slot = get(op, tb.O_ADDRESS)
+            if code == tb.MOVE and slot != 0 and place + 8 <= mapped:
+                store(slot, get(op, tb.O_WIDTH), row, load_word(base + place))
+            elif code == tb.NUMBER or slot != 0:
                 run_number(machine, op, base, mapped, start, regs, row)
         elif code <= tb.CHARACTERS:
             position = run_text(machine, op, base, mapped, end, position, regs, row)

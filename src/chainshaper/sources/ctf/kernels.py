@@ -223,8 +223,8 @@ def write_event(machine, number, packet, start, mapped, end, position, regs):
         store_word(get(event, tb.E_CPU) + 4 * row, np.uint64(get(packet, tb.P_CPU)))
     align, size = get(event, tb.E_ALIGN), get(event, tb.E_SIZE)
     begin = (position + align - 1) & -align
-    if get(event, tb.E_CONSTANT) == 0 or (begin + size >> 3) + 8 > mapped:
-        return execute(machine, event, tb.E_FILL, start, mapped, end, position, regs, row)
+    if get(event, tb.E_MOVED) == 0 or (begin + size >> 3) + 8 > mapped:
+        return execute(machine, event, tb.E_WALK, start, mapped, end, position, regs, row)
     batch = get(machine, tb.M_BATCHES) + number * tb.B_ROW
     if get(batch, 0) == tb.BATCH and move_batch(machine, event, batch) < 0:
         return np.int64(tb.FULL_DICTIONARY)

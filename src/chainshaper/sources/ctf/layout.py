@@ -58,14 +58,13 @@ STATE_WORDS = X_STACK + 16
     S_FREQUENCY, S_KNOWN, S_UUID_LOW, S_UUID_HIGH, S_COST, STREAM_COLUMNS,
 ) = range(21)
 
-# Event classes of all stream classes: operations (first, end) that WALK over context and payload,
-# and that FILL columns; ALIGN and SIZE where the former is one constant step, else 0; the COUNTER
-# of its table's rows, -1 where the event is not wanted; addresses of row 0 of TIME and CPU (or 0);
-# CONSTANT 1 where every event is laid out alike, SIZE bits of it.
+# Event classes of all stream classes: operations (first, end) of context and payload; ALIGN and
+# SIZE where these are one constant step, else 0, and MOVED 1 where they only move what they read;
+# the COUNTER of its table's rows, -1 where the event is not wanted; addresses of row 0 of TIME and
+# CPU (or 0).
 (
-    E_WALK, E_WALK_STOP, E_ALIGN, E_SIZE, E_FILL, E_FILL_STOP, E_COUNTER,
-    E_TIME, E_CPU, E_CONSTANT, E_COST, EVENT_COLUMNS,
-) = range(12)
+    E_WALK, E_WALK_STOP, E_ALIGN, E_SIZE, E_MOVED, E_COUNTER, E_TIME, E_CPU, E_COST, EVENT_COLUMNS,
+) = range(10)
 
 # Operations. Rows are two cache lines, and a shift away from each other.
 (
@@ -165,14 +164,12 @@ _Named = Mapping[tuple[str, str], str]
 
 
 class Event(NamedTuple):
-    """An event class: its row, its stream class's row, its scopes, to be read behind ``header``."""
+    """An event class: its row, its stream class's row, its columns' operations."""
 
     name: str
     row: list[int]
     stream: int
-    header: _Writer
-    scopes: _Scopes
-    named: _Named
+    columns: list[list[int]]
 
 
 @dataclass
@@ -205,26 +202,27 @@ class Layout:
         return self._arrays
 
     def attach(self, table: Table, time: int, cpu: int, slots: Sequence[tuple[int, int]]) -> None:
-        """Give a table's event classes what writes to its columns, whose addresses these are."""
-        self._arrays, self.steps = {}, 0
-        writing = [{O_ADDRESS: address, O_WIDTH: width} for address, width in slots]
+        """Have a table's events write to its columns, whose addresses and widths these are."""
+        self._arrays = {}
         for event in self.tables[table]:
-            row, writer = event.row, event.header.following(writing)
-            start, stop = row[E_FILL], row[E_FILL_STOP] = writer.run(event.scopes, event.named)
-            row[E_TIME], row[E_CPU] = time, cpu
-            constant = row[E_ALIGN] >= 8 and row[E_SIZE] > 0
-            row[E_CONSTANT] = int(constant and self._note_offsets(start, stop))
+            event.row[E_TIME], event.row[E_CPU] = time, cpu
+            for column, slot in zip(event.columns, slots, strict=True):
+                column[O_ADDRESS : O_WIDTH + 1] = slot
 
-    def _note_offsets(self, start: int, stop: int) -> bool:
-        """Note where each of an event's operations reads, if that is the same in every event."""
-        position = 0
+    def step(self, start: int, stop: int) -> tuple[int, int, bool]:
+        """ALIGN, SIZE and MOVED of an event; notes where its operations read."""
+        align, position, numbers = 1, 0, False
         for row in self.operations[start:stop]:
-            if row[O_CODE] not in {SKIP, CHARACTERS, MOVE} or row[O_REGISTER] >= 0:
-                return False
+            align = align if position else max(align, row[O_ALIGN])
+            number = row[O_CODE] == NUMBER and not row[O_FLAGS] & 4
+            constant = number or row[O_CODE] in {SKIP, MOVE, CHARACTERS}
+            if not constant or row[O_REGISTER] >= 0 or row[O_ALIGN] > align:
+                return 0, 0, False
+            numbers |= number
             position += -position % row[O_ALIGN]
             row[O_OFFSET] = position >> 3
             position += 8 * row[O_COUNT] if row[O_CODE] == CHARACTERS else row[O_SIZE]
-        return True
+        return align, position, align >= 8 and position > 0 and not numbers
 
     def cost(self, start: int, stop: int) -> int:
         """What running operations once costs at most, the turns of their loops aside."""
@@ -244,7 +242,7 @@ def lay_out(traces: Sequence[tsdl.TraceClass], wanted: Mapping[str, bool]) -> La
             header = _Writer(layout, trace.byte_order == "be", trace.referenced)
             in_header = header.run({"trace.packet.header": trace.packet_header}, {})
             for stream in trace.streams.values():
-                _add_stream(layout, trace, stream, header.following(fixed=True), in_header, wanted)
+                _add_stream(layout, trace, stream, header.following(True), in_header, wanted)
         except LayoutError as error:
             file = trace.path / "metadata"
             raise tsdl.CtfError(file, None, str(error), "the trace cannot be read") from None
@@ -267,49 +265,47 @@ _Frame = dict[str, "_Number | _Frame"]
 
 
 class _Place(NamedTuple):
-    """Where a type stands: the numbers around it, and its slot if it gets a column."""
+    """Where a type stands: the numbers around it, and whether it gets a column."""
 
     frames: tuple[_Frame, ...]
-    slot: dict[int, int]
+    has_column: bool
 
     def inside(self, frame: _Frame) -> _Place:
         """In a structure, variant or array, whose members get no columns."""
-        return _Place((*self.frames, frame), {})
+        return _Place((*self.frames, frame), False)
 
 
 @dataclass
 class _Writer:
     """Writes the operations of types that follow each other.
 
-    ``slots`` are the columns of operations that write to one each; without them events are only
-    stepped over. ``roots`` maps a dynamic scope to the numbers read there so far; a number whose
-    name is ``referenced`` gets a register, ``registers`` the next one. In headers (``fixed``) the
-    numbers of REGISTERS have those.
+    ``columns`` are those that write to one each. ``roots`` maps a dynamic scope to the numbers read
+    there so far; a number whose name is ``referenced`` gets a register, ``registers`` the next one.
+    In headers (``fixed``) the numbers of REGISTERS have those.
     """
 
     layout: Layout
     big: bool
     referenced: frozenset[str]
     fixed: bool = True
-    slots: Sequence[dict[int, int]] = ()
     registers: int = len(REGISTERS)
     roots: dict[str, _Frame] = field(default_factory=dict)
+    columns: list[list[int]] = field(default_factory=list)
     start: int = field(default=0, init=False)
 
-    def following(self, slots: Sequence[dict[int, int]] = (), fixed: bool = False) -> _Writer:
+    def following(self, fixed: bool) -> _Writer:
         """A writer for what follows in one of several places."""
-        return replace(self, roots=dict(self.roots), slots=slots, fixed=fixed)
+        return replace(self, roots=dict(self.roots), columns=[], fixed=fixed)
 
     def run(self, scopes: _Scopes, named: _Named) -> tuple[int, int]:
         """Lay out scopes: their first operation and the one after the last."""
         self.start = len(self.layout.operations)
-        slots = iter(self.slots)
         for scope, kind in scopes.items():
             frame = self.roots[scope] = _Frame()
             if kind is not None:
                 self._skip(kind.align, 0)
             for name, member in kind.fields if kind is not None else ():
-                place = _Place((frame,), next(slots, {}) if (scope, name) in named else {})
+                place = _Place((frame,), (scope, name) in named)
                 match member if self.fixed and name == "uuid" else None:
                     case tsdl.ArrayType(tsdl.IntegerType(8, 8), 16):
                         half = tsdl.IntegerType(64, 8, byte_order="le")
@@ -327,7 +323,7 @@ class _Writer:
             raise LayoutError(f"{name}: types nested too deeply")
         match kind:
             case tsdl.StringType():
-                self._row(TEXT, {O_ALIGN: 8, O_FLAGS: 1, **at.slot})
+                self._row(TEXT, {O_ALIGN: 8, O_FLAGS: 1}, at)
                 return 8
             case tsdl.StructType():
                 frame = at.frames[-1][name] = _Frame()
@@ -349,7 +345,7 @@ class _Writer:
         elif name in self.referenced:
             register, self.registers = self.registers, self.registers + 1
         at.frames[-1][name] = _Number(register, kind.signed, kind.mappings)
-        if not at.slot and register < 0 and not clock:
+        if not at.has_column and register < 0 and not clock:
             self._skip(kind.align, kind.size)
             return kind.size
         flags = kind.signed + 2 * big + 4 * clock
@@ -357,7 +353,7 @@ class _Writer:
         alike = kind.align >= 8 and kind.size in {8, 16, 32, 64} and (kind.size == 8 or not big)
         code = MOVE if alike and not clock and register < 0 else NUMBER
         columns = {O_ALIGN: kind.align, O_SIZE: kind.size, O_FLAGS: flags, O_REGISTER: register}
-        self._row(code, columns | at.slot)
+        self._row(code, columns, at)
         return kind.size
 
     def _array(self, name: str, kind: tsdl.ArrayType, at: _Place) -> int:
@@ -367,8 +363,8 @@ class _Writer:
         else:
             register = self._referred(kind.length, at).register
         columns = {O_ALIGN: tsdl.alignment(kind), O_REGISTER: register, O_COUNT: count}
-        if at.slot:
-            self._row(CHARACTERS, {**columns, **at.slot, O_FLAGS: int(tsdl.is_text(kind))})
+        if at.has_column:
+            self._row(CHARACTERS, {**columns, O_FLAGS: int(tsdl.is_text(kind))}, at)
             return 8 * count
         loop, first = self._row(LOOP, columns), len(rows)
         least = self._type(f"{name}[]", kind.element, at.inside({}))
@@ -437,11 +433,13 @@ class _Writer:
                 return found
         raise LayoutError(f"length or tag {path!r} names no number that is read before it")
 
-    def _row(self, code: int, columns: dict[int, int]) -> list[int]:
+    def _row(self, code: int, columns: dict[int, int], at: _Place | None = None) -> list[int]:
         row = [0] * OPERATION_COLUMNS
         for column, value in {O_CODE: code, O_ALIGN: 1, O_REGISTER: -1, **columns}.items():
             row[column] = value
         self.layout.operations.append(row)
+        if at is not None and at.has_column:
+            self.columns.append(row)
         return row
 
     def _skip(self, align: int, size: int) -> None:
@@ -496,11 +494,11 @@ def _add_stream(
             "event.fields": event.fields,
         }
         named, columns = _columns(scopes, kernel, wanted.get(event.name))
-        own = Event(event.name, [0] * EVENT_COLUMNS, len(layout.streams), header, scopes, named)
+        writer = header.following(False)
+        own = Event(event.name, [0] * EVENT_COLUMNS, len(layout.streams), writer.columns)
         layout.events.append(own)
-        start, stop = own.row[E_WALK], own.row[E_WALK_STOP] = header.following().run(scopes, {})
-        if stop == start + 1 and layout.operations[start][O_CODE] == SKIP:
-            own.row[E_ALIGN], own.row[E_SIZE] = layout.operations[start][O_ALIGN : O_SIZE + 1]
+        start, stop = own.row[E_WALK], own.row[E_WALK_STOP] = writer.run(scopes, named)
+        own.row[E_ALIGN : E_MOVED + 1] = layout.step(start, stop)
         own.row[E_COUNTER], own.row[E_COST] = -1, layout.cost(start, stop) + layout.cost(*in_event)
         if event.name in wanted:
             table = Table(event.name, columns, has_cpu)

@@ -160,10 +160,7 @@ class _File:
             limit = packets[first, tb.P_BYTE] + chunk_bytes
             last = max(int(np.searchsorted(packets[:, tb.P_BYTE], limit)), first + 1)
             clock, before = int(scratch.state[tb.X_CLOCK]), scratch.rows.copy()
-            _walk_events(
-                scratch.address, scratch.registers.ctypes.data, self.map.address, self.map.size,
-                packets.ctypes.data, first, last, self.counts.ctypes.data,
-            )  # fmt: skip
+            scratch.run(_walk_events, self.map, packets, first, last, self.counts.ctypes.data)
             self.chunks.append(_Chunk(first, last, clock, before, scratch.rows.copy()))
             if lean:
                 self.map.forget(packets[first:last])
@@ -244,10 +241,8 @@ def _fill(file: _File, chunk: _Chunk, layout: Layout) -> list[bytes]:
     while status == tb.FULL_DICTIONARY:
         scratch.rows[:], scratch.batches[:, 0] = chunk.before, 0
         scratch.state[tb.X_CLOCK] = chunk.clock
-        status = _fill_columns(
-            scratch.address, scratch.registers.ctypes.data, file.map.address, file.map.size,
-            file.packets.ctypes.data, chunk.first, chunk.last, len(layout.events),
-        )  # fmt: skip
+        numbers = (chunk.first, chunk.last, len(layout.events))
+        status = scratch.run(_fill_columns, file.map, file.packets, *numbers)
         if status == tb.FULL_DICTIONARY:
             scratch.grow()
     if status < 0 or (scratch.rows != scratch.caps).any():

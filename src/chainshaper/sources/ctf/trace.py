@@ -3,7 +3,7 @@
 import ctypes
 import mmap
 import struct
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,7 +16,6 @@ from chainshaper.sources.ctf.tsdl import CtfError, TraceClass, TsdlError, parse_
 from chainshaper.values.compiled import kernel
 
 _scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
-_rehash = kernel("chainshaper.sources.ctf.interpreter", "rehash")
 _REASONS = {
     tb.BAD_MAGIC: "packet does not begin with the CTF magic number",
     tb.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
@@ -178,19 +177,25 @@ class Scratch:
         self.entries = np.zeros((0, 4), np.int64)
         self.grow()
 
+    def run(
+        self, run: Callable[..., int], file: MappedFile, packets: NDArray[np.int64], *numbers: int
+    ) -> int:
+        """Run a kernel over a file's packets."""
+        given = (file.address, file.size, packets.ctypes.data)
+        return run(self.address, self.registers.ctypes.data, *given, *numbers)
+
     def strings(self) -> list[bytes]:
         entries = self.entries[: self.state[tb.X_STRINGS]].tolist()
         return [ctypes.string_at(address, length) for address, length, _, _ in entries]
 
     def grow(self) -> None:
+        """Begin anew with a dictionary of four times the places."""
         room = max(512, 4 * len(self.entries))
-        self.entries = np.concatenate([self.entries, np.zeros((room - len(self.entries), 4), "i8")])
+        self.entries, self.state[tb.X_STRINGS] = np.zeros((room, 4), np.int64), 0
         # One place more than used: places are read eight bytes at a time.
         self._slots = np.zeros(2 * room + 1, np.int32)
         self._words[tb.M_SLOTS], self._words[tb.M_MASK] = self._slots.ctypes.data, 2 * room - 1
         self._words[tb.M_ENTRIES], self._words[tb.M_ROOM] = self.entries.ctypes.data, room
-        if self.state[tb.X_STRINGS]:
-            _rehash(self.address, int(self.state[tb.X_STRINGS]))
 
 
 def _packet_table(path: Path, layout: Layout, folder: int) -> tuple[NDArray[np.int64], list[str]]:
@@ -203,10 +208,8 @@ def _packet_table(path: Path, layout: Layout, folder: int) -> tuple[NDArray[np.i
     reached = np.zeros(2, np.int64)
     status = tb.FULL
     while status == tb.FULL:
-        status = _scan_packets(
-            scratch.address, scratch.registers.ctypes.data, file.address, file.size,
-            packets.ctypes.data, len(packets), reached.ctypes.data, *layout.folders[folder],
-        )  # fmt: skip
+        numbers = (len(packets), reached.ctypes.data, *layout.folders[folder])
+        status = scratch.run(_scan_packets, file, packets, *numbers)
         if status == tb.FULL:
             packets = np.concatenate([packets, np.zeros_like(packets)])
     offset, found = reached.tolist()

@@ -46,7 +46,7 @@ _SETTINGS = {
     "BPFTRACE_MAX_BPF_PROGS": "4096",
     "BPFTRACE_CACHE_USER_SYMBOLS": "0",
 }
-_LOST = re.compile(rb"Lost (\d+) events")
+_LOST = re.compile(rb"^Lost (\d+) events", re.MULTILINE)
 _NICE = 10
 _SHORTEST_SUSPENSION_NS = 1_000_000
 _START_S, _READ_S, _STOP_S = 120.0, 10.0, 60.0
@@ -273,13 +273,8 @@ class EbpfTracer:
 
 def lost_events(*paths: Path) -> int:
     """How many events bpftrace says it has lost, in what it wrote into these files."""
-    count = 0
-    for path in paths:
-        if path.is_file():
-            with path.open("rb") as said:
-                lines = (line for line in said if line.startswith(b"Lost "))
-                count += sum(int(found[1]) for found in map(_LOST.match, lines) if found)
-    return count
+    said = (path.read_bytes() for path in paths if path.is_file())
+    return sum(int(found[1]) for text in said for found in _LOST.finditer(text))
 
 
 def _in_the_background(parent_pid: int) -> None:

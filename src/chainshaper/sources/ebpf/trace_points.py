@@ -155,10 +155,10 @@ def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
 def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
     """The libraries that a command with this environment can find, and all below `/opt/ros`."""
     prefixes = environment.get("AMENT_PREFIX_PATH", "").split(":")
-    folders = [Path(prefix) / "lib" for prefix in prefixes if prefix]
-    folders += [Path(entry) for entry in environment.get("LD_LIBRARY_PATH", "").split(":") if entry]
-    folders += sorted(_INSTALLATIONS.glob("*/lib"))
-    files = (folder / LIBRARY for folder in folders)
+    folders = [f"{prefix}/lib" for prefix in prefixes if prefix]
+    folders += filter(None, environment.get("LD_LIBRARY_PATH", "").split(":"))
+    folders += map(str, sorted(_INSTALLATIONS.glob("*/lib")))
+    files = [Path(folder, LIBRARY) for folder in folders]
     return tuple(dict.fromkeys(_found([file.absolute() for file in files if file.is_file()], {})))
 
 
@@ -231,14 +231,12 @@ def bpftrace_script(
     limits = [f"@traced[{pid}] = 1;" for pid in traced]
     theirs = " || ".join(f"uid == {user}" for user in sorted(users))
     restriction = " /@traced[pid]/" if limits else f" /{theirs}/" if theirs else ""
-    maps = ["@running"]
-    probes: list[tuple[str, Iterable[str]]] = []
+    maps, probes = ["@running"], dict[str, Iterable[str]]()
     if limits:
         maps.append("@traced")
-        probes.append(("BEGIN", limits))
         # `pid` is the parent here; a new thread's number is no process's, and does no harm.
         fork = "tracepoint:sched:sched_process_fork /@traced[pid]/"
-        probes.append((fork, ["@traced[args->child_pid] = 1;"]))
+        probes |= {"BEGIN": limits, fork: ["@traced[args->child_pid] = 1;"]}
     for code, point in enumerate(points, FIRST_POINT):
         if not _PLAIN.fullmatch(str(point.file)):
             raise InputError(
@@ -246,17 +244,17 @@ def bpftrace_script(
                 "that root runs: rename it, or give the file open, as /proc/PID/fd/N"
             )
         function = f'uprobe:"{point.file}":{FUNCTION_PREFIX}{point.event}{restriction}'
-        probes.append((function, _statements(point, code, attached)))
+        probes[function] = _statements(point, code, attached)
     if attached and any(point.handle for point in points):
         maps.append("@named")
     template = "\\t%lld" * len(_SWITCH) + "\\t" * (len(VALUES) - len(_SWITCH)) + "\\t%s\\t%s"
     values = [f"args->{name}" for name in (*_SWITCH.values(), "prev_comm", "next_comm")]
     involved = "@running[args->prev_pid] || @running[args->next_pid]"
     switch = f"tracepoint:sched:sched_switch /{involved}/"
-    probes.append((switch, [_printf(SWITCH_CODE, values, template, now="nsecs")]))
-    probes.append(("END", [f"clear({name});" for name in maps]))
-    blocks = ((probe, "\n".join(f"  {one}" for one in statements)) for probe, statements in probes)
-    return "\n".join(f"{probe}\n{{\n{body}\n}}\n" for probe, body in blocks)
+    probes[switch] = [_printf(SWITCH_CODE, values, template, now="nsecs")]
+    probes["END"] = [f"clear({name});" for name in maps]
+    blocks = ("\n  ".join((f"{probe}\n{{", *lines)) for probe, lines in probes.items())
+    return "\n".join(f"{block}\n}}\n" for block in blocks)
 
 
 def _statements(point: TracePoint, code: int, attached: bool) -> Iterator[str]:
@@ -337,8 +335,7 @@ def event_table(
     ).sort("time", maintain_order=True)
 
 
-@dataclass(frozen=True)
-class Printed:
+class Printed(NamedTuple):
     """The output of one run. ``cut_names``: how many were longer than what is printed.
 
     ``handles`` are the names of handles that were in use when tracing began, ``pid, event, handle,
@@ -356,21 +353,15 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
 
     ``ahead_ns`` is CLOCK_BOOTTIME, which bpftrace reads, minus CLOCK_MONOTONIC.
     """
-    lines = pl.read_csv(
-        path,
-        separator="\t",
-        quote_char=None,
-        schema=_SCHEMA,
-        truncate_ragged_lines=True,
-        ignore_errors=True,
-        encoding="utf8-lossy",
-    )
+    form: dict[str, Any] = {"separator": "\t", "quote_char": None, "encoding": "utf8-lossy"}
+    form |= {"schema": _SCHEMA, "truncate_ragged_lines": True, "ignore_errors": True}
+    lines = pl.read_csv(path, **form)
     with path.open("rb") as stream:
         stream.seek(-1, 2)
         if stream.read() != b"\n":  # bpftrace was killed while it wrote
             lines = lines.head(-1)
-    lines = lines.drop_nulls(CODE)  # bpftrace's own have no number in front
-    lines = lines.with_columns(pl.col("time") - ahead_ns)
+    # bpftrace's own lines have no number in front.
+    lines = lines.drop_nulls(CODE).with_columns(pl.col("time") - ahead_ns)
     texts = _texts(lines.filter(code=TEXT_CODE))
     parts: dict[str, list[pl.DataFrame]] = {}
     for code, point in enumerate(points, FIRST_POINT):
@@ -395,14 +386,13 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
     }
     event_of = {code: point.event for code, point in enumerate(points, FIRST_POINT)}
     named = texts.filter(place=NAME_PLACE).select("time", "tid", topic="text")
-    of_points = lines.filter(pl.col("code").is_in(list(event_of)))
-    handles = of_points.join(named, on=["time", "tid"]).select(
+    of_points = lines.filter(pl.col("code") >= FIRST_POINT).join(named, on=["time", "tid"])
+    handles = of_points.select(
         pl.col("pid").cast(pl.Int32),
         event=pl.col("code").replace_strict(event_of, return_dtype=pl.String),
         handle=pl.col(VALUES[0]).cast(pl.UInt64),
         topic="topic",
-    )
-    handles = handles.unique(maintain_order=True)
+    ).unique(maintain_order=True)
     rmw = texts.filter(place=RMW_PLACE)["text"]
     return Printed(tables, handles, rmw[0] if len(rmw) else None, int(texts["cut"].sum()))
 
