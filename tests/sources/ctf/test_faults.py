@@ -18,7 +18,6 @@ from made import make_trace
 from test_bytes import PLAIN
 
 from chainshaper.sources.ctf import CtfError, count_events, open_trace, read_events
-from chainshaper.sources.ctf.trace import read_metadata
 
 UUID = "2a6422d0-6cee-11e0-8c08-cb07d7b3a564"
 
@@ -194,9 +193,7 @@ def test_other_traces_packets_and_stray_files_are_named(tmp_path: Path) -> None:
 def test_numba_is_imported_only_to_decode() -> None:
     code = "import sys, chainshaper.sources.ctf; sys.exit('numba' in sys.modules)"
     environment = {"PYTHONPATH": ":".join(sys.path)}
-    assert (
-        subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
-    )
+    subprocess.run([sys.executable, "-c", code], env=environment, check=True)
 
 
 # As for the campaigns of tests/cli/test_fuzzing.py.
@@ -232,27 +229,3 @@ def test_random_damage_to_streams(tmp_path: Path) -> None:
         assert len(rows) <= len(data)
         if time.monotonic() > deadline:
             break
-
-
-def test_random_damage_to_metadata(tmp_path: Path) -> None:
-    make_trace(tmp_path, streams=1, packets=1, events=10)
-    path = tmp_path / "metadata"
-    text = lttng_metadata({"e": {"a": "u8[]", "s": "string"}}, {"vtid": "s32"})
-    words = ["{", "}", ";", "struct", "variant", "enum", "[", "]", "9", "0", "<id>", "string", "-"]
-    chance, deadline = random.Random(9), time.monotonic() + SECONDS
-    refused = 0
-    for _ in range(CASES):
-        pieces = text.split(" ")
-        for _ in range(chance.choice([1, 2, 5])):
-            place = chance.randrange(len(pieces))
-            pieces[place] = chance.choice([*words, chance.choice(pieces), ""])
-        path.write_text(" ".join(pieces))
-        try:
-            read_metadata(path)
-            rows_of(tmp_path)
-        except CtfError as error:
-            assert error.path == path
-            refused += 1
-        if time.monotonic() > deadline:
-            break
-    assert refused > 0

@@ -99,15 +99,20 @@ def read_events(
         for stream in trace.streams
         if counted or not rows.isdisjoint(stream.table[:, tb.P_STREAM].tolist())
     ]
-    files = _walked(used, layout, threads, lambda share: progress(share / 3))
-    ends = np.cumsum([file.rows for file in files], axis=0)
-    columns = [
-        _Columns(layout, number, table, int(ends[-1][number]) if files else 0)
-        for number, table in enumerate(layout.tables)
-    ]
-    texts = _filled(
-        files, layout, ends, columns, threads, lambda share: progress((1 + 2 * share) / 3)
-    )
+    files, workers = [_File(stream) for stream in used], threads or len(os.sched_getaffinity(0))
+    size = sum(file.map.size for file in files)
+    chunk = min(_CHUNK_BYTES, max(_SMALL_BYTES, size // workers))
+    with ThreadPoolExecutor(workers) as pool:
+        # Read twice, a trace that fits into memory had better stay there in between.
+        walks = pool.map(lambda file: file.walk(layout, chunk, size > _LARGE_BYTES), files)
+        for done, _ in enumerate(walks, 1):
+            progress(done / len(files) / 3)
+        ends = np.cumsum([file.rows for file in files], axis=0)
+        columns = [
+            _Columns(layout, number, table, int(ends[-1][number]) if files else 0)
+            for number, table in enumerate(layout.tables)
+        ]
+        texts = _filled(pool, files, layout, ends, columns, progress)
     try:
         events = Events(_frames(columns, texts))
     except pl.exceptions.PolarsError as error:
@@ -120,10 +125,6 @@ def read_events(
         for event, number in zip(layout.events, file.counts.tolist(), strict=False):
             events.counts[event.name] += number
     return events
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0))
 
 
 # Pass 1
@@ -182,33 +183,15 @@ def _warnings(files: Sequence[_File]) -> Iterator[str]:
             yield f"{file.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
 
 
-def _walked(
-    streams: Sequence[CtfStream],
-    layout: Layout,
-    threads: int | None,
-    progress: _Progress = lambda _: None,
-) -> list[_File]:
-    files, done = [_File(stream) for stream in streams], 0
-    size, workers = sum(file.map.size for file in files), threads or _cores()
-    chunk = min(_CHUNK_BYTES, max(_SMALL_BYTES, size // workers))
-    with ThreadPoolExecutor(workers) as pool:
-        # Read twice, a trace that fits into memory had better stay there in between.
-        steps = pool.map(lambda file: file.walk(layout, chunk, size > _LARGE_BYTES), files)
-        for file, _ in zip(files, steps, strict=True):
-            done += file.map.size
-            progress(done / max(size, 1))
-    return files
-
-
 # Pass 2
 
 
 def _filled(
+    pool: ThreadPoolExecutor,
     files: list[_File],
     layout: Layout,
     ends: NDArray[np.int64],
     columns: list["_Columns"],
-    threads: int | None,
     progress: _Progress,
 ) -> list[bytes]:
     """Pass 2 over all chunks; returns the texts and bytes that slots then have codes of.
@@ -222,14 +205,13 @@ def _filled(
         if (one.after > one.before).any()
     ]
     codes: dict[bytes, int] = {}
-    with ThreadPoolExecutor(threads or _cores()) as pool:
-        found = pool.map(lambda one: _fill(one[0], one[1], layout), chunks)
-        for done, ((_, chunk), strings) in enumerate(zip(chunks, found, strict=True), 1):
-            own = [codes.setdefault(string, len(codes)) for string in strings]
-            if own != list(range(len(own))):
-                for table in columns:
-                    table.recode(chunk, np.array(own, np.uint32))
-            progress(done / len(chunks))
+    found = pool.map(lambda one: _fill(one[0], one[1], layout), chunks)
+    for done, ((_, chunk), strings) in enumerate(zip(chunks, found, strict=True), 1):
+        own = [codes.setdefault(string, len(codes)) for string in strings]
+        if own != list(range(len(own))):
+            for table in columns:
+                table.recode(chunk, np.array(own, np.uint32))
+        progress((1 + 2 * done / len(chunks)) / 3)
     return list(codes)
 
 

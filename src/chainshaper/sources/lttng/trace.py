@@ -107,7 +107,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         for full_name in trace.event_names:
             if (name := table_name(full_name)) is not None:
                 self._sources.setdefault(name, []).append(full_name)
-        self.counts: dict[str, int] = {}
+        self.counts = Counter[str]()
         self.warnings: tuple[str, ...] = ()
         self._names: dict[int, str] = {}
         self._anonymous = 0
@@ -158,7 +158,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         return sum(1 for _ in self)
 
     def _counted(self, name: str) -> int:
-        return sum(self.counts.get(source, 0) for source in self._sources.get(name, ()))
+        return sum(self.counts[source] for source in self._sources.get(name, ()))
 
     def notes(self) -> Iterator[str]:
         """What a reader of the tables must know: damage, absent fields, numbers that were moved."""
@@ -216,8 +216,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
     def _take_stock(self, host: str, found: Events) -> None:
         """Count all events; move numbers that another host has, too."""
-        for name, count in found.counts.items():
-            self.counts[name] = self.counts.get(name, 0) + count
+        self.counts.update(found.counts)
         self.warnings += found.warnings
         self._moved[host] = 0
         if len(self._hosts) > 1:
