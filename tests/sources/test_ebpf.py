@@ -41,32 +41,19 @@ CYCLES, PERIOD_NS = 20, 50_000_000
 TOPICS = ("/ebpf1", "/ebpf2")
 
 
-@pytest.fixture
-def program() -> Program:
-    skip_without_bpftrace()
-    return built()
-
-
-@pytest.fixture
-def humble() -> Program:
-    skip_without_bpftrace()
-    return built("-DHUMBLE", version="4.1.1")
-
-
-@pytest.fixture
-def few() -> Program:
-    """Its trace points are those of callbacks alone, whose probes are set sooner."""
-    skip_without_bpftrace()
-    return built("-DFEW")
-
-
 @pytest.fixture(autouse=True)
-def set_up(monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest) -> None:
-    """The environment is as after sourcing the programs' set-up files."""
-    found = [name for name in ("program", "humble", "few") if name in request.fixturenames]
-    prefixes = [str(request.getfixturevalue(name).prefix) for name in found]
-    monkeypatch.setenv("AMENT_PREFIX_PATH", ":".join(prefixes))
-    monkeypatch.delenv("LD_LIBRARY_PATH", raising=False)
+def no_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("AMENT_PREFIX_PATH", "LD_LIBRARY_PATH"):
+        monkeypatch.delenv(name, raising=False)
+
+
+@pytest.fixture
+def few(no_environment: None, monkeypatch: pytest.MonkeyPatch) -> Program:
+    """Its trace points are those of callbacks alone, whose probes are set sooner; it is sourced."""
+    skip_without_bpftrace()
+    program = built("-DFEW")
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(program.prefix))
+    return program
 
 
 @pytest.fixture(scope="module")
@@ -169,10 +156,9 @@ def test_an_application_that_runs_already_is_attached_to_and_its_chain_is_found(
 
 
 @pytest.mark.timed  # a timer is known by wake-ups that are not late
-def test_an_application_of_humble_is_attached_to_by_the_handles_of_rcl(
-    humble: Program, tmp_path: Path
-) -> None:
-    assert_attached(humble, tmp_path / "trace", "humble")
+def test_an_application_of_humble_is_attached_to_by_the_handles_of_rcl(tmp_path: Path) -> None:
+    skip_without_bpftrace()
+    assert_attached(built("-DHUMBLE", version="4.1.1"), tmp_path / "trace", "humble")
 
 
 def test_of_strangers_nothing_is_recorded_or_run_unless_they_are_named(
