@@ -71,9 +71,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     streams: list[CtfStream] = []
     groups: dict[object, list[CtfStream]] = {}
     for number, folder in enumerate(folders):
-        for path in sorted(p for p in folder.path.iterdir() if p.is_file()):
-            if path.name == "metadata" or path.name.startswith("."):
-                continue
+        files = (p for p in folder.path.iterdir() if p.is_file() and p.name[0] != ".")
+        for path in sorted(p for p in files if p.name != "metadata"):
             table, warning = _packet_table(path, layout, number)
             warnings += warning
             if len(table):

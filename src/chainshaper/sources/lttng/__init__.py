@@ -171,11 +171,10 @@ class LttngSession:
                 self._ask("destroy", name)
         if self.daemon is not None:
             self.daemon.terminate()
-            try:
+            with suppress(subprocess.TimeoutExpired):
                 self.daemon.wait(_START_S)
-            except subprocess.TimeoutExpired:
-                self.daemon.kill()
-                self.daemon.wait()
+            self.daemon.kill()
+            self.daemon.wait()
         self._afterwards.communicate()
         self._afterwards = None
 
@@ -218,7 +217,7 @@ class LttngSession:
             raise OperationError(f"{what} does not answer: {error}") from None
         except ElementTree.ParseError as error:
             raise OperationError(f"{what} answers no XML: {error}") from None
-        said = _last_line(run.stderr).removeprefix("Error: ")
+        said = run.stderr.strip().rpartition("\n")[2].removeprefix("Error: ")
         raise OperationError(f"{what} failed: {said or f'exit code {run.returncode}'}")
 
     def _answers(self) -> bool:
@@ -261,7 +260,8 @@ class LttngSession:
         deadline = time.monotonic() + _START_S
         while not self._answers():
             if self.daemon.poll() is not None or time.monotonic() > deadline:
-                reason = _last_line(said.read_text(errors="replace")) or "it says nothing"
+                reason = said.read_text(errors="replace").strip().rpartition("\n")[2]
+                reason = reason or "it says nothing"
                 raise OperationError(f"the LTTng session daemon does not start: {reason}")
             time.sleep(0.05)
 
@@ -329,10 +329,6 @@ def _hears_one_command_only() -> bool:
         pid = int((_RUN_DIRECTORY / "lttng-sessiond.pid").read_text())
         return b"--apps-sock=" in read_proc(f"/proc/{pid}/cmdline")
     return False
-
-
-def _last_line(text: str) -> str:
-    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
 
 
 def buffer_size(

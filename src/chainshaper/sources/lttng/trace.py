@@ -237,14 +237,16 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 
 def _by_host(trace: CtfTrace, paths: Sequence[str | Path]) -> dict[str, CtfTrace]:
     """The trace in parts, one per traced host, or path of one; the first has foreign kernels'."""
-    hosts = [_fact(folder, "hostname") for folder in trace.folders]
     kernel = [folder.env.get("domain") == "kernel" for folder in trace.folders]
-    given = [next(p for p in paths if f.path.is_relative_to(p)) for f in trace.folders]
-    user = {(h, p) for h, p, k in zip(hosts, given, kernel, strict=True) if not k}
-    several = {host for host, count in Counter(host for host, _ in user).items() if count > 1}
+    places = [
+        (_fact(folder, "hostname"), next(p for p in paths if folder.path.is_relative_to(p)))
+        for folder in trace.folders
+    ]
+    user = {place for place, of_kernel in zip(places, kernel, strict=True) if not of_kernel}
+    several = Counter(host for host, _ in user)
     hosts = [
-        f"{host} in {path}" if host in several and (host, path) in user else host
-        for host, path in zip(hosts, given, strict=True)
+        f"{host} in {path}" if several[host] > 1 and (host, path) in user else host
+        for host, path in places
     ]
     traced = list(dict.fromkeys(h for h, k in zip(hosts, kernel, strict=True) if not k))
     if len(traced) < 2:

@@ -163,16 +163,15 @@ class TracedProcess:
         asked = min(int(self.header["objects"][0]), self._objects.size)
         records = self._objects[:asked].copy()
         own = np.flatnonzero(records["event"] > _TEXT)
-        texts: dict[tuple[int, int], tuple[int, bytearray]] = {}
+        texts: dict[int, dict[int, bytes]] = {}
         for at in np.flatnonzero(records["event"] == _TEXT):
-            number = int(np.searchsorted(own, at)) - 1
             length, place = divmod(int(records["values"][at, 0]), _PLACES)
-            _, text = texts.setdefault((number, place), (length, bytearray()))
-            text += records["values"][at, 1:].tobytes()
-        read: dict[int, dict[int, str]] = {}
-        for (number, place), (length, text) in texts.items():
-            read.setdefault(number, {})[place] = text[:length].decode(errors="replace")
-        return self._numbered(records[own]), read
+            said = texts.setdefault(int(np.searchsorted(own, at)) - 1, {})
+            said[place] = (said.get(place, b"") + records["values"][at, 1:].tobytes())[:length]
+        return self._numbered(records[own]), {
+            number: {place: text.decode(errors="replace") for place, text in said.items()}
+            for number, said in texts.items()
+        }
 
 
 def creation_tables(process: TracedProcess) -> tuple[dict[str, pl.DataFrame], TracingLibrary]:

@@ -333,7 +333,7 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
 // the places of texts as bits, that of a gid (0: none). CALL: handle, message, gid, sequence number
 // and source timestamp of a service's call. A record's number is the place in this list.
 // Not in it: rclcpp_executor_get_next_ready and _wait_for_work, which are some 100,000 a second.
-#define ALL_EVENTS \
+#define ALL_EVENTS(EVENT, CREATION, CALL) \
   CREATION(rcl_init, 0, 0) \
   CREATION(rcl_node_init, BIT(2) | BIT(3), 0) \
   CREATION(rmw_publisher_init, 0, 1) \
@@ -373,13 +373,8 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
   CALL(rmw_send_response) \
   CALL(rmw_take_response)
 
-#define EVENT(name, ...) number_##name,
-#define CREATION EVENT
-#define CALL EVENT
-enum { before_first = FIRST_EVENT - 1, ALL_EVENTS };
-#undef EVENT
-#undef CREATION
-#undef CALL
+#define NUMBER(name, ...) number_##name,
+enum { before_first = FIRST_EVENT - 1, ALL_EVENTS(NUMBER, NUMBER, NUMBER) };
 
 #define ARGUMENTS uint64_t a, uint64_t b, uint64_t c, uint64_t d, uint64_t e
 typedef void (*function)(ARGUMENTS);
@@ -407,13 +402,13 @@ typedef bool (*question)(void);
   } \
   bool ros_trace_enabled_##name(void) { return true; }
 
-#define EVENT(name, count, timed) \
+#define EVENT_HOOK(name, count, timed) \
   HOOK(name, own.latest = number_##name; \
        write_record(number_##name, 0, count, ((uint64_t[6]){a, b, c, d, e}), timed))
-#define CREATION(name, texts, gid) \
+#define CREATION_HOOK(name, texts, gid) \
   HOOK(name, create(number_##name, texts, gid, (uint64_t[6]){a, b, c, d, e}))
-#define CALL(name)
-ALL_EVENTS
+#define NO_HOOK(name)
+ALL_EVENTS(EVENT_HOOK, CREATION_HOOK, NO_HOOK)
 
 struct request_id {
   uint8_t writer[16];

@@ -84,8 +84,7 @@ class Script:
             code = self.process.wait()
         printed, said = _content(self.printed), _content(self.said)
         if problem is None and code != 0:
-            last = next((line for line in reversed(said.splitlines()) if line.strip()), "")
-            problem = last.strip() or f"the script ended with code {code}"
+            problem = said.strip().rpartition("\n")[2] or f"the script ended with code {code}"
         return ("" if problem else printed), problem
 
 
@@ -97,8 +96,7 @@ def environment_of(pid: int) -> Environment:
     try:
         with process_folder(pid) as folder:
             for _ in range(_LOOKS):
-                user = user_in(folder)
-                if user is not None:
+                if (user := user_in(folder)) is not None:
                     break
                 time.sleep(0.01)  # it may be about to become another program
             content = read_proc("environ", folder).decode(errors="surrogateescape")
