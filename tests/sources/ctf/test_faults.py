@@ -61,6 +61,12 @@ def test_what_is_no_ctf_1_8_trace_is_named_with_its_remedy(tmp_path: Path) -> No
     ("/* no end", 0, "unterminated comment"),
     ("struct { " * 60, 297, "nested"),
     ("", 0, "no trace block"),
+    ("trace { packet.header = 7; byte_order = le; };", 24, "must be a structure, not 7"),
+    ("typealias integer { size = 8; signed = maybe; } := x;", 39, "unknown signed 'maybe'"),
+    ("typealias 7 := x;", 10, "expected a type, found '7'"),
+    ("typealias struct none := x;", 22, "unknown type 'struct none'"),
+    ("typealias enum : struct { } { a } := x;", 28, "needs an integer type"),
+    ("typealias integer { size = 8; } x[2] : y;", 37, "expected ':='"),
 ])  # fmt: skip
 def test_metadata_faults_name_the_byte(tmp_path: Path, text: Any, place: Any, reason: Any) -> None:
     path = tmp_path / "metadata"
