@@ -12,6 +12,7 @@ import uuid
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from known import known
@@ -254,9 +255,9 @@ class Another:
         """Start it, and return when it records or has failed to."""
         folder.mkdir()
         mark, command = uuid.uuid4().hex, [*prefix, sys.executable, "-c", ANOTHER, folder]
-        pipes = dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
-        environment = {**os.environ, "MARK": mark}
-        self.process = subprocess.Popen(command, **pipes, text=True, env=environment)
+        options: dict[str, Any] = {"text": True, "env": {**os.environ, "MARK": mark}}
+        options |= dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
+        self.process: subprocess.Popen[str] = subprocess.Popen(command, **options)
         self.mark, self.home = f"MARK={mark}", Path(known(self.process.stdout).readline().strip())
 
     def end(self) -> str:

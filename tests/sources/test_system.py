@@ -12,20 +12,23 @@ VERSIONS = {
 }
 
 
+FIELDS: list[tuple[dict[str, set[str]], int, str | None]] = [
+    ({}, 0, None),
+    (OLD, 24, None),
+    ({**OLD, "rclcpp_executor_execute": set()}, 24, "humble"),
+    ({**OLD, "rclcpp_intra_publish": set(), "rclcpp_ring_buffer_enqueue": set()}, 24, "iron"),
+    (NEW, 0, None),
+    (NEW, 24, "jazzy"),
+    (NEW, 16, "kilted"),
+]
+
+
 def test_the_distribution_is_known_by_versions_or_fields_or_said_by_caret() -> None:
     for version, distribution in VERSIONS.items():
         tables = {"rcl_init": pl.DataFrame({"version": [version]})}
         assert distribution_of(tables, NEW) == distribution
-    for fields, gid_length, distribution in (
-        ({}, 0, None),
-        (OLD, 24, None),
-        ({**OLD, "rclcpp_executor_execute": {}}, 24, "humble"),
-        ({**OLD, "rclcpp_intra_publish": {}, "rclcpp_ring_buffer_enqueue": {}}, 24, "iron"),
-        (NEW, 0, None),
-        (NEW, 24, "jazzy"),
-        (NEW, 16, "kilted"),
-    ):
-        assert distribution_of({}, fields, gid_length) == distribution
+    for fields, gid_length, known in FIELDS:
+        assert distribution_of({}, fields, gid_length) == known
     said = {"caret_init": pl.DataFrame({"distribution": ["iron"]})}
     assert distribution_of({**tables, **said}, {}) == "iron"
 

@@ -91,8 +91,10 @@ def test_losses_are_counted(tmp_path: Path, files: Any) -> None:
     assert "11 events" in trace.warnings[0]
     # babeltrace2 does not count what was lost before a stream's first packet; counters wrap.
     lost = [(1 << 32) - 2, 3]
-    about = ({"packet_seq_num": n, "events_discarded": one} for n, one in enumerate(lost))
-    first = [encode_packet(declared, records(1, 1), one) for one in about]
+    first = [
+        encode_packet(declared, records(1, 1), {"packet_seq_num": n, "events_discarded": one})
+        for n, one in enumerate(lost)
+    ]
     write_trace(tmp_path / "first", text, {"a": first})
     assert open_trace(tmp_path / "first").discarded_events == (1 << 32) + 3
 
