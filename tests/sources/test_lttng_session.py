@@ -254,7 +254,7 @@ class Another:
     def __init__(self, folder: Path, *prefix: str) -> None:
         """Start it, and return when it records or has failed to."""
         folder.mkdir()
-        mark, command = uuid.uuid4().hex, [*prefix, sys.executable, "-c", ANOTHER, folder]
+        mark, command = uuid.uuid4().hex, [*prefix, sys.executable, "-c", ANOTHER, str(folder)]
         options: dict[str, Any] = {"text": True, "env": {**os.environ, "MARK": mark}}
         options |= dict.fromkeys(("stdin", "stdout", "stderr"), subprocess.PIPE)
         self.process: subprocess.Popen[str] = subprocess.Popen(command, **options)
