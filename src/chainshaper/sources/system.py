@@ -20,7 +20,6 @@ _RELEASES = {  # Versions of tracetools below these belong to the distribution.
     **{"eloquent": (1, 0), "foxy": (2, 0), "galactic": (3, 0), "humble": (5, 0), "iron": (7, 0)},
     **{"jazzy": (8, 3), "kilted": (8, 7), "lyrical": (8, 11)},
 }
-_LATER = "rolling"
 _VENDORS = {
     (0x01, 0x01): "rmw_connextdds",
     (0x01, 0x0F): "rmw_fastrtps_cpp",
@@ -75,7 +74,7 @@ def distribution_of(
     found = re.match(r"(\d+)\.(\d+)", _first(tables, "rcl_init", "version") or "")
     if found is not None:
         version = int(found[1]), int(found[2])
-        return next((name for name, below in _RELEASES.items() if version < below), _LATER)
+        return next((name for name, below in _RELEASES.items() if version < below), "rolling")
     if "timestamp" in fields.get("rmw_publish", ()):
         return {24: "jazzy", 16: "kilted"}.get(gid_length)
     if fields.keys() >= {"rmw_publish", "rclcpp_intra_publish", "rclcpp_ring_buffer_enqueue"}:

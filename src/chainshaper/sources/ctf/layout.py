@@ -488,11 +488,8 @@ def _add_stream(
     ids = {}
     for event in stream.events.values():
         ids[event.id] = len(layout.events)
-        scopes = {
-            "stream.event.context": stream.event_context,
-            "event.context": event.context,
-            "event.fields": event.fields,
-        }
+        scopes = {"stream.event.context": stream.event_context, "event.context": event.context}
+        scopes["event.fields"] = event.fields
         named, columns = _columns(scopes, kernel, wanted.get(event.name))
         writer = header.following(False)
         own = Event(event.name, [0] * EVENT_COLUMNS, len(layout.streams), writer.columns)
@@ -527,10 +524,8 @@ def _columns(
         for member in (kind.fields if kind is not None else ())
         if _has_column(member.type)
     }
-    present: dict[str, tuple[str, str]] = {}
-    for place in members:
-        if place[0] != "event.fields":
-            present.setdefault(tsdl.field_name(place[1]), place)
+    contexts = [place for place in members if place[0] != "event.fields"]
+    present = {tsdl.field_name(place[1]): place for place in reversed(contexts)}
     named: dict[tuple[str, str], str] = {}
     for column in ("pid", "tid", "procname") if procname else ("pid", "tid"):
         names = (column, f"v{column}") if kernel else (f"v{column}", column)
