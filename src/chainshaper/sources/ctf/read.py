@@ -274,14 +274,16 @@ class _Columns:
 
         Rows stand file by file, each in order of time but for clocks that went back.
         """
-        order: NDArray[np.int64] | slice = slice(None)
-        if (self.time[1:] < self.time[:-1]).any():
-            order = np.argsort(self.time, kind="stable")
-        found = {"time": pl.Series("time", self.time[order])}
+        time, cpu, *slots = self.time, self.cpu, *self.slots
+        if (time[1:] < time[:-1]).any():
+            order = np.argsort(time, kind="stable")
+            time, cpu, *slots = (
+                one.take(order, mode="clip") if one.size else one for one in (time, cpu, *slots)
+            )
+        found = {"time": pl.Series("time", time)}
         if self.table.has_cpu:
-            found["cpu"] = pl.Series("cpu", self.cpu[order])
-        for (name, kind), slot in zip(self.table.columns, self.slots, strict=True):
-            values = slot[order]
+            found["cpu"] = pl.Series("cpu", cpu)
+        for (name, kind), values in zip(self.table.columns, slots, strict=True):
             if tsdl.is_text(kind):
                 texts = categories if name == "procname" else strings
                 found[name] = texts.gather(pl.Series(values)).alias(name)
