@@ -133,24 +133,21 @@ def test_a_wheel_brings_the_library_that_works_for_its_machine(tmp_path: Path) -
     """Installed beside nothing else; and of another machine, by its compiler."""
     pytest.importorskip("hatchling")
     root, files = Path(__file__).parents[2], "chainshaper/sources/preload/libchainshaper_trace.so"
-    for compiler in ("cc", "aarch64-linux-gnu-gcc", "no-compiler"):
-        folder = tmp_path / compiler
-        words = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(folder)]
-        if compiler != "no-compiler" and shutil.which(compiler) is None:
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d"]
+    machines = {"no-compiler": "", "aarch64-linux-gnu-gcc": "aarch64", "cc": platform.machine()}
+    for compiler, machine in machines.items():
+        if machine and shutil.which(compiler) is None:
             pytest.skip(f"no {compiler} to build the library with")
-        environment = {**os.environ, "CC": compiler}
+        words, environment = [*build, str(tmp_path / compiler)], {**os.environ, "CC": compiler}
         subprocess.run(words, check=True, cwd=root, env=environment, capture_output=True)
-        (wheel,) = folder.iterdir()
-        names = zipfile.ZipFile(wheel).namelist()
-        tag = wheel.stem.split("-")[-1]
-        if compiler == "no-compiler":
-            assert (tag, files in names) == ("any", False)
-        else:
-            machine = platform.machine() if compiler == "cc" else "aarch64"
+        (wheel,) = (tmp_path / compiler).iterdir()
+        names, tag = zipfile.ZipFile(wheel).namelist(), wheel.stem.split("-")[-1]
+        if machine:
             assert re.fullmatch(rf"manylinux_2_\d+_{machine}", tag), tag
-            (content,) = (zipfile.ZipFile(wheel).read(one) for one in names if one == files)
+            content = zipfile.ZipFile(wheel).read(files)
             assert int.from_bytes(content[18:20], "little") == ELF_MACHINES[machine]
-    (wheel,) = (tmp_path / "cc").iterdir()
+        else:
+            assert (tag, files in names) == ("any", False)
     site = tmp_path / "site"
     words = ["-m", "pip", "install", "--no-deps", "--no-index", "--target", str(site), str(wheel)]
     subprocess.run([sys.executable, *words], check=True, capture_output=True)
@@ -542,12 +539,11 @@ def test_a_ring_whose_count_is_damaged_costs_no_other() -> None:
         assert memory.lost == len(counts)
 
 
-def test_root_builds_nothing_where_others_may_write(tmp_path: Path) -> None:
-    open_to_others = tmp_path / "cache"
-    open_to_others.mkdir()
-    open_to_others.chmod(0o777)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("chainshaper.sources.preload.own_cache", lambda: open_to_others / "own")
-        with pytest.raises(PlatformError, match="writable by others"):
-            in_cache("x.so", ["source"], lambda _: pytest.fail("it is built all the same"))
-    assert list(open_to_others.iterdir()) == []
+def test_root_builds_nothing_where_others_may_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tmp_path.chmod(0o777)
+    monkeypatch.setattr(preload, "own_cache", lambda: tmp_path / "own")
+    with pytest.raises(PlatformError, match="writable by others"):
+        in_cache("x.so", ["source"], lambda _: pytest.fail("it is built all the same"))
+    assert list(tmp_path.iterdir()) == []
