@@ -4,7 +4,7 @@ They run without Python's lock. `layout` says what they are given.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
-# ruff: noqa: PLR0911, PLR0917 - numbers rather than objects, whose references Numba would count
+# ruff: noqa: PLR0911, PLR0912, PLR0917 - numbers rather than objects, whose references Numba would count
 
 import numpy as np
 
@@ -162,48 +162,6 @@ def step_over(machine, row, start, mapped, end, position, regs):
     return execute(machine, row, tb.E_WALK, start, mapped, end, position, regs, ZERO)
 
 
-@compiled()
-def walk_events(machine, regs, base, size, packets, first, last, counts):
-    """Step through every event of the ``packets`` [first, last) of a file.
-
-    Advances ``counts`` per event class and the tables' row counters. An event that cannot be read
-    ends its packet: END becomes that event's position.
-    """
-    state, rows = get(machine, tb.M_STATE), get(machine, tb.M_ROWS)
-    for index in range(first, last):
-        packet = packets + index * tb.P_ROW
-        stream = get(machine, tb.M_STREAMS) + get(packet, tb.P_STREAM) * tb.S_ROW
-        at, end = get(packet, tb.P_BYTE), get(packet, tb.P_END)
-        start, mapped = base + at, size - at
-        put(state, tb.X_BUDGET, tb.BUDGET * ((end + 7) >> 3))
-        position = open_packet(machine, packet, base, size, regs)
-        if position < 0:
-            put(packet, tb.P_ERROR, position)
-            put(packet, tb.P_ERROR_AT, np.int64(0))
-            put(packet, tb.P_END, np.int64(0))
-            continue
-        while position < end:
-            before = get(state, tb.X_CLOCK)
-            after, event = read_header(machine, stream, start, mapped, end, position, regs)
-            row = get(machine, tb.M_EVENTS) + max(event, 0) * tb.E_ROW
-            if after >= 0:
-                after = step_over(machine, row, start, mapped, end, after, regs)
-                if not afforded(state, get(row, tb.E_COST)):
-                    after = np.int64(tb.OVER_BUDGET)
-            if after < 0 or after == position:
-                put(packet, tb.P_ERROR, min(after, np.int64(-1)))
-                put(packet, tb.P_ERROR_AT, position)
-                put(packet, tb.P_END, position)
-                put(state, tb.X_CLOCK, before)
-                break
-            put(counts, event, get(counts, event) + 1)
-            table = get(row, tb.E_COUNTER)
-            if table >= 0:
-                put(rows, table, get(rows, table) + 1)
-            position = after
-    return np.int64(0)
-
-
 @compiled(inline=True)
 def write_event(machine, number, packet, start, mapped, end, position, regs):
     """Write an event of class ``number`` to the next row of its table; the position behind it.
@@ -236,30 +194,52 @@ def write_event(machine, number, packet, start, mapped, end, position, regs):
 
 
 @compiled()
-def fill_columns(machine, regs, base, size, packets, first, last, events):
-    """Write the wanted events of the ``packets`` [first, last) of a file to the tables' next rows.
+def run_events(machine, regs, base, size, packets, first, last, counts, events):
+    """Step through every event of the ``packets`` [first, last) of a file: to count, or to write.
 
-    Returns 0, FULL_DICTIONARY where the caller has to give a larger one and begin again, or
-    another failure where the file has changed since its events were counted.
+    Where ``counts`` per event class are given, these and the tables' row counters advance; an event
+    that cannot be read ends its packet: END becomes that event's position. Else the wanted events,
+    of so many ``events`` classes, go to their tables' next rows. Returns 0, FULL_DICTIONARY where
+    the caller has to give a larger one and begin again, or another failure where the file has
+    changed since its events were counted.
     """
+    state, rows, counting = get(machine, tb.M_STATE), get(machine, tb.M_ROWS), counts != 0
     for index in range(first, last):
         packet = packets + index * tb.P_ROW
         stream = get(machine, tb.M_STREAMS) + get(packet, tb.P_STREAM) * tb.S_ROW
         at, end = get(packet, tb.P_BYTE), get(packet, tb.P_END)
-        start, mapped = base + at, size - at
-        position = open_packet(machine, packet, base, size, regs) if end > 0 else end
-        while 0 <= position < end:
-            position, event = read_header(machine, stream, start, mapped, end, position, regs)
-            if position >= 0:
-                row = get(machine, tb.M_EVENTS) + event * tb.E_ROW
-                if get(row, tb.E_COUNTER) < 0:
-                    position = step_over(machine, row, start, mapped, end, position, regs)
-                else:
-                    position = write_event(
-                        machine, event, packet, start, mapped, end, position, regs
-                    )
-        if position < 0 or (end > 0 and position > end):
-            return min(position, np.int64(-1))
+        start, mapped, before = base + at, size - at, get(state, tb.X_CLOCK)
+        if counting:
+            put(state, tb.X_BUDGET, tb.BUDGET * ((end + 7) >> 3))
+        position, read = ZERO, end  # of the event that is read, and behind it
+        if end > 0:
+            read = open_packet(machine, packet, base, size, regs)
+        while 0 <= read < end:
+            position, before = read, get(state, tb.X_CLOCK)
+            read, event = read_header(machine, stream, start, mapped, end, position, regs)
+            if read < 0:
+                break
+            row = get(machine, tb.M_EVENTS) + event * tb.E_ROW
+            table = get(row, tb.E_COUNTER)
+            if table >= 0 and not counting:
+                read = write_event(machine, event, packet, start, mapped, end, read, regs)
+                continue
+            read = step_over(machine, row, start, mapped, end, read, regs)
+            if counting and not afforded(state, get(row, tb.E_COST)):
+                read = np.int64(tb.OVER_BUDGET)
+            if read == position:
+                read = np.int64(tb.TRUNCATED)
+            if counting and read >= 0:
+                put(counts, event, get(counts, event) + 1)
+                if table >= 0:
+                    put(rows, table, get(rows, table) + 1)
+        if counting and read < 0:
+            put(packet, tb.P_ERROR, read)
+            put(packet, tb.P_ERROR_AT, position)
+            put(packet, tb.P_END, position)
+            put(state, tb.X_CLOCK, before)
+        elif read < 0 or read > end > 0:
+            return min(read, np.int64(tb.TRUNCATED))
     for event in range(events):
         batch = get(machine, tb.M_BATCHES) + event * tb.B_ROW
         row = get(machine, tb.M_EVENTS) + event * tb.E_ROW

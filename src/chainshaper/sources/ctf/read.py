@@ -22,8 +22,7 @@ from chainshaper.sources.ctf.layout import Layout, Table, lay_out
 from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scratch
 from chainshaper.values.compiled import kernel
 
-_walk_events = kernel("chainshaper.sources.ctf.kernels", "walk_events")
-_fill_columns = kernel("chainshaper.sources.ctf.kernels", "fill_columns")
+_run_events = kernel("chainshaper.sources.ctf.kernels", "run_events")
 _CHUNK_BYTES = 128 << 20
 _SMALL_BYTES = 4 << 20
 _LARGE_BYTES = 512 << 20
@@ -161,7 +160,7 @@ class _File:
             limit = packets[first, tb.P_BYTE] + chunk_bytes
             last = max(int(np.searchsorted(packets[:, tb.P_BYTE], limit)), first + 1)
             clock, before = int(scratch.state[tb.X_CLOCK]), scratch.rows.copy()
-            scratch.run(_walk_events, self.map, packets, first, last, self.counts.ctypes.data)
+            scratch.run(_run_events, self.map, packets, first, last, self.counts.ctypes.data, 0)
             self.chunks.append(_Chunk(first, last, clock, before, scratch.rows.copy()))
             if lean:
                 self.map.forget(packets[first:last])
@@ -223,8 +222,8 @@ def _fill(file: _File, chunk: _Chunk, layout: Layout) -> list[bytes]:
     while status == tb.FULL_DICTIONARY:
         scratch.rows[:], scratch.batches[:, 0] = chunk.before, 0
         scratch.state[tb.X_CLOCK] = chunk.clock
-        numbers = (chunk.first, chunk.last, len(layout.events))
-        status = scratch.run(_fill_columns, file.map, file.packets, *numbers)
+        numbers = (chunk.first, chunk.last, 0, len(layout.events))
+        status = scratch.run(_run_events, file.map, file.packets, *numbers)
         if status == tb.FULL_DICTIONARY:
             scratch.grow()
     if status < 0 or (scratch.rows != scratch.caps).any():
