@@ -1,4 +1,4 @@
-"""The compiled passes over a trace: find packets, count events, merge streams and write columns.
+"""The compiled passes over a trace: find packets, count events, and write columns.
 
 They run without Python's lock. `layout` says what they are given.
 """
