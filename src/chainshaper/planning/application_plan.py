@@ -4,10 +4,7 @@ Each chain has a :class:`~chainshaper.planning.plan.Plan`, whose cycles start ``
 instant from which those of all chains count, so all slots repeat with the **hyper-period**, the
 least common multiple of the cycles. Chains that begin at the same callback share the servers that
 run it; chains of different beginnings that pass the same node each reserve slots for its thread,
-which then runs in all of them.
-
-:attr:`ApplicationPlan.servers` is what back ends and the simulator carry out: every server once,
-its slots played out over the hyper-period. A plan for one chain is the same with one chain.
+which then runs in all of them: :attr:`ApplicationPlan.servers` is what back ends carry out.
 """
 
 import math
@@ -19,8 +16,8 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.overruns import in_cycle, slots_without, united, with_output_moved
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
-from chainshaper.planning.overruns import slots_without, united, with_output_moved
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
@@ -28,6 +25,8 @@ from chainshaper.planning.plan import (
     ShapingNode,
     Slot,
     Thread,
+    Wrong,
+    checked,
     publish_slots,
     publishing_servers,
     shaping_nodes,
@@ -82,9 +81,7 @@ class ApplicationPlan(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "ApplicationPlan":
-        for check in (_outputs, _shared_servers, _threads, _slot_count, _apart):
-            check(self)
-        return self
+        return checked(self, _outputs, _shared_servers, _threads, _slot_count, _apart)
 
     @property
     def cycle_ns(self) -> int:
@@ -99,27 +96,28 @@ class ApplicationPlan(Part):
         slots of all of these, at the best of their priorities.
         """
         named = {server.name: (server, one) for one in self.chains for server in one.servers}
-        homes: dict[Thread, list[str]] = {}
+        homes: dict[Thread, tuple[str, ...]] = {}
         for name, (server, _) in named.items():
             for thread in server.threads:
-                homes.setdefault(thread, []).append(name)
-        members: dict[tuple[str, ...], list[Thread]] = {}
-        for thread, names in homes.items():
-            members.setdefault(tuple(names), []).append(thread)
-        for name, (server, _) in named.items():
-            if not server.threads:
-                members[name,] = []
+                homes[thread] = (*homes.get(thread, ()), name)
+        empty = ((name,) for name, (server, _) in named.items() if not server.threads)
         found = []
-        for together, threads in members.items():
+        for together in dict.fromkeys((*homes.values(), *empty)):
             own = [named[name] for name in together]
-            slots = [slot for one in own for slot in _played_out(*one, self.cycle_ns)]
+            slots = [
+                slot
+                for server, chain in own
+                for begin in range(chain.offset_ns, chain.offset_ns + self.cycle_ns, chain.cycle_ns)
+                for start, end in _in_force(server, chain)
+                for slot in in_cycle(begin + start, begin + end, self.cycle_ns)
+            ]
             found.append(
                 Server(
                     name="+".join(together),
                     core=own[0][0].core,
                     priority=min(server.priority for server, _ in own),
                     slots=united(slots),
-                    threads=tuple(threads),
+                    threads=tuple(thread for thread, names in homes.items() if names == together),
                     best_effort=all(server.best_effort for server, _ in own),
                 )
             )
@@ -189,12 +187,16 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
     known_ns = waits_ns or [-WAITING_NS] * len(plan.chains)
     for chain, wait in zip(plan.chains, known_ns, strict=True):
         waits = plan.moves_timers or chain.policy in ("pipelined", "server-per-callback")
-        for server in chain_open_until_done(chain, wait + WAITING_NS if waits else 0).servers:
+        longer = chain_open_until_done(chain, wait + WAITING_NS if waits else 0).servers
+        for planned, server in zip(chain.servers, longer, strict=True):
             slots = slots_without(server.slots, [*_of_others(plan, chain, server)])
-            slots = _switched_beside_outputs(plan, chain, server, slots)
+            switched = {at for slot in slots for at in slot}
+            switched -= {at for slot in planned.slots for at in slot}
+            due = united([*_due_while_switched(plan, chain, server, switched)])
+            slots = slots_without(slots, slots_without(due, planned.slots))
             apart = server.model_copy(update={"slots": slots})
             if len(slots) * plan.cycle_ns > MOST_OPENED * chain.cycle_ns:
-                apart = next(one for one in chain.servers if one.name == server.name)
+                apart = planned
             known = opened.get(server.name, apart)  # of a server of several chains, the longest
             opened[server.name] = max(apart, known, key=lambda one: one.slots[-1][1])
     chains = (
@@ -208,14 +210,10 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
 def _of_others(plan: ApplicationPlan, chain: Plan, server: Server) -> Iterator[Slot]:
     """What is planned for other chains at a server's core and priority, in any of its cycles."""
     for other in plan.chains:
-        if other is chain or chain.equal_priorities == other.equal_priorities == "round-robin":
-            continue
-        for one in other.servers:
-            if one in chain.servers or one.best_effort or one.name == server.name:
-                continue
-            if (one.core, one.priority) != (server.core, server.priority):
-                continue
-            yield from _in_cycles_of(chain, other, one)
+        for one in other.servers if other is not chain else ():
+            own = one in chain.servers or one.name == server.name
+            if not own and _in_the_way(chain, server, other, one):
+                yield from _in_cycles_of(chain, other, one)
 
 
 def _in_cycles_of(chain: Plan, other: Plan, server: Server) -> Iterator[Slot]:
@@ -226,23 +224,15 @@ def _in_cycles_of(chain: Plan, other: Plan, server: Server) -> Iterator[Slot]:
         yield from ((again, again + end - start) for again in range(first, chain.cycle_ns, common))
 
 
-def _switched_beside_outputs(
-    plan: ApplicationPlan, chain: Plan, server: Server, slots: Sequence[Slot]
-) -> tuple[Slot, ...]:
-    """The slots without those of outputs on the core in which one of them began or ended, where
-    that is not planned.
-    """
-    planned = next(one for one in chain.servers if one.name == server.name).slots
-    edges = {edge for slot in slots for edge in slot} - {edge for slot in planned for edge in slot}
-    due = [
-        slot
-        for other in plan.chains
-        for one in publishing_servers(other)
-        if one.core == server.core and one.name != server.name
-        for slot in _in_cycles_of(chain, other, one)
-        if any(slot[0] < edge < slot[1] for edge in edges)
-    ]
-    return slots_without(slots, slots_without(united(due), planned))
+def _due_while_switched(
+    plan: ApplicationPlan, chain: Plan, server: Server, switched: set[int]
+) -> Iterator[Slot]:
+    """The slots of outputs on a server's core in which it is switched, in any of its cycles."""
+    for other in plan.chains:
+        for one in publishing_servers(other):
+            for slot in _in_cycles_of(chain, other, one) if one.core == server.core else ():
+                if one.name != server.name and any(slot[0] < at < slot[1] for at in switched):
+                    yield slot
 
 
 def combined(plans: Sequence[Plan]) -> ApplicationPlan:
@@ -290,17 +280,6 @@ def reach(plan: ApplicationPlan, place: int, latest_ns: int | None = None) -> tu
     return found[0], found[1]
 
 
-def _played_out(server: Server, chain: Plan, hyper_period_ns: int) -> Iterator[Slot]:
-    """A server's slots over the hyper-period; one that reaches beyond its end becomes two."""
-    for start_ns in range(chain.offset_ns, chain.offset_ns + hyper_period_ns, chain.cycle_ns):
-        for slot in _in_force(server, chain):
-            start = (slot[0] + start_ns) % hyper_period_ns
-            end = start + slot[1] - slot[0]
-            yield start, min(end, hyper_period_ns)
-            if end > hyper_period_ns:
-                yield 0, end - hyper_period_ns
-
-
 def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
     """A server's slots as they are carried out, from the start of a cycle of its chain on.
 
@@ -318,7 +297,7 @@ def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
     return [(start, min(end, start + chain.cycle_ns)) for start, end in slots]
 
 
-# The rules: each raises what is wrong, and where -------------------------------------------------
+# The rules ------------------------------------------------------------------------------------
 
 
 def _pairs(plan: ApplicationPlan) -> Iterator[tuple[Plan, Plan, tuple[str, int]]]:
@@ -327,34 +306,33 @@ def _pairs(plan: ApplicationPlan) -> Iterator[tuple[Plan, Plan, tuple[str, int]]
         yield one, two, ("chains", place)
 
 
-def _outputs(plan: ApplicationPlan) -> None:
+def _outputs(plan: ApplicationPlan) -> Wrong:
     for one, two, where in _pairs(plan):
         if one.chain.output is not None and one.chain.output == two.chain.output:
             reason = f"{one.chain.output} is the output of an earlier chain too: plan it once"
-            raise wrong_value(reason, *where, "chain", "output")
+            yield reason, *where, "chain", "output"
         ours = {name for node in shaping_nodes(one) for name in (node.name, node.output)}
         for node in shaping_nodes(two):
             if ours & {node.name, node.output}:
                 reason = f"an earlier chain has {node.name} or {node.output} too: write its own"
-                raise wrong_value(reason, *where, "shaping_node")
+                yield reason, *where, "shaping_node"
 
 
-def _shared_servers(plan: ApplicationPlan) -> None:
+def _shared_servers(plan: ApplicationPlan) -> Wrong:
     for one, two, where in _pairs(plan):
         known = {server.name: server for server in one.servers}
         for number, server in enumerate(two.servers):
-            if server.name not in known:
-                continue
-            if known[server.name] != server:
+            if known.get(server.name, server) != server:
                 reason = f"an earlier chain has another server {server.name!r}: rename one"
-                raise wrong_value(reason, *where, "servers", number, "name")
-            if (one.cycle_ns, one.offset_ns) != (two.cycle_ns, two.offset_ns):
+                yield reason, *where, "servers", number, "name"
+            other_cycle = (one.cycle_ns, one.offset_ns) != (two.cycle_ns, two.offset_ns)
+            if server.name in known and other_cycle:
                 reason = f"{server.name!r} is an earlier chain's too, whose cycles have another"
                 reason += " length or offset: write a server of its own"
-                raise wrong_value(reason, *where, "servers", number)
+                yield reason, *where, "servers", number
 
 
-def _threads(plan: ApplicationPlan) -> None:
+def _threads(plan: ApplicationPlan) -> Wrong:
     homes: dict[Thread, Server] = {}
     for place, chain in enumerate(plan.chains):
         for number, server in enumerate(chain.servers):
@@ -364,49 +342,46 @@ def _threads(plan: ApplicationPlan) -> None:
                     if other_thread != thread:
                         reason = f"{thread.text} may be {other_thread.text} in server"
                         reason += f" {homes[other_thread].name!r}: name the same callbacks in both"
-                        raise wrong_value(reason, *where, "threads")
+                        yield reason, *where, "threads"
                 if (other := homes.setdefault(thread, server)).core != server.core:
                     reason = f"{thread.text} would run on core {server.core} here and on core"
                     reason += f" {other.core} in server {other.name!r}: write one core"
-                    raise wrong_value(reason, *where, "core")
+                    yield reason, *where, "core"
 
 
-def _slot_count(plan: ApplicationPlan) -> None:
-    chains = plan.chains
-    slots = [sum(len(server.slots) for server in chain.servers) for chain in chains]
-    counts = [plan.cycle_ns // one.cycle_ns * own for one, own in zip(chains, slots, strict=True)]
-    if len(chains) > 1 and sum(counts) > MOST_SLOTS:
-        raise wrong_value(
-            f"all cycles repeat together after {duration_text(plan.cycle_ns)}, with {sum(counts)}"
-            f" slots; {MOST_SLOTS} is the most: use periods with a larger common divisor",
-            *("chains", len(chains) - 1, "cycle"),
-        )
+def _slot_count(plan: ApplicationPlan) -> Wrong:
+    count = sum(
+        plan.cycle_ns // chain.cycle_ns * len(server.slots)
+        for chain in plan.chains
+        for server in chain.servers
+    )
+    if len(plan.chains) > 1 and count > MOST_SLOTS:
+        reason = f"all cycles repeat together after {duration_text(plan.cycle_ns)}, with {count}"
+        reason += f" slots; {MOST_SLOTS} is the most: use periods with a larger common divisor"
+        yield reason, "chains", len(plan.chains) - 1, "cycle"
 
 
-def _apart(plan: ApplicationPlan) -> None:
+def _apart(plan: ApplicationPlan) -> Wrong:
     """Slots of one core and priority are disjoint in all cycles, across chains as inside one."""
     for one, two, where in _pairs(plan):
-        if one.equal_priorities == two.equal_priorities == "round-robin":
-            continue
-        for text in _collisions(one, two):
-            reason = f"{text}: move a slot, change an offset (`chainshaper offsets`), or give their"
-            raise wrong_value(f"{reason} servers other cores or priorities", *where, "offset")
+        common = math.gcd(one.cycle_ns, two.cycle_ns)
+        shared = {server.name for server in one.servers} & {server.name for server in two.servers}
+        for server, other in product(one.servers, two.servers):
+            if not _in_the_way(one, server, two, other) or shared & {server.name, other.name}:
+                continue
+            for (start, end), (other_start, other_end) in product(server.slots, other.slots):
+                later = (other_start + two.offset_ns - start - one.offset_ns) % common
+                if later < end - start or common - later < other_end - other_start:
+                    reason = f"the slot {slot_text((other_start, other_end))} of server"
+                    reason += f" {other.name!r} meets {slot_text((start, end))} of server"
+                    reason += f" {server.name!r} of {chain_name(one)} in some cycles, on core"
+                    reason += f" {server.core} at the same priority {server.priority}: move a slot,"
+                    reason += " change an offset (`chainshaper offsets`), or give their servers"
+                    yield f"{reason} other cores or priorities", *where, "offset"
 
 
-def _collisions(one: Plan, two: Plan) -> Iterator[str]:
-    """The slots of two chains that meet in some cycle, in words."""
-    common = math.gcd(one.cycle_ns, two.cycle_ns)
-    shared = {server.name for server in one.servers} & {server.name for server in two.servers}
-    for server, other in product(one.servers, two.servers):
-        if (server.core, server.priority) != (other.core, other.priority):
-            continue
-        if shared & {server.name, other.name} or server.best_effort or other.best_effort:
-            continue
-        for (start, end), (other_start, other_end) in product(server.slots, other.slots):
-            later = (other_start + two.offset_ns - start - one.offset_ns) % common
-            if later < end - start or common - later < other_end - other_start:
-                yield (
-                    f"the slot {slot_text((other_start, other_end))} of server {other.name!r} meets"
-                    f" {slot_text((start, end))} of server {server.name!r} of {chain_name(one)} in"
-                    f" some cycles, on core {server.core} at the same priority {server.priority}"
-                )
+def _in_the_way(one: Plan, server: Server, two: Plan, other: Server) -> bool:
+    """Whether the slots of two chains' servers have to be apart."""
+    turns = one.equal_priorities == two.equal_priorities == "round-robin"
+    same = (server.core, server.priority) == (other.core, other.priority)
+    return same and not (turns or server.best_effort or other.best_effort)

@@ -6,10 +6,9 @@ of slot α and φ the measured distribution, the average is eq. 5,
     Σ_α (φ(x_α) − φ(x_{α−1}))·x_α,
 
 and the last slot stays where single-band shaping has it. Where an output that comes into an open
-slot waits for the next one, an execution must be done when a slot begins: φ(x_α − Δ) stands for
-φ(x_α), as if all latencies were Δ longer. The optimum on a grid of instants is found
-by dynamic programming from the last slot backwards. With c_j of n latencies ≤ x_j, the least cost
-of the m bands behind one that ends at x_i is
+slot waits for the next one, φ(x_α − Δ) stands for φ(x_α), as if all latencies were Δ longer. The
+optimum on a grid of instants is found by dynamic programming from the last slot backwards. With c_j
+of n latencies ≤ x_j, the least cost of the m bands behind one that ends at x_i is
 
     B_m(i) = min over j of (c_j − c_i)·x_j + B_{m−1}(j),    B_1(i) = (n − c_i)·x_ν.
 
@@ -28,24 +27,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.gate.decision import IntoOpenSlot
+from chainshaper.planning import plan as plans
 from chainshaper.planning.margins import check_latencies
-from chainshaper.planning.plan import (
-    Plan,
-    Prediction,
-    Slot,
-    below_executors,
-    output_server,
-    publish_slots,
-    revised,
-    with_slots,
-)
+from chainshaper.planning.plan import Plan, Prediction, Slot, publish_slots
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.plan_choices import Goal, Solver
@@ -85,9 +75,8 @@ def predict_bands(
     if not ends or any(after <= before for before, after in pairwise(ends)):
         raise InputError(f"slot ends must ascend, at least one: found {ends}")
     at_start = publish_slot_ns if into_open_slot == "next-slot" else 0
-    ready = np.sort(latencies_ns) + at_start
     _refuse_before_longest(ends[-1] - at_start, int(latencies_ns.max()))
-    counts, mean = counts_and_mean(ready, ends)
+    counts, mean = counts_and_mean(np.sort(latencies_ns) + at_start, ends)
     return Prediction(
         mean_ns=round(float(mean)),
         max_ns=ends[-1],
@@ -167,12 +156,19 @@ class BandProblem:
         return first, -(-(self.last_end_ns - self.publish_slot_ns) // self.grid_ns) - first
 
 
-@dataclass(frozen=True)
-class Placement:
+class Placement(NamedTuple):
     """Slot ends, ascending, and the average that eq. 5 predicts for them."""
 
     slot_ends_ns: tuple[int, ...]
     mean_ns: float
+
+
+class BandChoice(NamedTuple):
+    """A curve of figure 7, the placement that ``auto`` takes from it, and why it stops there."""
+
+    curve: tuple[Placement, ...]
+    chosen: Placement
+    reason: str
 
 
 def with_bands(
@@ -210,22 +206,12 @@ def with_bands(
     else:
         placement = (place_by_swarm if solver == "pso" else place_randomly)(problem, bands, seed)
     length, ends = problem.publish_slot_ns, placement.slot_ends_ns
-    slots = tuple((end - length, end) for end in ends)
     likely, latest = (
         predict_bands(latencies, ends, length, plan.into_open_slot)
         for latencies in (latencies_ns, latencies_ns if most_ns is None else most_ns)
     )
     predicted = likely.model_copy(update={"mean_ns": latest.mean_ns})
-    return with_publish_slots(plan, slots, predicted=predicted)
-
-
-@dataclass(frozen=True)
-class BandChoice:
-    """A curve of figure 7, the placement that ``auto`` takes from it, and why it stops there."""
-
-    curve: tuple[Placement, ...]
-    chosen: Placement
-    reason: str
+    return with_publish_slots(plan, [(end - length, end) for end in ends], predicted=predicted)
 
 
 def choose_bands(
@@ -239,12 +225,10 @@ def choose_bands(
     curve = placement_curve(_problem(plan, latencies_ns, limits), MOST_BANDS)
     chosen, most = curve[-1], len(curve[-1].slot_ends_ns)
     why = "no more bands can be placed" if most < MOST_BANDS else "more bands are not tried"
-    for placement, following in pairwise(curve):
-        gain = 1 - following.mean_ns / placement.mean_ns
-        if gain < least_gain:
-            why = f"another band would lower the average by {gain:.2%}, less than {least_gain:.2%}"
-            chosen = placement
-            break
+    gains = ((1 - two.mean_ns / one.mean_ns, one) for one, two in pairwise(curve))
+    if small := next((own for own in gains if own[0] < least_gain), None):
+        gain, chosen = small
+        why = f"another band would lower the average by {gain:.2%}, less than {least_gain:.2%}"
     return BandChoice(tuple(curve), chosen, f"stopped at {len(chosen.slot_ends_ns)}: {why}")
 
 
@@ -259,12 +243,8 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
         raise InputError(f"a long publish slot may start from 0 ms to {duration_text(start)}")
     published = np.maximum(check_latencies(latencies_ns), slot_start_ns)
     # Published at once, the output is late by the publication itself, which the slot's end bounds.
-    predicted = Prediction(
-        mean_ns=round(int(published.sum()) / published.size),
-        max_ns=end,
-        jitter_ns=end - slot_start_ns,
-        shares=(1.0,),
-    )
+    mean_ns = round(int(published.sum()) / published.size)
+    predicted = plans.in_one_slot((slot_start_ns, end), mean_ns)
     slots = ((slot_start_ns, end),)
     return with_publish_slots(plan, slots, predicted=predicted, policy="one-long-slot")
 
@@ -276,17 +256,17 @@ def _problem(plan: Plan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]
 
 
 def _last_publish_slot(plan: Plan) -> Slot:
-    slots = publish_slots(plan)
-    if not slots:
-        raise InputError(f"a plan of policy {plan.policy} has no publish slot: plan shaping first")
-    return slots[-1]
+    if slots := publish_slots(plan):
+        return slots[-1]
+    raise InputError(f"a plan of policy {plan.policy} has no publish slot: plan shaping first")
 
 
-def with_publish_slots(plan: Plan, slots: tuple[Slot, ...], **changes: object) -> Plan:
+def with_publish_slots(plan: Plan, slots: Sequence[Slot], **changes: object) -> Plan:
     """The plan with other slots for its output, and other fields."""
-    publishing = output_server(plan)
-    servers = with_slots(plan.servers, {} if publishing is None else {publishing.name: slots})
-    return revised(plan, servers=below_executors(servers), **changes)
+    publishing = plans.output_server(plan)
+    others = {} if publishing is None else {publishing.name: slots}
+    servers = plans.below_executors(plans.with_slots(plan.servers, others))
+    return plans.revised(plan, servers=servers, **changes)
 
 
 def place_bands(
@@ -300,10 +280,10 @@ def place_bands(
 
     Raises OperationError: no placement exists; the message names the constraint that prevents it.
     """
-    refuse_more_than_fit(problem, bands)
+    _refuse_more_than_fit(problem, bands)
     if minimise == "jitter" and mean_at_most_ns is None:
         raise InputError("the smallest jitter is that of one band: say which average it may cost")
-    tables = _solve(problem, bands)
+    tables = _Tables(problem, bands)
     best = tables.best(bands)
     if best is None:
         raise OperationError(_why_none(problem, bands))
@@ -322,11 +302,10 @@ def place_bands(
 def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
     """The best placement for each number of bands from one on, as far as they fit (figure 7)."""
     most = min(most_bands, problem.room)
-    tables = _solve(problem, most)
+    tables = _Tables(problem, most)
     curve: list[Placement] = []
     for bands in range(1, most + 1):
-        best = tables.best(bands)
-        if best is not None:
+        if best := tables.best(bands):
             curve.append(best)
         elif curve:
             break
@@ -335,8 +314,7 @@ def placement_curve(problem: BandProblem, most_bands: int) -> list[Placement]:
     return curve
 
 
-def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
-    """Refuse no bands, or more than publish slots fit behind the shortest latency."""
+def _refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
     if bands < 1:
         raise InputError(f"{bands} bands: plan with one band at least")
     if bands > problem.room:
@@ -347,15 +325,48 @@ def refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
         )
 
 
-@dataclass(frozen=True)
 class _Tables:
-    """Grid positions and, for each number of bands behind one, their cost and the next band."""
+    """Grid positions and, for each number of bands behind one, their cost and the next band.
 
-    problem: BandProblem
-    ends: NDArray[np.int64]
-    counts: NDArray[np.int64]
-    costs: NDArray[np.int64]  # row m: m + 1 bands behind the position, UNREACHABLE if impossible
-    successors: NDArray[np.int32]  # position of the next band; −1 where the last one follows
+    Row m of ``costs`` is for m + 1 bands behind a position; ``successors`` are positions, −1 where
+    the last band follows.
+    """
+
+    def __init__(self, problem: BandProblem, bands: int) -> None:
+        slot, grid, last = problem.publish_slot_ns, problem.grid_ns, problem.last_end_ns
+        first, fitting = problem.positions
+        size = max(0, fitting) if bands > 1 else 0
+        layers = min(bands, size + 1)
+        if size * layers > MOST_CELLS:
+            reason = f"{size} positions for {layers} bands are too many to search"
+            raise InputError(f"{reason}: use a grid coarser than {duration_text(grid)}")
+        self.problem = problem
+        self.ends = (first + np.arange(size, dtype=np.int64)) * grid
+        counts = np.searchsorted(problem.ready_ns, self.ends, side="right").astype(np.int64)
+        behind = problem.latencies_ns.size - counts
+        reachable = behind <= problem.most_per_band
+        # x_α − x_{α−1} > Δ, at most LV, and no more latencies in between than a band may hold.
+        positions = np.arange(size, dtype=np.int64)
+        nearest = np.minimum(positions + slot // grid + 1, size)
+        farthest = np.full(size, size - 1)
+        if problem.max_share is not None:
+            farthest = np.searchsorted(counts, counts + problem.most_per_band, side="right") - 1
+        if problem.max_gap_ns is not None:
+            reachable &= last - self.ends <= problem.max_gap_ns
+            farthest = np.minimum(farthest, positions + problem.max_gap_ns // grid)
+        costs = np.where(reachable, behind * last, UNREACHABLE)[np.newaxis, :]
+        costs = np.vstack([costs, np.full((max(0, layers - 2), size), UNREACHABLE)])
+        self.counts, self.costs = counts, costs
+        self.successors = np.full(costs.shape, -1, dtype=np.int32)
+        if layers > 2:
+            # What loads machine code takes a moment to import, and two bands do without it.
+            from chainshaper.values.compiled import kernel
+
+            grid_rows, windows = np.stack([counts, self.ends]), np.stack([nearest, farthest])
+            work = np.empty((12, size + 1), dtype=np.int64)
+            tables = (grid_rows, windows, costs, self.successors, work)
+            places = [array.ctypes.data for array in tables]
+            kernel("chainshaper.planning.band_kernel", "fill_costs")(*places, size, layers - 1)
 
     def totals(self, bands: int) -> NDArray[np.int64]:
         """The cost of all bands for every position of the first; two bands at least."""
@@ -378,48 +389,12 @@ class _Tables:
 
     def read(self, bands: int, position: int) -> Placement:
         """The placement whose first band is at a position."""
-        total = int(self.totals(bands)[position])
+        mean = int(self.totals(bands)[position]) / self.problem.latencies_ns.size
         ends = [int(self.ends[position])]
         for behind in range(bands - 2, 0, -1):
             position = int(self.successors[behind, position])
             ends.append(int(self.ends[position]))
-        ends.append(self.problem.last_end_ns)
-        return Placement(tuple(ends), total / self.problem.latencies_ns.size)
-
-
-def _solve(problem: BandProblem, bands: int) -> _Tables:
-    slot, grid, last = problem.publish_slot_ns, problem.grid_ns, problem.last_end_ns
-    first, fitting = problem.positions
-    size = max(0, fitting) if bands > 1 else 0
-    layers = min(bands, size + 1)
-    if size * layers > MOST_CELLS:
-        reason = f"{size} positions for {layers} bands are too many to search"
-        raise InputError(f"{reason}: use a grid coarser than {duration_text(grid)}")
-    ends = (first + np.arange(size, dtype=np.int64)) * grid
-    counts = np.searchsorted(problem.ready_ns, ends, side="right").astype(np.int64)
-    behind = problem.latencies_ns.size - counts
-    reachable = behind <= problem.most_per_band
-    # x_α − x_{α−1} > Δ, at most LV, and no more latencies in between than a band may hold.
-    positions = np.arange(size, dtype=np.int64)
-    nearest = np.minimum(positions + slot // grid + 1, size)
-    farthest = np.full(size, size - 1)
-    if problem.max_share is not None:
-        farthest = np.searchsorted(counts, counts + problem.most_per_band, side="right") - 1
-    if problem.max_gap_ns is not None:
-        reachable &= last - ends <= problem.max_gap_ns
-        farthest = np.minimum(farthest, positions + problem.max_gap_ns // grid)
-    costs = np.where(reachable, behind * last, UNREACHABLE)[np.newaxis, :]
-    costs = np.vstack([costs, np.full((max(0, layers - 2), size), UNREACHABLE)])
-    successors = np.full(costs.shape, -1, dtype=np.int32)
-    if layers > 2:
-        # What loads machine code takes a moment to import, and two bands do without it.
-        from chainshaper.values.compiled import kernel
-
-        grid_rows, windows = np.stack([counts, ends]), np.stack([nearest, farthest])
-        work = np.empty((12, size + 1), dtype=np.int64)
-        tables = [array.ctypes.data for array in (grid_rows, windows, costs, successors, work)]
-        kernel("chainshaper.planning.band_kernel", "fill_costs")(*tables, size, layers - 1)
-    return _Tables(problem, ends, counts, costs, successors)
+        return Placement((*ends, self.problem.last_end_ns), mean)
 
 
 def _smallest_gap(problem: BandProblem, found: Placement, mean_at_most_ns: int | None) -> Placement:
@@ -439,17 +414,17 @@ def _smallest_gap(problem: BandProblem, found: Placement, mean_at_most_ns: int |
 
 def _why_none(problem: BandProblem, bands: int) -> str:
     """Which constraint leaves no placement: the one without which there is one."""
+    share, gap = problem.max_share or 1, duration_text(problem.max_gap_ns or 0)
     reasons = {
-        ("max_share",): f"no placement has every band at {problem.max_share or 1:.1%} of the"
-        " executions; allow a larger share or more bands",
-        ("max_gap_ns",): "no placement has neighbours within"
-        f" {duration_text(problem.max_gap_ns or 0)}; allow a larger gap",
+        ("max_share",): f"no placement has every band at {share:.1%} of the executions; allow a"
+        " larger share or more bands",
+        ("max_gap_ns",): f"no placement has neighbours within {gap}; allow a larger gap",
         ("max_share", "max_gap_ns"): "the largest gap and the largest share exclude each other;"
         " relax one",
     }
     for names, reason in reasons.items():
         changes: dict[str, Any] = dict.fromkeys(names)
-        if _solve(replace(problem, **changes), bands).best(bands) is not None:
+        if _Tables(replace(problem, **changes), bands).best(bands) is not None:
             return f"{bands} bands cannot be placed: {reason}"
     return _too_coarse(problem, bands)
 
@@ -492,7 +467,7 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
     Particles are the ends of all slots but the last. One that breaks a constraint costs more than
     any that does not, in proportion to how far it is off: where the swarm ends at one, this raises.
     """
-    refuse_more_than_fit(problem, bands)
+    _refuse_more_than_fit(problem, bands)
     last, slot, grid = problem.last_end_ns, problem.publish_slot_ns, problem.grid_ns
     if bands == 1:
         return _checked(problem, [last], "the single band")
@@ -522,7 +497,7 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
 
     Raises OperationError: the grid is too coarse, or no draw of many respects the limits.
     """
-    refuse_more_than_fit(problem, bands)
+    _refuse_more_than_fit(problem, bands)
     if bands == 1:
         return _checked(problem, [problem.last_end_ns], "the single band")
     first, size = problem.positions
@@ -542,11 +517,9 @@ def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) ->
 
 
 def _checked(problem: BandProblem, ends: list[int], what: str) -> Placement:
-    broken = broken_constraint(problem, ends)
-    if broken is not None:
-        raise OperationError(
-            f"{what} ended at a placement that is not allowed ({broken}); use the exact solver"
-        )
+    if broken := broken_constraint(problem, ends):
+        reason = f"{what} ended at a placement that is not allowed ({broken})"
+        raise OperationError(f"{reason}; use the exact solver")
     return Placement(tuple(ends), float(counts_and_mean(problem.ready_ns, ends)[1]))
 
 
@@ -556,10 +529,10 @@ def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
     into the current folder: a configuration that changes nothing makes it write no files.
     """
     state, configured = np.random.get_state(), os.environ.get("LOG_CFG")
-    with tempfile.TemporaryDirectory(prefix="chainshaper-") as folder:
-        configuration = Path(folder) / "logging.yaml"
-        configuration.write_text("version: 1\nincremental: true\n")
-        os.environ["LOG_CFG"] = str(configuration)
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml") as configuration:
+        configuration.write("version: 1\nincremental: true\n")
+        configuration.flush()
+        os.environ["LOG_CFG"] = configuration.name
         try:
             np.random.seed(seed)
             yield

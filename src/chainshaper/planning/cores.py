@@ -14,8 +14,8 @@ counts, in this order:
 2. the sum of all outputs' mean latencies, each as a share of its period;
 3. how many messages cross between cores.
 
-For up to ten executors all assignments are tried, which is exact. For more, the best of fewer cores
-is improved by moving one executor, or swapping two, for as long as that is better.
+Of up to ten executors all assignments are tried. Of more, the best of fewer cores is improved by
+moving one executor, or swapping two, for as long as that is better.
 """
 
 import math
@@ -28,10 +28,7 @@ from typing import NamedTuple, TypeAlias
 from chainshaper.planning.profile import Profile
 
 MOST_TRIED = 10  # executors, whose assignments are all tried
-
-MOST_OF_MEAN = 2
-"""So many times its mean a callback lasts: what took longer had to wait, before it was profiled."""
-
+MOST_OF_MEAN = 2  # so many times its mean a callback lasts at most: what took longer had to wait
 _Assignment: TypeAlias = tuple[int, ...]  # of each executor, the place of its core
 _Cost: TypeAlias = Callable[[_Assignment], tuple[float, float, int]]
 
@@ -63,9 +60,7 @@ def assign_cores(
     hosts = {node: min(group) for one in profiles for group in one.together for node in group}
     executors = list(dict.fromkeys(hosts.get(node, node) for node in nodes))
     executor_of = {node: executors.index(hosts.get(node, node)) for node in nodes}
-    graphs = _graphs(profiles, executor_of)
-
-    cost = partial(_cost, graphs, margin_ns)
+    cost = partial(_cost, _graphs(profiles, executor_of), margin_ns)
     best: _Assignment = (0,) * len(executors)
     for count in range(2, min(len(cores), len(executors)) + 1):
         if len(executors) <= MOST_TRIED:
@@ -128,24 +123,22 @@ def _improved(best: _Assignment, cores: int, cost: _Cost) -> _Assignment:
 def _cost(
     graphs: Sequence[_Graph], margin_ns: int, assignment: _Assignment
 ) -> tuple[float, float, int]:
-    cores = [{assignment[one.executor] for one in graph.callbacks} for graph in graphs]
     excess = latency = 0.0
-    slots, crossing = [], 0
+    slots, crossing = list[tuple[set[int], int, int]](), 0
     load = dict.fromkeys(assignment, 0.0)
-    for graph, own in zip(graphs, cores, strict=True):
+    for graph in graphs:
+        home = [assignment[one.executor] for one in graph.callbacks]
         mean = _played_out(graph, assignment, [one.mean_ns for one in graph.callbacks])
         longest = _played_out(graph, assignment, [one.longest_ns for one in graph.callbacks])
         latency += sum(mean[place] for place in graph.outputs) / graph.period_ns
-        slots.append(max(longest) + margin_ns)
-        for core in own:
-            load[core] += slots[-1] / graph.period_ns
-        home = [assignment[one.executor] for one in graph.callbacks]
+        slots.append((set(home), max(longest) + margin_ns, graph.period_ns))
+        for core in set(home):
+            load[core] += slots[-1][1] / graph.period_ns
         ends = zip(home, graph.callbacks, strict=True)
         crossing += sum(home[place] != core for core, one in ends for place in one.after)
-    for j, k in combinations(range(len(graphs)), 2):
-        if cores[j] & cores[k]:
-            common = math.gcd(graphs[j].period_ns, graphs[k].period_ns)
-            excess += max(0.0, (slots[j] + slots[k]) / common - 1)
+    for (ours, slot, period), (theirs, other, its) in combinations(slots, 2):
+        if ours & theirs:
+            excess += max(0.0, (slot + other) / math.gcd(period, its) - 1)
     excess += max(0.0, max(load.values()) - 1)
     return round(excess, 9), round(latency, 9), crossing
 
@@ -153,19 +146,15 @@ def _cost(
 def _played_out(graph: _Graph, assignment: _Assignment, lasting: Sequence[int]) -> list[int]:
     """When each callback of a cycle is done."""
     left, done, now = [*lasting], dict[int, int](), 0
-
-    def urgency_of(place: int) -> tuple[int, bool, int]:
-        return graph.callbacks[place].executor, left[place] == lasting[place], place
-
     while len(done) < len(left):
-        ready = [
-            place
+        ready = [  # the most urgent executor first, and of its callbacks the one that has begun
+            (one.executor, left[place] == lasting[place], place)
             for place, one in enumerate(graph.callbacks)
             if place not in done and all(before in done for before in one.after)
         ]
         running: dict[int, int] = {}  # on each core
-        for place in sorted(ready, key=urgency_of):
-            running.setdefault(assignment[graph.callbacks[place].executor], place)
+        for executor, _, place in sorted(ready):
+            running.setdefault(assignment[executor], place)
         step = min(left[place] for place in running.values())
         now += step
         for place in running.values():

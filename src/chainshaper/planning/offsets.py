@@ -22,14 +22,14 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from itertools import combinations
+from itertools import combinations, product
 from types import MappingProxyType
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.overruns import slots_without
+from chainshaper.planning.overruns import in_cycle, slots_without
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
@@ -38,6 +38,7 @@ from chainshaper.planning.plan import (
     publisher_servers,
     publishing_servers,
     revised,
+    running_servers,
 )
 from chainshaper.planning.shaping import OUTPUT_PRIORITY
 from chainshaper.values.durations import duration_text
@@ -49,10 +50,6 @@ MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for th
 SHARES = (0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of a slot that begins while no better one is open
 START_NS = 1_000_000  # at the least, so that the first callback begins in time
 MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
-
-_Intervals: TypeAlias = list[tuple[int, int]]  # closed; the first end is behind the last: around 0
-_Allowed: TypeAlias = dict[tuple[int, int], tuple[int, _Intervals]]
-"""For chains j, k whose slots can collide: g, and what (offset k − offset j) mod g may be."""
 
 
 class Timetable(NamedTuple):
@@ -101,13 +98,12 @@ def place_chains(
     try:
         return with_offsets(plans, together=together, time_limit_s=time_limit_s), []
     except OperationError as error:
-        if at_once is None or _shared_threads(plans, groups):
-            raise OperationError(f"{error}. {_turns_only(plans, groups)}") from error
+        shared = _shared_threads(plans, groups)
+        if at_once is None or shared:
+            raise OperationError(f"{error}. {_turns_only(plans, shared)}") from error
         ranked = _ranked(at_once(), groups)
-        remark = (
-            f"{error}. Instead, the chains run at the same time at priorities of their own, and"
-            " only their publish slots do not overlap."
-        )
+        remark = f"{error}. Instead, the chains run at the same time at priorities of their own,"
+        remark += " and only their publish slots do not overlap."
         apart = partial(with_offsets, ranked, together=together, time_limit_s=time_limit_s)
         return _longest_alone(apart), [remark]
 
@@ -133,8 +129,7 @@ def _refuse_too_full(plans: Sequence[Plan]) -> None:
     """Refuse chains that take more than all of a core, whatever their priorities are."""
     shares: dict[int, dict[str, float]] = {}
     for plan in plans:
-        beside = publishing_servers(plan)
-        cores = {one.core for one in plan.servers if one not in beside and not one.best_effort}
+        cores = {one.core for one in running_servers(plan)}
         longest_ns = plan.evidence.max_latency_ns - (plan.evidence.interference_ns or 0)
         if len(cores) == 1 and plan.policy not in PER_CALLBACK:  # these take turns
             share = (longest_ns + plan.margin.epsilon_ns) / plan.cycle_ns
@@ -147,10 +142,10 @@ def _refuse_too_full(plans: Sequence[Plan]) -> None:
             )
 
 
-def _turns_only(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> str:
+def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
     """Why chains that cannot take turns are not planned at the same time, and what helps."""
     helps = "periods with a larger common divisor, a smaller margin, or shorter chains"
-    if shared := _shared_threads(plans, together):
+    if shared:
         reason = f"They share {', '.join(sorted(shared))}, and so have to take turns"
         return f"{reason}. What helps: {helps}"
     if policies := ", ".join(sorted({one.policy for one in plans} & {*PER_CALLBACK})):
@@ -251,28 +246,26 @@ def _find_offsets(
     clock = len(tables)
     if windows:  # they are to a timetable without slots what the slots of others are to each
         tables = [*tables, Timetable("timers", math.lcm(*(one.cycle_ns for one in tables)), {})]
-    allowed = _allowed(tables)
+    puzzle = _Puzzle(tables)
     for k, (first, last) in windows.items():
         if last - first < (cycle := tables[k].cycle_ns):
-            _allow(allowed, (clock, k), cycle, [(first % cycle, last % cycle)])
-    for (core, priority), load in _loads(tables).items():
+            puzzle.free[k, clock] = cycle, in_cycle(-last, 1 - first, cycle)
+    for place, load in _loads(tables).items():
         if load > 1 + 1e-9:
-            names = ", ".join(one.name for one in tables if (core, priority) in one.slots)
-            raise OperationError(
-                f"the slots of {names} on core {core} at priority {priority} fill {load:.1%} of its"
-                " time"
-            )
+            names = ", ".join(one.name for one in tables if place in one.slots)
+            where = f"core {place[0]} at priority {place[1]}"
+            raise OperationError(f"the slots of {names} on {where} fill {load:.1%} of its time")
     offsets = dict.fromkeys(range(len(tables)), 0)
-    for group in linked(len(tables), allowed):
+    for group in linked(len(tables), puzzle.free):
         if len(group) == 1:
             continue
         if len(group) <= MOST_SEARCHED:
-            solution = _search(tables, allowed, group, {group[0]: 0})
+            solution = puzzle.searched(group, {group[0]: 0})
         else:
             deadline = time.monotonic() + time_limit_s
-            solution = _fitted(tables, allowed, group, deadline)
+            solution = puzzle.fitted(group, deadline)
             if solution is None:
-                solution = _solve(tables, allowed, group, max(0.0, deadline - time.monotonic()))
+                solution = puzzle.solved(group, max(0.0, deadline - time.monotonic()))
         if solution is None:
             raise OperationError(
                 f"there are no offsets at which {', '.join(tables[k].name for k in group)} keep"
@@ -281,41 +274,6 @@ def _find_offsets(
         zero = solution.get(clock, 0)
         offsets.update((k, (at - zero) % tables[k].cycle_ns) for k, at in solution.items())
     return offsets
-
-
-def _allowed(tables: Sequence[Timetable]) -> _Allowed:
-    allowed: _Allowed = {}
-    for j, k in combinations(range(len(tables)), 2):
-        common, forbidden = _collisions(tables[j], tables[k])
-        if forbidden:
-            taken = [(first, last + 1) for first, last in forbidden]
-            free = slots_without([(0, common)], taken)
-            if not free:
-                raise OperationError(_pair_too_long(tables[j], tables[k], common))
-            _allow(allowed, (j, k), common, [(first, end - 1) for first, end in free])
-    return allowed
-
-
-def _allow(allowed: _Allowed, pair: tuple[int, int], common: int, intervals: _Intervals) -> None:
-    """Allow these differences, and those the other way round."""
-    allowed[pair] = common, intervals
-    allowed[pair[::-1]] = common, [(-end % common, -start % common) for start, end in intervals]
-
-
-def _collisions(one: Timetable, two: Timetable) -> tuple[int, _Intervals]:
-    """g, and the differences of offsets modulo g at which slots collide."""
-    common = math.gcd(one.cycle_ns, two.cycle_ns)
-    forbidden: _Intervals = []
-    for place, slots in one.slots.items():
-        for start, end in slots:
-            for other_start, other_end in two.slots.get(place, []):
-                # They collide if `two` starts later by more than this and less than that.
-                first, last = start - other_end + 1, end - other_start - 1
-                if last - first + 1 >= common:
-                    return common, [(0, common - 1)]
-                first, last = first % common, last % common
-                forbidden += [(first, last)] if first <= last else [(0, last), (first, common - 1)]
-    return common, forbidden
 
 
 def linked(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
@@ -327,141 +285,135 @@ def linked(count: int, pairs: Iterable[tuple[int, int]]) -> list[list[int]]:
     return sorted(sorted(group) for group in {id(group): group for group in of.values()}.values())
 
 
-def _search(
-    tables: Sequence[Timetable], allowed: _Allowed, group: list[int], placed: dict[int, int]
-) -> dict[int, int] | None:
-    if len(placed) == len(group):
-        return placed
-    for k in (k for k in group if k not in placed):
-        candidates = _candidates(tables, allowed, k, placed)
-        fitting = np.ones(candidates.size, dtype=bool)
-        for j, base in placed.items():
-            fitting &= _apart(allowed, j, k, candidates - base)
-        for offset in candidates[fitting].tolist():
-            found = _search(tables, allowed, group, {**placed, k: offset})
-            if found is not None:
-                return found
-    return None
-
-
-def _candidates(
-    tables: Sequence[Timetable], allowed: _Allowed, k: int, placed: dict[int, int]
-) -> NDArray[np.int64]:
-    """Offsets of chain k, ascending, at which it is tight with one of the placed chains; or 0."""
-    found = [np.zeros(1, dtype=np.int64)]
-    for j, base in placed.items():
-        if (j, k) in allowed:
-            common, intervals = allowed[j, k]
-            ends = np.array(intervals, dtype=np.int64).ravel()
-            repeats = np.arange(0, tables[k].cycle_ns, common, dtype=np.int64)
-            found.append(np.add.outer((base + ends) % common, repeats).ravel())
-    return np.unique(np.concatenate(found))
-
-
-def _apart(allowed: _Allowed, j: int, k: int, distances: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which distances from an offset of chain j to one of chain k keep their slots apart."""
-    if (j, k) not in allowed:
-        return np.ones(distances.size, dtype=bool)
-    common, intervals = allowed[j, k]
-    distances = distances % common
-    apart = np.zeros(distances.size, dtype=bool)
-    for first, last in intervals:
-        behind, before = distances >= first, distances <= last
-        apart |= behind & before if first <= last else behind | before
-    return apart
-
-
-def _fitted(
-    tables: Sequence[Timetable], allowed: _Allowed, group: list[int], deadline: float
-) -> dict[int, int] | None:
-    """Chains fitted in one after the other; None says nothing.
-
-    A chain that fits nowhere pushes out what weighs least, to wait for its turn again, and weighs
-    more from then on: so the hard ones come to stay (guided ejection: Nagata and Bräysy, Operations
-    Research Letters 37, 2009).
+class _Puzzle:
+    """Timetables to be placed against each other. Where j < k can collide, ``free[j, k]`` are their
+    g and the slots in which (offset k − offset j) mod g may be.
     """
-    busy = [sum(b - a for slots in one.slots.values() for a, b in slots) for one in tables]
-    waiting = sorted(group, key=lambda k: (-tables[k].cycle_ns, busy[k]))
-    weight = dict.fromkeys(group, 1)
-    placed: dict[int, int] = {}
-    generator = random.Random(0)  # noqa: S311 - no secrets here; the same plans, the same offsets
-    for _ in range(MOST_FITTINGS):
-        if not waiting:
-            first = placed[group[0]]
-            return {k: (offset - first) % tables[k].cycle_ns for k, offset in placed.items()}
-        if time.monotonic() > deadline:
-            break
-        k = waiting.pop()
-        candidates = _candidates(tables, allowed, k, placed)
-        in_the_way = {j: ~_apart(allowed, j, k, candidates - placed[j]) for j in placed}
-        cost = sum((weight[j] * hit for j, hit in in_the_way.items()), np.zeros(candidates.size))
-        least = np.flatnonzero(cost == cost.min())
-        chosen = least[0]
-        if cost[chosen]:
-            weight[k] += 1
-            chosen = generator.choice(least)
-        for j, hit in in_the_way.items():
-            if hit[chosen]:
-                del placed[j]
-                waiting.append(j)
-        placed[k] = int(candidates[chosen])
-    return None
 
+    def __init__(self, tables: Sequence[Timetable]) -> None:
+        self.tables = tables
+        self.free: dict[tuple[int, int], tuple[int, tuple[Slot, ...]]] = {}
+        for (j, one), (k, two) in combinations(enumerate(tables), 2):
+            common = math.gcd(one.cycle_ns, two.cycle_ns)
+            taken: list[Slot] = []
+            for place in one.slots.keys() & two.slots.keys():
+                for (start, end), (its, ends) in product(one.slots[place], two.slots[place]):
+                    # They collide if `two` starts later by more than start − ends, less than this:
+                    taken += in_cycle(start - ends + 1, end - its, common)
+            if taken:
+                self.free[j, k] = common, slots_without([(0, common)], taken)
+                if not self.free[j, k][1]:
+                    raise OperationError(_pair_too_long(one, two, common))
 
-def _solve(
-    tables: Sequence[Timetable], allowed: _Allowed, group: list[int], time_limit_s: float
-) -> dict[int, int] | None:
-    cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
-    model = cp_model.CpModel()
-    offsets = {k: model.new_int_var(0, tables[k].cycle_ns - 1, f"offset{k}") for k in group}
-    model.add(offsets[group[0]] == 0)
-    for j, k in combinations(group, 2):
-        if (j, k) in allowed:
-            common, intervals = allowed[j, k]
-            least, most = -(tables[j].cycle_ns // common) - 1, tables[k].cycle_ns // common + 1
-            cycles = model.new_int_var(least, most, f"n{j}_{k}")
-            domain = cp_model.Domain.from_intervals([list(interval) for interval in intervals])
-            difference = offsets[k] - offsets[j] - common * cycles
-            model.add_linear_expression_in_domain(difference, domain)
-    for slots in _played_out(tables, group):
-        model.add_no_overlap(
-            [
-                model.new_fixed_size_interval_var(offsets[k] + start, end - start, "")
-                for k, start, end in slots
-            ]
-        )
-    solver = cp_model.CpSolver()
-    solver.parameters.max_time_in_seconds = time_limit_s
-    solver.parameters.num_workers = 1  # the same plans give the same offsets
-    status = solver.solve(model)
-    if status == cp_model.INFEASIBLE:
+    def searched(self, group: list[int], placed: dict[int, int]) -> dict[int, int] | None:
+        """Offsets of a group, of which some are placed; None: there are none."""
+        if len(placed) == len(group):
+            return placed
+        for k in (k for k in group if k not in placed):
+            candidates = self._candidates(k, placed)
+            apart = [self._apart(j, k, candidates - base) for j, base in placed.items()]
+            for offset in candidates[np.all(apart, axis=0)].tolist():
+                found = self.searched(group, {**placed, k: offset})
+                if found is not None:
+                    return found
         return None
-    if status in (cp_model.OPTIMAL, cp_model.FEASIBLE):
-        return {k: int(solver.value(offset)) for k, offset in offsets.items()}
-    raise OperationError(
-        f"undecided: no offsets for {len(group)} chains were found in time, nor a proof that there"
-        f" are none: {_fullest(tables, group)}. Put fewer chains on it, or allow more time"
-    )
 
+    def _candidates(self, k: int, placed: dict[int, int]) -> NDArray[np.int64]:
+        """Offsets of k, ascending, at which it is tight with one of what is placed; or 0."""
+        found = [np.zeros(1, dtype=np.int64)]
+        for j, base in placed.items():
+            if pair := self.free.get((min(j, k), max(j, k))):
+                common, free = pair
+                ends = np.array([(start, end - 1) for start, end in free], dtype=np.int64).ravel()
+                first = (base + (ends if j < k else -ends)) % common
+                repeats = np.arange(0, self.tables[k].cycle_ns, common, dtype=np.int64)
+                found.append(np.add.outer(first, repeats).ravel())
+        return np.unique(np.concatenate(found))
 
-def _played_out(
-    tables: Sequence[Timetable], group: list[int]
-) -> Iterator[list[tuple[int, int, int]]]:
-    """Per core and priority, every slot (chain, start, end) of a hyper-period and the cycle before.
+    def _apart(self, j: int, k: int, distances: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Which distances from an offset of j to one of k keep their slots apart."""
+        common, free = self.free.get((min(j, k), max(j, k)), (1, ((0, 1),)))
+        places = (distances if j < k else -distances) % common
+        apart = np.zeros(places.size, dtype=bool)
+        for start, end in free:
+            apart |= (start <= places) & (places < end)
+        return apart
 
-    Only from slots side by side does a solver see that a core is too full for all of them.
-    """
-    hyper_period = math.lcm(*(tables[k].cycle_ns for k in group))
-    if sum(hyper_period // tables[k].cycle_ns for k in group) > MOST_CYCLES:
-        return
-    slots = {k: tables[k].slots for k in group}
-    for place in sorted(set().union(*slots.values())):
-        yield [
-            (k, start + cycle, end + cycle)
-            for k in group
-            for start, end in slots[k].get(place, [])
-            for cycle in range(-tables[k].cycle_ns, hyper_period, tables[k].cycle_ns)
-        ]
+    def fitted(self, group: list[int], deadline: float) -> dict[int, int] | None:
+        """Chains fitted in one after the other; None says nothing.
+
+        A chain that fits nowhere pushes out what weighs least, to wait for its turn again, and
+        weighs more from then on: so the hard ones come to stay (guided ejection: Nagata and Bräysy,
+        Operations Research Letters 37, 2009).
+        """
+        tables = self.tables
+        busy = [sum(b - a for slots in one.slots.values() for a, b in slots) for one in tables]
+        waiting = sorted(group, key=lambda k: (-tables[k].cycle_ns, busy[k]))
+        weight = dict.fromkeys(group, 1)
+        placed: dict[int, int] = {}
+        generator = random.Random(0)  # noqa: S311 - no secrets; the same plans, the same offsets
+        for _ in range(MOST_FITTINGS):
+            if not waiting:
+                first = placed[group[0]]
+                return {k: (offset - first) % tables[k].cycle_ns for k, offset in placed.items()}
+            if time.monotonic() > deadline:
+                break
+            k = waiting.pop()
+            candidates = self._candidates(k, placed)
+            in_the_way = {j: ~self._apart(j, k, candidates - placed[j]) for j in placed}
+            cost = np.zeros(candidates.size)
+            cost += sum(weight[j] * hit for j, hit in in_the_way.items())
+            least = np.flatnonzero(cost == cost.min())
+            chosen = least[0]
+            if cost[chosen]:
+                weight[k] += 1
+                chosen = generator.choice(least)
+            for j, hit in in_the_way.items():
+                if hit[chosen]:
+                    del placed[j]
+                    waiting.append(j)
+            placed[k] = int(candidates[chosen])
+        return None
+
+    def solved(self, group: list[int], time_limit_s: float) -> dict[int, int] | None:
+        """The same by CP-SAT; None: there are none."""
+        cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
+        model, cycles = cp_model.CpModel(), {k: self.tables[k].cycle_ns for k in group}
+        offsets = {k: model.new_int_var(0, cycles[k] - 1, f"offset{k}") for k in group}
+        model.add(offsets[group[0]] == 0)
+        for (j, k), (common, free) in self.free.items():
+            if j not in offsets:
+                continue
+            least, most = -(cycles[j] // common) - 1, cycles[k] // common + 1
+            times = model.new_int_var(least, most, f"n{j}_{k}")
+            domain = cp_model.Domain.from_intervals([[start, end - 1] for start, end in free])
+            difference = offsets[k] - offsets[j] - common * times
+            model.add_linear_expression_in_domain(difference, domain)
+        # Only from slots side by side does a solver see that a core is too full for all of them.
+        hyper_period = math.lcm(*cycles.values())
+        few = sum(hyper_period // cycle for cycle in cycles.values()) <= MOST_CYCLES
+        for place in sorted({place for k in group for place in self.tables[k].slots if few}):
+            model.add_no_overlap(
+                [
+                    model.new_fixed_size_interval_var(offsets[k] + start + cycle, end - start, "")
+                    for k in group
+                    for start, end in self.tables[k].slots.get(place, [])
+                    for cycle in range(-cycles[k], hyper_period, cycles[k])
+                ]
+            )
+        solver = cp_model.CpSolver()
+        solver.parameters.max_time_in_seconds = time_limit_s
+        solver.parameters.num_workers = 1  # the same plans give the same offsets
+        status = solver.solve(model)
+        if status == cp_model.INFEASIBLE:
+            return None
+        if status in (cp_model.OPTIMAL, cp_model.FEASIBLE):
+            return {k: int(solver.value(offset)) for k, offset in offsets.items()}
+        raise OperationError(
+            f"undecided: no offsets for {len(group)} chains were found in time, nor a proof that"
+            f" there are none: {_fullest(self.tables, group)}. Put fewer chains on it, or allow"
+            " more time"
+        )
 
 
 def _loads(tables: Sequence[Timetable]) -> dict[tuple[int, int], float]:
@@ -481,11 +433,10 @@ def _fullest(tables: Sequence[Timetable], group: Sequence[int]) -> str:
 
 
 def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
-    longest = {
-        place: sum(max(end - start for start, end in own.slots[place]) for own in (one, two))
+    needed, (core, priority) = max(
+        (sum(max(end - start for start, end in own.slots[place]) for own in (one, two)), place)
         for place in one.slots.keys() & two.slots.keys()
-    }
-    (core, priority), needed = max(longest.items(), key=lambda item: (item[1], item[0]))
+    )
     excess = f", {duration_text(needed - common)} too long" if needed > common else ""
     return (
         f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide at"

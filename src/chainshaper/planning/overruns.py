@@ -8,24 +8,25 @@ what waited for the slot of a later cycle has expired when the thread may run ag
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import combinations, pairwise, product
+from itertools import chain, combinations, pairwise, product
 from typing import NamedTuple
 
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
-    Server,
     ShapingNode,
     Slot,
     Thread,
     below_executors,
+    meet,
     messages_waiting,
     output_server,
     publish_slots,
     publisher_servers,
     publishing_servers,
     revised,
+    running_servers,
     server_of,
     until,
     with_slots,
@@ -97,60 +98,56 @@ def output_lifespan(plan: Plan) -> int | None:
 def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
-    The servers that run the chain to its end stay open until the cycle's end (section 6), whatever
-    becomes of the output: stopped at L̄ + ε, the chain would go on in the next cycle, and delay its
-    output too. Where an output that missed its slot is to leave at once, so does the last publish
-    slot of an asynchronous publisher. The slots of other servers of the same core and priority are
-    left out, and the last ``closed_ns`` of a cycle: a thread whose timer expires in these waits for
-    its slot. A stage of a pipeline stays open until the next slot of its core begins.
+    The servers that run the chain to its end stay open until the cycle's end (section 6): stopped
+    at L̄ + ε, the chain would go on in the next cycle, and delay its output too. Where an output
+    that missed its slot is to leave at once, so does the last publish slot of an asynchronous
+    publisher. The slots of other servers of the same core and priority are left out, and the last
+    ``closed_ns`` of a cycle: a thread whose timer expires in these waits for its slot. A stage of a
+    pipeline stays open until the next slot of its core begins.
 
-    Servers of callbacks stay open as well, but for one of its own in which chains begin: a callback
-    that was stopped would take its next slot, which is as long as one execution, and every output
-    would be late until two short executions met. A server of a whole chain that shapes nothing is
-    closed as it says: it is there for what runs beside it.
+    Servers of callbacks stay open too, but for one in which chains begin: a callback that was
+    stopped would take its next slot, and every output would be late until two short executions met.
+    A server of a whole chain that shapes nothing is there for what runs beside it: it is closed.
     """
-    if plan.overrun == "publish" and plan.policy == "pipelined":
-        longer_stages = dict(_longer_stages(plan, plan.cycle_ns - closed_ns))
-        return revised(plan, servers=with_slots(plan.servers, longer_stages))
+    end_ns = plan.cycle_ns - closed_ns
+    longer: dict[str, Sequence[Slot]] = {}
+    if plan.policy == "pipelined" and plan.overrun == "publish":
+        for one in running_servers(plan):
+            same_core = (other.slots for other in plan.servers if other.core == one.core)
+            starts = sorted(start for slots in same_core for start, _ in slots)
+            longer[one.name] = [
+                (start, next((later for later in starts if later >= end), max(end, end_ns)))
+                for start, end in one.slots
+            ]
+        return revised(plan, servers=with_slots(plan.servers, longer))
     if plan.policy == "server-per-callback":
+        for one in plan.servers:
+            begins = one.slots[0][0] == 0 and len(plan.servers) > 1
+            if not begins and not one.best_effort:
+                longer[one.name] = until(one, end_ns)
         # Not checked: behind what is planned, slots of servers meet.
-        return plan.model_copy(update={"servers": tuple(_until(plan, plan.cycle_ns - closed_ns))})
+        return plan.model_copy(update={"servers": with_slots(plan.servers, longer)})
     if plan.policy not in ("shaped", "one-long-slot") or output_server(plan) is None:
         return plan
-    beside = [*publishing_servers(plan), *(one for one in plan.servers if one.best_effort)]
     done, _ = publish_slots(plan)[-1]
-    at_once = [one for _, one, _ in publisher_servers(plan) if plan.overrun == "publish"]
-    running = [
-        server
-        for server in plan.servers
-        if server in at_once
-        or (server not in beside and server.slots[-1][0] < done <= server.slots[-1][1])
+    to_the_end = [
+        one for one in running_servers(plan) if one.slots[-1][0] < done <= one.slots[-1][1]
     ]
-    longer: dict[str, tuple[Slot, ...]] = {}
-    for server in sorted(running, key=lambda one: one.slots[-1][1], reverse=True):
+    at_once = [one for _, one, _ in publisher_servers(plan) if plan.overrun == "publish"]
+    in_turn = [one for one in plan.servers if one in to_the_end or one in at_once]
+    for one in sorted(in_turn, key=lambda server: server.slots[-1][1], reverse=True):
         taken = [
             slot
             for other in plan.servers
-            if other is not server and plan.equal_priorities == "apart"
-            if (other.core, other.priority) == (server.core, server.priority)
+            if other is not one and plan.equal_priorities == "apart"
+            if (other.core, other.priority) == (one.core, one.priority)
             for slot in longer.get(other.name, other.slots)
         ]
-        *before, (start, end) = server.slots
-        until_end = (start, max(end, plan.cycle_ns - closed_ns))
-        longer[server.name] = slots_without([*before, until_end], taken)
+        longer[one.name] = slots_without(until(one, end_ns), taken)
     try:
         return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))
     except InputError:  # below its executor, a publisher would meet another server's slot
         return plan
-
-
-def _until(plan: Plan, end_ns: int) -> Iterator[Server]:
-    """The servers, with last slots that end there, but for one that begins chains for others."""
-    for server in plan.servers:
-        begins = server.slots[0][0] == 0 and len(plan.servers) > 1
-        end = server.slots[-1][1]
-        longer = end if begins or server.best_effort else max(end, end_ns)
-        yield server.model_copy(update={"slots": until(server, longer)})
 
 
 def with_output_moved(plan: Plan, by_ns: int) -> Plan:
@@ -191,6 +188,13 @@ def united(slots: Sequence[Slot]) -> tuple[Slot, ...]:
     return tuple(found)
 
 
+def in_cycle(opens_ns: int, closes_ns: int, cycle_ns: int) -> tuple[Slot, ...]:
+    """A slot that repeats every cycle, in one of these: one slot, or two."""
+    start = opens_ns % cycle_ns
+    end = start + closes_ns - opens_ns
+    return ((start, end),) if end <= cycle_ns else ((0, end - cycle_ns), (start, cycle_ns))
+
+
 def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, ...]:
     """Slots but for what is taken of them."""
     left = []
@@ -201,16 +205,6 @@ def slots_without(slots: Sequence[Slot], taken: Sequence[Slot]) -> tuple[Slot, .
                 left.append((free_from, min(begins, end)))
             free_from = max(free_from, ends)
     return tuple(left)
-
-
-def _longer_stages(plan: Plan, end_ns: int) -> Iterator[tuple[str, list[Slot]]]:
-    """The slots of a pipeline's stages until the next slot of the core, or the cycle's end."""
-    for stage in (server for server in plan.servers if server not in publishing_servers(plan)):
-        of_core = [server.slots for server in plan.servers if server.core == stage.core]
-        starts = sorted(start for slots in of_core for start, _ in slots)
-        ends = [next((one for one in starts if one >= b), end_ns) for _, b in stage.slots]
-        slots = zip(stage.slots, ends, strict=True)
-        yield stage.name, [(start, max(end, longer)) for (start, end), longer in slots]
 
 
 @dataclass(frozen=True)
@@ -307,24 +301,19 @@ def publication_warnings(plan: Plan) -> list[str]:
 
 def plan_warnings(*plans: Plan) -> list[str]:
     """What a person must know before relying on plans; one sentence each, none if all is well."""
-    first = (_about_stages, _about_bands, _about_late_outputs)
-    about = (*first, _about_evidence, publication_warnings)
-    names = [f"{plan.chain.spec or plan.chain.output}: " if plans[1:] else "" for plan in plans]
-    return [
-        f"{name}{warning}"
-        for name, plan in zip(names, plans, strict=True)
-        for one in about
-        for warning in one(plan)
-    ]
+    found = []
+    for plan in plans:
+        name = f"{plan.chain.spec or plan.chain.output}: " if plans[1:] else ""
+        about = chain(_about_stages(plan), _about_late_outputs(plan), _about_evidence(plan))
+        found += [f"{name}{warning}" for warning in (*about, *publication_warnings(plan))]
+    return found
 
 
 def _about_stages(plan: Plan) -> Iterator[str]:
     """Where a pipeline is cut, what it costs, and what has to be right for it."""
     if plan.policy != "pipelined":
         return
-    longest, cycle = plan.evidence.max_latency_ns, plan.cycle_ns
-    beside = publishing_servers(plan)
-    stages = [one for one in plan.servers if one not in beside and not one.best_effort]
+    longest, cycle, stages = plan.evidence.max_latency_ns, plan.cycle_ns, running_servers(plan)
     where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
     cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
     waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""
@@ -335,22 +324,11 @@ def _about_stages(plan: Plan) -> Iterator[str]:
     )
     for one, two in combinations(stages, 2):
         both = product(one.slots, two.slots) if one.core == two.core else ()
-        if any(first[0] < second[1] and second[0] < first[1] for first, second in both):
+        if any(meet(*pair) for pair in both):
             yield (
                 f"{one.name} and {two.name} have core {one.core} at the same time: right only where"
                 " their callbacks wait rather than compute."
             )
-
-
-def _about_bands(plan: Plan) -> Iterator[str]:
-    """Bands that hardly any cycle takes, such as those that are close for closeness' sake."""
-    shares = plan.predicted.shares
-    idle = [number for number, share in enumerate(shares, start=1) if share < IDLE_BAND]
-    if idle and len(shares) > 1 and plan.modes is None:
-        yield (
-            f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(map(str, idle))} of"
-            f" {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
-        )
 
 
 def _leaves_at(plan: Plan) -> int:
@@ -360,8 +338,16 @@ def _leaves_at(plan: Plan) -> int:
 
 
 def _about_late_outputs(plan: Plan) -> Iterator[str]:
-    """How many outputs will be late, if the sample tells, and what the machine's stalls cost."""
-    evidence, margin = plan.evidence, plan.margin
+    """Which bands hardly any cycle takes, how many outputs will be late, if the sample tells, and
+    what the machine's stalls cost.
+    """
+    evidence, margin, shares = plan.evidence, plan.margin, plan.predicted.shares
+    idle = [str(number) for number, share in enumerate(shares, start=1) if share < IDLE_BAND]
+    if idle and len(shares) > 1 and plan.modes is None:
+        yield (
+            f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(idle)} of"
+            f" {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
+        )
     cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
     if evidence.all_disturbed:
         cycles = max(evidence.samples, evidence.disturbed)

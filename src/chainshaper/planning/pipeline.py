@@ -18,8 +18,7 @@ chain.
 **Search.** The shortest cut is that with the earliest end; of several, with the fewest stages, then
 the fewest cores. Once cut, cores and turns are chosen, the starts obey difference constraints
 (s_b ≥ s_a + constant), whose least solution is a longest path. What is chosen is searched in depth,
-stage by stage, bounded by the shortest cut of the rest: exact, and quick unless cores are nearly
-full. After :data:`MOST_STEPS` the best so far has to do.
+bounded by the shortest cut of the rest. After :data:`MOST_STEPS` the best so far has to do.
 
 **Slots that open early.** The longest of all stages never come in one instance. So slots open in
 the end as soon as the first data may come, unless another stage has the core then, or a slot would
@@ -34,8 +33,9 @@ from itertools import accumulate, count, pairwise, product
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.plan import Plan, Prediction, Server, Slot, Thread, publish_slots, revised
-from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY
+from chainshaper.planning.overruns import in_cycle
+from chainshaper.planning.plan import Plan, in_one_slot, publish_slots, revised
+from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY, server_for
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.yaml_file import wrong_values_refused
@@ -139,14 +139,13 @@ def _turns(
     stage waits for a cycle or more in the shortest cut: it could begin a cycle earlier.
     """
     lengths = [longest[first][end] for first, end, _ in pieces]
-    last, place = len(pieces) - 1, pieces[-1][2]
+    last = len(pieces) - 1
     choices = []
-    for stage in range(last):
-        if pieces[stage][2] == place:
-            apart = sum(lengths[stage:last])
-            least = max(0, -(-(apart + lengths[last] + margin_ns) // cycle_ns) - 1)
-            most = apart // cycle_ns + last - stage
-            choices.append([(stage, last, number) for number in range(least, most + 1)])
+    for stage in (one for one in range(last) if pieces[one][2] == pieces[last][2]):
+        apart = sum(lengths[stage:last])
+        least = max(0, -(-(apart + lengths[last] + margin_ns) // cycle_ns) - 1)
+        most = apart // cycle_ns + last - stage
+        choices.append([(stage, last, number) for number in range(least, most + 1)])
     return product(*choices)
 
 
@@ -199,6 +198,7 @@ def opened_early(
     return tuple(opened)
 
 
+@wrong_values_refused(Plan)
 def pipelined(
     plan: Plan,
     nodes: Sequence[str],
@@ -230,34 +230,21 @@ def pipelined(
     opens = stages[-1].closes_ns
     if opens % cycle + length > cycle:  # a publish slot does not wrap
         opens = -(-opens // cycle) * cycle
-    done = opens + length
-    with wrong_values_refused(Plan):
-        servers = tuple(
-            Server(
-                name=f"stage{number}",
-                core=cores[stage.place],
-                priority=CHAIN_PRIORITY + cores[: stage.place].count(cores[stage.place]),
-                slots=in_cycle(stage.opens_ns, stage.closes_ns, cycle),
-                threads=tuple(
-                    Thread(node=n) for n in dict.fromkeys(nodes[stage.first : stage.end])
-                ),
-            )
-            for number, stage in enumerate(stages, start=1)
-        )
-        output = Server(
-            name="output",
-            core=servers[-1].core,
-            priority=OUTPUT_PRIORITY,
-            slots=in_cycle(opens, done, cycle),
-            threads=(node.thread,),
-        )
-        return revised(
-            plan,
-            policy="pipelined",
-            servers=(*servers, output),
-            shaping_node=node.model_copy(update={"core": output.core}),
-            predicted=Prediction(mean_ns=done, max_ns=done, jitter_ns=length, shares=(1.0,)),
-        )
+    servers = []
+    for number, stage in enumerate(stages, start=1):
+        core, slots = cores[stage.place], in_cycle(stage.opens_ns, stage.closes_ns, cycle)
+        urgency = CHAIN_PRIORITY + cores[: stage.place].count(core)
+        own = dict.fromkeys(nodes[stage.first : stage.end])
+        servers.append(server_for(own, f"stage{number}", core, urgency, slots))
+    slots = in_cycle(opens, opens + length, cycle)
+    servers.append(server_for([node.thread.node], "output", core, OUTPUT_PRIORITY, slots))
+    return revised(
+        plan,
+        policy="pipelined",
+        servers=tuple(servers),
+        shaping_node=node.model_copy(update={"core": core}),
+        predicted=in_one_slot((opens, opens + length)),
+    )
 
 
 def stage_places(
@@ -284,13 +271,6 @@ def _cuts(nodes: Sequence[str]) -> list[int]:
     """Where stages may begin and end: a node's thread is in one stage."""
     places = range(len(nodes) + 1)
     return [place for place in places if set(nodes[:place]).isdisjoint(nodes[place:])]
-
-
-def in_cycle(opens_ns: int, closes_ns: int, cycle_ns: int) -> tuple[Slot, ...]:
-    """A slot of the chain's latency axis as it repeats every cycle: one slot, or two."""
-    start = opens_ns % cycle_ns
-    end = start + closes_ns - opens_ns
-    return ((start, end),) if end <= cycle_ns else ((0, end - cycle_ns), (start, cycle_ns))
 
 
 def _refuse_too_long(

@@ -6,15 +6,14 @@ their values with a unit (``period: 100ms``). Slots are half-open and count from
 
 A server may stop the thread of an asynchronous publisher (design 1, section 3.2.1), which shares
 locks with the rest of its process. With Fast DDS 2.14, three things are destructive and refused:
-a slot hardly longer than a send (0.25 ms; stopped in the midst of one, the thread has what every
-publisher and the executor need); a thread that out-ranks its executor on the same core (it spins
-for the lock under which the executor hands a message over, after the shortest latency at the
-earliest); and a history too shallow for what is handed over while it may not run.
+a slot hardly longer than a send (0.25 ms; stopped in one, the thread has what every publisher
+needs); a thread that out-ranks its executor on the same core (it spins for the lock under which the
+executor hands a message over); and a history too shallow for what comes while it may not run.
 """
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import combinations, pairwise, product
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from itertools import chain, combinations, pairwise, product
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 from pydantic import AfterValidator, Field, model_validator
@@ -25,6 +24,7 @@ from chainshaper.values.plan_choices import EqualPriorities, Fallback, Policy, S
 from chainshaper.values.yaml_file import (
     Duration,
     FullName,
+    Model,
     Part,
     PositiveDuration,
     wrong_value,
@@ -50,8 +50,28 @@ def _plain_name(what: str) -> AfterValidator:
 ModeName = Annotated[str, _plain_name("mode")]
 Count = Annotated[int, Field(ge=0)]
 FromOne = Annotated[int, Field(ge=1)]
+Share = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 Slot: TypeAlias = tuple[Duration, Duration]
 """A time slot [start, end) of a cycle."""
+Wrong: TypeAlias = Iterator[tuple[str | int, ...]]
+"""What a rule finds: the reason, and where it is wrong, by keys as in the file."""
+
+
+def checked(model: Model, *rules: Callable[[Model], Wrong]) -> Model:
+    """A model that obeys these rules: the first that does not hold is raised."""
+    for reason, *where in chain.from_iterable(rule(model) for rule in rules):
+        raise wrong_value(str(reason), *where)
+    return model
+
+
+def slot_text(slot: Slot) -> str:
+    """A slot as people write it: ``[86ms, 87ms)``."""
+    return f"[{duration_text(slot[0])}, {duration_text(slot[1])})"
+
+
+def meet(one: Slot, two: Slot) -> bool:
+    """Whether two slots overlap."""
+    return one[0] < two[1] and two[0] < one[1]
 
 
 class ChainOfPlan(Part):
@@ -69,13 +89,13 @@ class ChainOfPlan(Part):
 class Evidence(Part):
     """The measurements that the plan rests on: end-to-end latencies under high SCHED_FIFO.
 
-    They are of undisturbed cycles; where the machine disturbed all but one at most
-    (``all_disturbed``), of all. ``max_of_all_ns`` is of all, ``incomplete`` counts traversals
-    without an end; ``utilisation`` is the share of its core that the chain takes,
-    ``interference_ns`` the part of the average and the longest latency that is for others
+    They are of undisturbed cycles, or of all, where the machine disturbed all but one at most
+    (``all_disturbed``). ``max_of_all_ns`` is of all, ``incomplete`` counts traversals without an
+    end, ``utilisation`` is the share of its core that the chain takes, ``interference_ns`` the part
+    of the average and the longest latency that is for others
     (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's asynchronous
     publisher, ``longest_publication_ns`` of its synchronous one; ``publish_slot`` says where Δ is
-    from. ``intra_process``: subscribers get the output without DDS. ``None`` is: not known.
+    from. ``intra_process``: subscribers get the output without DDS. None is: not known.
     """
 
     recording: str | None = None
@@ -169,16 +189,14 @@ class Server(Part):
 
     @model_validator(mode="after")
     def _slots_ascend(self) -> "Server":
-        for number, slot in enumerate(self.slots):
+        for number, (before, slot) in enumerate(pairwise(((0, 0), *self.slots))):
+            what = f"the slot {slot_text(slot)}"
             if slot[0] >= slot[1]:
-                reason = "is empty: its end must come after its start"
-            elif number and slot[0] < (before := self.slots[number - 1])[1]:
-                reason = (
-                    f"begins before {slot_text(before)} ends: write slots ascending, no overlap"
-                )
-            else:
-                continue
-            raise wrong_value(f"the slot {slot_text(slot)} {reason}", "slots", number)
+                reason = f"{what} is empty: its end must come after its start"
+                raise wrong_value(reason, "slots", number)
+            if slot[0] < before[1]:
+                reason = f"{what} begins before {slot_text(before)} ends: write slots ascending"
+                raise wrong_value(f"{reason}, no overlap", "slots", number)
         return self
 
 
@@ -186,13 +204,13 @@ class ShapingNode(Part):
     """The node that takes the chain's output from ``input`` and republishes it on ``output``, in
     the slots of the server that has its thread.
 
-    It sleeps until ``spin_ns`` before the slot and spins from there; it pauses for ``pause_ns``
-    after a publication so that it does not delay delivery. ``publisher`` is the node whose output
-    it takes, where that is not `chain.publisher`. The executors of ``receivers``, which subscribe
-    to the output, run under SCHED_FIFO below all servers. ``depth`` messages may wait in it (None:
-    see :class:`.Wishes`). With ``in_process`` it is a thread in the publisher's process, where a
-    library takes what is published, which tracers call ``input``. With ``delivery_ns`` a library in
-    the receivers' processes hands them each message that long behind its publication.
+    It spins from ``spin_ns`` before the slot on, and pauses for ``pause_ns`` after a publication so
+    that it does not delay delivery. ``publisher`` is the node whose output it takes, where that is
+    not `chain.publisher`. The executors of ``receivers``, which subscribe to the output, run under
+    SCHED_FIFO below all servers. ``depth`` messages may wait in it (None: see :class:`.Wishes`).
+    With ``in_process`` it is a thread in the publisher's process, where a library takes what is
+    published, which tracers call ``input``. With ``delivery_ns`` a library in the receivers'
+    processes hands them each message that long behind its publication.
     """
 
     name: Annotated[str, _plain_name("node")]
@@ -219,11 +237,9 @@ class ShapingNode(Part):
             reason = f"the node would feed itself: let the chain publish on {self.output}_tmp"
             raise wrong_value(reason, "input")
         if self.delivery_ns is not None and not self.receivers:
-            raise wrong_value(
-                f"no receiver of {self.output} is named: plan with --receivers, from a recording"
-                " that has its subscribers, or leave out --delivery",
-                "delivery_ns",
-            )
+            reason = f"no receiver of {self.output} is named: plan with --receivers, from a"
+            reason += " recording that has its subscribers, or leave out --delivery"
+            raise wrong_value(reason, "delivery_ns")
         return self
 
 
@@ -274,7 +290,7 @@ class Prediction(Part):
     mean_ns: Duration
     max_ns: Duration
     jitter_ns: Duration
-    shares: tuple[Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)], ...] = ()
+    shares: tuple[Share, ...] = ()
     modes: "dict[ModeName, Prediction] | None" = None
 
 
@@ -285,11 +301,6 @@ class BandPrediction(NamedTuple):
     end_ns: int
     share: float
     jitter_ns: int
-
-
-def slot_text(slot: Slot) -> str:
-    """A slot as people write it: ``[86ms, 87ms)``."""
-    return f"[{duration_text(slot[0])}, {duration_text(slot[1])})"
 
 
 class Plan(Part):
@@ -326,10 +337,15 @@ class Plan(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "Plan":
-        first = (_cycle, _servers, _overlaps, _shaping_nodes, _modes)
-        for check in (*first, _publisher_threads, _entry, _adaptation):
-            check(self)
-        return self
+        rules = (_servers, _overlaps, _shaping_nodes, _modes, _publisher_threads, _choices)
+        return checked(self, _cycle, *rules)
+
+
+def in_one_slot(slot: Slot, mean_ns: int | None = None) -> Prediction:
+    """What is promised of outputs that all leave in one slot, by default (eq. 5) at its end."""
+    start, end = slot
+    mean_ns = end if mean_ns is None else mean_ns
+    return Prediction(mean_ns=mean_ns, max_ns=end, jitter_ns=end - start, shares=(1.0,))
 
 
 def server_of(plan: Plan, thread: Thread) -> Server | None:
@@ -382,6 +398,12 @@ def publishing_servers(plan: Plan) -> tuple[Server, ...]:
     )
 
 
+def running_servers(plan: Plan) -> list[Server]:
+    """The servers that run the chain: in which nothing is published, and none for best effort."""
+    publishing = publishing_servers(plan)
+    return [one for one in plan.servers if one not in publishing and not one.best_effort]
+
+
 def with_slots(
     servers: Iterable[Server], slots: Mapping[str, Sequence[Slot]]
 ) -> tuple[Server, ...]:
@@ -393,8 +415,9 @@ def with_slots(
 
 
 def until(server: Server, end_ns: int) -> tuple[Slot, ...]:
-    """A server's slots, of which the last ends at another instant."""
-    return (*server.slots[:-1], (server.slots[-1][0], end_ns))
+    """A server's slots, the last of which does not end earlier than that."""
+    *before, (start, end) = server.slots
+    return (*before, (start, max(end, end_ns)))
 
 
 def revised(plan: Plan, **changes: object) -> Plan:
@@ -404,168 +427,141 @@ def revised(plan: Plan, **changes: object) -> Plan:
         return Plan.model_validate({**values, **changes})
 
 
-# The rules: each raises what is wrong, and where (keys as in the file) -------------------------
+# The rules ------------------------------------------------------------------------------------
 
 
-def _cycle(plan: Plan) -> None:
+def _cycle(plan: Plan) -> Wrong:
     cycle, period, longest = plan.cycle_ns, plan.chain.period_ns, plan.evidence.max_latency_ns
     if cycle % period:
-        raise wrong_value(
+        yield (
             f"{duration_text(cycle)} is no multiple of the period {duration_text(period)}",
             "cycle",
         )
     if cycle <= longest and plan.policy not in PER_CALLBACK:
-        raise wrong_value(
-            f"{duration_text(cycle)} is not longer than the longest latency measured,"
-            f" {duration_text(longest)}: plan with a longer period or a shorter chain",
-            "cycle",
-        )
+        reason = f"{duration_text(cycle)} is not longer than the longest latency measured,"
+        reason += f" {duration_text(longest)}: plan with a longer period or a shorter chain"
+        yield reason, "cycle"
     if plan.policy == "pipelined" and plan.anchor == "cycle":
         reason = "an output of a pipeline is whole cycles old, as only its stamp says: write stamp"
-        raise wrong_value(reason, "anchor")
+        yield reason, "anchor"
 
 
-def _servers(plan: Plan) -> None:
-    names: set[str] = set()
+def _servers(plan: Plan) -> Wrong:
     homes: dict[Thread, str] = {}
     for place, server in enumerate(plan.servers):
-        if server.name in names:
-            reason = f"two servers are named {server.name!r}: rename one"
-            raise wrong_value(reason, "servers", place, "name")
-        names.add(server.name)
+        where = ("servers", place)
+        if server.name in (one.name for one in plan.servers[:place]):
+            yield f"two servers are named {server.name!r}: rename one", *where, "name"
         for number, slot in enumerate(server.slots):
             if slot[1] > plan.cycle_ns:
-                cycle = duration_text(plan.cycle_ns)
-                reason = (
-                    f"the slot {slot_text(slot)} ends after the cycle {cycle}: move or split it"
-                )
-                raise wrong_value(reason, "servers", place, "slots", number)
+                what = f"the slot {slot_text(slot)} ends after the cycle"
+                reason = f"{what} {duration_text(plan.cycle_ns)}: move or split it"
+                yield reason, *where, "slots", number
         for number, thread in enumerate(server.threads):
             for taken in filter(thread.overlaps, homes):
                 reason = f"{taken.text} is already in server {homes[taken]!r}: write it in one"
-                raise wrong_value(reason, "servers", place, "threads", number)
+                yield reason, *where, "threads", number
             homes[thread] = server.name
         for other in plan.servers:
             above = server.best_effort and not other.best_effort and server.core == other.core
             if above and server.priority <= other.priority:
                 reason = f"best effort comes behind all others: write more than {other.priority}"
-                raise wrong_value(reason, "servers", place, "priority")
+                yield reason, *where, "priority"
 
 
-def _overlaps(plan: Plan) -> None:
+def _overlaps(plan: Plan) -> Wrong:
     """Two servers of one core may overlap only when a priority says who runs, or by turns."""
-    if plan.equal_priorities == "round-robin":
-        return
-    for (_, one), (place, two) in combinations(enumerate(plan.servers), 2):
+    apart = plan.equal_priorities == "apart"
+    for (_, one), (place, two) in combinations(enumerate(plan.servers) if apart else (), 2):
         if (one.core, one.priority) != (two.core, two.priority):
             continue
         for (number, slot), other in product(enumerate(two.slots), one.slots):
-            if slot[0] < other[1] and other[0] < slot[1]:
-                reason = (
-                    f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server {one.name!r}"
-                    f" on core {one.core}: move one, or give one server another priority"
-                )
-                raise wrong_value(reason, "servers", place, "slots", number)
+            if meet(slot, other):
+                reason = f"the slot {slot_text(slot)} overlaps {slot_text(other)} of server"
+                reason += f" {one.name!r} on core {one.core}: move one, or give one server another"
+                yield f"{reason} priority", "servers", place, "slots", number
 
 
-def _shaping_nodes(plan: Plan) -> None:
-    further = enumerate(plan.further_shaping_nodes)
-    first = [] if plan.shaping_node is None else [(("shaping_node",), plan.shaping_node)]
-    placed = [*first, *((("further_shaping_nodes", number), node) for number, node in further)]
-    for where, node in placed:
-        others = [other for place, other in placed if place != where]
-        server, output = server_of(plan, node.thread), plan.chain.output
+def _shaping_nodes(plan: Plan) -> Wrong:
+    output, nodes = plan.chain.output, shaping_nodes(plan)
+    for place, node in enumerate(nodes, start=-1 if plan.shaping_node else 0):
+        where = ("shaping_node",) if place < 0 else ("further_shaping_nodes", place)
+        others, server = [one for one in nodes if one is not node], server_of(plan, node.thread)
         if any(node.name == other.name or node.output == other.output for other in others):
             reason = f"another one has the name {node.name} or the output {node.output} too: both"
-            raise wrong_value(f"{reason} must be its own", *where)
-        if node is plan.shaping_node and output not in (None, node.output):
+            yield f"{reason} must be its own", *where
+        if place < 0 and output not in (None, node.output):
             reason = f"publishes {node.output}, but the chain's output is {output}"
-            raise wrong_value(f"{reason}: make them the same", *where, "output")
+            yield f"{reason}: make them the same", *where, "output"
         if server is None:
-            reason = (
-                f"no server holds its thread: add {{node: {node.thread.node}}} to one's threads"
-            )
-            raise wrong_value(reason, *where, "name")
-        if server.core != node.core:
+            reason = f"no server holds its thread: add {{node: {node.thread.node}}} to one's"
+            yield f"{reason} threads", *where, "name"
+        elif server.core != node.core:
             reason = f"{node.core}, but server {server.name!r} is on {server.core}"
-            raise wrong_value(f"{reason}: make them the same", *where, "core")
-    if not placed and plan.shaping_thread != "free":
+            yield f"{reason}: make them the same", *where, "core"
+    if not nodes and plan.shaping_thread != "free":
         reason = f"{plan.shaping_thread}, but the plan has no shaping node: remove it"
-        raise wrong_value(reason, "shaping_thread")
+        yield reason, "shaping_thread"
 
 
-def _modes(plan: Plan) -> None:
+def _modes(plan: Plan) -> Wrong:
     if plan.modes is None:
         return
     if plan.shaping_node is None:
-        reason = (
-            "only a shaping node knows the mode of the system, and the plan has none: plan with"
-        )
-        raise wrong_value(f"{reason} synchronous publication, or without modes", "modes")
-    if plan.modes.topic in (plan.shaping_node.input, plan.shaping_node.output):
+        reason = "only a shaping node knows the mode of the system, and the plan has none: plan"
+        yield f"{reason} with synchronous publication, or without modes", "modes"
+    elif plan.modes.topic in (plan.shaping_node.input, plan.shaping_node.output):
         reason = f"{plan.modes.topic} carries the chain's output: name that of the mode"
-        raise wrong_value(reason, "modes", "topic")
+        yield reason, "modes", "topic"
     slots = len(publish_slots(plan))
     for mode, band in plan.modes.bands.items():
         if band > slots:
             reason = f"{band}, but there are {slots} slots: write from 1 to {slots}, or add a slot"
-            raise wrong_value(reason, "modes", "bands", mode)
+            yield reason, "modes", "bands", mode
 
 
-def _publisher_threads(plan: Plan) -> None:
+def _publisher_threads(plan: Plan) -> Wrong:
     """A gated asynchronous publisher must not stop, or be stopped by, its process."""
     measured, depth = plan.evidence.longest_send_ns, plan.chain.output_depth
     shortest = max(SHORTEST_SLOT_NS, SENDS_PER_SLOT * (measured or 0))
+    took = f" (the longest took {duration_text(measured)})" if measured else ""
     for place, server, nodes in publisher_servers(plan):
+        where = ("servers", place)
         for number, slot in enumerate(server.slots):
             if slot[1] - slot[0] < shortest:
-                took = f" (the longest took {duration_text(measured)})" if measured else ""
-                reason = (
-                    f"the slot {slot_text(slot)} is too short for a publisher's thread: stopped in"
-                    f" a send{took}, it would block the whole process; make it"
-                    f" {duration_text(shortest)} or longer (--publish-slot)"
-                )
-                raise wrong_value(reason, "servers", place, "slots", number)
+                reason = f"the slot {slot_text(slot)} is too short for a publisher's thread:"
+                reason += f" stopped in a send{took}, it would block the whole process; make it"
+                reason += f" {duration_text(shortest)} or longer (--publish-slot)"
+                yield reason, *where, "slots", number
         for node, other in product(nodes, plan.servers):
             for slot in _out_ranked(plan, server, node, other):
-                reason = (
-                    f"the publisher thread of {node} would out-rank its executor, which server"
-                    f" {other.name!r} runs at priority {other.priority} in {slot_text(slot)}, and"
-                    f" spin for its lock: write a number above {other.priority}, or move the slot"
-                )
-                raise wrong_value(reason, "servers", place, "priority")
+                reason = f"the publisher thread of {node} would out-rank its executor, which server"
+                reason += f" {other.name!r} runs at priority {other.priority} in {slot_text(slot)},"
+                reason += f" and spin for its lock: write a number above {other.priority}, or move"
+                yield f"{reason} the slot", *where, "priority"
         if plan.overrun == "publish" and plan.policy not in ("shaped", "one-long-slot"):
-            raise wrong_value(
-                f"under {plan.policy} an asynchronous output in its own cycle looks like an"
-                " overrun: write wait or discard, or plan with --publication synchronous",
-                "overrun",
-            )
+            reason = f"under {plan.policy} an asynchronous output in its own cycle looks like an"
+            reason += " overrun: write wait or discard, or plan with --publication synchronous"
+            yield reason, "overrun"
         waiting = messages_waiting(plan, server)
         if depth is not None and plan.chain.publisher in nodes and depth < waiting:
-            raise wrong_value(
-                f"a history of {depth} is too shallow for the {waiting} messages that come while"
-                f" the thread may not run: give {plan.chain.output or 'the output'} a depth of"
-                f" {waiting + 1}, or the server {server.name!r} more slots",
-                *("chain", "output_depth"),
-            )
+            reason = f"a history of {depth} is too shallow for the {waiting} messages that come"
+            reason += f" while the thread may not run: give {plan.chain.output or 'the output'} a"
+            reason += f" depth of {waiting + 1}, or the server {server.name!r} more slots"
+            yield reason, "chain", "output_depth"
 
 
-def _entry(plan: Plan) -> None:
+def _choices(plan: Plan) -> Wrong:
     gated = any(publisher_servers(plan))
     if plan.into_open_slot == "next-slot" and (gated or plan.policy != "shaped"):
-        raise wrong_value(
-            "only a shaping node sees when an output comes, under the policy shaped, not"
-            f" {'a gated publisher' if gated else plan.policy}: write at-once",
-            "into_open_slot",
-        )
-
-
-def _adaptation(plan: Plan) -> None:
+        found = "a gated publisher" if gated else plan.policy
+        reason = "only a shaping node sees when an output comes, under the policy shaped, not"
+        yield f"{reason} {found}: write at-once", "into_open_slot"
     latest = None if plan.adaptation is None else plan.adaptation.max_latency_ns
     for slot in publish_slots(plan)[-1:]:
         if latest is not None and slot[1] > latest:
             reason = f"{duration_text(latest)}, but the slot {slot_text(slot)} ends behind it"
-            raise wrong_value(f"{reason}: write more", "adaptation", "max_latency")
+            yield f"{reason}: write more", "adaptation", "max_latency"
 
 
 def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Slot]:
@@ -574,7 +570,7 @@ def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Sl
         return []
     if not any(map(Thread(node=node).overlaps, other.threads)):
         return []
-    earliest = plan.evidence.min_latency_ns
+    earliest = plan.evidence.min_latency_ns  # before, it has no output to hand over
     return [
         slot
         for slot in server.slots
@@ -586,21 +582,20 @@ def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:
     """The servers, with those of publishers' threads ranked below what may run at the same time,
     and those for best effort behind all others of their core.
     """
+
+    def behind(server: Server, others: Iterable[Server]) -> Server:
+        worse = (one.priority + 1 for one in others if one.core == server.core)
+        return server.model_copy(update={"priority": max([server.priority, *worse])})
+
     publishing = [s for s in servers if any(t.role == "publisher" for t in s.threads)]
-    executors = [one for one in servers if one not in publishing and not one.best_effort]
-
-    def priority(server: Server) -> int:
-        others = (one for one in executors if server in publishing and one.core == server.core)
-        below = (one.priority + 1 for one in others if one.slots[-1][1] > server.slots[0][0])
-        return max([server.priority, *below])
-
-    ranked = [one.model_copy(update={"priority": priority(one)}) for one in servers]
-
-    def behind(server: Server) -> int:
-        others = (one for one in ranked if one.core == server.core and not one.best_effort)
-        return max([server.priority, *(one.priority + 1 for one in others if server.best_effort)])
-
-    return tuple(one.model_copy(update={"priority": behind(one)}) for one in ranked)
+    usual = [one for one in servers if one not in publishing and not one.best_effort]
+    ranked = []
+    for one in servers:
+        begins_ns = one.slots[0][0]
+        below = (other for other in usual if other.slots[-1][1] > begins_ns)
+        ranked.append(behind(one, below if one in publishing else ()))
+    rest = [one for one in ranked if not one.best_effort]
+    return tuple(behind(one, rest if one.best_effort else ()) for one in ranked)
 
 
 def publisher_servers(plan: Plan) -> Iterator[tuple[int, Server, list[str]]]:

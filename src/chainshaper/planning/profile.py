@@ -1,23 +1,20 @@
 """What was measured of a chain, and how long others can have its core while all of them run.
 
-While a recording is made every chain runs, at one priority, in whatever order messages come. What
-one instance took is therefore an accident: in another run the branches of a fork may be called in
-another order. Planned together, each chain's latencies are what it takes *alone* (its callbacks,
-without the time for which the others had its core), and to these is added the longest time for
-which the others can have it (Joseph and Pandya, The Computer Journal 29, 1986):
+While a recording is made every chain runs, at one priority, in whatever order messages come. So
+what one instance took is an accident. Planned together, each chain's latencies are what it takes
+*alone* (its callbacks, without the time for which the others had its core), and to these is added
+the longest time for which the others can have it (Joseph and Pandya, The Computer Journal 29,
+1986):
 
     R = L + Σ ⌈(R + J) / T⌉ · C,
 
 over all that may run before the chain on its cores, each every T, for C at most, and up to J later
-in one cycle than in another:
+in one cycle than in another: the branches that begin with it, in any order, behind the fork; chains
+of a better priority, where they run at the same time; the shaping nodes of all other chains, which
+spin before a slot and publish.
 
-* the branches that begin with it, in any order, behind the fork: they share its server and its
-  priority;
-* chains of a better priority, where they run at the same time (where they take turns, none);
-* the shaping nodes of all other chains, which spin before a slot and publish.
-
-What delays a cycle is between none of it and all. The longest latency, and the last slot with it,
-is behind all of it; bands before that are placed by what was measured, as far as it is in between.
+The longest latency, and the last slot with it, is behind all of it; bands before that are placed by
+what was measured, as far as it is in between.
 """
 
 import math
@@ -65,17 +62,15 @@ class Profile:
     ``measured_ns`` what it took there, where others may delay it to the latency (None: that).
     ``nodes`` and ``topics`` have the node and the topic of each callback of the chain. ``core_of``
     names the core of every node whose executor takes part, also on branches that the chain waits
-    for, ``cores`` that of any node that has one core, of ``every_node`` in the recording; of a node
-    with several executors, ``executors`` are those that take part, each by its callbacks.
-    ``begins`` is the first callback's number in the graph, and its name, ``upstream`` the topics
-    that the output waits for: on the chain, on those branches, and before the chain begins.
-    ``receivers`` are other nodes that subscribe to the output. ``callbacks`` are those of the chain
-    and its branches, see
-    :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and ``every_step_ns``
-    are what each callback of the chain took, a row per latency. ``asynchronous``: the process of
-    the output's writer has a thread that publishes; ``together`` are nodes that share a process,
-    ``simulated`` nodes of the chain that follow `/clock`, ``interfering`` what else the chain's
-    threads run. The rest is
+    for; of a node with several executors, ``executors`` are those that take part, each by its
+    callbacks. ``cores`` is for any node of the recording with one core. ``begins`` is the first
+    callback's number in the graph, and its name, ``upstream`` the topics that the output waits for:
+    on the chain, on those branches, and before. ``callbacks`` are those of the chain and its
+    branches, see :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and
+    ``every_step_ns`` are what each callback of the chain took, a row per latency.
+    ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
+    are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
+    ``interfering`` what else the chain's threads run. The rest is
     :class:`~chainshaper.planning.plan.Evidence`, and :class:`~.plan.ChainOfPlan`.
     """
 
@@ -231,10 +226,8 @@ def deciding_cycles(profile: Profile) -> str | None:
     where = ""
     if len(profile.steps_ns) == latencies.size and profile.nodes:
         longer = profile.steps_ns[few[0]] - np.median(profile.steps_ns, axis=0)
-        worst = int(np.argmax(longer))
-        where = (
-            f", {milliseconds(longer[worst], 1)} ms of it more than usual at {profile.nodes[worst]}"
-        )
+        more, node = milliseconds(longer.max(), 1), profile.nodes[int(np.argmax(longer))]
+        where = f", {more} ms of it more than usual at {node}"
     if last < START_UP_NS:
         cause = "it is the start-up (first instances, discovery)"
         remedy = f"--skip {format_duration((last // 1_000_000_000 + 1) * 1_000_000_000)}"
@@ -301,11 +294,16 @@ def with_interference(
             one, siblings = undelayed[k], [undelayed[j] for j in group if j != k]
             forked = {*_stages([one])} - {*_stages(siblings)}  # none of these before the fork
             rivals = [Rival(one.period_ns, _demand(one, siblings, forked))]
-            rivals += [_group(one, chains) for chains in better if at_once]
+            for chains in better if at_once else ():  # what waits elsewhere comes late
+                cost = _demand(one, chains, _stages([one]))
+                jitter = max(0, max(map(_longest_in_time, chains)) - cost)
+                rivals.append(Rival(chains[0].period_ns, cost, jitter))
             for place, other in enumerate(undelayed):
                 cores = _cores(one, forked if place in group else _stages([one]))
                 if gates and place != k and other.core_of.get(other.last or "") in cores:
-                    rivals.append(_gate(other, wishes.spin_ns))
+                    longest = other.longest_publication_ns
+                    cost = wishes.spin_ns + (SHORTEST_SLOT_NS if longest is None else longest)
+                    rivals.append(Rival(other.period_ns, cost))
             delay = interference(_longest_in_time(one), rivals, one.period_ns)
             delayed[k] = _later(one, delay, profiles[k].latencies_ns)
         better.append([delayed[k] for k in group])
@@ -337,9 +335,7 @@ def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> P
 
 
 def _longest_in_time(profile: Profile) -> int:
-    """The longest of all cycles that fit into the period: one that does not is late anyway, and
-    would leave no room to count in what delays the others.
-    """
+    """The longest of all cycles that fit into the period: one that does not is late anyway."""
     every = profile.every
     return int(every[every < profile.period_ns].max(initial=0))
 
@@ -358,16 +354,3 @@ def _demand(profile: Profile, others: Sequence[Profile], stages: Collection[_Sta
     own, cores = _stages([profile]), _cores(profile, stages)
     theirs = (one for stage, one in _stages(others).items() if stage not in own)
     return sum(one.max_response_ns for one in theirs if one.core in cores)
-
-
-def _group(profile: Profile, chains: Sequence[Profile]) -> Rival:
-    """Chains of one beginning that run before a chain: what waits elsewhere comes late."""
-    cost = _demand(profile, chains, _stages([profile]))
-    longest = max(map(_longest_in_time, chains))
-    return Rival(chains[0].period_ns, cost, max(0, longest - cost))
-
-
-def _gate(other: Profile, spin_ns: int) -> Rival:
-    """Another chain's shaping node: it spins before its slot, and publishes."""
-    longest = other.longest_publication_ns
-    return Rival(other.period_ns, spin_ns + (SHORTEST_SLOT_NS if longest is None else longest))

@@ -16,7 +16,9 @@ from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from chainshaper.planning import shaping
 from chainshaper.planning.bands import (
     BandChoice,
     choose_bands,
@@ -48,6 +50,7 @@ from chainshaper.planning.plan import (
     Plan,
     Prediction,
     Slot,
+    in_one_slot,
     revised,
 )
 from chainshaper.planning.profile import (
@@ -57,20 +60,6 @@ from chainshaper.planning.profile import (
     up_to,
     with_interference,
 )
-from chainshaper.planning.shaping import (
-    evidence_of,
-    let_per_callback,
-    let_per_chain,
-    over_cores,
-    plan_shaping,
-    server_per_callback,
-    server_per_chain,
-    with_best_effort,
-    with_executors,
-    with_first_node_apart,
-    with_sink,
-    with_turns,
-)
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy, Wishes
@@ -78,7 +67,6 @@ from chainshaper.values.plan_choices import Policy, Wishes
 DEFAULT_CORE = 1
 OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
-_CUT = ("pipelined", "server-per-callback")
 _LIMITS = ("grid_ns", "max_gap_ns", "max_share")
 
 
@@ -145,28 +133,23 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         measured = replace(profile, latencies_ns=latencies)
     plan = finish(_shaped(measured, request, margin, sinks))
     if request.policy in OWN_SLOTS:
-        delay_ns = profile.interference_ns
-        figures = evidence_of(profile.latencies_ns, interference_ns=delay_ns).model_dump(
-            exclude_unset=True
-        )
+        own = shaping.evidence_of(profile.latencies_ns, interference_ns=profile.interference_ns)
+        figures = own.model_dump(exclude_unset=True)
         plan = revised(plan, evidence=plan.evidence.model_copy(update=figures))
     for sink in sinks:
         if not sink.topics:
             raise InputError("a sink needs the topic it is published on: plan from a recording")
-        plan = with_sink(
-            plan,
-            sink.latencies_ns,
-            sink.topics[-1],
-            publisher=sink.last,
-            receivers=sink.receivers if request.with_receivers else (),
+        ends, receivers = sink.topics[-1], sink.receivers if request.with_receivers else ()
+        plan = shaping.with_sink(
+            plan, sink.latencies_ns, ends, publisher=sink.last, receivers=receivers
         )
     no_process = plan.shaping_node is None or plan.shaping_node.in_process
     if request.fallback != _STANDARD.fallback and no_process:
         reason = f"--fallback {request.fallback} is for a shaping node that is a process"
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
-    plan = with_executors(plan, [one.executors for one in (profile, *sinks)])
-    plan = with_turns(revised(plan, modes=modes), request.equal_priorities)
-    return with_best_effort([plan], best_effort_cores([profile], request))[0]
+    plan = shaping.with_executors(plan, [one.executors for one in (profile, *sinks)])
+    plan = shaping.with_turns(revised(plan, modes=modes), request.equal_priorities)
+    return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
 
 
 def _prepared(every: Sequence[Profile], request: PlanRequest) -> list[Profile]:
@@ -278,8 +261,8 @@ def moved_to(
 def band_choice(
     plan: Plan, profile: Profile, request: PlanRequest, sinks: Sequence[Profile] = ()
 ) -> BandChoice:
-    """The curve of figure 7 for a plan, and the number of bands that ``auto`` takes from it; with
-    what :func:`plan_chain` made the plan of.
+    """The curve of figure 7 for a plan that :func:`plan_chain` made of this, and what ``auto``
+    takes from it.
     """
     latencies = _prepared((profile, *sinks), request)[0].measured
     return choose_bands(plan, latencies, **_of(request, *_LIMITS, "least_gain"))
@@ -300,17 +283,19 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
         )
     if request.percentile is not None:  # what takes longer has been left out
         return profile
-    share = request.overrun_probability or OVERRUN_PROBABILITY
-    latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
     every = profile.every
-    covered = every[every <= covered_latency(every, share, latest)]
+    covered = every[every <= _covering(every, profile, request)]
     latencies = covered if covered.size > 1 else every  # none fits, which the planner refuses
     return replace(profile, latencies_ns=latencies, every_latency_ns=every)
 
 
-def _latest(profile: Profile, request: PlanRequest) -> int:
-    """The longest latency behind which a publish slot fits into the cycle."""
-    return profile.period_ns - _slot_ns(profile, request) - least_epsilon_ns(request.publication)
+def _covering(latencies: NDArray[np.int64], profile: Profile, request: PlanRequest) -> int:
+    """The latency that covers all of these but the promised share, as far as a publish slot fits
+    into the cycle behind it.
+    """
+    latest = profile.period_ns - _slot_ns(profile, request) - least_epsilon_ns(request.publication)
+    share = request.overrun_probability or OVERRUN_PROBABILITY
+    return covered_latency(latencies, share, None if request.policy in OWN_SLOTS else latest)
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -355,19 +340,16 @@ def with_modes(
 
     The prediction of the whole is for modes in force as often as they were measured.
     """
-    ends, cycles = [end for _, end in slots], [0] * len(slots)
-    alone = {}
+    cycles = [0] * len(slots)
     for mode, own in measured.items():
-        start, end = slots[(place := modes.bands[mode] - 1)]
-        cycles[place] += own.samples
-        alone[mode] = Prediction(mean_ns=end, max_ns=end, jitter_ns=end - start, shares=(1.0,))
+        cycles[modes.bands[mode] - 1] += own.samples
     shares = tuple(own / sum(cycles) for own in cycles)
     predicted = Prediction(
-        mean_ns=round(sum(share * end for share, end in zip(shares, ends, strict=True))),
-        max_ns=ends[-1],
-        jitter_ns=ends[-1] - slots[0][0],
+        mean_ns=round(sum(share * end for share, (_, end) in zip(shares, slots, strict=True))),
+        max_ns=slots[-1][1],
+        jitter_ns=slots[-1][1] - slots[0][0],
         shares=shares,
-        modes=alone,
+        modes={mode: in_one_slot(slots[modes.bands[mode] - 1]) for mode in measured},
     )
     evidence = plan.evidence.model_copy(update={"modes": dict(measured)})
     return with_publish_slots(plan, slots, evidence=evidence, predicted=predicted, modes=modes)
@@ -388,7 +370,9 @@ def _together(
     why = f"but each mode's slot is placed from its own latencies, here {len(slots)}: leave it out"
     _refuse_placement(replace(request, bands=1) if request.bands == len(slots) else request, why)
     measured = {
-        mode: evidence_of(one.latencies_ns, **_of(one, "recording", "disturbed", "all_disturbed"))
+        mode: shaping.evidence_of(
+            one.latencies_ns, **_of(one, "recording", "disturbed", "all_disturbed")
+        )
         for mode, one in apart.items()
     }
     both = replace(
@@ -417,11 +401,11 @@ def _shaped(
             )
         values["output_depth"] = profile.output_depth
     if request.publication == "in-process" and profile.intra_process:
-        reason = (
-            f"subscribers of {profile.topics[-1]} get its messages inside the process of {last}"
+        raise InputError(
+            f"subscribers of {profile.topics[-1]} get its messages inside the process of {last},"
+            " where no gate before DDS sees them: switch that off, or plan with --publication"
+            " synchronous and --node component"
         )
-        remedy = "switch that off, or plan with --publication synchronous and --node component"
-        raise InputError(f"{reason}, where no gate before DDS sees them: {remedy}")
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it
     length = _slot_ns(profile, request)
@@ -429,7 +413,7 @@ def _shaped(
     values["publish_slot"] = found if request.publish_slot_ns is None else "given"
     # At once by default, unless the thread of an asynchronous publisher has outputs due later.
     bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
-    plan = plan_shaping(
+    plan = shaping.plan_shaping(
         profile.latencies_ns,
         profile.period_ns,
         wishes=request,
@@ -451,8 +435,10 @@ def _shaped(
         if not profile.nodes:
             raise InputError("a slot for the first node needs the chain's nodes: give a recording")
         first = profile.nodes[0]
-        plan = with_first_node_apart(plan, first, request.first_slot_ns, core_of.pop(first, None))
-    return over_cores(plan, core_of) if core_of else plan
+        plan = shaping.with_first_node_apart(
+            plan, first, request.first_slot_ns, core_of.pop(first, None)
+        )
+    return shaping.over_cores(plan, core_of) if core_of else plan
 
 
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
@@ -471,9 +457,7 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
     stalls = 0
     shown_late = request.percentile is not None  # what takes longer has been left out
     if not shown_late and (request.policy not in OWN_SLOTS or request.policy == "pipelined"):
-        share = probability or OVERRUN_PROBABILITY  # a stall belongs to no single callback
-        latest = None if request.policy in OWN_SLOTS else _latest(profile, request)
-        stalls = max(0, covered_latency(covered, share, latest) - longest)
+        stalls = max(0, _covering(covered, profile, request) - longest)  # of no single callback
     epsilon = least_epsilon_ns(request.publication) + stalls
     return Margin(
         epsilon_ns=epsilon,
@@ -494,7 +478,8 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
             raise InputError("one long slot needs its start: add --slot-start, such as 62ms")
         return with_long_slot(plan, profile.latencies_ns, request.slot_start_ns)
     if request.policy in ("server-per-chain", "let-per-chain"):
-        return (server_per_chain if request.policy in UNSHAPED else let_per_chain)(plan)
+        unshaped = request.policy in UNSHAPED
+        return (shaping.server_per_chain if unshaped else shaping.let_per_chain)(plan)
     if not profile.callbacks or not profile.topics:
         reason = f"the policy {request.policy} needs the chain's callbacks"
         raise InputError(f"{reason}: plan from a recording")
@@ -504,8 +489,9 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
             steps = every[every.sum(axis=1) <= profile.longest_ns]
         return pipelined(plan, profile.nodes, steps, profile.core_of, request.cores)
     if request.policy == "server-per-callback":
-        return server_per_callback(plan, profile.callbacks, margin_ns=plan.margin.epsilon_ns)
-    return let_per_callback(plan, profile.topics, profile.nodes)
+        margin_ns = plan.margin.epsilon_ns
+        return shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)
+    return shaping.let_per_callback(plan, profile.topics, profile.nodes)
 
 
 def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> None:
@@ -524,7 +510,7 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
     cores = request.cores or ()
     if request.policy != "pipelined" and len(set(cores)) < len(cores):
         raise InputError("--cores names a core twice, which only stages may have: name each once")
-    if request.first_slot_ns is not None and request.policy in _CUT:
+    if request.first_slot_ns is not None and request.policy in ("pipelined", "server-per-callback"):
         reason = f"and the policy {request.policy} cuts the whole chain into servers"
         raise InputError(f"--first-slot gives the first node a server, {reason}: leave it out")
     if request.policy == "shaped":
@@ -562,6 +548,11 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
                 f" {shaped.name} publishes later than it was measured: plan one of the two alone"
             )
     for one, two in combinations(profiles, 2):
+        if sinks and one.period_ns != two.period_ns:
+            raise InputError(
+                f"{two.name} has the period {duration_text(two.period_ns)}, {one.name}"
+                f" {duration_text(one.period_ns)}: plan one of the two alone"
+            )
         if one.begins is None or two.begins is None or one.begins == two.begins:
             continue
         begin = (
@@ -576,12 +567,6 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
             raise InputError(
                 f"{begin}, and both need {', '.join(common)}: neither's cycles can start without"
                 " the other's. Begin both where all of it comes from, or plan one of the two alone"
-            )
-    for one, two in combinations(profiles, 2):
-        if sinks and one.period_ns != two.period_ns:
-            raise InputError(
-                f"{two.name} has the period {duration_text(two.period_ns)}, {one.name}"
-                f" {duration_text(one.period_ns)}: plan one of the two alone"
             )
 
 

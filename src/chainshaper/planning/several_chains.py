@@ -1,13 +1,11 @@
 """From the profiles of several chains to one plan of their application.
 
 Each chain is planned as if it were alone (:func:`~chainshaper.planning.request.plan_chain`), and
-what they share is then made one:
-
-* chains that begin at the same callback, branches of one graph, share the servers that run it,
-  which stay open for the slowest of them; each has its output in slots of its own;
-* chains of different beginnings that pass the same node take turns on its thread;
-* chains that share no more than a core take turns on it, or run at the same time at priorities of
-  their own (:func:`~chainshaper.planning.offsets.place_chains`).
+what they share is then made one: chains that begin at the same callback, branches of one graph,
+share the servers that run it, which stay open for the slowest of them; each has its output in slots
+of its own. Chains of different beginnings take turns on the threads of nodes that they share, and
+on cores, or run there at priorities of their own
+(:func:`~chainshaper.planning.offsets.place_chains`).
 """
 
 from collections.abc import Iterator, Sequence
@@ -24,6 +22,7 @@ from chainshaper.planning.plan import (
     Server,
     publishing_servers,
     revised,
+    running_servers,
     with_slots,
 )
 from chainshaper.planning.profile import Profile, with_interference
@@ -189,34 +188,23 @@ def _sharing_servers(plans: list[Plan]) -> list[Plan]:
         raise InputError(f"{reason}: shape them, or plan them one by one")
     shared: dict[tuple[int, int], Server] = {}  # by core and where the first slot starts
     for plan in plans:
-        publishing = publishing_servers(plan)
-        for server in (one for one in plan.servers if one not in publishing):
+        for server in running_servers(plan):
             place = (server.core, server.slots[0][0])
-            shared[place] = _joined(shared.get(place, server), server)
+            known = shared.get(place, server)
+            slots = max(known.slots, server.slots, key=lambda own: own[-1][1])
+            threads = tuple(dict.fromkeys((*known.threads, *server.threads)))
+            shared[place] = known.model_copy(update={"slots": slots, "threads": threads})
     taken: list[Server] = []
     changed = []
-    for plan in plans:
-        later = _behind(plan, taken)
-        own = publishing_servers(later)
+    for plan in plans:  # so much later that no publish slots meet on their core
+        gates = publishing_servers(plan)
+        by_ns = behind_others(chain_name(plan), gates, taken, plan.cycle_ns)
+        later = {s.name: [(start + by_ns, end + by_ns) for start, end in s.slots] for s in gates}
+        own = with_slots(gates, later)
         taken += own
-        changed.append(revised(later, servers=(*shared.values(), *own)))
+        predicted = _later(plan.predicted, by_ns)
+        changed.append(revised(plan, servers=(*shared.values(), *own), predicted=predicted))
     return changed
-
-
-def _joined(one: Server, two: Server) -> Server:
-    """A server with the threads of both, open as long as the longer of them."""
-    longest = max(one.slots, two.slots, key=lambda slots: slots[-1][1])
-    threads = tuple(dict.fromkeys((*one.threads, *two.threads)))
-    return one.model_copy(update={"slots": longest, "threads": threads})
-
-
-def _behind(plan: Plan, taken: Sequence[Server]) -> Plan:
-    """The plan with its publish slots so much later that none meets those taken on their core."""
-    gates = publishing_servers(plan)
-    later_ns = behind_others(chain_name(plan), gates, taken, plan.cycle_ns)
-    slots = {s.name: [(a + later_ns, b + later_ns) for a, b in s.slots] for s in gates}
-    predicted = _later(plan.predicted, later_ns)
-    return revised(plan, servers=with_slots(plan.servers, slots), predicted=predicted)
 
 
 def _later(predicted: Prediction, later_ns: int) -> Prediction:

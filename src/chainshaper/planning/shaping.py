@@ -7,10 +7,10 @@ plans one chain; further functions take its plan and return one that covers more
 (sections 5.1 and 5.4), or of another policy (sections 2.5, 5.1 and 5.3).
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from itertools import product, zip_longest
-from typing import Any, NoReturn
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,11 +30,14 @@ from chainshaper.planning.plan import (
     Slot,
     Thread,
     below_executors,
+    in_one_slot,
+    meet,
     output_server,
     publish_slots,
     publisher_servers,
     publishing_servers,
     revised,
+    running_servers,
     until,
     with_slots,
 )
@@ -50,6 +53,7 @@ PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get 
 _WISHES = {field.name for field in fields(Wishes)}
 
 
+@wrong_values_refused(Plan)
 def plan_shaping(
     latencies_ns: NDArray[np.int64],
     period_ns: int,
@@ -90,30 +94,34 @@ def plan_shaping(
     start = longest + epsilon
     if (end := start + length) > period_ns:
         alone = values.get("interference_ns") is None
-        _refuse_too_long(longest, epsilon, length, period_ns, alone=alone)
-    with wrong_values_refused(Plan):
-        chain = ChainOfPlan(period_ns=period_ns, **of_chain)
-        node, gated = _gate(chain, wishes, core, fifo_priority, receivers)
-        threads = tuple(Thread(node=name) for name in nodes)
-        running = Server(
-            name="chain", core=core, priority=CHAIN_PRIORITY, slots=((0, start),), threads=threads
-        )
-        return Plan(
-            chain=chain,
-            evidence=evidence_of(latencies, **values),
-            margin=margin or Margin(epsilon_ns=epsilon),
-            policy="shaped",
-            cycle_ns=period_ns,
-            anchor=wishes.anchor,
-            overrun=wishes.overrun or "publish",
-            into_open_slot=wishes.into_open_slot,
-            messages=wishes.messages,
-            fallback=wishes.fallback,
-            shaping_thread=wishes.shaping_thread,
-            servers=(running, _publishing("output", core, (start, end), gated)),
-            shaping_node=node,
-            predicted=predict_bands(latencies, [end], length, wishes.into_open_slot),
-        )
+        raise OperationError(_too_long(longest, epsilon, length, period_ns, alone=alone))
+    chain = ChainOfPlan(period_ns=period_ns, **of_chain)
+    node, gated = _gate(chain, wishes, core, fifo_priority, receivers)
+    running = server_for(nodes, "chain", core, CHAIN_PRIORITY, [(0, start)])
+    return Plan(
+        chain=chain,
+        evidence=evidence_of(latencies, **values),
+        margin=margin or Margin(epsilon_ns=epsilon),
+        policy="shaped",
+        cycle_ns=period_ns,
+        anchor=wishes.anchor,
+        overrun=wishes.overrun or "publish",
+        into_open_slot=wishes.into_open_slot,
+        messages=wishes.messages,
+        fallback=wishes.fallback,
+        shaping_thread=wishes.shaping_thread,
+        servers=(running, _publishing("output", core, (start, end), gated)),
+        shaping_node=node,
+        predicted=predict_bands(latencies, [end], length, wishes.into_open_slot),
+    )
+
+
+def server_for(
+    nodes: Iterable[str], name: str, core: int, priority: int, slots: Sequence[Slot]
+) -> Server:
+    """A server that runs the executors of these nodes."""
+    threads = tuple(Thread(node=node) for node in nodes)
+    return Server(name=name, core=core, priority=priority, slots=tuple(slots), threads=threads)
 
 
 def _publishing(name: str, core: int, slot: Slot, threads: tuple[Thread, ...]) -> Server:
@@ -174,10 +182,8 @@ def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
     )
 
 
-def _refuse_too_long(
-    longest: int, epsilon: int, publish_slot: int, period: int, *, alone: bool
-) -> NoReturn:
-    """Name what would make the chain fit: unless it is ``alone``, others may not fit then."""
+def _too_long(longest: int, epsilon: int, publish_slot: int, period: int, *, alone: bool) -> str:
+    """What would make the chain fit: unless it is ``alone``, others may not fit then."""
     missing = longest + epsilon + publish_slot - period
     remedies = ["a longer period", "a shorter chain"]
     if alone and longest + epsilon < period:
@@ -186,7 +192,7 @@ def _refuse_too_long(
         remedies.insert(0, f"a margin of {duration_text(period - longest - publish_slot)}")
     if alone and longest >= period:
         remedies.append("a pipeline of stages, each shorter than the cycle (--policy pipelined)")
-    raise OperationError(
+    return (
         f"the longest latency {duration_text(longest)}, the margin {duration_text(epsilon)} and"
         f" the publish slot {duration_text(publish_slot)} do not fit into the cycle of"
         f" {duration_text(period)}: {duration_text(missing)} too long. What helps:"
@@ -194,6 +200,7 @@ def _refuse_too_long(
     )
 
 
+@wrong_values_refused(Plan)
 def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
@@ -204,19 +211,12 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     chain, others = _chain_and_others(plan)
     if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:
         raise InputError(f"no core is named for {', '.join(missing)}: name one for each node")
-    cores = list(dict.fromkeys(core_of.values()))
-    with wrong_values_refused(Plan):
-        split = [
-            Server(
-                name=f"{chain.name}_core{core}" if len(cores) > 1 else chain.name,
-                core=core,
-                priority=chain.priority,
-                slots=chain.slots,
-                threads=tuple(Thread(node=node) for node, its in core_of.items() if its == core),
-            )
-            for core in cores
-        ]
-        return revised(plan, servers=(*split, *others))
+    split = []
+    for core in dict.fromkeys(core_of.values()):
+        name = chain.name if len(set(core_of.values())) == 1 else f"{chain.name}_core{core}"
+        nodes = (node for node, its in core_of.items() if its == core)
+        split.append(server_for(nodes, name, core, chain.priority, chain.slots))
+    return revised(plan, servers=(*split, *others))
 
 
 def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | None = None) -> Plan:
@@ -233,15 +233,14 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | N
     if not start < slot_end_ns < end:
         limits = f"after {duration_text(start)} and before {duration_text(end)}"
         raise InputError(f"the first node's slot must end {limits}, where the chain's does")
-    own_core = chain.core if core is None else core
-    slots = ((start, slot_end_ns),)
-    alone = {"name": "first", "core": own_core, "slots": slots, "threads": (thread,)}
+    own_core, slots = chain.core if core is None else core, [(start, slot_end_ns)]
+    alone = server_for([node], "first", own_core, chain.priority, slots)
     rest = tuple(other for other in chain.threads if other != thread)
-    behind = {"slots": ((slot_end_ns, end),), "threads": rest}
-    split = (chain.model_copy(update=alone), chain.model_copy(update=behind))
-    return revised(plan, servers=(*split, *others))
+    behind = chain.model_copy(update={"slots": ((slot_end_ns, end),), "threads": rest})
+    return revised(plan, servers=(alone, behind, *others))
 
 
+@wrong_values_refused(Plan)
 def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[Plan]:
     """Plans whose first has a server on each core for these nodes, which are in none of the chains.
 
@@ -256,18 +255,11 @@ def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[
     worst = max(server.priority for plan in plans for server in plan.servers)
     # Threads of publishers come behind their executors where overruns may finish.
     worst += any(any(publisher_servers(plan)) for plan in plans)
-    with wrong_values_refused(Plan):
-        added = [
-            Server(
-                name=f"best_effort_core{core}",
-                core=core,
-                priority=worst + 1,
-                slots=((0, first.cycle_ns),),
-                threads=tuple(Thread(node=node) for node, its in core_of.items() if its == core),
-                best_effort=True,
-            )
-            for core in sorted(set(core_of.values()))
-        ]
+    added = []
+    for core in sorted(set(core_of.values())):
+        nodes = (node for node, its in core_of.items() if its == core)
+        own = server_for(nodes, f"best_effort_core{core}", core, worst + 1, [(0, first.cycle_ns)])
+        added.append(own.model_copy(update={"best_effort": True}))
     return [revised(first, servers=(*first.servers, *added)), *others]
 
 
@@ -314,7 +306,7 @@ def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cyc
     later_ns = min(
         later
         for later in {0, *(max(0, end - start) for (start, _), (_, end) in pairs)}
-        if not any(one[0] + later < two[1] and two[0] < one[1] + later for one, two in pairs)
+        if not any(meet((one[0] + later, one[1] + later), two) for one, two in pairs)
     )
     if (end := later_ns + max(one.slots[-1][1] for one in own)) > cycle_ns:
         raise OperationError(
@@ -324,6 +316,7 @@ def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cyc
     return later_ns
 
 
+@wrong_values_refused(Plan)
 def with_sink(
     plan: Plan,
     latencies_ns: NDArray[np.int64],
@@ -355,20 +348,17 @@ def with_sink(
     gates, wanted = publishing_servers(plan), {"slots": ((start, start + length),)}
     start += behind_others(output, [publishing.model_copy(update=wanted)], gates, plan.cycle_ns)
     # Servers that run the graph to its end stay open until the slowest sink is done.
-    running = [server for server in plan.servers if server not in gates]
+    running = running_servers(plan)
     latest = max((server.slots[-1][1] for server in running), default=done)
-    slowest = [server for server in running if server.slots[-1][1] == latest < done]
+    slowest = [server for server in running if server.slots[-1][1] == latest]
     longer = with_slots(plan.servers, {server.name: until(server, done) for server in slowest})
-    with wrong_values_refused(Plan):
-        added = () if node is None else (_node_like(node, output, publisher, receivers),)
-        thread = added[0].thread if added else Thread(node=publisher or "", role="publisher")
-        name = f"output_{thread.node.strip('/')}"
-        server = _publishing(name, publishing.core, (start, start + length), (thread,))
-        return revised(
-            plan,
-            servers=below_executors([*longer, server]),
-            further_shaping_nodes=(*plan.further_shaping_nodes, *added),
-        )
+    added = () if node is None else (_node_like(node, output, publisher, receivers),)
+    thread = added[0].thread if added else Thread(node=publisher or "", role="publisher")
+    name = f"output_{thread.node.strip('/')}"
+    server = _publishing(name, publishing.core, (start, start + length), (thread,))
+    further = (*plan.further_shaping_nodes, *added)
+    servers = below_executors([*longer, server])
+    return revised(plan, servers=servers, further_shaping_nodes=further)
 
 
 # What shaping is compared with -----------------------------------------------------------------
@@ -390,9 +380,7 @@ class CallbackTimes:
 
 
 def server_per_chain(plan: Plan) -> Plan:
-    """One server for the whole chain, nothing shaped (section 3.1; table 4 row 2): its latency is
-    what was measured.
-    """
+    """One server for the chain, nothing shaped (section 3.1; table 4 row 2): what was measured."""
     publishing, evidence = output_server(plan), plan.evidence
     longest, jitter = evidence.max_latency_ns, evidence.max_latency_ns - evidence.min_latency_ns
     return revised(
@@ -405,6 +393,7 @@ def server_per_chain(plan: Plan) -> Plan:
     )
 
 
+@wrong_values_refused(Plan)
 def server_per_callback(
     plan: Plan, callbacks: Sequence[CallbackTimes], *, margin_ns: int = 0
 ) -> Plan:
@@ -427,22 +416,26 @@ def server_per_callback(
             " (--epsilon), or move callbacks to another core"
         )
     last, (start, _) = callbacks[-1], slots[-1]
-    of_node: dict[str, list[tuple[int, Slot]]] = {}
-    for callback, slot in zip(callbacks, slots, strict=True):
-        of_node.setdefault(callback.node, []).append((callback.core, slot))
-    with wrong_values_refused(Plan):
-        return revised(
-            plan,
-            policy="server-per-callback",
-            shaping_node=None,
-            further_shaping_nodes=(),
-            servers=tuple(_server_of_node(node, own) for node, own in of_node.items()),
-            predicted=Prediction(
-                mean_ns=start + last.mean_response_ns,
-                max_ns=start + last.max_response_ns,
-                jitter_ns=last.max_response_ns - last.min_response_ns,
-            ),
-        )
+    servers = []
+    for node in dict.fromkeys(callback.node for callback in callbacks):
+        cores = {callback.core for callback in callbacks if callback.node == node}
+        if len(cores) > 1:
+            raise InputError(f"{node} runs on one core, not on {sorted(cores)}: correct it")
+        pairs = zip(callbacks, slots, strict=True)
+        own = united([slot for callback, slot in pairs if callback.node == node])
+        servers.append(server_for([node], node.strip("/"), cores.pop(), OUTPUT_PRIORITY, own))
+    return revised(
+        plan,
+        policy="server-per-callback",
+        shaping_node=None,
+        further_shaping_nodes=(),
+        servers=tuple(servers),
+        predicted=Prediction(
+            mean_ns=start + last.mean_response_ns,
+            max_ns=start + last.max_response_ns,
+            jitter_ns=last.max_response_ns - last.min_response_ns,
+        ),
+    )
 
 
 def _slots_in_sequence(callbacks: Sequence[CallbackTimes], margin_ns: int) -> list[Slot]:
@@ -462,20 +455,6 @@ def _slots_in_sequence(callbacks: Sequence[CallbackTimes], margin_ns: int) -> li
     return slots
 
 
-def _server_of_node(node: str, own: list[tuple[int, Slot]]) -> Server:
-    """A server with a node's slots, adjacent ones joined."""
-    cores = {core for core, _ in own}
-    if len(cores) > 1:
-        raise InputError(f"{node} runs on one core, not on {sorted(cores)}: correct it")
-    return Server(
-        name=node.strip("/"),
-        core=cores.pop(),
-        priority=OUTPUT_PRIORITY,
-        slots=united([slot for _, slot in own]),
-        threads=(Thread(node=node),),
-    )
-
-
 def let_per_chain(plan: Plan) -> Plan:
     """Logical execution time for the chain as one task: its output leaves in a slot at the start of
     the next cycle, so the latency is one period (section 5.3, table 5).
@@ -491,6 +470,7 @@ def let_per_chain(plan: Plan) -> Plan:
     return revised(plan, policy="let-per-chain", servers=servers, predicted=predicted)
 
 
+@wrong_values_refused(Plan)
 def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str] = ()) -> Plan:
     """Logical execution time for every callback: each one's output waits for the next cycle.
 
@@ -514,27 +494,25 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
         )
     others = [server for server in plan.servers if server is not publishing]
     chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
-    with wrong_values_refused(Plan):
-        inside: tuple[ShapingNode, ...] = ()
-        threads = [Thread(node=name, role="publisher") for name in publishers]
-        if last is not None:
-            known = zip_longest(topics[:-1], publishers[: len(topics) - 1])
-            inside = tuple(_node_like(last, topic, publisher) for topic, publisher in known)
-            threads = [node.thread for node in (*inside, last)]
-        gates = []
-        # Backwards: whatever a fast callback makes of the data of one slot, that of its own
-        # output is over.
-        for number, thread in enumerate(reversed(threads)):
-            name = f"output_{thread.node.strip('/')}" if number else "output"
-            slot = (number * length, (number + 1) * length)
-            gates.append(_publishing(name, publishing.core, slot, (thread,)))
-        return revised(
-            plan,
-            policy="let-per-callback",
-            servers=(*chain, *gates),
-            further_shaping_nodes=inside,
-            predicted=_after_periods(plan, len(threads), length),
-        )
+    inside: tuple[ShapingNode, ...] = ()
+    threads = [Thread(node=name, role="publisher") for name in publishers]
+    if last is not None:
+        known = zip_longest(topics[:-1], publishers[: len(topics) - 1])
+        inside = tuple(_node_like(last, topic, publisher) for topic, publisher in known)
+        threads = [node.thread for node in (*inside, last)]
+    gates = []
+    # Backwards: whatever a fast callback makes of the data of one slot, that of its output is over.
+    for number, thread in enumerate(reversed(threads)):
+        name = f"output_{thread.node.strip('/')}" if number else "output"
+        slot = (number * length, (number + 1) * length)
+        gates.append(_publishing(name, publishing.core, slot, (thread,)))
+    return revised(
+        plan,
+        policy="let-per-callback",
+        servers=(*chain, *gates),
+        further_shaping_nodes=inside,
+        predicted=_after_periods(plan, len(threads), length),
+    )
 
 
 def _one_slot(plan: Plan) -> tuple[Server, int]:
@@ -546,5 +524,5 @@ def _one_slot(plan: Plan) -> tuple[Server, int]:
 
 
 def _after_periods(plan: Plan, periods: int, slot_ns: int) -> Prediction:
-    latency = periods * plan.chain.period_ns + slot_ns
-    return Prediction(mean_ns=latency, max_ns=latency, jitter_ns=slot_ns, shares=(1.0,))
+    start = periods * plan.chain.period_ns
+    return in_one_slot((start, start + slot_ns))
