@@ -2,9 +2,8 @@
 
 **Shaping** (sections 3.1 and 3.2): the chain runs in a server that is open from the start of a
 cycle until every execution seen so far was complete, and its output is published in a server whose
-slot comes then: late for most cycles, but at the same time in all of them. :func:`plan_shaping`
-plans one chain; further functions take its plan and return one that covers more of a graph
-(sections 5.1 and 5.4), or of another policy (sections 2.5, 5.1 and 5.3).
+slot comes then. :func:`plan_shaping` plans one chain; further functions take its plan and return
+one that covers more of a graph (5.1 and 5.4), or of another policy (2.5, 5.1 and 5.3).
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -73,8 +72,8 @@ def plan_shaping(
     ε, L̄ + ε + Δ) (eq. 4 with a shaping node, eq. 2 with an asynchronous publisher thread), in the
     same cycle (eq. 3) and on the same core, at the better priority.
 
-    ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process) unless
-    the wishes say otherwise; Δ is 1 ms. ``nodes`` are those whose executors run the chain,
+    ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process), Δ is
+    1 ms unless the wishes say otherwise. ``nodes`` are those whose executors run the chain,
     ``fifo_priority`` and ``receivers`` for the shaping node.
     ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` and
     :class:`~chainshaper.planning.plan.Evidence`, and single
@@ -110,7 +109,7 @@ def plan_shaping(
         messages=wishes.messages,
         fallback=wishes.fallback,
         shaping_thread=wishes.shaping_thread,
-        servers=(running, _publishing("output", core, (start, end), gated)),
+        servers=(running, _publishing(gated, core, (start, end), "output")),
         shaping_node=node,
         predicted=predict_bands(latencies, [end], length, wishes.into_open_slot),
     )
@@ -124,18 +123,21 @@ def server_for(
     return Server(name=name, core=core, priority=priority, slots=tuple(slots), threads=threads)
 
 
-def _publishing(name: str, core: int, slot: Slot, threads: tuple[Thread, ...]) -> Server:
+def _publishing(thread: Thread | None, core: int, slot: Slot, name: str | None = None) -> Server:
+    """The server in whose slot a thread publishes; with bare latencies it is not known."""
+    name = name or f"output_{thread.node.strip('/') if thread else ''}"
+    threads = (thread,) if thread else ()
     return Server(name=name, core=core, priority=OUTPUT_PRIORITY, slots=(slot,), threads=threads)
 
 
 def _gate(
     chain: ChainOfPlan, wishes: Wishes, core: int, fifo_priority: int, receivers: Sequence[str]
-) -> tuple[ShapingNode | None, tuple[Thread, ...]]:
-    """The shaping node of a chain's output, if any, and the threads that publish it."""
+) -> tuple[ShapingNode | None, Thread | None]:
+    """The shaping node of a chain's output, if any, and the thread that publishes it."""
     if wishes.publication == "asynchronous" and chain.publisher is not None:
-        return None, (Thread(node=chain.publisher, role="publisher"),)
+        return None, Thread(node=chain.publisher, role="publisher")
     if chain.output is None:
-        return None, ()
+        return None, None
     if wishes.publication == "asynchronous":
         raise InputError("asynchronous publication: name the node that publishes the output")
     pause = min(PAUSE_NS, chain.period_ns // 20) if wishes.pause_ns is None else wishes.pause_ns
@@ -150,7 +152,7 @@ def _gate(
         in_process=wishes.publication == "in-process",
         delivery_ns=wishes.delivery_ns,
     )
-    return node, (node.thread,)
+    return node, node.thread
 
 
 def _names(output: str) -> dict[str, str]:
@@ -205,8 +207,7 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
     ``core_of`` names the core of every node that takes part, also on branches that the chain waits
-    for, the most urgent first: it is that whose timer begins the cycle. Raises InputError: a node
-    is missing.
+    for, the most urgent first. Raises InputError: a node is missing.
     """
     chain, others = _chain_and_others(plan)
     if missing := [thread.node for thread in chain.threads if thread.node not in core_of]:
@@ -221,10 +222,8 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
 
 def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | None = None) -> Plan:
     """The chain's first node in a server of its own, [0, ``slot_end_ns``), on a ``core`` (default:
-    the chain's), the rest behind it.
-
-    Stopped until its slot, a first callback that is no timer starts every execution at the
-    beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
+    the chain's), the rest behind it. So a first callback that is no timer starts every execution at
+    the beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
     """
     chain, others = _chain_and_others(plan)
     (start, end), thread = chain.slots[0], Thread(node=node)
@@ -273,10 +272,10 @@ def with_turns(plan: Plan, equal_priorities: EqualPriorities) -> Plan:
 
 
 def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
-    found = next((server for server in plan.servers if server.name == "chain"), None)
-    if found is None:
-        raise InputError("the plan has no server named 'chain': begin with a shaped plan")
-    return found, [server for server in plan.servers if server is not found]
+    for server in plan.servers:
+        if server.name == "chain":
+            return server, [other for other in plan.servers if other is not server]
+    raise InputError("the plan has no server named 'chain': begin with a shaped plan")
 
 
 def with_executors(
@@ -328,10 +327,9 @@ def with_sink(
     """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
 
     The sink gets a shaping node; where the plan's output is published asynchronously, the thread of
-    its ``publisher`` is gated instead. ``latencies_ns`` are those from the start of the graph to
-    this sink. Its slot starts the plan's margin after the longest, or where a publish slot that is
-    in the way on the same core ends; the chain's servers stay open as long as the slowest sink
-    needs. The prediction stays that of the first output.
+    its ``publisher`` is gated instead. ``latencies_ns`` are from the start of the graph to this
+    sink. Its slot starts the plan's margin after the longest, or where a publish slot that is in
+    the way on the same core ends; the chain's servers stay open as long as the slowest sink needs.
 
     Raises InputError: the plan shapes nothing, or this sink already. OperationError: the slot does
     not fit into the cycle.
@@ -354,8 +352,7 @@ def with_sink(
     longer = with_slots(plan.servers, {server.name: until(server, done) for server in slowest})
     added = () if node is None else (_node_like(node, output, publisher, receivers),)
     thread = added[0].thread if added else Thread(node=publisher or "", role="publisher")
-    name = f"output_{thread.node.strip('/')}"
-    server = _publishing(name, publishing.core, (start, start + length), (thread,))
+    server = _publishing(thread, publishing.core, (start, start + length))
     further = (*plan.further_shaping_nodes, *added)
     servers = below_executors([*longer, server])
     return revised(plan, servers=servers, further_shaping_nodes=further)
@@ -397,12 +394,11 @@ def server_per_chain(plan: Plan) -> Plan:
 def server_per_callback(
     plan: Plan, callbacks: Sequence[CallbackTimes], *, margin_ns: int = 0
 ) -> Plan:
-    """Time-triggered scheduling: each callback runs in a slot of its own, as long as its longest.
+    """Time-triggered scheduling: each callback runs in a slot of its own (table 4 row 1).
 
-    A slot starts when the slots of all callbacks that this one waits for have ended (table 4 row
-    1), and the slot before it on its core. It is the longest response time plus ``margin_ns`` long,
-    rounded up to whole milliseconds. Callbacks of one node share a server with several slots.
-    Each of ``callbacks`` comes after those it waits for; the chain's last stands last.
+    It starts when the slots of all callbacks that this one waits for have ended, and the slot
+    before it on its core, and lasts for the longest response time plus ``margin_ns``, rounded up to
+    whole milliseconds. Each of ``callbacks`` comes after those it waits for, the chain's last last.
 
     Raises InputError: no callbacks, or one that waits for itself or a later one. OperationError:
     the slots do not fit into the cycle.
@@ -503,9 +499,8 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     gates = []
     # Backwards: whatever a fast callback makes of the data of one slot, that of its output is over.
     for number, thread in enumerate(reversed(threads)):
-        name = f"output_{thread.node.strip('/')}" if number else "output"
         slot = (number * length, (number + 1) * length)
-        gates.append(_publishing(name, publishing.core, slot, (thread,)))
+        gates.append(_publishing(thread, publishing.core, slot, None if number else "output"))
     return revised(
         plan,
         policy="let-per-callback",
