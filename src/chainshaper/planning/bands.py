@@ -12,13 +12,13 @@ of n latencies ≤ x_j, the least cost of the m bands behind one that ends at x_
 
     B_m(i) = min over j of (c_j − c_i)·x_j + B_{m−1}(j),    B_1(i) = (n − c_i)·x_ν.
 
-**Why this is exact, also under tight constraints.** For row i, column j costs the value at c_i of a
-line with intercept c_j·x_j + B_{m−1}(j) and slope −x_j. Every constraint (Δ, LV, the cap on a
-band's share) says that j lies in a window whose ends ascend with i, and so do the c_i. The kernel
-keeps the lower envelope of the lines, in an order of rows in which windows only grow, so that it
-loses no line that a later row needs. Each layer is linear in the number of grid points.
+**Why this is exact.** For row i, column j costs the value at c_i of a line with intercept
+c_j·x_j + B_{m−1}(j) and slope −x_j. Every constraint (Δ, LV, the cap on a band's share) says that j
+lies in a window whose ends ascend with i, and so do the c_i. The kernel keeps the lower envelope of
+the lines, in an order of rows in which windows only grow, so that it loses no line that a later row
+needs. Each layer is linear in the number of grid points.
 
-Placement by particle swarm and at random (section 5.1.5, tables 3 and 4) are for comparison.
+Particle swarm and chance (section 5.1.5, tables 3 and 4) are for comparison.
 """
 
 import os
@@ -87,10 +87,8 @@ def predict_bands(
 
 def _refuse_before_longest(latest_ns: int, longest_ns: int) -> None:
     if latest_ns < longest_ns:
-        raise InputError(
-            f"the last slot takes outputs until {duration_text(latest_ns)}, before the longest"
-            f" latency {duration_text(longest_ns)}: move it behind"
-        )
+        reason = f"the last slot takes outputs until {duration_text(latest_ns)}, before the longest"
+        raise InputError(f"{reason} latency {duration_text(longest_ns)}: move it behind")
 
 
 @dataclass(frozen=True)
@@ -118,10 +116,10 @@ class BandProblem:
             raise InputError("the publish slot and the grid must be longer than 0 ms")
         _refuse_before_longest(self.last_end_ns - self.at_start_ns, int(latencies[-1]))
         if gap is not None and gap <= slot:
-            raise InputError(
-                f"a largest gap of {duration_text(gap)} is not longer than the publish slot"
-                f" {duration_text(slot)}, so no two slots could follow each other: allow more"
+            reason = (
+                f"no two slots could follow each other: the largest gap {duration_text(gap)} is"
             )
+            raise InputError(f"{reason} not longer than the publish slot {duration_text(slot)}")
         if share is not None and not 0 < share <= 1:
             raise InputError(f"the largest share per band must be above 0, at most 1: not {share}")
         if latencies.size * self.last_end_ns >= 2**62:
@@ -187,9 +185,8 @@ def with_bands(
     """A shaped plan with ``bands`` publish slots of the plan's length (Δ); the last one stays.
 
     ``most_ns`` are the latencies where others delay all executions, behind which the average is
-    not. ``auto`` takes as many as each lower the average by ``least_gain`` of it at least. For
-    ``minimise`` and ``mean_at_most_ns`` see :func:`place_bands`; ``limits`` are ``grid_ns``,
-    ``max_gap_ns`` and ``max_share`` of :class:`BandProblem`.
+    not. For ``auto`` see :func:`choose_bands`, for ``minimise`` and ``mean_at_most_ns``
+    :func:`place_bands`; ``limits`` are those of :class:`BandProblem`.
 
     Raises OperationError: no such placement exists; the message names the binding constraint.
     """
@@ -462,10 +459,9 @@ def _broken(
 
 
 def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
-    """Place bands with PySwarms and the paper's parameters; the same ``seed``, the same result.
-
-    Particles are the ends of all slots but the last. One that breaks a constraint costs more than
-    any that does not, in proportion to how far it is off: where the swarm ends at one, this raises.
+    """Place bands with PySwarms and the paper's parameters. Particles are the ends of all slots but
+    the last; one that breaks a constraint costs more, the further it is off, than any that does
+    not.
     """
     _refuse_more_than_fit(problem, bands)
     last, slot, grid = problem.last_end_ns, problem.publish_slot_ns, problem.grid_ns
@@ -525,8 +521,8 @@ def _checked(problem: BandProblem, ends: list[int], what: str) -> Placement:
 
 @contextmanager
 def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
-    """PySwarms draws from NumPy's global generator, whose state comes back, and sets up logging
-    into the current folder: a configuration that changes nothing makes it write no files.
+    """PySwarms draws from NumPy's global generator, whose state comes back, and logs into the
+    current folder, unless a configuration says otherwise.
     """
     state, configured = np.random.get_state(), os.environ.get("LOG_CFG")
     with tempfile.NamedTemporaryFile("w", suffix=".yaml") as configuration:

@@ -1,10 +1,9 @@
 """Which core runs which executor: found from what overlaps in time.
 
-The paper takes the assignment as given (sections 5.1 and 5.4). Executors gain from a core of their
-own where branches of a graph run at the same time, or slots of different chains would collide.
-
-An assignment is judged by playing out one cycle of each graph: of the callbacks for which all is
-done that they wait for, the most urgent executor's runs on each core, in the order of
+The paper takes the assignment as given (sections 5.1 and 5.4). Executors gain from cores of their
+own where branches run at the same time, or slots of different chains would collide. An assignment
+is judged by playing out one cycle of each graph: of the callbacks for which all is done that they
+wait for, the most urgent executor's runs on each core, in the order of
 :mod:`chainshaper.enforcement.threads`: chains first, then the branches that they wait for. What
 counts, in this order:
 
@@ -75,8 +74,8 @@ def assign_cores(
 
 
 def _graphs(profiles: Sequence[Profile], executor_of: dict[str, int]) -> list[_Graph]:
-    """The graphs of all chains: those that begin together are one, whose callbacks are the same as
-    far as they wait for the same.
+    """The graphs of all chains: those that begin together are one; callbacks of one node that wait
+    for the same are the same.
     """
     graphs: dict[Hashable, _Graph] = {}
     known: dict[Hashable, int] = {}

@@ -3,8 +3,7 @@
 **By default** (:func:`covered_latency`) so far that a stated share of *all* cycles is in time, also
 of those that the machine disturbed: an actuator does not care who caused a delay. How many of n
 measured cycles may lie beyond follows from the binomial distribution alone (Wilks, Annals of
-Mathematical Statistics 12, 1941): nothing is assumed but that the cycles to come are like those
-measured. The longest of 299 latencies covers 99 % with 95 % confidence.
+Mathematical Statistics 12, 1941), if the cycles to come are like those measured.
 
 **Beyond the sample** (:func:`derive_margin`) the excesses of latencies over a high threshold u
 follow, in the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan). With ζ the share
@@ -44,8 +43,8 @@ EPSILON_NS = 1_000_000  # a margin's beyond latencies: the way to the shaping no
 HOP_NS = 200_000  # so long that way takes: measured 0.07 to 0.2 ms; a gate in the process has none
 OVERRUN_PROBABILITY = 0.01  # the share of all cycles that may be late by default, at most
 
-# A tail is the n^(2/3) longest of n latencies, or these parts of it: the more there are, the
-# further out it begins. A fixed share would leave large samples with a systematic error.
+# A tail is the n^(2/3) longest of n latencies, or these parts of it. A fixed share would leave
+# large samples with a systematic error.
 TAILS = (1.0, 0.85, 0.7, 0.6, 0.5)
 FEWEST_EXCESSES, MOST_EXCESSES = 50, 2_000
 MOST_PROBABLE = 0.001
@@ -219,10 +218,8 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
         raise InputError(f"overrun probability {probability}: {reason}")
     fewest = round(FEWEST_EXCESSES**1.5)
     if latencies.size <= fewest:
-        raise OperationError(
-            f"{latencies.size} latencies are too few to say anything about rarer ones: measure"
-            f" more than {fewest} cycles, or give the margin yourself"
-        )
+        reason = f"{latencies.size} latencies are too few to say anything about rarer ones: measure"
+        raise OperationError(f"{reason} more than {fewest} cycles, or give the margin yourself")
     _refuse_not_stationary(latencies)
     ordered = np.sort(latencies)
     longest = min(ordered.size ** (2 / 3), MOST_EXCESSES)
@@ -248,11 +245,9 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
                 f" {probability:g}: its latency lies between {duration_text(low)} and"
                 f" {duration_text(high)}. Measure more cycles, or ask for less"
             )
-    raise OperationError(
-        "the longest latencies do not follow a generalised Pareto distribution above any of"
-        f" {len(thresholds)} thresholds (best p-value {best:.3f}): look for two modes of the"
-        " application in one recording, or give the margin yourself"
-    )
+    reason = "the longest latencies do not follow a generalised Pareto distribution above any of"
+    remedy = "look for two modes of the application in one recording, or give the margin"
+    raise OperationError(f"{reason} {len(thresholds)} thresholds (best p {best:.3f}): {remedy}")
 
 
 def _fit_above(
@@ -327,11 +322,9 @@ def _refuse_not_stationary(latencies: _Latencies) -> None:
     halves = stats.ks_2samp(latencies[:half], latencies[half:], method="asymp").pvalue
     trend = stats.kendalltau(np.arange(latencies.size), latencies).pvalue
     if min(halves, trend) < SIGNIFICANCE / 2:
-        raise OperationError(
-            f"the latencies are not stationary (two halves alike: p = {halves:.2g}; no trend:"
-            f" p = {trend:.2g}): measure after start-up, in one operating mode and the order of"
-            " time, or give the margin yourself"
-        )
+        reason = f"not stationary (two halves alike: p = {halves:.2g}; no trend: p = {trend:.2g})"
+        remedy = "measure after start-up, in one mode and the order of time, or give the margin"
+        raise OperationError(f"the latencies are {reason}: {remedy} yourself")
 
 
 def _refuse_clusters(latencies: _Latencies, threshold: int) -> None:
@@ -342,10 +335,9 @@ def _refuse_clusters(latencies: _Latencies, threshold: int) -> None:
     share = float(above.mean())
     chance = stats.binomtest(followed, long, share, alternative="greater").pvalue
     if chance < SIGNIFICANCE:
-        raise OperationError(
-            f"long latencies come in clusters ({followed} of {long} are followed by another,"
-            f" p = {chance:.2g}), as when one delays the next: remove the cause, or give the margin"
-        )
+        reason = f"({followed} of {long} are followed by another, p = {chance:.2g})"
+        remedy = "as when one delays the next: remove the cause, or give the margin"
+        raise OperationError(f"long latencies come in clusters {reason}, {remedy}")
 
 
 # On line ------------------------------------------------------------------------------------------
@@ -365,11 +357,11 @@ class Tail:
       forgotten; the tail is taken to have grown as much as the median.
     * Every now and then the window is looked at. If its latest cycles lie elsewhere than those
       before, it begins with them. A **drift**, where thirds of it lie apart, is taken out. Then the
-      share that is late by now is compared with the promise; where one so small begins that the
-      window has hardly any beyond, the generalised Pareto distribution says.
+      share that is late is compared with the promise; of a share that the window has hardly any
+      beyond, the generalised Pareto distribution says.
     * Slots move earlier when far fewer than promised are late, or latencies fall, and that has been
       worth it for :attr:`.Adaptation.after` cycles on end; for twice as many, each time that this
-      was wrong and nothing has changed since: on stationary input moves get rarer and rarer.
+      was wrong and nothing has changed since.
     """
 
     rules: Adaptation
@@ -498,9 +490,7 @@ def _by_chance(trials: int, probability: float, doubt: float) -> int:
 
 def _without_drift(latencies: _Floats) -> tuple[_Floats, float]:
     """Latencies in their order as they would be now, and by how much they rise from their first
-    third to the last; 0, where these do not show a trend.
-
-    Medians of thirds are apart where they differ by four standard errors.
+    third to the last; 0, where the medians differ by less than four standard errors.
     """
     third, size = latencies.size // 3, latencies.size
     first, middle, last = latencies[:third], latencies[third : size - third], latencies[-third:]

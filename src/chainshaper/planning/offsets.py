@@ -1,12 +1,9 @@
 """Several chains on shared cores: when each one's cycles start, so that no slots collide.
 
-Chains are moved against each other until every two slots of one core and one priority are disjoint
-in all cycles of their hyper-period. The paper leaves this open (section 3.1).
-
-Two slots [a, a + d) and [b, b + e) that repeat every T and U collide in some cycle unless the
-distance of their starts, modulo g = gcd(T, U), is in [d, g − e]: the distances that occur are all
-numbers congruent to it. So each pair of chains allows a set of differences of offsets modulo g, and
-nothing else matters.
+The paper leaves this open (section 3.1). Two slots [a, a + d) and [b, b + e) that repeat every T
+and U collide in some cycle unless the distance of their starts, modulo g = gcd(T, U), is in [d, g −
+e]: the distances that occur are all numbers congruent to it. So each pair of chains allows a set of
+differences of offsets modulo g, and nothing else matters.
 
 **Few chains are searched exhaustively.** From any solution, take the chains that are not linked to
 the first by a chain of tight pairs (pairs whose difference is at an end of an allowed interval),
@@ -86,8 +83,7 @@ def place_chains(
     The chains take turns where they can (:func:`with_offsets`). Where they cannot, ``at_once``
     plans them again, with the latencies that they have when they run at the same time: the chain
     with the shorter period at the better priority, and only their publish slots stay apart. None
-    begins while a better one runs, where there are such offsets, for slots count from when a chain
-    really begins; and each has its core for as long as there can be.
+    begins while a better one runs, where that can be, for slots count from when a chain begins.
 
     Raises: as :func:`with_offsets`; OperationError also where chains that cannot take turns may not
     run at the same time, or nothing says how long they delay each other then.
@@ -136,10 +132,10 @@ def _refuse_too_full(plans: Sequence[Plan]) -> None:
             shares.setdefault(cores.pop(), {})[chain_name(plan)] = share
     for core, of in sorted(shares.items()):
         if len(of) > 1 and (load := sum(of.values())) > 1 + 1e-9:
-            raise OperationError(
-                f"with their margins, {', '.join(of)} fill {load:.1%} of the time of core {core}."
-                " What helps: another core for one of them, longer periods, or smaller margins"
+            reason = (
+                f"with their margins, {', '.join(of)} fill {load:.1%} of the time of core {core}"
             )
+            raise OperationError(f"{reason}: another core, longer periods, or smaller margins help")
 
 
 def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
@@ -191,10 +187,9 @@ def with_offsets(
     """The plans of several chains with offsets that keep their slots apart.
 
     ``together`` are groups of chains (places in ``plans``) that begin at the same callback: they
-    share servers and have one offset (default: none do). The first group, and any that shares no
-    core with another, has the offset 0, unless groups have ``windows``: from when and until when
-    cycles may begin. For the share ``alone`` of its slot no chain that begins has its core taken by
-    one of a better priority.
+    have one offset (default: none do). The first group, and any that shares no core with another,
+    has the offset 0, unless groups have ``windows``: from when and until when cycles may begin. For
+    the share ``alone`` of its slot no chain that begins loses its core to one of a better priority.
 
     Raises InputError: plans that govern the same output. OperationError: there are no such offsets,
     or the time was up before an answer. PlatformError: many chains collide and OR-tools is missing.
@@ -267,10 +262,9 @@ def _find_offsets(
             if solution is None:
                 solution = puzzle.solved(group, max(0.0, deadline - time.monotonic()))
         if solution is None:
-            raise OperationError(
-                f"there are no offsets at which {', '.join(tables[k].name for k in group)} keep"
-                f" their slots apart, although any two of them could: {_fullest(tables, group)}"
-            )
+            names = ", ".join(tables[k].name for k in group)
+            reason = f"no offsets at which {names} keep their slots apart, although any two"
+            raise OperationError(f"there are {reason} of them could: {_fullest(tables, group)}")
         zero = solution.get(clock, 0)
         offsets.update((k, (at - zero) % tables[k].cycle_ns) for k, at in solution.items())
     return offsets
@@ -342,9 +336,8 @@ class _Puzzle:
     def fitted(self, group: list[int], deadline: float) -> dict[int, int] | None:
         """Chains fitted in one after the other; None says nothing.
 
-        A chain that fits nowhere pushes out what weighs least, to wait for its turn again, and
-        weighs more from then on: so the hard ones come to stay (guided ejection: Nagata and Bräysy,
-        Operations Research Letters 37, 2009).
+        A chain that fits nowhere pushes out what weighs least, and weighs more from then on
+        (guided ejection: Nagata and Bräysy, Operations Research Letters 37, 2009).
         """
         tables = self.tables
         busy = [sum(b - a for slots in one.slots.values() for a, b in slots) for one in tables]
@@ -409,11 +402,9 @@ class _Puzzle:
             return None
         if status in (cp_model.OPTIMAL, cp_model.FEASIBLE):
             return {k: int(solver.value(offset)) for k, offset in offsets.items()}
-        raise OperationError(
-            f"undecided: no offsets for {len(group)} chains were found in time, nor a proof that"
-            f" there are none: {_fullest(self.tables, group)}. Put fewer chains on it, or allow"
-            " more time"
-        )
+        reason = f"undecided: no offsets for {len(group)} chains were found in time, nor a proof"
+        remedy = f"{_fullest(self.tables, group)}. Put fewer chains on it, or allow more time"
+        raise OperationError(f"{reason} that there are none: {remedy}")
 
 
 def _loads(tables: Sequence[Timetable]) -> dict[tuple[int, int], float]:

@@ -256,15 +256,13 @@ def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) ->
         gated = f"{node} is to publish {topic}, but {node} does not publish it"
         raise InputError(f"{gated}: plan again from a recording of this application")
     if writer.asynchronous is False:
+        reason = f"{node} publishes {topic} synchronously, so gating its thread would hold nothing"
         raise InputError(
-            f"{node} publishes {topic} synchronously, so gating its thread would hold nothing:"
-            " publish it asynchronously, or plan with --publication synchronous"
+            f"{reason}: publish asynchronously, or plan with --publication synchronous"
         )
     if writer.depth is not None and writer.depth < waiting:
-        raise InputError(
-            f"{topic} has a history of {writer.depth}, but {waiting} messages come while the"
-            f" publisher thread of {node} may not run: give it a depth of {waiting + 1}"
-        )
+        reason = f"{topic} has a history of {writer.depth}, but {waiting} messages come while the"
+        raise InputError(f"{reason} thread of {node} may not run: give it a depth of {waiting + 1}")
 
 
 def publication_warnings(plan: Plan) -> list[str]:
@@ -325,10 +323,8 @@ def _about_stages(plan: Plan) -> Iterator[str]:
     for one, two in combinations(stages, 2):
         both = product(one.slots, two.slots) if one.core == two.core else ()
         if any(meet(*pair) for pair in both):
-            yield (
-                f"{one.name} and {two.name} have core {one.core} at the same time: right only where"
-                " their callbacks wait rather than compute."
-            )
+            said = f"{one.name} and {two.name} have core {one.core} at the same time"
+            yield f"{said}: right only where their callbacks wait rather than compute."
 
 
 def _leaves_at(plan: Plan) -> int:
@@ -344,10 +340,8 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     evidence, margin, shares = plan.evidence, plan.margin, plan.predicted.shares
     idle = [str(number) for number, share in enumerate(shares, start=1) if share < IDLE_BAND]
     if idle and len(shares) > 1 and plan.modes is None:
-        yield (
-            f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(idle)} of"
-            f" {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
-        )
+        said = f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(idle)} of"
+        yield f"{said} {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
     cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
     if evidence.all_disturbed:
         cycles = max(evidence.samples, evidence.disturbed)
@@ -355,17 +349,13 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     fewest = min([cycles, *apart])
     if fewest < needed:
         of = " of a mode" if fewest < cycles else ""
-        yield (
-            f"the sample is small: {fewest} cycles{of} are too few to say how late one output in a"
-            f" hundred will be. Record {needed} cycles{of} or more."
-        )
+        said = f"the sample is small: {fewest} cycles{of} are too few to say how late one output in"
+        yield f"{said} a hundred will be. Record {needed} cycles{of} or more."
     stall = evidence.longest_stall_ns
     what = "" if stall is None else f", longest stall {milliseconds(stall)} ms"
     if evidence.all_disturbed:
-        yield (
-            f"the machine disturbed every cycle, but one at most{what}: its stalls are in the plan."
-            " Record again on a calmer machine."
-        )
+        said = f"the machine disturbed every cycle, but one at most{what}"
+        yield f"{said}: its stalls are in the plan. Record again on a calmer machine."
     elif evidence.disturbed:
         yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."
     if margin.stalls_ns:
@@ -394,42 +384,32 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
     longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
     last = max((end for _, end in publish_slots(plan)), default=longest)
     if evidence.realtime is False:
-        yield (
-            "the latencies were taken without real-time scheduling: other programs are in them."
-            " Record again with the privilege to use SCHED_FIFO."
-        )
+        said = "the latencies were taken without real-time scheduling: other programs are in them."
+        yield f"{said} Record again with the privilege to use SCHED_FIFO."
     if evidence.lost_events:
-        yield (
-            f"{evidence.lost_events} events were lost while recording, maybe the longest latency's:"
-            " record again, see the recording's notes."
-        )
+        said = f"{evidence.lost_events} events were lost while recording, maybe the longest"
+        yield f"{said} latency's: record again, see the recording's notes."
     if evidence.interference_ns:
         delay = milliseconds(evidence.interference_ns)
         yield f"{delay} ms of the slot are for other chains, which may have the core first."
     if evidence.incomplete:
-        yield (
-            f"{evidence.incomplete} executions of the chain have no end in the recording; their"
-            " latencies, which may be the longest, are not in the plan."
-        )
+        said = f"{evidence.incomplete} executions of the chain have no end in the recording; their"
+        yield f"{said} latencies, which may be the longest, are not in the plan."
     if margin.confidence_interval_ns:
         low, high = map(duration_text, margin.confidence_interval_ns)
         epsilon = duration_text(margin.epsilon_ns)
         yield f"the margin {epsilon} is an estimate, 95 % confidence between {low} and {high}."
     if NEARLY_FULL * cycle < last <= cycle:
-        yield (
-            f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}: an execution"
-            " a little longer than any measured delays the next one."
-        )
+        said = f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}"
+        yield f"{said}: an execution a little longer than any measured delays the next one."
     if longest >= cycle and plan.policy != "pipelined":
         yield (
             f"the longest latency {duration_text(longest)} is not shorter than the cycle"
             f" {duration_text(cycle)}: executions delayed each other while they were measured."
         )
     if NEARLY_FULL * cycle < longest < cycle:
-        yield (
-            f"the longest execution takes more than {NEARLY_FULL:.0%} of a cycle, where the kernel"
-            " throttles real-time threads (/proc/sys/kernel/sched_rt_runtime_us)."
-        )
+        said = f"the longest execution takes more than {NEARLY_FULL:.0%} of a cycle, where the"
+        yield f"{said} kernel throttles real-time threads (/proc/sys/kernel/sched_rt_runtime_us)."
     if used > NEARLY_FULL:
         yield f"the chain takes {used:.1%} of its core: latencies will pile up, whatever the slots."
 

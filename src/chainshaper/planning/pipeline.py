@@ -20,9 +20,9 @@ the fewest cores. Once cut, cores and turns are chosen, the starts obey differen
 (s_b ≥ s_a + constant), whose least solution is a longest path. What is chosen is searched in depth,
 bounded by the shortest cut of the rest. After :data:`MOST_STEPS` the best so far has to do.
 
-**Slots that open early.** The longest of all stages never come in one instance. So slots open in
-the end as soon as the first data may come, unless another stage has the core then, or a slot would
-be longer than a cycle. With a core for each stage, all is over by the chain's own L̄ + ε.
+**Slots that open early.** The longest of all stages never come in one instance. So slots open as
+soon as the first data may come, unless another stage has the core then, or a slot would be longer
+than a cycle. With a core for each stage, all is over by the chain's own L̄ + ε.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -136,7 +136,7 @@ def _turns(
     """In which turns the last stage may follow those before it on its core.
 
     With K turns in between, s_a + W_a + ε + K·CT ≤ s_b and s_b + W_b + ε ≤ s_a + (K + 1)·CT. No
-    stage waits for a cycle or more in the shortest cut: it could begin a cycle earlier.
+    stage of the shortest cut waits for a cycle or more.
     """
     lengths = [longest[first][end] for first, end, _ in pieces]
     last = len(pieces) - 1
@@ -250,10 +250,8 @@ def pipelined(
 def stage_places(
     nodes: Sequence[str], steps_ns: NDArray[np.int64], cycle_ns: int, cores: int
 ) -> dict[str, int]:
-    """On which of so many cores to measure nodes, so that instances do not pile up.
-
-    On that of their stage, by the medians, without a margin. Where no cut fits, the fullest stage
-    has as little to do as can be.
+    """On which of so many cores to measure nodes: on that of their stage, by the medians, without a
+    margin. Where no cut fits, the fullest stage has as little to do as can be.
     """
     usual, cuts = _longest(np.median(steps_ns, axis=0, keepdims=True)), _cuts(nodes)
     cycles = (cycle_ns * tenths // 10 for tenths in count(10))

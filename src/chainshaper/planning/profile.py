@@ -208,9 +208,8 @@ def interfering_callback(profile: Profile) -> str | None:
 
 
 def deciding_cycles(profile: Profile) -> str | None:
-    """Which few cycles decide the longest latency, the likely cause, and what leaves them out.
-
-    They are 1 % of all at most, and :data:`APART` times as long as the next longest.
+    """Which few cycles, 1 % at most and :data:`APART` times as long as the next longest, decide the
+    longest latency, the likely cause, and what leaves them out.
     """
     latencies, starts = profile.latencies_ns, profile.starts
     order = np.argsort(latencies, kind="stable")[::-1]

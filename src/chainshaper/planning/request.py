@@ -1,9 +1,8 @@
 """From what was measured of a chain, and what is wished, to its plan of any policy.
 
-Further outputs of a chain's graph can be planned with it (``sinks``); several chains, of equal
-standing, are planned by :mod:`chainshaper.planning.several_chains`. A plan is made from latencies
+Further outputs of a chain's graph can be planned with it (``sinks``). A plan is made from latencies
 that were measured while nothing was shaped: shaping a topic that another chain's output waits for
-makes that one later than was measured, and its slot too early. Such chains are refused.
+makes that one later than was measured. Such chains are refused.
 """
 
 from collections import Counter
@@ -116,10 +115,9 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         margin = _margin(profile, request)
     longest, period = profile.longest_ns, profile.period_ns
     if request.policy == "let-per-chain" and longest >= period:
-        raise OperationError(
-            f"LET per chain has to be done in the period {duration_text(period)}, and the longest"
-            f" latency is {duration_text(longest)}: plan LET per callback, or a longer period"
-        )
+        reason = f"LET per chain has to be done in the period {duration_text(period)}, and the"
+        reason += f" longest latency is {duration_text(longest)}"
+        raise OperationError(f"{reason}: plan LET per callback, or a longer period")
     measured = profile
     if request.policy in OWN_SLOTS:  # shaping, only the start of the plan, must fit into a cycle
         length = _slot_ns(profile, request)
@@ -178,9 +176,7 @@ def best_effort_cores(
     request: PlanRequest,
     core_of: Mapping[str, int] = MappingProxyType({}),
 ) -> dict[str, int]:
-    """The core of each node that is best effort: its own, if it has one, or the first chain's, by
-    ``core_of`` where that is to be moved.
-    """
+    """The core of each node that is best effort: its own, or the first chain's, by ``core_of``."""
     if not request.best_effort:
         return {}
     cores = {node: core for one in profiles for node, core in one.cores.items()}
@@ -543,16 +539,13 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
         delayed = shaped.topics if policy == "let-per-callback" else shaped.topics[-1:]
         on_the_way = sorted(waiting.upstream.intersection(delayed))
         if on_the_way and policy not in UNSHAPED:
-            raise InputError(
-                f"{waiting.name} waits for {', '.join(on_the_way)}, which the plan for"
-                f" {shaped.name} publishes later than it was measured: plan one of the two alone"
-            )
+            reason = f"{waiting.name} waits for {', '.join(on_the_way)}, which the plan for"
+            reason += f" {shaped.name} publishes later than it was measured"
+            raise InputError(f"{reason}: plan one of the two alone")
     for one, two in combinations(profiles, 2):
         if sinks and one.period_ns != two.period_ns:
-            raise InputError(
-                f"{two.name} has the period {duration_text(two.period_ns)}, {one.name}"
-                f" {duration_text(one.period_ns)}: plan one of the two alone"
-            )
+            reason = f"{two.name} has the period {duration_text(two.period_ns)}, {one.name}"
+            raise InputError(f"{reason} {duration_text(one.period_ns)}: plan one of the two alone")
         if one.begins is None or two.begins is None or one.begins == two.begins:
             continue
         begin = (

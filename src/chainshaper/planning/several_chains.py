@@ -66,9 +66,8 @@ def plan_application(
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
             raise
-        raise OperationError(
-            f"{str(error).rstrip('.')}. It fits with {', or with '.join(fits)}"
-        ) from error
+        reason = str(error).rstrip(".")
+        raise OperationError(f"{reason}. It fits with {', or with '.join(fits)}") from error
 
 
 def with_own_names(plans: Sequence[Plan], together: Sequence[Sequence[int]] = ()) -> list[Plan]:

@@ -484,10 +484,8 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
             " publication, its nodes, the one that publishes its output last"
         )
     if length * len(given) > plan.cycle_ns:
-        raise OperationError(
-            f"{len(given)} publish slots of {duration_text(length)} do not fit into the cycle"
-            f" {duration_text(plan.cycle_ns)}: use shorter slots"
-        )
+        reason = f"{len(given)} publish slots of {duration_text(length)} do not fit into the cycle"
+        raise OperationError(f"{reason} {duration_text(plan.cycle_ns)}: use shorter slots")
     others = [server for server in plan.servers if server is not publishing]
     chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
     inside: tuple[ShapingNode, ...] = ()
