@@ -3,12 +3,14 @@
 import json
 import time
 from collections.abc import Callable
-from itertools import pairwise
+from functools import partial
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bare_plans import MS, slots_ms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from known import known
@@ -37,7 +39,6 @@ from chainshaper.splicing import shaped_outputs
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 from chainshaper.values.errors import InputError, OperationError
 
-MS = 1_000_000
 RULES = Adaptation()
 SHAPES: dict[str, Callable[[Any, int], Any]] = {
     "normal": lambda random, n: 50 * MS * (1 + 0.04 * random.standard_normal(n)),
@@ -140,22 +141,24 @@ def test_a_drift_is_followed_in_steps_of_one_direction(direction: int) -> None:
     assert 5 <= len(moves) <= 25
 
 
+def chain_of_11_ms() -> tuple[Any, float]:
+    latencies = np.random.default_rng(2).normal(11 * MS, 0.3 * MS, 9_000)
+    return latencies, float(np.quantile(latencies, 0.99))
+
+
 def test_outputs_that_wait_for_the_one_before_are_no_step() -> None:
     """A standstill of 60 ms, of a chain of 11 ms every 20: each is 9 ms less late than the last."""
-    latencies = np.random.default_rng(2).normal(11 * MS, 0.3 * MS, 9_000)
-    start = float(np.quantile(latencies, 0.99))
+    latencies, start = chain_of_11_ms()
     latencies[5_000:5_007] = np.arange(71, 8, -9) * MS
     ((at, to),) = follow(latencies, start)[:1]
-    assert 5_000 < at < 5_007, "taken for a step"
-    assert to > 1.5 * start
+    assert (5_000 < at < 5_007, to > 1.5 * start) == (True, True), "taken for a step"
     assert follow(latencies, start, cycle_ns=20 * MS) == []
 
 
 @pytest.mark.parametrize("grown", [1.3, 2.5])
 def test_a_step_is_one_also_where_outputs_wait(grown: float) -> None:
     """Even beyond the cycle, where every output is behind one that took longer."""
-    latencies = np.random.default_rng(3).normal(11 * MS, 0.3 * MS, 9_000)
-    start = float(np.quantile(latencies, 0.99))
+    latencies, start = chain_of_11_ms()
     latencies[6_000:] *= grown
     (at, to), *_ = follow(latencies, start, cycle_ns=20 * MS)
     assert 6_000 < at < 6_000 + 2 * RULES.window // 8
@@ -184,43 +187,36 @@ def test_the_chains_slot_and_the_outputs_move_together() -> None:
     assert (first, last) == ((9 * MS, 10 * MS), (19 * MS, 20 * MS))
 
 
-def beside_another(place: int, slot: tuple[int, int]) -> ApplicationPlan:
-    """The small chain, and one whose only server has a slot, like its own at a place."""
+def other_chain(
+    servers: dict[int, dict[str, Any]], output: str | None = None, **changes: Any
+) -> ApplicationPlan:
+    """The small chain, and one like it, but for these changes of the servers that it has."""
     one, other = small(), small().model_copy(deep=True)
-    alike = {"name": "other", "slots": (slot,), "threads": ()}
-    server = other.servers[place].model_copy(update=alike)
-    bare = other.chain.model_copy(update={"spec": "/b..", "output": None, "publisher": None})
-    return combined([one, revised(other, chain=bare, servers=(server,), shaping_node=None)])
+    own = tuple(other.servers[place].model_copy(update=new) for place, new in servers.items())
+    gate = None
+    if output is not None:
+        names = {"name": "other_gate", "input": f"{output}_tmp", "output": output}
+        gate = known(other.shaping_node).model_copy(update=names)
+    spec = {"spec": "/b..", "output": output, "publisher": output}
+    chain = other.chain.model_copy(update=spec)
+    return combined([one, revised(other, chain=chain, servers=own, shaping_node=gate, **changes)])
 
 
-def test_slots_do_not_move_into_another_chains() -> None:
-    """One whose chain has [30 ms, 40 ms) of the same core and priority."""
-    both = beside_another(0, (30 * MS, 40 * MS))
+def test_slots_do_not_move_into_another_chains_nor_jump_over_them() -> None:
+    """One whose chain has [30 ms, 40 ms), or an output of 1 ms [30 ms, 31 ms): 9 or 8 ms."""
+    both = other_chain({0: {"name": "other", "slots": ((30 * MS, 40 * MS),), "threads": ()}})
     assert reach(both, 0)[1] == 9 * MS
     with pytest.raises(InputError, match=r"meets \[0 ms, 30\.001 ms\)"):
         with_slots_moved(both, {0: 9_001_000})
-
-
-def test_slots_do_not_jump_over_another_chains() -> None:
-    """By hand: an output of 1 ms at [21 ms, 22 ms), and another's at [30 ms, 31 ms): 8 ms."""
-    both = beside_another(1, (30 * MS, 31 * MS))
+    both = other_chain({1: {"name": "other", "slots": ((30 * MS, 31 * MS),), "threads": ()}})
     assert reach(both, 0)[1] == 8 * MS
     with_slots_moved(both, {0: 10 * MS})
 
 
 def test_of_chains_that_share_a_server_one_follows() -> None:
     """Each would move what the other has moved."""
-    one, other = small(), small().model_copy(deep=True)
-    chain, output = other.servers
-    thread = Thread(node="/other_gate")
-    output = output.model_copy(update={"name": "out", "priority": 9, "threads": (thread,)})
-    assert other.shaping_node is not None
-    gate = other.shaping_node.model_copy(
-        update={"name": "other_gate", "input": "/b_tmp", "output": "/b"}
-    )
-    spec = other.chain.model_copy(update={"spec": "/b..", "output": "/b", "publisher": "/b"})
-    other = revised(other, chain=spec, servers=(chain, output), shaping_node=gate)
-    _, reaches_ns, (why,) = followed_chains(combined([one, other]), "freezer")
+    gate = {"name": "out", "priority": 9, "threads": (Thread(node="/other_gate"),)}
+    _, reaches_ns, (why,) = followed_chains(other_chain({0: {}, 1: gate}, "/b"), "freezer")
     assert list(reaches_ns) == [0]
     assert "latencies: its server chain is also that of /t1../t3, which follows" in why
 
@@ -235,36 +231,23 @@ def test_no_server_is_switched_while_an_output_is_due(
     """By hand: the first chain may finish until 47 ms, 2 + 1 before its timer of the next cycle,
     but not from 30 to 46.5 ms, which are another's, whose output is due then on the same core.
     """
-    one, other = small(), small().model_copy(deep=True)
-    chain, output = other.servers
-    thread = Thread(node="/other_gate")
-    chain = chain.model_copy(
-        update={"name": "b", "slots": ((30 * MS, round(46.5 * MS)),), "threads": ()}
-    )
-    slots = ((round(46.5 * MS), round(due_until * MS)),)
-    output = output.model_copy(update={"name": "out", "slots": slots, "threads": (thread,)})
-    assert other.shaping_node is not None
-    gate = other.shaping_node.model_copy(
-        update={"name": "other_gate", "input": "/b_tmp", "output": "/b"}
-    )
-    spec = other.chain.model_copy(update={"spec": "/b..", "output": "/b", "publisher": "/b"})
-    other = revised(other, chain=spec, servers=(chain, output), shaping_node=gate)
-    enforced = open_until_done(combined([one, other]), [2 * MS, 2 * MS])
-    found = [(start / MS, end / MS) for start, end in enforced.chains[0].servers[0].slots]
-    assert found == opened
+    begins = round(46.5 * MS)
+    chain = {"name": "b", "slots": ((30 * MS, begins),), "threads": ()}
+    gate = {"name": "out", "threads": (Thread(node="/other_gate"),)}
+    gate |= {"slots": ((begins, round(due_until * MS)),)}
+    enforced = open_until_done(other_chain({0: chain, 1: gate}, "/b"), [2 * MS, 2 * MS])
+    assert slots_ms(enforced.chains[0])["chain"] == opened
 
 
-@pytest.mark.parametrize(
-    ("plan", "words"),
-    [
+def test_what_cannot_follow_says_why() -> None:
+    modes = Modes(topic="/m", default="a", bands={"a": 1})
+    for plan, words in (
         (let_per_chain(small()), "under let-per-chain slots are where the policy has them"),
-        (small(modes=Modes(topic="/m", default="a", bands={"a": 1})), "each mode has latencies"),
+        (small(modes=modes), "each mode has latencies"),
         (small(shaping_node=None), "no shaping node sees when outputs come"),
-    ],
-)
-def test_what_cannot_follow_says_why(plan: Plan, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        followed_chains(whole(plan), "freezer")
+    ):
+        with pytest.raises(InputError, match=words):
+            followed_chains(whole(plan), "freezer")
 
 
 def test_only_slots_that_a_back_end_can_move_with_a_cycle_follow() -> None:
@@ -292,24 +275,21 @@ def pages(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> None:
-    plan = small()
-    node = plan.shaping_node
-    assert node is not None
-    with pytest.raises(OperationError, match="no gates publish it now"):
-        SlotFollower(plan, (), (0, 8 * MS), lambda _: 0)
-    turn = Turn("gate", node.output)
-    assert turn.take(None)
-    asked: list[int] = []
+    plan, asked = small(), list[int]()
 
     def put_in_force(by_ns: int) -> int:
         asked.append(by_ns)
         return 1_000
 
-    follower = SlotFollower(plan, (), (0, 8 * MS), put_in_force)
+    follow_it = partial(SlotFollower, plan, (), (0, 8 * MS), put_in_force)
+    with pytest.raises(OperationError, match="no gates publish it now"):
+        follow_it()
+    turn = Turn("gate", known(plan.shaping_node).output)
+    assert turn.take(None)
+    follower = follow_it()
     with pytest.raises(OperationError, match="another run has the slots"):
-        SlotFollower(plan, (), (0, 8 * MS), put_in_force)
-    by, _ = known(turn.moved())
-    assert by == 0
+        follow_it()
+    assert known(turn.moved())[0] == 0
     late = Release(25 * MS, 0, slot=None, cycles_waited=0, anchor="cycle", overrun="publish")
     outcome = Outcome(Waiting(b"", arrival_ns=25 * MS, stamp_ns=None, phase_ns=0), late, 0)
     for _ in range(20):
@@ -323,19 +303,16 @@ def test_a_gate_is_followed_until_the_run_ends_however_it_does(pages: Path) -> N
     assert f"its slots are moved by +{move.moved_ns / MS:g} ms" in output_text(output)
     assert json.loads(json.dumps(move.__dict__))["why"] == "its promise did not hold any more"
     follower.end()
-    back = turn.moved()
-    assert back is not None
-    assert back[0] == 0
-    assert back[1] <= time.monotonic_ns()
-    again = SlotFollower(plan, (), (0, 8 * MS), put_in_force)
+    back, since = known(turn.moved())
+    assert (back, since <= time.monotonic_ns()) == (0, True)
+    again = follow_it()
     assert known(turn.moved())[0] == 0, "not where the run before had them"
     again.end()
 
 
 def test_counts_of_chance_are_those_of_the_binomial_distribution() -> None:
-    for trials in (8, 64, 300, 3000):
-        for probability in (1e-4, 0.01, 0.25, 0.5):
-            sure = bdtrc(np.arange(trials + 1), trials, probability)
-            for doubt in (1e-9, 1e-6, 0.5, 1 - 1e-6):
-                expected = np.count_nonzero(sure > doubt)
-                assert margins._by_chance(trials, probability, doubt) == expected
+    for trials, probability in product((8, 64, 300, 3000), (1e-4, 0.01, 0.25, 0.5)):
+        sure = bdtrc(np.arange(trials + 1), trials, probability)
+        for doubt in (1e-9, 1e-6, 0.5, 1 - 1e-6):
+            expected = np.count_nonzero(sure > doubt)
+            assert margins._by_chance(trials, probability, doubt) == expected

@@ -79,18 +79,10 @@ def _chain(name: str, cycle_ms: int, latency_ms: int, core: int = 1, priority: i
     return _plan(name, cycle_ms * MS, (core, priority, [(0, busy)]), (0, 1, [(busy, busy + MS)]))
 
 
-def test_two_chains_take_turns_on_a_core() -> None:
-    first, second = with_offsets([_chain("a", 100, 60), _chain("b", 100, 40)])
-    assert first.offset_ns == 0
-    assert second.offset_ns == 60 * MS
-    assert second.servers == _chain("b", 100, 40).servers  # slots count from their own cycle
-
-
 def test_chains_that_share_nothing_stay_where_they_are() -> None:
     chains = [_chain("a", 100, 60), _chain("b", 70, 60, core=2)]
     apart = [revised(chain, servers=chain.servers[:1]) for chain in chains]
     assert with_offsets(apart) == tuple(apart)
-    assert with_offsets(apart[:1]) == tuple(apart[:1])
     # Different priorities may overlap, but not their publish slots.
     _, second = with_offsets([_chain("a", 100, 60), _chain("b", 100, 60, priority=3)])
     assert second.offset_ns % (100 * MS) >= MS
@@ -111,15 +103,6 @@ def _assert_apart(plans: Sequence[Plan]) -> None:
     for slots in places.values():
         for (_, end), (start, _) in itertools.pairwise(sorted(slots)):
             assert end <= start
-
-
-def test_many_chains_are_solved() -> None:
-    generator = random.Random(2)
-    chains = [
-        _chain(f"c{number}", generator.choice([50, 100, 200]), generator.randint(1, 4))
-        for number in range(12)
-    ]
-    _assert_apart(with_offsets(chains))
 
 
 def _loaded(periods: list[int], load: float) -> list[Plan]:
@@ -187,41 +170,34 @@ def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
 
 
 def test_chains_at_once_whose_delays_no_plan_has_are_refused() -> None:
-    reason = (
-        r"a and b on core 1 at priority 2 .* modulo 50 ms, and their longest take 70 ms, 20 ms too"
-        r" long. At the same time .* \(`chainshaper plan REC --chain a --chain b`\)"
-    )
     chains = [_shaped("a", 100, 50), _shaped("b", 50, 20)]
-    with pytest.raises(OperationError, match=reason):
-        place_chains(chains)
     apart = [revised(one, policy="server-per-callback") for one in chains]
-    with pytest.raises(OperationError, match=r"Planned as server-per-callback, .* take turns"):
-        place_chains(apart)
     thread = Thread(node="/filter")
     shared = [
         revised(one, servers=(one.servers[0].model_copy(update={"threads": (thread,)}), gate))
         for one in chains
         for gate in one.servers[1:]
     ]
-    for at_once in (None, lambda: shared):
-        with pytest.raises(OperationError, match=r"share the executor of /filter, and so have to"):
-            place_chains(shared, at_once=at_once)
     # Priorities of their own help as little where they fill more than the core's time.
     both = [_shaped("a", 100, 60), _shaped("b", 100, 50)]
     worse = both[1].servers[0].model_copy(update={"priority": 3})
     both[1] = revised(both[1], servers=(worse, *both[1].servers[1:]))
     longest = [one.evidence.model_copy(update={"max_latency_ns": 55 * MS}) for one in both]
-    with pytest.raises(OperationError, match=r"a, b fill 110.0% of the time of core 1"):
-        place_chains([revised(p, evidence=e) for p, e in zip(both, longest, strict=True)])
-
-
-def test_who_collides_is_named_where_both_are() -> None:
-    wide, narrow = (
-        _plan("a", 100, (1, 2, [(0, 90)]), (0, 2, [(0, 60)])),
-        _plan("b", 100, (0, 2, [(0, 50)])),
-    )
-    with pytest.raises(OperationError, match=r"on core 0 at priority 2 .* 110 ns, 10 ns too long"):
-        with_offsets([wide, narrow])
+    full = [revised(p, evidence=e) for p, e in zip(both, longest, strict=True)]
+    for plans, reason in (
+        (
+            chains,
+            r"a and b on core 1 at priority 2 .* modulo 50 ms, and their longest take 70 ms, 20 ms"
+            r" too long. At the same time .* \(`chainshaper plan REC --chain a --chain b`\)",
+        ),
+        (apart, r"Planned as server-per-callback, .* take turns"),
+        (shared, r"share the executor of /filter, and so have to"),
+        (full, r"a, b fill 110.0% of the time of core 1"),
+    ):
+        with pytest.raises(OperationError, match=reason):
+            place_chains(plans)
+    with pytest.raises(OperationError, match=r"share the executor of /filter, and so have to"):
+        place_chains(shared, at_once=lambda: shared)
 
 
 def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:
@@ -234,17 +210,18 @@ def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:
 @pytest.mark.parametrize(
     ("chains", "words"),
     [
+        # Who collides is named where both are.
         (
-            [_chain("a", 100, 60), _chain("b", 100, 50)],
-            "slots of a and b on core 1 at priority 2 collide at every offset.*10 ms too long",
+            [
+                _plan("a", 100, (1, 2, [(0, 90)]), (0, 2, [(0, 60)])),
+                _plan("b", 100, (0, 2, [(0, 50)])),
+            ],
+            r"slots of a and b on core 0 at priority 2 collide at every.* 110 ns, 10 ns too long",
         ),
         ([_chain("a", 100, 6), _chain("b", 70, 5)], "modulo 10 ms"),
+        ([_chain(name, 100, 40) for name in "abc"], "core 1 at priority 2 fill 120.0% of its time"),
+        # Each gap that b leaves holds one of the others, and there are two gaps.
         (
-            [_chain("a", 100, 40), _chain("b", 100, 40), _chain("c", 100, 40)],
-            "core 1 at priority 2 fill 120.0% of its time",
-        ),
-        (
-            # Each gap that b leaves holds one of the others, and there are two gaps.
             [_chain("b", 50, 5), *(_chain(name, 100, 30) for name in "acd")],
             "no offsets at which b, a, c, d keep their slots apart, although any two",
         ),
