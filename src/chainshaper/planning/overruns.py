@@ -11,26 +11,9 @@ from dataclasses import dataclass
 from itertools import chain, combinations, pairwise, product
 from typing import NamedTuple
 
+from chainshaper.planning import plan as plans
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
-from chainshaper.planning.plan import (
-    PER_CALLBACK,
-    Plan,
-    ShapingNode,
-    Slot,
-    Thread,
-    below_executors,
-    meet,
-    messages_waiting,
-    output_server,
-    publish_slots,
-    publisher_servers,
-    publishing_servers,
-    revised,
-    running_servers,
-    server_of,
-    until,
-    with_slots,
-)
+from chainshaper.planning.plan import PER_CALLBACK, Plan, ShapingNode, Slot, Thread
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError
 
@@ -52,7 +35,7 @@ def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
     if plan.policy == "let-per-callback":
         if node in plan.further_shaping_nodes:
             return plan.further_shaping_nodes.index(node) + 1
-        return len(publishing_servers(plan))
+        return len(plans.publishing_servers(plan))
     return (plan.predicted.max_ns - 1) // plan.cycle_ns if plan.policy in PER_CALLBACK else 0
 
 
@@ -73,7 +56,7 @@ def expected(plan: Plan) -> Expected | None:
     leave, shares = tuple(start for start, _ in slots_of_latency(plan)), plan.predicted.shares
     if plan.policy == "one-long-slot" or not 0 < len(leave) == len(shares):
         return None
-    apart = STOPPED_THREAD_NS if any(publisher_servers(plan)) else GATE_NS
+    apart = STOPPED_THREAD_NS if any(plans.publisher_servers(plan)) else GATE_NS
     mean = round(sum(share * start for share, start in zip(shares, leave, strict=True)))
     return Expected(leave, mean, leave[-1] + apart, leave[-1] - leave[0] + apart)
 
@@ -89,9 +72,9 @@ def output_lifespan(plan: Plan) -> int | None:
     publisher = plan.chain.publisher
     if plan.overrun != "discard" or publisher is None or cycles_until_output(plan):
         return None
-    if server_of(plan, Thread(node=publisher, role="publisher")) is None:
+    if plans.server_of(plan, Thread(node=publisher, role="publisher")) is None:
         return None
-    slots = publish_slots(plan)
+    slots = plans.publish_slots(plan)
     return max([slots[0][1], *(after[1] - before[1] for before, after in pairwise(slots))])
 
 
@@ -112,28 +95,28 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     end_ns = plan.cycle_ns - closed_ns
     longer: dict[str, Sequence[Slot]] = {}
     if plan.policy == "pipelined" and plan.overrun == "publish":
-        for one in running_servers(plan):
+        for one in plans.running_servers(plan):
             same_core = (other.slots for other in plan.servers if other.core == one.core)
             starts = sorted(start for slots in same_core for start, _ in slots)
             longer[one.name] = [
                 (start, next((later for later in starts if later >= end), max(end, end_ns)))
                 for start, end in one.slots
             ]
-        return revised(plan, servers=with_slots(plan.servers, longer))
+        return plans.revised(plan, servers=plans.with_slots(plan.servers, longer))
     if plan.policy == "server-per-callback":
         for one in plan.servers:
             begins = one.slots[0][0] == 0 and len(plan.servers) > 1
             if not begins and not one.best_effort:
-                longer[one.name] = until(one, end_ns)
+                longer[one.name] = plans.until(one, end_ns)
         # Not checked: behind what is planned, slots of servers meet.
-        return plan.model_copy(update={"servers": with_slots(plan.servers, longer)})
-    if plan.policy not in ("shaped", "one-long-slot") or output_server(plan) is None:
+        return plan.model_copy(update={"servers": plans.with_slots(plan.servers, longer)})
+    if plan.policy not in ("shaped", "one-long-slot") or plans.output_server(plan) is None:
         return plan
-    done, _ = publish_slots(plan)[-1]
+    done, _ = plans.publish_slots(plan)[-1]
     to_the_end = [
-        one for one in running_servers(plan) if one.slots[-1][0] < done <= one.slots[-1][1]
+        one for one in plans.running_servers(plan) if one.slots[-1][0] < done <= one.slots[-1][1]
     ]
-    at_once = [one for _, one, _ in publisher_servers(plan) if plan.overrun == "publish"]
+    at_once = [one for _, one, _ in plans.publisher_servers(plan) if plan.overrun == "publish"]
     in_turn = [one for one in plan.servers if one in to_the_end or one in at_once]
     for one in sorted(in_turn, key=lambda server: server.slots[-1][1], reverse=True):
         taken = [
@@ -143,9 +126,11 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
             if (other.core, other.priority) == (one.core, one.priority)
             for slot in longer.get(other.name, other.slots)
         ]
-        longer[one.name] = slots_without(until(one, end_ns), taken)
+        longer[one.name] = slots_without(plans.until(one, end_ns), taken)
     try:
-        return revised(plan, servers=below_executors(with_slots(plan.servers, longer)))
+        return plans.revised(
+            plan, servers=plans.below_executors(plans.with_slots(plan.servers, longer))
+        )
     except InputError:  # below its executor, a publisher would meet another server's slot
         return plan
 
@@ -154,7 +139,7 @@ def with_output_moved(plan: Plan, by_ns: int) -> Plan:
     """The plan with the slots of its output moved by so much, and with them the ends of those that
     run the chain until then. Raises InputError: there they may not be.
     """
-    edges = {edge for slot in publish_slots(plan) for edge in slot}
+    edges = {edge for slot in plans.publish_slots(plan) for edge in slot}
     slots = {
         server.name: [
             (start + by_ns * (start in edges), end + by_ns * (end in edges))
@@ -163,7 +148,7 @@ def with_output_moved(plan: Plan, by_ns: int) -> Plan:
         for server in plan.servers
         if not server.best_effort
     }
-    return revised(plan, servers=with_slots(plan.servers, slots))
+    return plans.revised(plan, servers=plans.with_slots(plan.servers, slots))
 
 
 def why_not_followed(plan: Plan) -> str | None:
@@ -228,11 +213,11 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
     """
     warnings: list[str] = []
     output = plan.chain.output
-    for _, server, nodes in publisher_servers(plan):
+    for _, server, nodes in plans.publisher_servers(plan):
         for node in nodes:
             own = {writer.topic: writer for writer in writers if writer.node == node}
             if node == plan.chain.publisher and output is not None:
-                _check_output(output, node, own.get(output), messages_waiting(plan, server))
+                _check_output(output, node, own.get(output), plans.messages_waiting(plan, server))
             processes = {writer.process for writer in own.values()} - {None}
             beside = (one for one in writers if one.node == node or one.process in processes)
             others = [
@@ -268,7 +253,7 @@ def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) ->
 def publication_warnings(plan: Plan) -> list[str]:
     """What a plan for asynchronous publication asks of the application; one sentence each."""
     warnings = []
-    for _, server, nodes in publisher_servers(open_until_done(plan)):
+    for _, server, nodes in plans.publisher_servers(open_until_done(plan)):
         names = ", ".join(nodes)
         warnings.append(
             f"only asynchronous publication can be shaped like this, and all of it is: what else"
@@ -282,7 +267,7 @@ def publication_warnings(plan: Plan) -> list[str]:
                 f" {duration_text(ROOMY_SLOT_NS)} (--publish-slot) costs nothing."
             )
         depth, mine = plan.chain.output_depth, plan.chain.publisher in nodes
-        if mine and plan.overrun == "wait" and depth == messages_waiting(plan, server):
+        if mine and plan.overrun == "wait" and depth == plans.messages_waiting(plan, server):
             warnings.append(
                 f"a history of {depth} has no room for an output that overran: give it one more."
             )
@@ -297,11 +282,11 @@ def publication_warnings(plan: Plan) -> list[str]:
     return warnings
 
 
-def plan_warnings(*plans: Plan) -> list[str]:
+def plan_warnings(*chains: Plan) -> list[str]:
     """What a person must know before relying on plans; one sentence each, none if all is well."""
     found = []
-    for plan in plans:
-        name = f"{plan.chain.spec or plan.chain.output}: " if plans[1:] else ""
+    for plan in chains:
+        name = f"{plan.chain.spec or plan.chain.output}: " if chains[1:] else ""
         about = chain(_about_stages(plan), _about_late_outputs(plan), _about_evidence(plan))
         found += [f"{name}{warning}" for warning in (*about, *publication_warnings(plan))]
     return found
@@ -311,7 +296,11 @@ def _about_stages(plan: Plan) -> Iterator[str]:
     """Where a pipeline is cut, what it costs, and what has to be right for it."""
     if plan.policy != "pipelined":
         return
-    longest, cycle, stages = plan.evidence.max_latency_ns, plan.cycle_ns, running_servers(plan)
+    longest, cycle, stages = (
+        plan.evidence.max_latency_ns,
+        plan.cycle_ns,
+        plans.running_servers(plan),
+    )
     where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
     cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
     waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""
@@ -322,7 +311,7 @@ def _about_stages(plan: Plan) -> Iterator[str]:
     )
     for one, two in combinations(stages, 2):
         both = product(one.slots, two.slots) if one.core == two.core else ()
-        if any(meet(*pair) for pair in both):
+        if any(plans.meet(*pair) for pair in both):
             said = f"{one.name} and {two.name} have core {one.core} at the same time"
             yield f"{said}: right only where their callbacks wait rather than compute."
 
@@ -382,7 +371,7 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         )
     evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
     longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
-    last = max((end for _, end in publish_slots(plan)), default=longest)
+    last = max((end for _, end in plans.publish_slots(plan)), default=longest)
     if evidence.realtime is False:
         said = "the latencies were taken without real-time scheduling: other programs are in them."
         yield f"{said} Record again with the privilege to use SCHED_FIFO."
@@ -417,4 +406,4 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
 def slots_of_latency(plan: Plan) -> tuple[Slot, ...]:
     """The publish slots as latencies: under LET, and in a pipeline, they are of a later cycle."""
     delay = cycles_until_output(plan) * plan.cycle_ns
-    return tuple((start + delay, end + delay) for start, end in publish_slots(plan))
+    return tuple((start + delay, end + delay) for start, end in plans.publish_slots(plan))

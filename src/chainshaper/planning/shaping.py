@@ -14,12 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.planning import plan as plans
 from chainshaper.planning.bands import predict_bands
 from chainshaper.planning.margins import check_latencies, least_epsilon_ns
 from chainshaper.planning.overruns import united
 from chainshaper.planning.plan import (
-    SHORTEST_SLOT_NS,
-    ChainOfPlan,
     Evidence,
     Margin,
     Plan,
@@ -28,17 +27,6 @@ from chainshaper.planning.plan import (
     ShapingNode,
     Slot,
     Thread,
-    below_executors,
-    in_one_slot,
-    meet,
-    output_server,
-    publish_slots,
-    publisher_servers,
-    publishing_servers,
-    revised,
-    running_servers,
-    until,
-    with_slots,
 )
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
@@ -80,9 +68,9 @@ def plan_shaping(
     :class:`~chainshaper.values.plan_choices.Wishes`. OperationError: L̄ + ε + Δ does not fit.
     """
     latencies = check_latencies(latencies_ns)
-    of_chain = {n: values.pop(n) for n in ChainOfPlan.model_fields.keys() & values.keys()}
+    of_chain = {n: values.pop(n) for n in plans.ChainOfPlan.model_fields.keys() & values.keys()}
     wishes = replace(wishes or Wishes(), **{n: values.pop(n) for n in _WISHES & values.keys()})
-    length = SHORTEST_SLOT_NS if wishes.publish_slot_ns is None else wishes.publish_slot_ns
+    length = plans.SHORTEST_SLOT_NS if wishes.publish_slot_ns is None else wishes.publish_slot_ns
     longest = int(latencies.max())
     least = least_epsilon_ns(wishes.publication)
     given = least if wishes.epsilon_ns is None else wishes.epsilon_ns
@@ -94,7 +82,7 @@ def plan_shaping(
     if (end := start + length) > period_ns:
         alone = values.get("interference_ns") is None
         raise OperationError(_too_long(longest, epsilon, length, period_ns, alone=alone))
-    chain = ChainOfPlan(period_ns=period_ns, **of_chain)
+    chain = plans.ChainOfPlan(period_ns=period_ns, **of_chain)
     node, gated = _gate(chain, wishes, core, fifo_priority, receivers)
     running = server_for(nodes, "chain", core, CHAIN_PRIORITY, [(0, start)])
     return Plan(
@@ -131,7 +119,11 @@ def _publishing(thread: Thread | None, core: int, slot: Slot, name: str | None =
 
 
 def _gate(
-    chain: ChainOfPlan, wishes: Wishes, core: int, fifo_priority: int, receivers: Sequence[str]
+    chain: plans.ChainOfPlan,
+    wishes: Wishes,
+    core: int,
+    fifo_priority: int,
+    receivers: Sequence[str],
 ) -> tuple[ShapingNode | None, Thread | None]:
     """The shaping node of a chain's output, if any, and the thread that publishes it."""
     if wishes.publication == "asynchronous" and chain.publisher is not None:
@@ -217,7 +209,7 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
         name = chain.name if len(set(core_of.values())) == 1 else f"{chain.name}_core{core}"
         nodes = (node for node, its in core_of.items() if its == core)
         split.append(server_for(nodes, name, core, chain.priority, chain.slots))
-    return revised(plan, servers=(*split, *others))
+    return plans.revised(plan, servers=(*split, *others))
 
 
 def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | None = None) -> Plan:
@@ -236,30 +228,32 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | N
     alone = server_for([node], "first", own_core, chain.priority, slots)
     rest = tuple(other for other in chain.threads if other != thread)
     behind = chain.model_copy(update={"slots": ((slot_end_ns, end),), "threads": rest})
-    return revised(plan, servers=(alone, behind, *others))
+    return plans.revised(plan, servers=(alone, behind, *others))
 
 
 @wrong_values_refused(Plan)
-def with_best_effort(plans: Sequence[Plan], core_of: Mapping[str, int]) -> list[Plan]:
+def with_best_effort(chains: Sequence[Plan], core_of: Mapping[str, int]) -> list[Plan]:
     """Plans whose first has a server on each core for these nodes, which are in none of the chains.
 
     It is open all the time, and runs what no other server wants to run: R_m' of section 3.1, R_int
     of section 5.1. Raises InputError: a node is in a server already.
     """
-    first, *others = plans
-    known = {one.node: server.name for p in plans for server in p.servers for one in server.threads}
+    first, *others = chains
+    known = {
+        one.node: server.name for p in chains for server in p.servers for one in server.threads
+    }
     for node in sorted(known.keys() & core_of.keys()):
         reason = f"{node} is in the server {known[node]!r}"
         raise InputError(f"{reason}: best effort are nodes beside chains")
-    worst = max(server.priority for plan in plans for server in plan.servers)
+    worst = max(server.priority for plan in chains for server in plan.servers)
     # Threads of publishers come behind their executors where overruns may finish.
-    worst += any(any(publisher_servers(plan)) for plan in plans)
+    worst += any(any(plans.publisher_servers(plan)) for plan in chains)
     added = []
     for core in sorted(set(core_of.values())):
         nodes = (node for node, its in core_of.items() if its == core)
         own = server_for(nodes, f"best_effort_core{core}", core, worst + 1, [(0, first.cycle_ns)])
         added.append(own.model_copy(update={"best_effort": True}))
-    return [revised(first, servers=(*first.servers, *added)), *others]
+    return [plans.revised(first, servers=(*first.servers, *added)), *others]
 
 
 def with_turns(plan: Plan, equal_priorities: EqualPriorities) -> Plan:
@@ -268,7 +262,7 @@ def with_turns(plan: Plan, equal_priorities: EqualPriorities) -> Plan:
         return plan
     best = min(server.priority for server in plan.servers)
     equal = tuple(one.model_copy(update={"priority": best}) for one in plan.servers)
-    return revised(plan, servers=below_executors(equal), equal_priorities="round-robin")
+    return plans.revised(plan, servers=plans.below_executors(equal), equal_priorities="round-robin")
 
 
 def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
@@ -292,7 +286,7 @@ def with_executors(
             apart = own if own and one.role == "executor" else [()]
             threads += [one.model_copy(update={"callbacks": names}) for names in apart]
         servers.append(server.model_copy(update={"threads": tuple(threads)}))
-    return revised(plan, servers=tuple(servers))
+    return plans.revised(plan, servers=tuple(servers))
 
 
 def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cycle_ns: int) -> int:
@@ -305,7 +299,7 @@ def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cyc
     later_ns = min(
         later
         for later in {0, *(max(0, end - start) for (start, _), (_, end) in pairs)}
-        if not any(meet((one[0] + later, one[1] + later), two) for one, two in pairs)
+        if not any(plans.meet((one[0] + later, one[1] + later), two) for one, two in pairs)
     )
     if (end := later_ns + max(one.slots[-1][1] for one in own)) > cycle_ns:
         raise OperationError(
@@ -334,7 +328,7 @@ def with_sink(
     Raises InputError: the plan shapes nothing, or this sink already. OperationError: the slot does
     not fit into the cycle.
     """
-    node, publishing = plan.shaping_node, output_server(plan)
+    node, publishing = plan.shaping_node, plans.output_server(plan)
     if publishing is None or not publishing.threads:
         raise InputError("a further sink needs a plan that shapes one output already")
     if output in {plan.chain.output, *(other.output for other in plan.further_shaping_nodes)}:
@@ -343,19 +337,21 @@ def with_sink(
         raise InputError(f"a thread is to be gated, but who publishes {output} is not known")
     done = start = int(check_latencies(latencies_ns).max()) + plan.margin.epsilon_ns
     length = publishing.slots[-1][1] - publishing.slots[-1][0]
-    gates, wanted = publishing_servers(plan), {"slots": ((start, start + length),)}
+    gates, wanted = plans.publishing_servers(plan), {"slots": ((start, start + length),)}
     start += behind_others(output, [publishing.model_copy(update=wanted)], gates, plan.cycle_ns)
     # Servers that run the graph to its end stay open until the slowest sink is done.
-    running = running_servers(plan)
+    running = plans.running_servers(plan)
     latest = max((server.slots[-1][1] for server in running), default=done)
     slowest = [server for server in running if server.slots[-1][1] == latest]
-    longer = with_slots(plan.servers, {server.name: until(server, done) for server in slowest})
+    longer = plans.with_slots(
+        plan.servers, {server.name: plans.until(server, done) for server in slowest}
+    )
     added = () if node is None else (_node_like(node, output, publisher, receivers),)
     thread = added[0].thread if added else Thread(node=publisher or "", role="publisher")
     server = _publishing(thread, publishing.core, (start, start + length))
     further = (*plan.further_shaping_nodes, *added)
-    servers = below_executors([*longer, server])
-    return revised(plan, servers=servers, further_shaping_nodes=further)
+    servers = plans.below_executors([*longer, server])
+    return plans.revised(plan, servers=servers, further_shaping_nodes=further)
 
 
 # What shaping is compared with -----------------------------------------------------------------
@@ -378,9 +374,9 @@ class CallbackTimes:
 
 def server_per_chain(plan: Plan) -> Plan:
     """One server for the chain, nothing shaped (section 3.1; table 4 row 2): what was measured."""
-    publishing, evidence = output_server(plan), plan.evidence
+    publishing, evidence = plans.output_server(plan), plan.evidence
     longest, jitter = evidence.max_latency_ns, evidence.max_latency_ns - evidence.min_latency_ns
-    return revised(
+    return plans.revised(
         plan,
         policy="server-per-chain",
         servers=tuple(server for server in plan.servers if server is not publishing),
@@ -420,7 +416,7 @@ def server_per_callback(
         pairs = zip(callbacks, slots, strict=True)
         own = united([slot for callback, slot in pairs if callback.node == node])
         servers.append(server_for([node], node.strip("/"), cores.pop(), OUTPUT_PRIORITY, own))
-    return revised(
+    return plans.revised(
         plan,
         policy="server-per-callback",
         shaping_node=None,
@@ -462,8 +458,8 @@ def let_per_chain(plan: Plan) -> Plan:
     ends = {s.name: length if s is publishing else plan.cycle_ns for s in plan.servers}
     slots = {name: ((0, end),) for name, end in ends.items()}
     predicted = _after_periods(plan, 1, length)
-    servers = with_slots(plan.servers, slots)
-    return revised(plan, policy="let-per-chain", servers=servers, predicted=predicted)
+    servers = plans.with_slots(plan.servers, slots)
+    return plans.revised(plan, policy="let-per-chain", servers=servers, predicted=predicted)
 
 
 @wrong_values_refused(Plan)
@@ -487,7 +483,7 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
         reason = f"{len(given)} publish slots of {duration_text(length)} do not fit into the cycle"
         raise OperationError(f"{reason} {duration_text(plan.cycle_ns)}: use shorter slots")
     others = [server for server in plan.servers if server is not publishing]
-    chain = with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
+    chain = plans.with_slots(others, {server.name: ((0, plan.cycle_ns),) for server in others})
     inside: tuple[ShapingNode, ...] = ()
     threads = [Thread(node=name, role="publisher") for name in publishers]
     if last is not None:
@@ -499,7 +495,7 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     for number, thread in enumerate(reversed(threads)):
         slot = (number * length, (number + 1) * length)
         gates.append(_publishing(thread, publishing.core, slot, None if number else "output"))
-    return revised(
+    return plans.revised(
         plan,
         policy="let-per-callback",
         servers=(*chain, *gates),
@@ -510,7 +506,7 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
 
 def _one_slot(plan: Plan) -> tuple[Server, int]:
     """The server of the output, and how long its only slot is."""
-    publishing, slots = output_server(plan), publish_slots(plan)
+    publishing, slots = plans.output_server(plan), plans.publish_slots(plan)
     if publishing is None or len(slots) != 1:
         raise InputError(f"LET needs a plan with one publish slot; this one has {len(slots)}")
     return publishing, slots[0][1] - slots[0][0]
@@ -518,4 +514,4 @@ def _one_slot(plan: Plan) -> tuple[Server, int]:
 
 def _after_periods(plan: Plan, periods: int, slot_ns: int) -> Prediction:
     start = periods * plan.chain.period_ns
-    return in_one_slot((start, start + slot_ns))
+    return plans.in_one_slot((start, start + slot_ns))
