@@ -15,24 +15,11 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
+from chainshaper.planning import plan as plans
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import in_cycle, slots_without, united, with_output_moved
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
-from chainshaper.planning.plan import (
-    PER_CALLBACK,
-    Plan,
-    Server,
-    ShapingNode,
-    Slot,
-    Thread,
-    Wrong,
-    checked,
-    publish_slots,
-    publishing_servers,
-    shaping_nodes,
-    slot_text,
-    with_slots,
-)
+from chainshaper.planning.plan import PER_CALLBACK, Plan, Server, ShapingNode, Slot, Thread, Wrong
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
@@ -81,7 +68,7 @@ class ApplicationPlan(Part):
 
     @model_validator(mode="after")
     def _consistent(self) -> "ApplicationPlan":
-        return checked(self, _outputs, _shared_servers, _threads, _slot_count, _apart)
+        return plans.checked(self, _outputs, _shared_servers, _threads, _slot_count, _apart)
 
     @property
     def cycle_ns(self) -> int:
@@ -131,7 +118,7 @@ class ApplicationPlan(Part):
     @property
     def shaping_nodes(self) -> tuple[ShapingNode, ...]:
         """Those of all chains."""
-        return tuple(node for chain in self.chains for node in shaping_nodes(chain))
+        return tuple(node for chain in self.chains for node in plans.shaping_nodes(chain))
 
     @property
     def takes_turns(self) -> bool:
@@ -155,7 +142,7 @@ class ApplicationPlan(Part):
     def free_threads(self) -> set[Thread]:
         """Threads that stand in servers, and that no back end keeps there: their gates do."""
         free = (chain for chain in self.chains if chain.shaping_thread == "free")
-        return {node.thread for chain in free for node in shaping_nodes(chain)}
+        return {node.thread for chain in free for node in plans.shaping_nodes(chain)}
 
 
 def whole(plan: "Plan | ApplicationPlan") -> ApplicationPlan:
@@ -166,7 +153,7 @@ def whole(plan: "Plan | ApplicationPlan") -> ApplicationPlan:
 def plan_of_chain(plan: "Plan | ApplicationPlan", output: str | None) -> Plan | None:
     """The plan of the chain with this output, or of one that names none; None: there is no such."""
     for chain in whole(plan).chains:
-        named = (chain.chain.output, *(node.output for node in shaping_nodes(chain)))
+        named = (chain.chain.output, *(node.output for node in plans.shaping_nodes(chain)))
         if chain.chain.output is None or output in named:
             return chain
     return None
@@ -229,16 +216,16 @@ def _due_while_switched(
 ) -> Iterator[Slot]:
     """The slots of outputs on a server's core in which it is switched, in any of its cycles."""
     for other in plan.chains:
-        for one in publishing_servers(other):
+        for one in plans.publishing_servers(other):
             for slot in _in_cycles_of(chain, other, one) if one.core == server.core else ():
                 if one.name != server.name and any(slot[0] < at < slot[1] for at in switched):
                     yield slot
 
 
-def combined(plans: Sequence[Plan]) -> ApplicationPlan:
+def combined(chains: Sequence[Plan]) -> ApplicationPlan:
     """The plan of an application from those of its chains. Raises InputError: they make none."""
     with wrong_values_refused(ApplicationPlan):
-        return ApplicationPlan(chains=tuple(plans))
+        return ApplicationPlan(chains=tuple(chains))
 
 
 def with_slots_moved(plan: ApplicationPlan, moved_ns: Mapping[int, int]) -> ApplicationPlan:
@@ -247,7 +234,7 @@ def with_slots_moved(plan: ApplicationPlan, moved_ns: Mapping[int, int]) -> Appl
     for place, by_ns in moved_ns.items():
         own = with_output_moved(chains[place], by_ns)
         slots = {server.name: server.slots for server in own.servers}  # others may share these
-        others = ({"servers": with_slots(one.servers, slots)} for one in chains)
+        others = ({"servers": plans.with_slots(one.servers, slots)} for one in chains)
         chains = [one.model_copy(update=change) for one, change in zip(chains, others, strict=True)]
         chains[place] = own
     return combined(chains)
@@ -257,7 +244,7 @@ def reach(plan: ApplicationPlan, place: int, latest_ns: int | None = None) -> tu
     """How far the slots of a chain's output may be moved, earlier (negative) and later (ns), none
     to end behind ``latest_ns``. Raises InputError: not at all, and why.
     """
-    slots, cycle_ns = publish_slots(plan.chains[place]), plan.chains[place].cycle_ns
+    slots, cycle_ns = plans.publish_slots(plan.chains[place]), plan.chains[place].cycle_ns
     latest = min(cycle_ns, cycle_ns if latest_ns is None else latest_ns)
     reason = "they begin and end where they have to"
     found = [0, 0]
@@ -286,7 +273,7 @@ def _in_force(server: Server, chain: Plan) -> Sequence[Slot]:
     Around these a shaping node's thread needs time to take messages, to watch the clock, to pause,
     and for its notes; and until the cycle's end, where what missed its slot leaves at once.
     """
-    nodes = [node for node in shaping_nodes(chain) if node.thread in server.threads]
+    nodes = [node for node in plans.shaping_nodes(chain) if node.thread in server.threads]
     if not nodes or chain.shaping_thread == "free":
         return server.slots
     before = BEFORE_NS + max(node.spin_ns for node in nodes)
@@ -311,8 +298,8 @@ def _outputs(plan: ApplicationPlan) -> Wrong:
         if one.chain.output is not None and one.chain.output == two.chain.output:
             reason = f"{one.chain.output} is the output of an earlier chain too: plan it once"
             yield reason, *where, "chain", "output"
-        ours = {name for node in shaping_nodes(one) for name in (node.name, node.output)}
-        for node in shaping_nodes(two):
+        ours = {name for node in plans.shaping_nodes(one) for name in (node.name, node.output)}
+        for node in plans.shaping_nodes(two):
             if ours & {node.name, node.output}:
                 reason = f"an earlier chain has {node.name} or {node.output} too: write its own"
                 yield reason, *where, "shaping_node"
@@ -372,8 +359,8 @@ def _apart(plan: ApplicationPlan) -> Wrong:
             for (start, end), (other_start, other_end) in product(server.slots, other.slots):
                 later = (other_start + two.offset_ns - start - one.offset_ns) % common
                 if later < end - start or common - later < other_end - other_start:
-                    reason = f"the slot {slot_text((other_start, other_end))} of server"
-                    reason += f" {other.name!r} meets {slot_text((start, end))} of server"
+                    reason = f"the slot {plans.slot_text((other_start, other_end))} of server"
+                    reason += f" {other.name!r} meets {plans.slot_text((start, end))} of server"
                     reason += f" {server.name!r} of {chain_name(one)} in some cycles, on core"
                     reason += f" {server.core} at the same priority {server.priority}: move a slot,"
                     reason += " change an offset (`chainshaper offsets`), or give their servers"

@@ -17,7 +17,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning import shaping
+from chainshaper.planning import margins, shaping
+from chainshaper.planning import plan as plans
 from chainshaper.planning.bands import (
     BandChoice,
     choose_bands,
@@ -26,32 +27,9 @@ from chainshaper.planning.bands import (
     with_publish_slots,
 )
 from chainshaper.planning.cores import assign_cores
-from chainshaper.planning.margins import (
-    MOST_PROBABLE,
-    OVERRUN_PROBABILITY,
-    check_latencies,
-    covered_latency,
-    cycles_needed,
-    derive_margin,
-    late_share,
-    least_epsilon_ns,
-)
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import pipelined, stage_places
-from chainshaper.planning.plan import (
-    PER_CALLBACK,
-    SENDS_PER_SLOT,
-    SHORTEST_SLOT_NS,
-    UNSHAPED,
-    Evidence,
-    Margin,
-    Modes,
-    Plan,
-    Prediction,
-    Slot,
-    in_one_slot,
-    revised,
-)
+from chainshaper.planning.plan import UNSHAPED, Evidence, Margin, Modes, Plan, Prediction, Slot
 from chainshaper.planning.profile import (
     Profile,
     alone,
@@ -64,7 +42,7 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy, Wishes
 
 DEFAULT_CORE = 1
-OWN_SLOTS = (*PER_CALLBACK, "let-per-chain")
+OWN_SLOTS = (*plans.PER_CALLBACK, "let-per-chain")
 """Policies whose plan has no slot behind the chain's, in the same cycle."""
 _LIMITS = ("grid_ns", "max_gap_ns", "max_share")
 
@@ -127,13 +105,13 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
                 f" {duration_text(length)} leave nothing of the cycle of {duration_text(period)}:"
                 " plan with a shorter publish slot, or a smaller margin"
             )
-        latencies = np.minimum(check_latencies(profile.latencies_ns), most)
+        latencies = np.minimum(margins.check_latencies(profile.latencies_ns), most)
         measured = replace(profile, latencies_ns=latencies)
     plan = finish(_shaped(measured, request, margin, sinks))
     if request.policy in OWN_SLOTS:
         own = shaping.evidence_of(profile.latencies_ns, interference_ns=profile.interference_ns)
         figures = own.model_dump(exclude_unset=True)
-        plan = revised(plan, evidence=plan.evidence.model_copy(update=figures))
+        plan = plans.revised(plan, evidence=plan.evidence.model_copy(update=figures))
     for sink in sinks:
         if not sink.topics:
             raise InputError("a sink needs the topic it is published on: plan from a recording")
@@ -146,7 +124,7 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         reason = f"--fallback {request.fallback} is for a shaping node that is a process"
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
     plan = shaping.with_executors(plan, [one.executors for one in (profile, *sinks)])
-    plan = shaping.with_turns(revised(plan, modes=modes), request.equal_priorities)
+    plan = shaping.with_turns(plans.revised(plan, modes=modes), request.equal_priorities)
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
 
 
@@ -221,7 +199,7 @@ def cores_for(
             raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
         return {node: cores[k] for node, k in _places(profiles, cores).items()}
-    least = least_epsilon_ns(request.publication)
+    least = margins.least_epsilon_ns(request.publication)
     margin = least if request.epsilon_ns is None else request.epsilon_ns
     return assign_cores(profiles, cores, margin_ns=margin, worth=worth)
 
@@ -289,9 +267,15 @@ def _covering(latencies: NDArray[np.int64], profile: Profile, request: PlanReque
     """The latency that covers all of these but the promised share, as far as a publish slot fits
     into the cycle behind it.
     """
-    latest = profile.period_ns - _slot_ns(profile, request) - least_epsilon_ns(request.publication)
-    share = request.overrun_probability or OVERRUN_PROBABILITY
-    return covered_latency(latencies, share, None if request.policy in OWN_SLOTS else latest)
+    latest = (
+        profile.period_ns
+        - _slot_ns(profile, request)
+        - margins.least_epsilon_ns(request.publication)
+    )
+    share = request.overrun_probability or margins.OVERRUN_PROBABILITY
+    return margins.covered_latency(
+        latencies, share, None if request.policy in OWN_SLOTS else latest
+    )
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -302,9 +286,9 @@ def _slot_ns(profile: Profile, request: PlanRequest) -> int:
         return request.publish_slot_ns
     longest = profile.longest_publication_ns or 0
     if request.publication == "asynchronous":
-        longest = SENDS_PER_SLOT * (profile.longest_send_ns or 0)
+        longest = plans.SENDS_PER_SLOT * (profile.longest_send_ns or 0)
     grid = max(1, request.grid_ns)
-    return max(SHORTEST_SLOT_NS, -(-longest // grid) * grid)
+    return max(plans.SHORTEST_SLOT_NS, -(-longest // grid) * grid)
 
 
 def place_modes(
@@ -345,7 +329,7 @@ def with_modes(
         max_ns=slots[-1][1],
         jitter_ns=slots[-1][1] - slots[0][0],
         shares=shares,
-        modes={mode: in_one_slot(slots[modes.bands[mode] - 1]) for mode in measured},
+        modes={mode: plans.in_one_slot(slots[modes.bands[mode] - 1]) for mode in measured},
     )
     evidence = plan.evidence.model_copy(update={"modes": dict(measured)})
     return with_publish_slots(plan, slots, evidence=evidence, predicted=predicted, modes=modes)
@@ -358,8 +342,8 @@ def _together(
     gives a plan the slots.
     """
     apart = {mode: _covered(profile.of_modes[mode], request) for mode in modes.bands}
-    margins = {mode: _margin(one, request) for mode, one in apart.items()}
-    starts = {mode: one.longest_ns + margins[mode].epsilon_ns for mode, one in apart.items()}
+    own = {mode: _margin(one, request) for mode, one in apart.items()}
+    starts = {mode: one.longest_ns + own[mode].epsilon_ns for mode, one in apart.items()}
     given = None if request.bands_of_modes == "found" else modes.bands
     bands, slots = place_modes(starts, _slot_ns(profile, request), given)
     modes = modes.model_copy(update={"bands": bands})
@@ -378,9 +362,9 @@ def _together(
         disturbed=sum(one.disturbed for one in apart.values()),
         all_disturbed=any(one.all_disturbed for one in apart.values()) or None,
     )
-    late = [margin.overrun_probability or 0.0 for margin in margins.values()]
+    late = [margin.overrun_probability or 0.0 for margin in own.values()]
     last = {"epsilon_ns": slots[-1][0] - both.longest_ns, "overrun_probability": max(late) or None}
-    margin = margins[max(starts, key=starts.__getitem__)].model_copy(update=last)
+    margin = own[max(starts, key=starts.__getitem__)].model_copy(update=last)
     return both, margin, modes, partial(with_modes, modes=modes, slots=slots, measured=measured)
 
 
@@ -405,7 +389,7 @@ def _shaped(
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it
     length = _slot_ns(profile, request)
-    found = "measured" if length > SHORTEST_SLOT_NS else "least"
+    found = "measured" if length > plans.SHORTEST_SLOT_NS else "least"
     values["publish_slot"] = found if request.publish_slot_ns is None else "given"
     # At once by default, unless the thread of an asynchronous publisher has outputs due later.
     bound = request.publication == "asynchronous" and request.policy in OWN_SLOTS
@@ -442,23 +426,23 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
     if request.epsilon_ns is not None:
         if request.epsilon_ns < 0:
             raise InputError("epsilon must be 0 ms or more")
-        late = late_share(every, longest + request.epsilon_ns)
+        late = margins.late_share(every, longest + request.epsilon_ns)
         return Margin(epsilon_ns=request.epsilon_ns, overrun_probability=late)
     covered = profile.latencies_ns if request.ideal_machine else every
-    if probability is not None and probability < MOST_PROBABLE:
-        return derive_margin(covered, probability, request.seed, longest_ns=longest)
-    if probability is not None and covered.size < (needed := cycles_needed(probability)):
+    if probability is not None and probability < margins.MOST_PROBABLE:
+        return margins.derive_margin(covered, probability, request.seed, longest_ns=longest)
+    if probability is not None and covered.size < (needed := margins.cycles_needed(probability)):
         reason = f"{covered.size} cycles are too few for an overrun probability of {probability:g}"
         raise OperationError(f"{reason}: measure {needed} or more")
     stalls = 0
     shown_late = request.percentile is not None  # what takes longer has been left out
     if not shown_late and (request.policy not in OWN_SLOTS or request.policy == "pipelined"):
         stalls = max(0, _covering(covered, profile, request) - longest)  # of no single callback
-    epsilon = least_epsilon_ns(request.publication) + stalls
+    epsilon = margins.least_epsilon_ns(request.publication) + stalls
     return Margin(
         epsilon_ns=epsilon,
         source="measured",
-        overrun_probability=late_share(every, longest + epsilon),
+        overrun_probability=margins.late_share(every, longest + epsilon),
         stalls_ns=stalls,
     )
 
