@@ -6,7 +6,6 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from chainshaper import load_application
 from chainshaper.planning import CallbackTimes, Profile, cores
@@ -20,17 +19,7 @@ def _work(
     *callbacks: tuple[str, int, tuple[int, ...]], begins: str = "", period: int = 100
 ) -> Profile:
     """A chain of callbacks: node, time in ms, places of those that it waits for."""
-    times = [
-        CallbackTimes(
-            node,
-            0,
-            min_response_ns=0,
-            mean_response_ns=ms * MS,
-            max_response_ns=ms * MS,
-            after=after,
-        )
-        for node, ms, after in callbacks
-    ]
+    times = [CallbackTimes(node, 0, 0, ms * MS, ms * MS, after) for node, ms, after in callbacks]
     return Profile(np.zeros(2, np.int64), period * MS, begins=(0, begins), callbacks=tuple(times))
 
 
@@ -48,17 +37,11 @@ def test_a_branch_that_runs_beside_another_gets_a_core_of_its_own() -> None:
     """2 + 20 + 31 + 4 + 40 = 97 ms on one core; beside the rear filter the front one costs 11."""
     found = assign_cores([PARKING], [1, 0])
     assert found == {"throttler": 1, "rear": 1, "front": 0, "fusion": 1, "ndt": 1}
-    assert assign_cores([replace(PARKING, period_ns=50 * MS)], [1, 0]) == found, (
-        "too long, but less"
-    )
+    too_long = replace(PARKING, period_ns=50 * MS)
+    assert assign_cores([too_long], [1, 0]) == found, "too long, but less"
     assert assign_cores([PARKING], [1, 0], worth=0.2) == found  # 77 ms: 20.6 % less
     assert set(assign_cores([PARKING], [1, 0], worth=0.21).values()) == {1}
     assert set(assign_cores([PARKING], [3]).values()) == {3}
-
-
-def test_what_runs_one_after_the_other_stays_on_one_core() -> None:
-    chain = _work(("a", 10, ()), ("b", 10, (0,)), ("c", 10, (1,)))
-    assert assign_cores([chain], [2, 1, 0]) == {"a": 2, "b": 2, "c": 2}
 
 
 def test_one_cycle_is_played_out_by_hand_the_more_urgent_first() -> None:
@@ -75,25 +58,18 @@ def test_one_cycle_is_played_out_by_hand_the_more_urgent_first() -> None:
     assert played == [10 * MS, 30 * MS, 45 * MS, 35 * MS], "c interrupts x from 30 to 35 ms"
 
 
-def test_nodes_of_one_process_stay_together() -> None:
-    assert set(
-        assign_cores([replace(PARKING, together=(("rear", "front"),))], [1, 0]).values()
-    ) == {1}
-
-
-@pytest.mark.parametrize(("first", "core"), [(12, 1), (13, 0)])
-def test_chains_whose_slots_would_collide_get_cores_of_their_own(first: int, core: int) -> None:
-    """With periods of 100 and 40 ms both slots must fit into 20 ms."""
-    assert assign_cores([_alone("a", first, 100), _alone("b", 8, 40)], [1, 0])["b"] == core
-
-
-def test_of_three_chains_of_which_any_two_fit_one_goes_elsewhere() -> None:
+def test_chains_and_processes_keep_or_get_cores_by_hand() -> None:
+    chain = _work(("a", 10, ()), ("b", 10, (0,)), ("c", 10, (1,)))
+    assert assign_cores([chain], [2, 1, 0]) == {"a": 2, "b": 2, "c": 2}, "one after the other"
+    process = replace(PARKING, together=(("rear", "front"),))
+    assert set(assign_cores([process], [1, 0]).values()) == {1}
+    # With periods of 100 and 40 ms both slots must fit into 20 ms.
+    for first, core in ((12, 1), (13, 0)):
+        assert assign_cores([_alone("a", first, 100), _alone("b", 8, 40)], [1, 0])["b"] == core
+    # Of three chains of which any two fit, one goes elsewhere.
     chains = [_alone(name, 40, 100) for name in "abc"]
     assert sorted(assign_cores(chains, [0, 1, 2]).values()) == [0, 0, 1]
-
-
-def test_outputs_of_one_graph_have_their_common_callbacks_once() -> None:
-    """Source 10, sinks 40 each: one after the other, and twice the source, is more than 100 ms."""
+    # Source 10, sinks 40 each: one after the other, and twice the source, is more than 100 ms.
     sinks = [_work(("source", 10, ()), (name, 40, (0,))) for name in "ab"]
     assert assign_cores(sinks, [0, 1]) == {"source": 0, "a": 0, "b": 1}
     assert set(assign_cores(sinks, [0, 1], worth=0.5).values()) == {0}, "10 + 80 ms fit"

@@ -16,6 +16,7 @@ from chainshaper.planning import (
     plan_json,
     publish_slots,
     save_plan,
+    save_plans,
 )
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan import (
@@ -64,19 +65,15 @@ format: 1
 def test_a_hand_edited_plan_is_read(tmp_path: Path) -> None:
     """And its JSON form has integer nanoseconds."""
     plan = _load(tmp_path, GOOD)
-    assert plan.cycle_ns == 100_000_000
-    assert plan.evidence.mean_latency_ns == 48_123_456
+    assert (plan.cycle_ns, plan.evidence.mean_latency_ns) == (100_000_000, 48_123_456)
     assert plan.evidence.realtime is True
-    assert plan.servers[1].slots == ((64_000_000, 65_000_000),)
-    assert publish_slots(plan) == ((64_000_000, 65_000_000),)
+    assert plan.servers[1].slots == publish_slots(plan) == ((64_000_000, 65_000_000),)
     assert server_of(plan, Thread(node="/n1")) == plan.servers[0]
     assert server_of(plan, Thread(node="/n9")) is None
     values = plan_json(plan)
+    promised = {"mean_ns": 65_000_000, "max_ns": 65_000_000, "jitter_ns": 1_000_000}
     assert values["bands_ns"] == [65_000_000]
-    assert values["predicted"] == {
-        **{"mean_ns": 65_000_000, "max_ns": 65_000_000, "jitter_ns": 1_000_000, "shares": [1.0]},
-        "modes": None,
-    }
+    assert values["predicted"] == {**promised, "shares": [1.0], "modes": None}
     assert values["servers"][0]["slots"] == [[0, 64_000_000]]
     assert values["chain"]["period_ns"] == 100_000_000
 
@@ -97,7 +94,6 @@ WRONG_VALUES = [
     ("max_latency: 63ms", "max_latency: 40ms", 18, "evidence.mean_latency", "ascend"),
     ("samples: 320", "samples: many", 16, "evidence.samples", "'many' is not a whole number"),
     ("realtime: yes", "realtime: 1", 20, "evidence.realtime", "not true or false"),
-    ("[[0, 64ms]]", "[[0, 64]]", 3, "servers[0].slots[0][1]", "unit"),
     ("[[0, 64ms]]", "[[64ms, 3ms]]", 3, "servers[0].slots[0]", "empty"),
     ("[[0, 64ms]]", "[[0, 64ms], [99ms, 101ms]]", 3, "servers[0].slots[1]", "after the cycle"),
     ("[[0, 64ms]]", "[[5ms, 9ms], [0ms, 4ms]]", 3, "servers[0].slots[1]", "ascending"),
@@ -114,7 +110,6 @@ WRONG_VALUES = [
     ("role: executor", "callbacks: [t]", 3, "servers[0].threads[0].callbacks[0]", "no callback"),
     ("{node: /chainshaper_t5}", "{node: /other}", 23, "shaping_node.name", "no server holds"),
     ("input: /t5_tmp", "input: /t5", 23, "shaping_node.input", "feed itself"),
-    ("input: /t5_tmp", "input: /t5//tmp", 23, "shaping_node.input", "full ROS"),
     ("output: /t5, core", "output: /t6, core", 23, "shaping_node.output", "make them the same"),
     ("fifo_priority: 84", "fifo_priority: 99", 23, "shaping_node.fifo_priority", "equal to 98"),
     ("{name: chainshaper_t5,", "{name: /x,", 23, "shaping_node.name", "not a node's name"),
@@ -122,7 +117,6 @@ WRONG_VALUES = [
     ("shares: [1]", "shares: [.nan]", 25, "predicted.shares[0]", "finite"),
     ("shares: [1]", "shares: 1", 25, "predicted.shares", "not a list"),
     ("policy: shaped", "policy: fast", 12, "policy", "'shaped'"),
-    ("anchor: stamp", "anchor: sea", 22, "anchor", "'stamp' or 'cycle'"),
     ("format: 1", "format: 2", 26, "format", "should be 1"),
     ('spec: "/t1../t5"', "spec: 7", 13, "chain.spec", "7 is not a text"),
 ]
@@ -161,7 +155,6 @@ WRONG_MODES = [  # what is replaced, by what, the line in the modes, the key, an
     ("{city: 2, highway: 1}", "[2, 1]", 4, "modes.bands", "dictionary"),
     ("topic: /mode", "topic: /t5_tmp", 2, "modes.topic", "carries the chain's output"),
     ("late: next-slot", "late: never", 5, "modes.late", "'next-slot'"),
-    ("late: next-slot", "early: wait", 5, "modes.early", "unknown key"),
 ]
 
 
@@ -170,9 +163,7 @@ WRONG_ADAPTATIONS = [
     ("window: 2000", "window: 7", 27, "adaptation.window", "equal to 500"),
     ("late: 1.4", "late: 1", 27, "adaptation.late", "greater than 1"),
     ("gain: 0.02", "gain: 2%", 27, "adaptation.gain", "not a number"),
-    ("after: 9", "after: 0", 27, "adaptation.after", "equal to 1"),
     ("max_latency: 70ms", "max_latency: 64ms", 27, "adaptation.max_latency", "ends behind it"),
-    ("gain: 0.02", "gains: 0.02", 27, "adaptation.gains", "unknown key"),
 ]
 
 
@@ -193,15 +184,11 @@ def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, 
 
 
 def test_a_mode_publishes_in_a_slot_of_its_own(tmp_path: Path) -> None:
-    modes = _load(tmp_path, WITH_MODES).modes
     bands = {"city": 2, "highway": 1}
-    assert modes == Modes(topic="/mode", default="city", bands=bands, late="next-slot")
+    given = Modes(topic="/mode", default="city", bands=bands, late="next-slot")
+    assert _load(tmp_path, WITH_MODES).modes == given
     shorter = _load(tmp_path, WITH_MODES.replace("  late: next-slot\n", "")).modes
-    assert shorter is not None
-    assert shorter.late == "wait"
-
-
-def test_modes_need_a_shaping_node(tmp_path: Path) -> None:
+    assert shorter == given.model_copy(update={"late": "wait"})
     start, end = WITH_MODES.index("shaping_node:"), WITH_MODES.index("predicted:")
     with pytest.raises(InputError, match="modes: only a shaping node knows the mode"):
         _load(tmp_path, WITH_MODES[:start] + WITH_MODES[end:])
@@ -211,11 +198,8 @@ def test_every_wrong_value_is_named_once(tmp_path: Path) -> None:
     text = GOOD.replace("cycle: 100ms", "cycel: 100ms").replace("[[0, 64ms]]", "[[0, 64]]")
     with pytest.raises(InputError) as caught:
         _load(tmp_path, text)
-    assert [line.split(": ")[1] for line in str(caught.value).splitlines()] == [
-        "cycle",
-        "servers[0].slots[0][1]",
-        "cycel",
-    ]
+    named = [line.split(": ")[1] for line in str(caught.value).splitlines()]
+    assert named == ["cycle", "servers[0].slots[0][1]", "cycel"]
 
 
 def test_overlap_is_judged_per_core_and_priority(tmp_path: Path) -> None:
@@ -227,15 +211,9 @@ def test_overlap_is_judged_per_core_and_priority(tmp_path: Path) -> None:
         _load(tmp_path, same_core.replace("priority: 1", "priority: 2"))
     touching = GOOD.replace("core: 0", "core: 1").replace("priority: 1", "priority: 2")
     _load(tmp_path, touching)  # half-open: [0, 64) and [64, 65) do not overlap
-
-
-def test_two_shaping_nodes_may_not_share_name_or_output(tmp_path: Path) -> None:
-    second = (
-        "further_shaping_nodes:\n  - {name: other, input: /a, output: /t5, core: 0,"
-        " fifo_priority: 84, spin: 0, pause: 0}\n"
-    )
+    second = "further_shaping_nodes:\n  - {name: other, input: /a, output: /t5, core: 0,"
     with pytest.raises(InputError, match="both must be its own"):
-        _load(tmp_path, GOOD + second)
+        _load(tmp_path, f"{GOOD}{second} fifo_priority: 84, spin: 0, pause: 0}}\n")
 
 
 @pytest.mark.parametrize(
@@ -270,18 +248,20 @@ def test_what_is_no_plan_at_all_is_refused(tmp_path: Path, text: str, words: str
 
 
 def test_unreadable_files_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="cannot be read"):
-        load_plan(tmp_path / "absent.yaml")
-    with pytest.raises(InputError, match="is a folder; wanted is a file"):
-        load_plan(tmp_path)
     (tmp_path / "latin").write_bytes(b"a: 1\nchain: \xff\xfe")
-    with pytest.raises(InputError, match=":2: not a text in UTF-8"):
-        load_plan(tmp_path / "latin")
+    for name, words in (
+        ("absent.yaml", "cannot be read"),
+        ("", "is a folder; wanted is a file"),
+        ("latin", ":2: not a text in UTF-8"),
+    ):
+        with pytest.raises(InputError, match=words):
+            load_plan(tmp_path / name)
 
 
-def test_nothing_is_overwritten_unless_told(tmp_path: Path) -> None:
-    plan = _load(tmp_path, GOOD)
-    target = tmp_path / "out.yaml"
+def test_nothing_is_overwritten_unless_told_and_a_failed_write_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plan, target = _load(tmp_path, GOOD), tmp_path / "out.yaml"
     save_plan(plan, target)
     with pytest.raises(InputError, match="not overwritten"):
         save_plan(plan, target)
@@ -289,19 +269,23 @@ def test_nothing_is_overwritten_unless_told(tmp_path: Path) -> None:
     assert load_plan(target) == plan
     with pytest.raises(InputError, match="no such folder"):
         save_plan(plan, tmp_path / "absent" / "plan.yaml")
-    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.yaml", "plan.yaml"]
-
-
-def test_a_failed_write_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan = _load(tmp_path, GOOD)
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OperationError, match="No space left"):
-        save_plan(plan, tmp_path / "out.yaml")
-    assert [file.name for file in tmp_path.iterdir()] == ["plan.yaml"]
+        save_plan(plan, tmp_path / "other.yaml")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["out.yaml", "plan.yaml"]
+    monkeypatch.undo()
+    written = save_plans([plan, plan], tmp_path / "both")
+    assert [file.name for file in written] == ["1_t5.yaml", "2_t5.yaml"]
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(OperationError, match="No space left"):
+        save_plans([plan], tmp_path / "none")
+    assert not (tmp_path / "none").exists()
+    with pytest.raises(InputError, match="not overwritten"):
+        save_plans([plan], tmp_path / "both")
 
 
 NAMES = st.from_regex(r"(/[A-Za-z_][A-Za-z0-9_]{0,5}){1,3}", fullmatch=True)
@@ -318,70 +302,58 @@ def modes(slots: int) -> st.SearchStrategy[Modes]:
     )
 
 
-def optional(strategy: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    return st.none() | strategy
-
-
 @st.composite
 def plans(draw: st.DrawFn) -> Plan:
     """Any plan the rules allow: times anywhere in 64 bits, names as ROS 2 permits them."""
+
+    def some(**fields: st.SearchStrategy[Any]) -> dict[str, Any]:
+        return draw(st.fixed_dictionaries({}, optional=fields))
+
     period = draw(st.integers(8, 2**62))
     low, mean, high = sorted(draw(st.lists(st.integers(1, period - 1), min_size=3, max_size=3)))
     bounds = sorted(draw(st.sets(st.integers(0, period), min_size=4, max_size=8)))
     slots = tuple(zip(bounds[::2], bounds[1::2], strict=False))
-    output, times = draw(NAMES), st.integers(0, 10**12)
-    node = ShapingNode(
-        name="gate",
-        input=output + "_tmp",
-        output=output,
-        core=0,
-        fifo_priority=draw(st.integers(1, 98)),
-        spin_ns=draw(times),
-        pause_ns=draw(times),
-    )
-    threads = [Thread(node=name) for name in sorted(draw(st.sets(NAMES, max_size=3)))]
+    output, times, any_bool = draw(NAMES), st.integers(0, 10**12), st.booleans()
+    priority = draw(st.integers(1, 98))
+    waits = {"core": 0, "fifo_priority": priority, "spin_ns": draw(times), "pause_ns": draw(times)}
+    node = ShapingNode(name="gate", input=output + "_tmp", output=output, **waits)
+    threads = {Thread(node=name) for name in draw(st.sets(NAMES, max_size=3))} - {node.thread}
     name = draw(st.text(min_size=1).filter(lambda name: name != "chain"))
-    interval = (3, 123_456_789)
-    derived = Margin(epsilon_ns=7, source="derived", confidence_interval_ns=interval)
-    threads = [thread for thread in threads if thread != node.thread]
-    whole = ((0, period),)
-    chain = Server(name="chain", core=1, priority=2, slots=whole, threads=tuple(threads))
+    derived = Margin(epsilon_ns=7, source="derived", confidence_interval_ns=(3, 123_456_789))
+    whole, own = ((0, period),), tuple(sorted(threads, key=lambda thread: thread.node))
+    latencies = {"min_latency_ns": low, "mean_latency_ns": mean, "max_latency_ns": high}
+    known = some(
+        recording=st.text(),
+        realtime=any_bool,
+        longest_stall_ns=times,
+        utilisation=st.floats(0, 2),
+        longest_send_ns=times,
+        longest_publication_ns=times,
+        all_disturbed=st.just(True),
+    )
+    chain = some(spec=st.text(), publisher=NAMES, output_depth=st.integers(1, 100))
+    late, after = st.floats(1.1, 10), st.integers(1, 10**6)
     return Plan(
-        chain=ChainOfPlan(
-            spec=draw(optional(st.text())),
-            output=output,
-            publisher=draw(optional(NAMES)),
-            output_depth=draw(optional(st.integers(1, 100))),
-            period_ns=period,
-        ),
-        evidence=Evidence(
-            recording=draw(optional(st.text())),
-            samples=draw(st.integers(1, 10**12)),
-            min_latency_ns=low,
-            mean_latency_ns=mean,
-            max_latency_ns=high,
-            realtime=draw(optional(st.booleans())),
-            longest_stall_ns=draw(optional(times)),
-            utilisation=draw(optional(st.floats(0, 2))),
-            longest_send_ns=draw(optional(times)),
-            longest_publication_ns=draw(optional(times)),
-            all_disturbed=draw(st.sampled_from([None, True])),
-        ),
+        chain=ChainOfPlan(output=output, period_ns=period, **chain),
+        evidence=Evidence(samples=draw(st.integers(1, 10**12)), **latencies, **known),
         margin=draw(st.sampled_from([derived, Margin(epsilon_ns=draw(times))])),
         policy="shaped",
         cycle_ns=period,
         offset_ns=draw(st.integers(0, 3)),
-        anchor=draw(st.sampled_from(["stamp", "cycle"])),
-        overrun=draw(st.sampled_from(["wait", "discard", "publish"])),
-        into_open_slot=draw(st.sampled_from(["at-once", "next-slot"])),
-        fallback=draw(st.sampled_from(["bypass", "silence"])),
-        servers=(chain, Server(name=name, core=0, priority=1, slots=slots, threads=(node.thread,))),
-        shaping_node=node,
-        modes=draw(optional(modes(len(slots)))),
-        adaptation=draw(
-            optional(st.builds(Adaptation, late=st.floats(1.1, 10), after=st.integers(1, 10**6)))
+        servers=(
+            Server(name="chain", core=1, priority=2, slots=whole, threads=own),
+            Server(name=name, core=0, priority=1, slots=slots, threads=(node.thread,)),
         ),
+        shaping_node=node,
         predicted=Prediction(mean_ns=1, max_ns=high, jitter_ns=0, shares=draw(SHARES)),
+        **some(
+            anchor=st.sampled_from(["stamp", "cycle"]),
+            overrun=st.sampled_from(["wait", "discard", "publish"]),
+            into_open_slot=st.sampled_from(["at-once", "next-slot"]),
+            fallback=st.sampled_from(["bypass", "silence"]),
+            modes=modes(len(slots)),
+            adaptation=st.builds(Adaptation, late=late, after=after),
+        ),
     )
 
 
@@ -392,8 +364,8 @@ def test_what_is_dumped_is_loaded_equal(plan: Plan) -> None:
         file = Path(folder) / "plan.yaml"
         save_plan(plan, file)
         again = load_plan(file)
-        assert again == plan
-        assert dump_plan(again) == dump_plan(plan)
+    assert again == plan
+    assert dump_plan(again) == dump_plan(plan)
 
 
 def _load(folder: Path, text: str) -> Plan:
