@@ -1,12 +1,14 @@
 """How long other chains can have a chain's core: by hand, and played out."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from bare_plans import MS, slots_ms
 from hypothesis import given
 from hypothesis import strategies as st
 from known import known
@@ -24,13 +26,13 @@ from chainshaper.planning import (
 )
 from chainshaper.planning.application_plan import combined, open_until_done
 from chainshaper.planning.overruns import expected
+from chainshaper.planning.plan import with_slots
 from chainshaper.planning.profile import Profile, Rival, interference, with_interference
 from chainshaper.reporting.latency import expected_text
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy
-
-MS = 1_000_000
+from chainshaper.workload.description import Application
 
 
 def _response(own: int, rivals: list[Rival], phases: list[int]) -> int:
@@ -85,14 +87,21 @@ nodes:
 """
 
 
+def recorded(
+    text: str, chains: Sequence[str], folder: Path, cycles: int
+) -> tuple[Application, tuple[Profile, ...]]:
+    """A described application, and what a simulation of it says of its chains."""
+    pytest.importorskip("numba")
+    (folder / "app.yaml").write_text(text)
+    application = load_application(folder / "app.yaml")
+    recording = simulate(application, folder / "rec", cycles=cycles)
+    return application, profile_chains(recording, chains)
+
+
 @pytest.mark.parametrize(("period", "before"), [("50ms", 0), ("40ms", 3)])
 def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path: Path) -> None:
-    pytest.importorskip("numba")
-    (tmp_path / "graph.yaml").write_text(GRAPH.replace("PERIOD", period))
-    application = load_application(tmp_path / "graph.yaml")
-    recording = simulate(application, tmp_path / "rec", cycles=40)
     chains = ("/in../left", "/in../right", "/first../other")
-    profiles = profile_chains(recording, chains)
+    _, profiles = recorded(GRAPH.replace("PERIOD", period), chains, tmp_path, cycles=40)
     alone = [int(one.every_step_ns.sum(axis=1).max()) / MS for one in profiles]
     # Dispatching and messages take some of a millisecond; the branch that came second, 5 ms later,
     # has not waited here.
@@ -110,12 +119,9 @@ def test_branches_and_a_better_chain_by_hand(period: str, before: int, tmp_path:
 def test_bands_are_where_outputs_come_and_the_last_is_behind_all_that_may_delay(
     tmp_path: Path,
 ) -> None:
-    pytest.importorskip("numba")
     varied = GRAPH.replace("{constant: 5ms}", "{uniform: [2ms, 10ms]}").replace("PERIOD", "100ms")
-    (tmp_path / "graph.yaml").write_text(varied)
-    application = load_application(tmp_path / "graph.yaml")
-    recording = simulate(application, tmp_path / "rec", cycles=500)
-    profiles = profile_chains(recording, ("/in../left", "/in../right"))
+    chains = ("/in../left", "/in../right")
+    application, profiles = recorded(varied, chains, tmp_path, cycles=500)
     plan, _ = plan_application(profiles, PlanRequest(bands=3, publish_slot_ns=200_000))
     shaped = simulate(application, tmp_path / "shaped", plan, cycles=500)
     for profile, chain in zip(profiles, plan.chains, strict=True):
@@ -135,7 +141,7 @@ def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = 
     second = half.copy()
     second[:9] += stalls_ms * MS
     topics = (f"/{name}1", f"/{name}2")
-    nodes = (topics[0], last or topics[1])
+    nodes, took = (topics[0], last or topics[1]), int(half[0])
     return Profile(
         2 * half,
         100 * MS,
@@ -145,10 +151,7 @@ def _profile(name: str, latency_ms: int, stalls_ms: int = 0, last: str | None = 
         topics=topics,
         begins=(ord(name), name),
         core_of=dict.fromkeys(nodes, 1),
-        callbacks=tuple(
-            CallbackTimes(n, 1, MS, int(half[0]), int(half[0]), (0,) * k)
-            for k, n in enumerate(nodes)
-        ),
+        callbacks=tuple(CallbackTimes(n, 1, MS, took, took, (0,) * k) for k, n in enumerate(nodes)),
         steps_ns=np.stack([half, half], axis=1),
         every_step_ns=np.stack([half, second], axis=1),
     )
@@ -198,20 +201,12 @@ def test_chains_of_which_only_latencies_are_known_take_turns() -> None:
 
 def test_chains_of_two_timers_of_one_node_take_turns() -> None:
     """Written by nodes, both begin with one name; their servers differ in nothing but time."""
-    nodes = ("/source", "/filter")
-    both = [
-        replace(
-            one,
-            spec=f"/source..{one.topics[-1]}",
-            nodes=nodes,
-            core_of=dict.fromkeys(nodes, 1),
-            callbacks=tuple(
-                replace(callback, node=node, publishes=topic)
-                for callback, node, topic in zip(one.callbacks, nodes, one.topics, strict=True)
-            ),
-        )
-        for one in (_profile("a", 30), _profile("b", 30))
-    ]
+    nodes, both = ("/source", "/filter"), []
+    for one in (_profile("a", 30), _profile("b", 30)):
+        stages = zip(one.callbacks, nodes, one.topics, strict=True)
+        callbacks = tuple(replace(own, node=n, publishes=topic) for own, n, topic in stages)
+        spec, cores = f"/source..{one.topics[-1]}", dict.fromkeys(nodes, 1)
+        both.append(replace(one, spec=spec, nodes=nodes, core_of=cores, callbacks=callbacks))
     plan, _ = plan_application(both)
     (running, _), (other, _) = (chain.servers for chain in plan.chains)
     assert (running.name, other.name) == ("chain", "chain_2")
@@ -272,28 +267,20 @@ nodes:
 """
 
 
+TURNS = ("/a1../a2", "/b1../b2")
+
+
 def test_an_overrun_goes_on_behind_the_next_chain_and_does_not_hit_it(tmp_path: Path) -> None:
     """The first chain's slot ends after 20 of up to 26 ms, and the second's follows at once."""
-    pytest.importorskip("numba")
-    (tmp_path / "app.yaml").write_text(OVERRUNNING)
-    application = load_application(tmp_path / "app.yaml")
-    recording = simulate(application, tmp_path / "rec", cycles=100)
-    plan, _ = plan_application(profile_chains(recording, ("/a1../a2", "/b1../b2")))
-    first, second = plan.chains
-    chain, output = first.servers
-    earlier = [
-        chain.model_copy(update={"slots": ((0, 20 * MS),)}),
-        output.model_copy(update={"slots": ((20 * MS, 21 * MS),)}),
+    application, profiles = recorded(OVERRUNNING, TURNS, tmp_path, cycles=100)
+    first, second = plan_application(profiles)[0].chains
+    earlier = {"chain": [(0, 20 * MS)], "output": [(20 * MS, 21 * MS)]}
+    tight = [
+        first.model_copy(update={"servers": with_slots(first.servers, earlier)}),
+        second.model_copy(update={"offset_ns": 20 * MS}),
     ]
-    tight = combined(
-        [
-            first.model_copy(update={"servers": tuple(earlier)}),
-            second.model_copy(update={"offset_ns": 20 * MS}),
-        ]
-    )
-    shaped = simulate(application, tmp_path / "shaped", tight, cycles=300)
-    late = measure_latency(shaped, "/a1../a2").analysis.statistics
-    other = measure_latency(shaped, "/b1../b2").analysis.statistics
+    shaped = simulate(application, tmp_path / "shaped", combined(tight), cycles=300)
+    late, other = (measure_latency(shaped, chain).analysis.statistics for chain in TURNS)
     assert (other.late, other.jitter_ns) == (0, 0)
     # It had 6 ms to go at most, behind a slot of the second chain that lasts for 10 to 13.
     assert 60 < (late.late or 0) < 180
@@ -303,30 +290,26 @@ def test_an_overrun_goes_on_behind_the_next_chain_and_does_not_hit_it(tmp_path: 
 @pytest.mark.parametrize("policy", ["pipelined", "server-per-callback", "let-per-callback"])
 def test_chains_with_slots_per_callback_only_take_turns(policy: Policy, tmp_path: Path) -> None:
     """30 ms every 40 and 26 every 100 do not."""
-    pytest.importorskip("numba")
     text = OVERRUNNING.replace("50ms", "40ms").replace("constant: 6ms", "constant: 22ms")
-    (tmp_path / "app.yaml").write_text(text)
-    recording = simulate(load_application(tmp_path / "app.yaml"), tmp_path / "rec", cycles=40)
-    profiles = profile_chains(recording, ("/a1../a2", "/b1../b2"))
+    _, profiles = recorded(text, TURNS, tmp_path, cycles=40)
     with pytest.raises(OperationError, match=f"core 1 .*Planned as {policy}, .* take turns"):
         plan_application(profiles, PlanRequest(policy=policy))
 
 
 def test_simulated_servers_of_callbacks_begin_at_their_chains_offsets(tmp_path: Path) -> None:
     """A timer whose phase is late in its slot would be stopped, and cost a cycle."""
-    pytest.importorskip("numba")
     text = OVERRUNNING.replace("50ms", "100ms, phase: 33ms")
-    (tmp_path / "app.yaml").write_text(text)
-    application, chains = load_application(tmp_path / "app.yaml"), ("/a1../a2", "/b1../b2")
-    recording = simulate(application, tmp_path / "rec", cycles=100)
-    request = PlanRequest(policy="server-per-callback")
-    plan, _ = plan_application(profile_chains(recording, chains), request)
+    application, profiles = recorded(text, TURNS, tmp_path, cycles=100)
+    plan, _ = plan_application(profiles, PlanRequest(policy="server-per-callback"))
     shaped = simulate(application, tmp_path / "shaped", plan, cycles=100)
-    for chain, one in zip(chains, plan.chains, strict=True):
+    for chain, one in zip(TURNS, plan.chains, strict=True):
         found = measure_latency(shaped, chain)
         assert (found.analysis.statistics.max_ns or 0) < one.servers[-1].slots[-1][1]
         starts = found.analysis.traversals["start"] % (100 * MS)
         assert abs(starts - one.offset_ns).max() < MS
+
+
+KNOWN = replace(_profile("a", 40), every_node=("/a1", "/a2", "/b1"))
 
 
 @pytest.mark.parametrize(
@@ -340,26 +323,18 @@ def test_simulated_servers_of_callbacks_begin_at_their_chains_offsets(tmp_path: 
     ],
 )
 def test_wishes_that_cannot_be_are_refused(wishes: dict[str, Any], said: str) -> None:
-    profile = replace(_profile("a", 40), every_node=("/a1", "/a2", "/b1"))
     with pytest.raises((InputError, OperationError), match=said):
-        plan_chain(profile, PlanRequest(**wishes))
+        plan_chain(KNOWN, PlanRequest(**wishes))
 
 
-def test_the_first_node_has_its_slot_on_its_own_core() -> None:
+def test_the_first_node_has_its_slot_on_its_own_core_and_best_effort_is_no_stage() -> None:
     """Timer on core 0, the rest on core 1: [0, 2) there, and [2, 41) ms here."""
-    profile = replace(_profile("a", 40), core_of={"/a1": 0, "/a2": 1})
-    plan = plan_chain(profile, PlanRequest(first_slot_ns=2 * MS))
-    assert {one.name: (one.core, one.slots) for one in plan.servers} == {
-        "first": (0, ((0, 2 * MS),)),
-        "chain": (1, ((2 * MS, 41 * MS),)),
-        "output": (1, ((41 * MS, 42 * MS),)),
-    }
-
-
-def test_a_list_of_chains_is_for_another_function_and_best_effort_is_no_stage() -> None:
-    with pytest.raises(InputError, match="plan with `plan_application`"):
-        plan_recording("absent", ["/a1../a2", "/b1../b2"])  # type: ignore[arg-type]
-    profile = replace(_profile("a", 40), every_node=("/a1", "/a2", "/b1"))
-    plan = plan_chain(profile, PlanRequest(policy="pipelined", best_effort=("/b1",)))
+    apart = replace(_profile("a", 40), core_of={"/a1": 0, "/a2": 1})
+    plan = plan_chain(apart, PlanRequest(first_slot_ns=2 * MS))
+    assert slots_ms(plan) == {"first": [(0, 2)], "chain": [(2, 41)], "output": [(41, 42)]}
+    assert {one.name: one.core for one in plan.servers} == {"first": 0, "chain": 1, "output": 1}
+    plan = plan_chain(KNOWN, PlanRequest(policy="pipelined", best_effort=("/b1",)))
     (stages,) = (one for one in plan_warnings(plan) if "stages:" in one)
     assert "/b1" not in stages
+    with pytest.raises(InputError, match="plan with `plan_application`"):
+        plan_recording("absent", ["/a1../a2", "/b1../b2"])  # type: ignore[arg-type]
