@@ -9,7 +9,7 @@ from bare_plans import MS, bare_plan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chainshaper import load_application_plan, save_application_plan, save_plan
+from chainshaper import load_application_plan, load_plan, save_application_plan, save_plan
 from chainshaper.flow.threads import server_table
 from chainshaper.planning.application_plan import ApplicationPlan, combined, plan_of_chain, whole
 from chainshaper.planning.plan import Plan, Server, Slot, Thread, revised
@@ -31,18 +31,6 @@ def _chain(name: str, cycle: int, offset: int, *servers: Server) -> Plan:
     return bare_plan(f"{named}..", cycle * MS, *servers, output=named, offset_ns=offset * MS)
 
 
-def test_slots_are_played_out_over_the_hyper_period() -> None:
-    """By hand: cycles of 4 and 6 ms repeat after 12; b begins 5 ms late, so it ends in the next."""
-    a = _chain("a", 4, 0, _server("a", [(0, 1)], "x"))
-    b = _chain("b", 6, 5, _server("b", [(0, 2)], "y", core=2))
-    both = combined([a, b])
-    assert both.cycle_ns == 12 * MS
-    one, two = both.servers
-    assert one.slots == _server("by hand", [(0, 1), (4, 5), (8, 9)]).slots
-    assert two.slots == _server("by hand", [(0, 1), (5, 7), (11, 12)]).slots
-    assert whole(a).servers == a.servers
-
-
 def test_a_thread_of_several_chains_runs_in_the_slots_of_all() -> None:
     """By hand: x runs at 0–1, 4–5, 8–9 for a, and at 1–2, 7–8 for b; what touches is one slot."""
     a = _chain("a", 4, 0, _server("a", [(0, 1)], "x"))
@@ -52,6 +40,7 @@ def test_a_thread_of_several_chains_runs_in_the_slots_of_all() -> None:
     assert shared.slots == _server("by hand", [(0, 2), (4, 5), (7, 9)]).slots
     assert (own.name, [thread.node for thread in own.threads]) == ("b", ["/y"])
     assert own.slots == _server("by hand", [(1, 2), (7, 8)]).slots
+    assert whole(a).servers == a.servers
 
 
 _SLOTS = st.lists(st.integers(0, 5), min_size=2, max_size=4, unique=True).map(sorted)
@@ -113,7 +102,7 @@ def three() -> ApplicationPlan:
 def test_a_plan_is_written_with_each_server_once_and_read_again(
     three: ApplicationPlan, tmp_path: Path
 ) -> None:
-    path = tmp_path / "plan.yaml"
+    path, alone = tmp_path / "plan.yaml", tmp_path / "alone.yaml"
     save_application_plan(three, path)
     text = path.read_text()
     assert text.count("name: chain\n") == 1
@@ -123,6 +112,15 @@ def test_a_plan_is_written_with_each_server_once_and_read_again(
     assert [one.name for one in three.servers] == ["chain", "out_a", "out_b", "chain_2"]
     assert plan_of_chain(three, "/b") == three.chains[1]
     assert plan_of_chain(three, "/nowhere") is None
+    # Plans of one chain are written as ever.
+    chain = three.chains[2]
+    save_plan(chain, alone)
+    assert "format: 1" in alone.read_text()
+    assert load_application_plan(alone) == plan_in(plan_values(whole(chain))) == whole(chain)
+    assert plans_as_text(whole(chain).chains) == alone.read_text()
+    assert plan_values(whole(chain)) == chain.model_dump(mode="json")
+    with pytest.raises(InputError, match="the plan is of several chains"):
+        load_plan(path)
 
 
 def test_threads_have_the_plans_order_unless_single_callbacks_were_measured(
@@ -130,24 +128,11 @@ def test_threads_have_the_plans_order_unless_single_callbacks_were_measured(
 ) -> None:
     assert three.most_urgent_first == ("/first", "/second", "/gate_a", "/gate_b", "/third")
     assert [one.places for one in server_table(three).servers] == [2, 1, 1, 1]
-    alone = three.chains[0]
-    single = combined([revised(alone, policy="let-per-callback")])
+    single = combined([revised(three.chains[0], policy="let-per-callback")])
     assert single.most_urgent_first == ("/first",)
     assert [one.places for one in server_table(single).servers] == [2, 1], "the others share one"
-    turns = combined([revised(alone, equal_priorities="round-robin")])
+    turns = combined([revised(three.chains[0], equal_priorities="round-robin")])
     assert turns.most_urgent_first == ()
-
-
-def test_plans_of_one_chain_are_read_and_written_as_ever(
-    three: ApplicationPlan, tmp_path: Path
-) -> None:
-    chain, path = three.chains[2], tmp_path / "plan.yaml"
-    save_plan(chain, path)
-    assert "format: 1" in path.read_text()
-    assert load_application_plan(path) == whole(chain)
-    assert plans_as_text(whole(chain).chains) == path.read_text()
-    assert plan_in(chain.model_dump(mode="json")) == whole(chain)
-    assert plan_values(whole(chain)) == chain.model_dump(mode="json")
 
 
 @pytest.mark.parametrize(
@@ -181,16 +166,17 @@ def test_what_was_edited_wrongly_is_named_with_its_line(
 
 def test_what_makes_no_plan_together_is_refused() -> None:
     shared = _chain("a", 10, 0, _server("s", [(0, 1)], "x"))
-    with pytest.raises(InputError, match="cycles have another length or offset"):
-        combined([shared, _chain("b", 10, 1, *shared.servers)])
-    elsewhere = _chain("b", 10, 0, _server("t", [(0, 1)], "x", core=2))
-    with pytest.raises(InputError, match="of /x would run on core 2 here and on core 1"):
-        combined([shared, elsewhere])
     # 997, 1009 and 1013 ms have no common divisor: together they repeat after eleven days.
-    apart = [
-        _chain(name, cycle, 0, _server(name, [(0, 1)], name, core=core))
-        for core, (name, cycle) in enumerate((("a", 997), ("b", 1009), ("c", 1013)))
-    ]
-    with pytest.raises(InputError, match=r"repeat together after .* 10000 is the most"):
-        combined(apart)
+    cycles = enumerate((("a", 997), ("b", 1009), ("c", 1013)))
+    apart = [_chain(n, ms, 0, _server(n, [(0, 1)], n, core=core)) for core, (n, ms) in cycles]
+    for chains, words in (
+        ([shared, _chain("b", 10, 1, *shared.servers)], "cycles have another length or offset"),
+        (
+            [shared, _chain("b", 10, 0, _server("t", [(0, 1)], "x", core=2))],
+            "of /x would run on core 2 here and on core 1",
+        ),
+        (apart, r"repeat together after .* 10000 is the most"),
+    ):
+        with pytest.raises(InputError, match=words):
+            combined(chains)
     assert len(combined(apart[:2]).servers[0].slots) == 1009

@@ -315,13 +315,15 @@ def plans(draw: st.DrawFn) -> Plan:
     slots = tuple(zip(bounds[::2], bounds[1::2], strict=False))
     output, times, any_bool = draw(NAMES), st.integers(0, 10**12), st.booleans()
     priority = draw(st.integers(1, 98))
-    waits = {"core": 0, "fifo_priority": priority, "spin_ns": draw(times), "pause_ns": draw(times)}
+    waits: dict[str, Any] = {"core": 0, "fifo_priority": priority}
+    waits |= {"spin_ns": draw(times), "pause_ns": draw(times)}
     node = ShapingNode(name="gate", input=output + "_tmp", output=output, **waits)
     threads = {Thread(node=name) for name in draw(st.sets(NAMES, max_size=3))} - {node.thread}
     name = draw(st.text(min_size=1).filter(lambda name: name != "chain"))
     derived = Margin(epsilon_ns=7, source="derived", confidence_interval_ns=(3, 123_456_789))
     whole, own = ((0, period),), tuple(sorted(threads, key=lambda thread: thread.node))
-    latencies = {"min_latency_ns": low, "mean_latency_ns": mean, "max_latency_ns": high}
+    latencies: dict[str, Any] = {"min_latency_ns": low, "mean_latency_ns": mean}
+    latencies |= {"max_latency_ns": high}
     known = some(
         recording=st.text(),
         realtime=any_bool,
