@@ -50,12 +50,9 @@ def _compress(grid, windows, costs, work, positions):
     counts, ends = table_at(grid), table_at(grid + 8 * positions)
     nearest, farthest = table_at(windows), table_at(windows + 8 * positions)
     cost, column_of, base = table_at(costs), table_at(work), table_at(work + row)
-    slope, row_of, count_of = (
-        table_at(work + 2 * row),
-        table_at(work + 3 * row),
-        table_at(work + 4 * row),
-    )
-    first, last = table_at(work + 5 * row), table_at(work + 6 * row)
+    slope, row_of = table_at(work + 2 * row), table_at(work + 3 * row)
+    count_of, first = table_at(work + 4 * row), table_at(work + 5 * row)
+    last = table_at(work + 6 * row)
     remaining = table_at(work + 7 * row)  # columns before a position
     width = height = 0
     for k in range(positions):

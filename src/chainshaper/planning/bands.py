@@ -203,10 +203,9 @@ def with_bands(
     else:
         placement = (place_by_swarm if solver == "pso" else place_randomly)(problem, bands, seed)
     length, ends = problem.publish_slot_ns, placement.slot_ends_ns
-    likely, latest = (
-        predict_bands(latencies, ends, length, plan.into_open_slot)
-        for latencies in (latencies_ns, latencies_ns if most_ns is None else most_ns)
-    )
+    most = latencies_ns if most_ns is None else most_ns
+    latest = predict_bands(most, ends, length, plan.into_open_slot)
+    likely = predict_bands(latencies_ns, ends, length, plan.into_open_slot)
     predicted = likely.model_copy(update={"mean_ns": latest.mean_ns})
     return with_publish_slots(plan, [(end - length, end) for end in ends], predicted=predicted)
 

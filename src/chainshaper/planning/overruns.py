@@ -296,11 +296,8 @@ def _about_stages(plan: Plan) -> Iterator[str]:
     """Where a pipeline is cut, what it costs, and what has to be right for it."""
     if plan.policy != "pipelined":
         return
-    longest, cycle, stages = (
-        plan.evidence.max_latency_ns,
-        plan.cycle_ns,
-        plans.running_servers(plan),
-    )
+    longest, cycle = plan.evidence.max_latency_ns, plan.cycle_ns
+    stages = plans.running_servers(plan)
     where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
     cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
     waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""

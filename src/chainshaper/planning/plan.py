@@ -381,10 +381,8 @@ def band_predictions(plan: Plan) -> tuple[BandPrediction, ...]:
     slots, shares = publish_slots(plan), plan.predicted.shares
     if len(slots) != len(shares):
         return ()
-    return tuple(
-        BandPrediction(start, end, share, 0 if plan.into_open_slot == "next-slot" else end - start)
-        for (start, end), share in zip(slots, shares, strict=True)
-    )
+    exact, bands = plan.into_open_slot == "next-slot", zip(slots, shares, strict=True)
+    return tuple(BandPrediction(a, b, own, 0 if exact else b - a) for (a, b), own in bands)
 
 
 def publishing_servers(plan: Plan) -> tuple[Server, ...]:
@@ -433,10 +431,8 @@ def revised(plan: Plan, **changes: object) -> Plan:
 def _cycle(plan: Plan) -> Wrong:
     cycle, period, longest = plan.cycle_ns, plan.chain.period_ns, plan.evidence.max_latency_ns
     if cycle % period:
-        yield (
-            f"{duration_text(cycle)} is no multiple of the period {duration_text(period)}",
-            "cycle",
-        )
+        reason = f"{duration_text(cycle)} is no multiple of the period {duration_text(period)}"
+        yield reason, "cycle"
     if cycle <= longest and plan.policy not in PER_CALLBACK:
         reason = f"{duration_text(cycle)} is not longer than the longest latency measured,"
         reason += f" {duration_text(longest)}: plan with a longer period or a shorter chain"

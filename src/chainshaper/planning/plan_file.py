@@ -7,6 +7,7 @@ its name in its place.
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from shutil import rmtree
 from textwrap import indent
 from typing import Any
 
@@ -25,6 +26,8 @@ _HEADER = """\
 # slots are half-open, [start, end), and count from the start of a cycle.
 """
 
+_UNLESS_OTHERWISE = {"offset_ns", "into_open_slot", "shaping_thread", "equal_priorities"}
+_UNLESS_OTHERWISE |= {"further_shaping_nodes"}  # these are not written while they are as usual
 _SECTION_COMMENTS = {
     "evidence": "the measurements behind the plan",
     "margin": "epsilon: how far the chain's slot reaches beyond the longest latency measured",
@@ -69,35 +72,25 @@ def plans_as_text(plans: Sequence[Plan]) -> str:
         values = _yaml_values(plan)
         del values["format"]
         names = [server["name"] for server in values["servers"]]
-        values["servers"] = [
-            name if name in known else server
-            for name, server in zip(names, values["servers"], strict=True)
-        ]
+        pairs = zip(names, values["servers"], strict=True)
+        values["servers"] = [name if name in known else server for name, server in pairs]
         known.update(names)
         text += "- " + indent(_sections(values), "  ")[2:]
     return text
 
 
 def _yaml_values(plan: Plan) -> dict[str, Any]:
-    values = plan.model_dump(mode="json", by_alias=True, exclude_none=True, context=AS_YAML)
+    names = _UNLESS_OTHERWISE if plan.shaping_node else {*_UNLESS_OTHERWISE, "fallback"}
+    usual = {name for name in names if getattr(plan, name) == Plan.model_fields[name].default}
+    how: dict[str, Any] = {"mode": "json", "by_alias": True, "context": AS_YAML}
+    values = plan.model_dump(exclude_none=True, exclude=usual, **how)
     for server in values["servers"]:
-        server["threads"] = [
-            _OnOneLine({key: value for key, value in thread.items() if value})
-            for thread in server["threads"]
-        ]
+        threads = ({key: own for key, own in one.items() if own} for one in server["threads"])
+        server["threads"] = [_OnOneLine(thread) for thread in threads]
         if not server["best_effort"]:
             del server["best_effort"]
     if "modes" in values:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
-    if plan.offset_ns == 0:
-        del values["offset"]
-    for name in ("into_open_slot", "shaping_thread", "equal_priorities"):
-        if values[name] == Plan.model_fields[name].default:
-            del values[name]
-    if plan.shaping_node is None and plan.fallback == "bypass":
-        del values["fallback"]
-    if not values["further_shaping_nodes"]:
-        del values["further_shaping_nodes"]
     return values
 
 
@@ -160,9 +153,7 @@ def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
             written.append(folder / f"{number}_{name}.yaml")
             save_plan(plan, written[-1])
     except OperationError:
-        for path in written:
-            path.unlink(missing_ok=True)
-        folder.rmdir()
+        rmtree(folder)
         raise
     return written
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import partial
 from itertools import combinations, permutations
-from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -150,9 +149,7 @@ def _apart(profile: Profile) -> Profile:
 
 
 def best_effort_cores(
-    profiles: Sequence[Profile],
-    request: PlanRequest,
-    core_of: Mapping[str, int] = MappingProxyType({}),
+    profiles: Sequence[Profile], request: PlanRequest, core_of: Mapping[str, int] | None = None
 ) -> dict[str, int]:
     """The core of each node that is best effort: its own, or the first chain's, by ``core_of``."""
     if not request.best_effort:
@@ -267,15 +264,10 @@ def _covering(latencies: NDArray[np.int64], profile: Profile, request: PlanReque
     """The latency that covers all of these but the promised share, as far as a publish slot fits
     into the cycle behind it.
     """
-    latest = (
-        profile.period_ns
-        - _slot_ns(profile, request)
-        - margins.least_epsilon_ns(request.publication)
-    )
+    least_ns = margins.least_epsilon_ns(request.publication) + _slot_ns(profile, request)
+    latest = None if request.policy in OWN_SLOTS else profile.period_ns - least_ns
     share = request.overrun_probability or margins.OVERRUN_PROBABILITY
-    return margins.covered_latency(
-        latencies, share, None if request.policy in OWN_SLOTS else latest
-    )
+    return margins.covered_latency(latencies, share, latest)
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -349,12 +341,10 @@ def _together(
     modes = modes.model_copy(update={"bands": bands})
     why = f"but each mode's slot is placed from its own latencies, here {len(slots)}: leave it out"
     _refuse_placement(replace(request, bands=1) if request.bands == len(slots) else request, why)
-    measured = {
-        mode: shaping.evidence_of(
-            one.latencies_ns, **_of(one, "recording", "disturbed", "all_disturbed")
-        )
-        for mode, one in apart.items()
-    }
+    measured = {}
+    for mode, one in apart.items():
+        conditions = _of(one, "recording", "disturbed", "all_disturbed")
+        measured[mode] = shaping.evidence_of(one.latencies_ns, **conditions)
     both = replace(
         profile,
         latencies_ns=np.concatenate([one.latencies_ns for one in apart.values()]),

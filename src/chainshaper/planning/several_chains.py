@@ -144,11 +144,9 @@ def _planned(
                 found[k] = plan
         return with_own_names(found, groups)
 
+    at_once = None if request.policy in PER_CALLBACK else partial(plans, at_once=True)
     placed, remarks = place_chains(
-        plans(at_once=False),
-        together=groups,
-        time_limit_s=time_limit_s,
-        at_once=None if request.policy in PER_CALLBACK else partial(plans, at_once=True),
+        plans(at_once=False), together=groups, time_limit_s=time_limit_s, at_once=at_once
     )
     return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 

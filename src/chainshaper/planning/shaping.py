@@ -38,6 +38,8 @@ CHAIN_PRIORITY = 2
 BOUNDARY_NS = 1_000_000  # slots of callbacks are whole multiples of it
 PAUSE_NS = 2_000_000  # a receiver on a slow machine takes a millisecond to get to its callback
 _WISHES = {field.name for field in fields(Wishes)}
+_OF_PLAN = ("anchor", "into_open_slot", "messages", "fallback", "shaping_thread")  # of these
+_NO_NODES: dict[str, object] = {"shaping_node": None, "further_shaping_nodes": ()}
 
 
 @wrong_values_refused(Plan)
@@ -91,15 +93,11 @@ def plan_shaping(
         margin=margin or Margin(epsilon_ns=epsilon),
         policy="shaped",
         cycle_ns=period_ns,
-        anchor=wishes.anchor,
         overrun=wishes.overrun or "publish",
-        into_open_slot=wishes.into_open_slot,
-        messages=wishes.messages,
-        fallback=wishes.fallback,
-        shaping_thread=wishes.shaping_thread,
         servers=(running, _publishing(gated, core, (start, end), "output")),
         shaping_node=node,
         predicted=predict_bands(latencies, [end], length, wishes.into_open_slot),
+        **{name: getattr(wishes, name) for name in _OF_PLAN},
     )
 
 
@@ -380,8 +378,7 @@ def server_per_chain(plan: Plan) -> Plan:
         plan,
         policy="server-per-chain",
         servers=tuple(server for server in plan.servers if server is not publishing),
-        shaping_node=None,
-        further_shaping_nodes=(),
+        **_NO_NODES,
         predicted=Prediction(mean_ns=evidence.mean_latency_ns, max_ns=longest, jitter_ns=jitter),
     )
 
@@ -419,8 +416,7 @@ def server_per_callback(
     return plans.revised(
         plan,
         policy="server-per-callback",
-        shaping_node=None,
-        further_shaping_nodes=(),
+        **_NO_NODES,
         servers=tuple(servers),
         predicted=Prediction(
             mean_ns=start + last.mean_response_ns,
