@@ -50,10 +50,17 @@ def test_rays_meet_the_floor_walls_and_the_tops_of_boxes_where_they_must() -> No
     assert turned.reshape(3, 3)[1, 0] == pytest.approx(min(6.0 / np.cos(down), 2 / np.sin(-down)))
 
 
-def test_points_are_moved_from_where_the_lidar_is_mounted() -> None:
+def test_points_are_moved_from_where_the_lidar_is_mounted_and_clouds_keep_their_stamp() -> None:
     point = np.array([[2.0, 1.0, -1.9]], dtype=np.float32)
     assert in_vehicle(point, REAR) == pytest.approx(np.array([[-2.8, -1.0, 0.0]]), abs=1e-6)
     assert np.linalg.norm(directions(FRONT), axis=1) == pytest.approx(1.0, abs=1e-6)
+    stamp, points = 1_700_000_000_000_000_000, np.zeros((1, 3), dtype=np.float32)
+    message = cloud_message(point, like=scan_message(points, stamp, 41))
+    assert (origin_of(message), number_in(message)) == (stamp, 41)
+    # A voxel becomes the centroid of its points.
+    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.1, 0.1, 0.1]], dtype=np.float32)
+    centroids = np.array([[-0.1, 0.1, 0.1], [0.2, 0.1, 0.1]])
+    assert voxel_centroids(points, 1.0) == pytest.approx(centroids)
 
 
 def test_filters_keep_what_stands_and_lose_ground_dust_and_the_vehicle_itself() -> None:
@@ -69,13 +76,6 @@ def test_filters_keep_what_stands_and_lose_ground_dust_and_the_vehicle_itself() 
     dust = np.array([[-9.0, -9, 0]], dtype=np.float32)
     clean = without_outliers(np.concatenate([standing, dust]))
     assert (clean[:, 0] > 0).all() and len(clean) > 400
-
-
-def test_a_voxel_becomes_the_centroid_of_its_points() -> None:
-    points = np.array([[0.1, 0.1, 0.1], [0.3, 0.1, 0.1], [-0.1, 0.1, 0.1]], dtype=np.float32)
-    assert voxel_centroids(points, 1.0) == pytest.approx(
-        np.array([[-0.1, 0.1, 0.1], [0.2, 0.1, 0.1]])
-    )
 
 
 def test_the_drive_is_a_closed_smooth_loop() -> None:
@@ -118,12 +118,3 @@ def test_the_localizer_finds_its_way_through_the_whole_pipeline(
         check_pose(pose_message(found, like=cloud))
     error, worst = root_mean_square_error(tmp_path / "errors")
     assert 0 < error < worst < 0.05
-
-
-def test_a_cloud_keeps_stamp_and_number_of_what_it_was_made_from() -> None:
-    message = cloud_message(
-        np.ones((3, 3), dtype=np.float32),
-        like=scan_message(np.zeros((1, 3), dtype=np.float32), 1_700_000_000_000_000_000, 41),
-    )
-    assert origin_of(message) == 1_700_000_000_000_000_000
-    assert number_in(message) == 41

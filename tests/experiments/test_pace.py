@@ -17,14 +17,11 @@ def test_the_ordinary_pace_of_a_core_is_its_median() -> None:
     assert ordinary_pace({}) == {}
 
 
-def test_a_window_has_the_mean_pace_of_all_stretches_that_it_meets() -> None:
+def test_a_window_has_the_mean_pace_of_all_stretches_that_it_meets_if_they_were_watched() -> None:
     start, end = np.array([150, 210, 0, 310]), np.array([250, 290, 100, 320])
     first, second = relative_pace(_tables(), start, end, {0: 20.0, 1: 3.5})
     # 20 and 50: 35; only 50; only 20, since a window ends before its end.
     assert first.tolist() == [35 / 20, 50 / 20, 1, 1]
     assert second[0] == 2
-
-
-def test_a_core_that_nobody_watched_has_no_pace() -> None:
-    (row,) = relative_pace(_tables(), np.array([150]), np.array([250]), {7: 20.0})
+    (row,) = relative_pace(_tables(), start, end, {7: 20.0})
     assert np.isnan(row).all()

@@ -29,24 +29,15 @@ def test_figures_of_calm_cycles_in_time_stand_beside_those_of_all() -> None:
     runs = [a_run("live", 10, 12, 90, -1e-6, 130, disturbed=(2,)), a_run("simulated", 20, 21)]
     paper: dict[str, Value] = {"average": 11, "maximum": 12.5, "jitter": "≈ 2", "late": None}
     lines = lines_of("a", runs, paper, late_from_ns=100 * MS, why="so")
-    assert [(line.what, line.unit, line.paper, line.why) for line in lines] == [
-        ("a: average", "ms", 11, "so"),
-        ("a: maximum", "ms", 12.5, "so"),
-        ("a: jitter", "ms", "≈ 2", "so"),
-        ("a: late", "cycles", None, "so"),
+    assert [(line.what, line.unit, line.paper, line.why, *values(line)) for line in lines] == [
+        ("a: average", "ms", 11, "so", 20.5, 20.5, 11.0, 60.5),
+        ("a: maximum", "ms", 12.5, "so", 21.0, 21.0, 12.0, 130.0),
+        ("a: jitter", "ms", "≈ 2", "so", 1.0, 1.0, 2.0, 120.0),
+        ("a: late", "cycles", None, "so", 0, 0, 1, 1),
     ]
-    assert [values(line) for line in lines] == [
-        (20.5, 20.5, 11.0, 60.5),
-        (21.0, 21.0, 12.0, 130.0),
-        (1.0, 1.0, 2.0, 120.0),
-        (0, 0, 1, 1),
-    ]
-
-
-def test_late_outputs_of_disturbed_cycles_are_counted() -> None:
-    (line,) = lines_of("a", [a_run("live", 10, 130, 140, disturbed=(2,))], {"late": None},
-                       late_from_ns=100 * MS)  # fmt: skip
-    assert values(line) == (None, None, 1, 2)
+    late = [a_run("live", 10, 130, 140, disturbed=(2,))]
+    (line,) = lines_of("a", late, {"late": None}, late_from_ns=100 * MS)
+    assert values(line) == (None, None, 1, 2), "those of disturbed cycles are counted"
 
 
 def test_an_interval_holds_what_the_figure_is_when_blocks_are_drawn_again() -> None:
@@ -64,20 +55,11 @@ def test_an_interval_holds_what_the_figure_is_when_blocks_are_drawn_again() -> N
 
 
 def test_a_machine_that_stood_still_is_seen_by_its_stalls_alone() -> None:
-    def recorded(*stalls_ms: float) -> SimpleNamespace:
-        stalls = pl.DataFrame(
-            {"cpu": [0] * len(stalls_ms), "duration": [s * MS for s in stalls_ms]}
-        )
-        return SimpleNamespace(
-            events={
-                "machine_stall": stalls,
-                "callback_start": pl.DataFrame({"time": [0, 4_000 * MS]}),
-            }
-        )
-
-    assert not stood_still(recorded(20.0, 19.0))  # type: ignore[arg-type]
-    assert stood_still(recorded(20.0, 21.0))  # type: ignore[arg-type]
-    assert not stood_still(recorded())  # type: ignore[arg-type]
+    starts = pl.DataFrame({"time": [0, 4_000 * MS]})
+    for stalls_ms, still in (([20.0, 19.0], False), ([20.0, 21.0], True), ([], False)):
+        values = {"cpu": [0] * len(stalls_ms), "duration": [one * MS for one in stalls_ms]}
+        events = {"machine_stall": pl.DataFrame(values), "callback_start": starts}
+        assert stood_still(SimpleNamespace(events=events)) == still  # type: ignore[arg-type]
 
 
 def test_measured_values_stay_when_nothing_is_measured(tmp_path: Path) -> None:
@@ -102,11 +84,7 @@ def test_measured_values_stay_when_nothing_is_measured(tmp_path: Path) -> None:
         run["column"]: tuple(run[of] for of in ("cycles", "disturbed", "blocks", "repeats"))
         for run in document["runs"]
     }
-    assert counted == {
-        "live": (2, 1, 2, 2),
-        "simulated": (2, 0, 1, 0),
-        "fast": (1, 0, 1, 0),
-    }
+    assert counted == {"live": (2, 1, 2, 2), "simulated": (2, 0, 1, 0), "fast": (1, 0, 1, 0)}
     rows = pl.read_parquet(tmp_path / "x.parquet")
     assert rows.filter(pl.col("column") == "live")["latency_ns"].to_list() == [10 * MS, 12 * MS]
     assert rows.filter(pl.col("column") == "simulated")["latency_ns"].to_list() == [8 * MS, 8 * MS]
