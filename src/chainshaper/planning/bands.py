@@ -350,19 +350,19 @@ class _Tables:
         if problem.max_gap_ns is not None:
             reachable &= last - self.ends <= problem.max_gap_ns
             farthest = np.minimum(farthest, positions + problem.max_gap_ns // grid)
-        costs = np.where(reachable, behind * last, UNREACHABLE)[np.newaxis, :]
-        costs = np.vstack([costs, np.full((max(0, layers - 2), size), UNREACHABLE)])
+        costs = np.full((max(1, layers - 1), size), UNREACHABLE)
+        costs[0] = np.where(reachable, behind * last, UNREACHABLE)
         self.counts, self.costs = counts, costs
         self.successors = np.full(costs.shape, -1, dtype=np.int32)
-        if layers > 2:
+        work = np.empty((3, size), dtype=np.int64)
+        for layer in range(1, layers - 1):
             # What loads machine code takes a moment to import, and two bands do without it.
             from chainshaper.values.compiled import kernel
 
-            grid_rows, windows = np.stack([counts, self.ends]), np.stack([nearest, farthest])
-            work = np.empty((12, size + 1), dtype=np.int64)
-            tables = (grid_rows, windows, costs, self.successors, work)
-            places = [array.ctypes.data for array in tables]
-            kernel("chainshaper.planning.band_kernel", "fill_costs")(*places, size, layers - 1)
+            rows = (costs[layer - 1], costs[layer], self.successors[layer])
+            tables = (counts, self.ends, nearest, farthest, *rows, work)
+            places = [table.ctypes.data for table in tables]
+            kernel("chainshaper.planning.band_kernel", "fill_layer")(*places, size)
 
     def totals(self, bands: int) -> NDArray[np.int64]:
         """The cost of all bands for every position of the first; two bands at least."""
