@@ -372,9 +372,7 @@ class Tail:
     earliest_ns: int = 0
     cycle_ns: float = math.inf
     seen: int = 0
-    _latencies: _Floats = field(init=False)
-    _begin: int = 0
-    _end: int = 0
+    _window: deque[float] = field(init=False)
     _lates: deque[int] = field(default_factory=lambda: deque(maxlen=AT_ONCE[-1]))
     _worth_since: int | None = None
     _earlier_at: int | None = None
@@ -382,19 +380,14 @@ class Tail:
     _shape: tuple[float, float] = field(init=False)  # median, and latency to aim at
 
     def __post_init__(self) -> None:
-        self._latencies = np.zeros(2 * self.rules.window)
+        self._window = deque(maxlen=self.rules.window)
         self._after, self._shape = self.rules.after, (self.usual_ns, float(self.start_ns))
 
     def saw(self, latency_ns: int) -> int | None:
         """The next output; where the slot is to begin from now on (None: where it does)."""
-        if self._end == self._latencies.size:
-            window = self.rules.window
-            self._latencies[:window] = self._latencies[window:]
-            self._begin, self._end = self._begin - window, window
-        waited = self._end > 0 and self._latencies[self._end - 1] > self.cycle_ns
-        self._latencies[self._end] = latency_ns
-        self._end, self.seen = self._end + 1, self.seen + 1
-        self._begin = max(self._begin, self._end - self.rules.window)
+        waited = bool(self._window) and self._window[-1] > self.cycle_ns
+        self._window.append(latency_ns)
+        self.seen += 1
         if latency_ns > self.start_ns and not waited:
             self._lates.append(self.seen)
             for cycles in AT_ONCE:
@@ -408,32 +401,33 @@ class Tail:
     def _step(self, cycles: int) -> int | None:
         """Of the last ``cycles`` too many are late, to be chance, from the first late one on."""
         first = next(one for one in self._lates if one > self.seen - cycles)
-        change = max(self._begin, self._end - 1 - (self.seen - first))
-        self._forget(change)
-        new = self._latencies[change : self._end]
+        new = self._begin_with(1 + self.seen - first)
         usual, aim = self._shape
         error = 1.25 * (aim - usual) / 3 / math.sqrt(new.size)  # of a median, if it were normal
         grown = (float(np.median(new)) + 2 * error) / usual
         return self._move_to(max(aim * grown, float(np.median(new[new > self.start_ns]))))
 
-    def _forget(self, change: int) -> None:
-        """The window begins with a change; of what came before, the shape is remembered."""
-        before = self._latencies[self._begin : change]
+    def _begin_with(self, latest: int) -> _Floats:
+        """So many latencies are the window; of what came before, the shape is remembered."""
+        window = np.array(self._window, dtype=float)
+        before = window[:-latest]
         if before.size >= self.rules.window // 8:
             aim = _beyond(before, AIM * self.promised)[0]
             self._shape = float(np.median(before)), aim
-        self._begin, self._after, self._worth_since = change, self.rules.after, None
+        self._window = deque(window[-latest:], maxlen=self.rules.window)
+        self._after, self._worth_since = self.rules.after, None
+        return window[-latest:]
 
     def _look(self) -> int | None:
-        window, size = self._latencies[self._begin : self._end], self._end - self._begin
+        size = len(self._window)
         if size < max(LATEST + 1, self.rules.window // 8):
             return None
-        now, rise = _without_drift(window)
+        now, rise = _without_drift(np.array(self._window, dtype=float))
         low, high = np.quantile(now[:-LATEST], (0.25, 0.75))
         most = _by_chance(LATEST, 0.25, DOUBT_AT_ONCE)
         latest = now[-LATEST:]
         if max(np.count_nonzero(latest < low), np.count_nonzero(latest > high)) > most:
-            self._forget(self._end - LATEST)
+            self._begin_with(LATEST)
             return None
         if rise:
             self._after = self.rules.after
