@@ -20,7 +20,7 @@ from chainshaper.planning.overruns import (
     open_until_done,
     plan_warnings,
 )
-from chainshaper.planning.pipeline import Longest, Stage, opened_early, shortest_cut
+from chainshaper.planning.pipeline import Longest, opened_early, shortest_cut
 from chainshaper.planning.plan import publish_slots
 from chainshaper.planning.plan_file import dump_plan, load_plan
 from chainshaper.planning.request import cores_for
@@ -109,16 +109,6 @@ def test_the_cut_is_the_shortest_there_is(problem: Problem) -> None:
         slots = [slot for s in own for slot in in_cycle(s.opens_ns, s.closes_ns, cycle)]
         assert all(0 <= start < end <= cycle for start, end in slots)
         assert apart(slots, cycle)
-
-
-def test_a_stage_waits_for_its_turn() -> None:
-    """On the first core 5 of 10 are left, but they begin 3 after the data are there."""
-    longest = longest_of([[5, 7, 5]])
-    stages = shortest_cut(longest, range(4), 0, 10, 2)
-    assert stages == (Stage(0, 1, 0, 0, 5), Stage(1, 2, 1, 5, 12), Stage(2, 3, 0, 15, 20))
-    alone = shortest_cut(longest, range(4), 0, 10, 3)
-    assert alone == (*stages[:2], Stage(2, 3, 2, 12, 17))
-    assert shortest_cut(longest_of([[5, 7, 9]]), range(4), 0, 10, 2) is None
 
 
 # Plans -----------------------------------------------------------------------------------------

@@ -467,9 +467,9 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
 def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> None:
     """Refuse wishes that nothing fulfils, with further ``sinks``, and ``modes`` measured or not."""
     if request.bands_of_modes == "found" and not (modes and request.policy == "shaped"):
+        reason = "nothing says which mode was in force while latencies were measured"
         raise InputError(
-            "nothing says which mode was in force while latencies were measured: give the modes'"
-            " own profiles (--mode-profile MODE=REC), or describe what `announces` them"
+            f"{reason}: add --mode-profile MODE=REC, or describe what `announces` them"
         )
     if request.epsilon_ns is not None and request.overrun_probability is not None:
         raise InputError("the margin is either given or covers a share: leave out one of both")
@@ -526,10 +526,8 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
             f"{two.name} begins at {two.begins[1]}, {one.name} at another callback, {one.begins[1]}"
         )
         if sinks:
-            raise InputError(
-                f"{begin}, and slots of a sink count from the beginning of the chain: name one"
-                " behind the same first callback, or plan one of the two alone"
-            )
+            reason = f"{begin}, and slots of a sink count from the beginning of the chain"
+            raise InputError(f"{reason}: name one behind the same callback, or plan one alone")
         if common := sorted(_waited_for(one, two) | _waited_for(two, one)):
             raise InputError(
                 f"{begin}, and both need {', '.join(common)}: neither's cycles can start without"

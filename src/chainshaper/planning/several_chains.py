@@ -8,6 +8,7 @@ on cores, or run there at priorities of their own
 (:func:`~chainshaper.planning.offsets.place_chains`).
 """
 
+from bisect import bisect
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -238,14 +239,9 @@ def _fitting(
                 names = (one.name for one in profiles if free in map(core_of.get, one.core_of))
                 yield f"{''.join(names)} on a core of its own while it is recorded"
     if request.epsilon_ns and fits(replace(request, epsilon_ns=0)):
-        low, high = 0, request.epsilon_ns // _MARGIN_STEP_NS + 1
-        while high - low > 1:
-            middle = (low + high) // 2
-            if fits(replace(request, epsilon_ns=middle * _MARGIN_STEP_NS)):
-                low = middle
-            else:
-                high = middle
-        yield f"--epsilon {format_duration(low * _MARGIN_STEP_NS)}"
+        margins = range(_MARGIN_STEP_NS, request.epsilon_ns + 1, _MARGIN_STEP_NS)
+        most = bisect(margins, False, key=lambda ns: not fits(replace(request, epsilon_ns=ns)))
+        yield f"--epsilon {format_duration(most * _MARGIN_STEP_NS)}"
     smaller = replace(request, ideal_machine=True, overrun_probability=None)
     if request.epsilon_ns is None and not request.ideal_machine and fits(smaller):
         yield "a margin for a machine that does not stall (--ideal-machine)"
