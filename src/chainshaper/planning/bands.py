@@ -116,10 +116,9 @@ class BandProblem:
             raise InputError("the publish slot and the grid must be longer than 0 ms")
         _refuse_before_longest(self.last_end_ns - self.at_start_ns, int(latencies[-1]))
         if gap is not None and gap <= slot:
-            reason = (
-                f"no two slots could follow each other: the largest gap {duration_text(gap)} is"
-            )
-            raise InputError(f"{reason} not longer than the publish slot {duration_text(slot)}")
+            reason = f"not longer than the publish slot {duration_text(slot)}: allow more"
+            gap_is = f"the largest gap {duration_text(gap)} is"
+            raise InputError(f"no two slots could follow each other: {gap_is} {reason}")
         if share is not None and not 0 < share <= 1:
             raise InputError(f"the largest share per band must be above 0, at most 1: not {share}")
         if latencies.size * self.last_end_ns >= 2**62:
@@ -314,11 +313,13 @@ def _refuse_more_than_fit(problem: BandProblem, bands: int) -> None:
     if bands < 1:
         raise InputError(f"{bands} bands: plan with one band at least")
     if bands > problem.room:
-        raise InputError(
-            f"{bands} bands cannot be placed: behind the shortest latency"
-            f" {duration_text(int(problem.latencies_ns[0]))} there is room for {problem.room}"
-            f" publish slots of {duration_text(problem.publish_slot_ns)}: use fewer or shorter"
+        where = (
+            f"behind the shortest latency {duration_text(int(problem.latencies_ns[0]))} there is"
         )
+        reason = (
+            f"room for {problem.room} publish slots of {duration_text(problem.publish_slot_ns)}"
+        )
+        raise InputError(f"{bands} bands cannot be placed: {where} {reason}: use fewer or shorter")
 
 
 class _Tables:

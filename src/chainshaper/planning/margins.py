@@ -240,11 +240,10 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
             low, high = fit.interval_ns
             if high - low <= WIDEST_INTERVAL * fit.latency_ns:
                 return fit
-            raise OperationError(
-                f"{latencies.size} latencies are too few for an overrun probability of"
-                f" {probability:g}: its latency lies between {duration_text(low)} and"
-                f" {duration_text(high)}. Measure more cycles, or ask for less"
-            )
+            reason = f"{latencies.size} latencies are too few for an overrun probability of"
+            where = f"its latency lies between {duration_text(low)} and {duration_text(high)}"
+            remedy = "Measure more cycles, or ask for less"
+            raise OperationError(f"{reason} {probability:g}: {where}. {remedy}")
     reason = "the longest latencies do not follow a generalised Pareto distribution above any of"
     remedy = "look for two modes of the application in one recording, or give the margin"
     raise OperationError(f"{reason} {len(thresholds)} thresholds (best p {best:.3f}): {remedy}")

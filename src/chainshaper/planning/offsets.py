@@ -132,10 +132,9 @@ def _refuse_too_full(plans: Sequence[Plan]) -> None:
             shares.setdefault(cores.pop(), {})[chain_name(plan)] = share
     for core, of in sorted(shares.items()):
         if len(of) > 1 and (load := sum(of.values())) > 1 + 1e-9:
-            reason = (
-                f"with their margins, {', '.join(of)} fill {load:.1%} of the time of core {core}"
-            )
-            raise OperationError(f"{reason}: another core, longer periods, or smaller margins help")
+            reason = f"with their margins, {', '.join(of)} fill {load:.1%} of the time of core"
+            remedy = "another core, longer periods, or smaller margins help"
+            raise OperationError(f"{reason} {core}: {remedy}")
 
 
 def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
@@ -150,11 +149,9 @@ def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
     recordings = {one.evidence.recording or "REC" for one in plans}
     recording = recordings.pop() if len(recordings) == 1 else "REC"
     chains = " ".join(f"--chain {chain_name(one)}" for one in plans)
-    return (
-        "At the same time they would delay each other, and these plans do not say by how much: plan"
-        f" them together (`chainshaper plan {recording} {chains}`), which adds it. Where all were"
-        " measured at priorities of their own, write these into the plans"
-    )
+    said = "At the same time they would delay each other, and these plans do not say by how much:"
+    said += f" plan them together (`chainshaper plan {recording} {chains}`), which adds it. Where"
+    return f"{said} all were measured at priorities of their own, write these into the plans"
 
 
 def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
@@ -429,11 +426,9 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
         for place in one.slots.keys() & two.slots.keys()
     )
     excess = f", {duration_text(needed - common)} too long" if needed > common else ""
-    return (
-        f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide at"
-        f" every offset: they meet in every distance modulo {duration_text(common)}, and their"
-        f" longest take {duration_text(needed)}{excess}"
-    )
+    said = f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide"
+    said += f" at every offset: they meet in every distance modulo {duration_text(common)}, and"
+    return f"{said} their longest take {duration_text(needed)}{excess}"
 
 
 def chain_name(plan: Plan) -> str:

@@ -228,11 +228,10 @@ def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
             if others:
                 doubt = {True: "", None: " (if asynchronous)"}
                 topics = sorted({f"{one.topic}{doubt[one.asynchronous]}" for one in others})
-                warnings.append(
-                    f"{', '.join(topics)} of {', '.join(sorted({one.node for one in others}))}"
-                    f" will be delayed as well, until the slots of server {server.name!r}: publish"
-                    " synchronously, or from another process, which has a thread of its own."
-                )
+                said = f"{', '.join(topics)} of {', '.join(sorted({one.node for one in others}))}"
+                said += f" will be delayed as well, until the slots of server {server.name!r}:"
+                remedy = "publish synchronously, or from another process, which has its own thread."
+                warnings.append(f"{said} {remedy}")
     return warnings
 
 
@@ -242,9 +241,7 @@ def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) ->
         raise InputError(f"{gated}: plan again from a recording of this application")
     if writer.asynchronous is False:
         reason = f"{node} publishes {topic} synchronously, so gating its thread would hold nothing"
-        raise InputError(
-            f"{reason}: publish asynchronously, or plan with --publication synchronous"
-        )
+        raise InputError(f"{reason}: publish so, or plan with --publication synchronous")
     if writer.depth is not None and writer.depth < waiting:
         reason = f"{topic} has a history of {writer.depth}, but {waiting} messages come while the"
         raise InputError(f"{reason} thread of {node} may not run: give it a depth of {waiting + 1}")
@@ -255,22 +252,20 @@ def publication_warnings(plan: Plan) -> list[str]:
     warnings = []
     for _, server, nodes in plans.publisher_servers(open_until_done(plan)):
         names = ", ".join(nodes)
-        warnings.append(
-            f"only asynchronous publication can be shaped like this, and all of it is: what else"
-            f" {names} publishes so, such as /rosout, waits for the slots of {server.name!r} too."
-        )
+        said = f"all asynchronous publication is shaped: what else {names} publishes so, such as"
+        warnings.append(f"{said} /rosout, waits for the slots of {server.name!r} too.")
         shortest = min(end - start for start, end in server.slots)
         if shortest < ROOMY_SLOT_NS:
-            warnings.append(
-                f"a slot of {duration_text(shortest)} that opens late may end while {names}"
-                " sends, which blocks the whole process until the next one; one of"
-                f" {duration_text(ROOMY_SLOT_NS)} (--publish-slot) costs nothing."
+            said = (
+                f"a slot of {duration_text(shortest)} that opens late may end while {names} sends"
             )
+            said += ", which blocks the whole process until the next one; one of"
+            said += f" {duration_text(ROOMY_SLOT_NS)} (--publish-slot) costs nothing."
+            warnings.append(said)
         depth, mine = plan.chain.output_depth, plan.chain.publisher in nodes
         if mine and plan.overrun == "wait" and depth == plans.messages_waiting(plan, server):
-            warnings.append(
-                f"a history of {depth} has no room for an output that overran: give it one more."
-            )
+            said = f"a history of {depth} has no room for an output that overran"
+            warnings.append(f"{said}: give it one more.")
     if plan.overrun == "discard" and warnings:
         lifespan, topic = output_lifespan(plan), plan.chain.output or "their topic"
         warnings.append(
@@ -301,11 +296,9 @@ def _about_stages(plan: Plan) -> Iterator[str]:
     where = (f"{', '.join(t.node for t in one.threads)} on core {one.core}" for one in stages)
     cost = _leaves_at(plan) - longest - plan.margin.epsilon_ns
     waits = f"; {milliseconds(cost)} ms of it for stages that wait for their turn" if cost else ""
-    yield (
-        f"the chain takes up to {milliseconds(longest)} ms, {longest / cycle:.2f} times its cycle,"
-        f" and has {len(stages)} stages: {'; '.join(where)}. Outputs leave at"
-        f" {milliseconds(_leaves_at(plan))} ms, once a cycle{waits}."
-    )
+    said = f"the chain takes up to {milliseconds(longest)} ms, {longest / cycle:.2f} times its"
+    said += f" cycle, and has {len(stages)} stages: {'; '.join(where)}. Outputs leave at"
+    yield f"{said} {milliseconds(_leaves_at(plan))} ms, once a cycle{waits}."
     for one, two in combinations(stages, 2):
         both = product(one.slots, two.slots) if one.core == two.core else ()
         if any(plans.meet(*pair) for pair in both):
@@ -346,26 +339,20 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
         yield f"the machine disturbed {evidence.disturbed} of {cycles} cycles{what}."
     if margin.stalls_ns:
         end = _leaves_at(plan)
-        yield (
-            f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
-            f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
-            f" {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
-        )
+        said = f"covering the disturbed cycles costs {milliseconds(margin.stalls_ns)} ms: outputs"
+        said += f" leave at {milliseconds(end)} ms; on a machine that does not stall it would be"
+        yield f"{said} {milliseconds(end - margin.stalls_ns)} ms (--ideal-machine)."
     late = margin.overrun_probability or 0.0
     if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
-        yield (
-            f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their slot"
-            f" ({plan.overrun}): a larger margin (--epsilon) or a calmer machine helps."
-        )
+        said = f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their"
+        yield f"{said} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."
 
 
 def _about_evidence(plan: Plan) -> Iterator[str]:
     """What is doubtful about the measurements, or about how much of the cycle is used."""
     if plan.modes is not None and plan.evidence.modes is None:
-        yield (
-            "nothing says which mode was in force, so the modes share bands of them all: one that"
-            " takes longer will be late. Give each one's profile (--mode-profile MODE=REC)."
-        )
+        said = "nothing says which mode was in force, so the modes share bands of them all"
+        yield f"{said}: one that takes longer is late. Give each one's profile (--mode-profile)."
     evidence, cycle, margin = plan.evidence, plan.cycle_ns, plan.margin
     longest, used = evidence.max_latency_ns, evidence.utilisation or 0.0
     last = max((end for _, end in plans.publish_slots(plan)), default=longest)
@@ -389,10 +376,8 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         said = f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}"
         yield f"{said}: an execution a little longer than any measured delays the next one."
     if longest >= cycle and plan.policy != "pipelined":
-        yield (
-            f"the longest latency {duration_text(longest)} is not shorter than the cycle"
-            f" {duration_text(cycle)}: executions delayed each other while they were measured."
-        )
+        said = f"the longest latency {duration_text(longest)} is not shorter than the cycle"
+        yield f"{said} {duration_text(cycle)}: executions delayed each other while measured."
     if NEARLY_FULL * cycle < longest < cycle:
         said = f"the longest execution takes more than {NEARLY_FULL:.0%} of a cycle, where the"
         yield f"{said} kernel throttles real-time threads (/proc/sys/kernel/sched_rt_runtime_us)."

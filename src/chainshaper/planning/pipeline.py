@@ -280,11 +280,12 @@ def _refuse_too_long(
         if needed > cycle_ns:
             several = ", ".join(dict.fromkeys(nodes[first:end]))
             why = "" if end == first + 1 else " together, which one thread has to run,"
-            raise OperationError(
-                f"the work of {several}{why} takes up to {duration_text(longest[first][end])},"
-                f" with its margin {duration_text(needed - cycle_ns)} longer than the cycle: take"
-                f" a period of {duration_text(needed)}, or parts of it in nodes of their own"
+            took, excess = duration_text(longest[first][end]), duration_text(needed - cycle_ns)
+            reason = f"{why} takes up to {took}, with its margin {excess} longer than the cycle"
+            remedy = (
+                f"take a period of {duration_text(needed)}, or parts of it in nodes of their own"
             )
+            raise OperationError(f"the work of {several}{reason}: {remedy}")
 
 
 def _no_room(

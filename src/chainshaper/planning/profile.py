@@ -200,11 +200,9 @@ def interfering_callback(profile: Profile) -> str | None:
     if worst.origins and not set(worst.origins) & {*profile.core_of}:
         nodes = " and ".join(f"--best-effort {node}" for node in worst.origins)
         remedy = f"with {nodes} what triggers it runs only when the chain does not"
-    return (
-        f"{profile.name}: in {worst.share:.0%} of its cycles one of its threads also runs"
-        f" {worst.label}, which is not part of it, for up to"
-        f" {milliseconds(worst.longest_ns, 1)} ms: {remedy}"
-    )
+    said = f"{profile.name}: in {worst.share:.0%} of its cycles one of its threads also runs"
+    said += f" {worst.label}, which is not part of it, for up to"
+    return f"{said} {milliseconds(worst.longest_ns, 1)} ms: {remedy}"
 
 
 def deciding_cycles(profile: Profile) -> str | None:
@@ -238,11 +236,9 @@ def deciding_cycles(profile: Profile) -> str | None:
         remedy = f"--percentile {math.floor(1000 * (1 - number / latencies.size)) / 10:g}"
     cycles = ", ".join(f"{start / 1e9:.1f} s" for start in starts[few[:3]])
     longest, beyond = milliseconds(int(latencies[few[0]]), 1), milliseconds(next_longest, 1)
-    return (
-        f"{number} of {latencies.size} cycles decide{'s' * (number == 1)} the longest latency, at"
-        f" {cycles}{', …' * (number > 3)}: {longest} ms{where}; the next longest takes {beyond} ms."
-        f" Likely {cause}: leave it out with {remedy}"
-    )
+    said = f"{number} of {latencies.size} cycles decide{'s' * (number == 1)} the longest latency,"
+    said += f" at {cycles}{', …' * (number > 3)}: {longest} ms{where}; the next longest takes"
+    return f"{said} {beyond} ms. Likely {cause}: leave it out with {remedy}"
 
 
 class Rival(NamedTuple):

@@ -99,10 +99,12 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     if request.policy in OWN_SLOTS:  # shaping, only the start of the plan, must fit into a cycle
         length = _slot_ns(profile, request)
         if (most := period - margin.epsilon_ns - length) < 1:
+            both = f"margin {duration_text(margin.epsilon_ns)} and the publish slot"
+            reason = (
+                f"{duration_text(length)} leave nothing of the cycle of {duration_text(period)}"
+            )
             raise OperationError(
-                f"the margin {duration_text(margin.epsilon_ns)} and the publish slot"
-                f" {duration_text(length)} leave nothing of the cycle of {duration_text(period)}:"
-                " plan with a shorter publish slot, or a smaller margin"
+                f"the {both} {reason}: plan with a shorter slot, or smaller margin"
             )
         latencies = np.minimum(margins.check_latencies(profile.latencies_ns), most)
         measured = replace(profile, latencies_ns=latencies)
@@ -219,11 +221,9 @@ def moved_to(
         own = {node: core_of[node] for node in one.core_of}
         homes = {(own[node], core) for node, core in one.core_of.items()}
         if not len(homes) == len(set(own.values())) == len(set(one.core_of.values())):
-            doubts.append(
-                f"{one.name} was measured with its executors on cores in another way than planned,"
-                " which is another latency: measure it so (`chainshaper profile --cores"
-                f" {','.join(map(str, cores))}`)"
-            )
+            said = f"{one.name} was measured with its executors on cores in another way than"
+            said += " planned, which is another latency: measure it so (`chainshaper profile"
+            doubts.append(f"{said} --cores {','.join(map(str, cores))}`)")
         callbacks = tuple(replace(each, core=core_of[each.node]) for each in one.callbacks)
         moved.append(replace(one, core_of=own, callbacks=callbacks))
     return tuple(moved), doubts
@@ -248,10 +248,9 @@ def _covered(profile: Profile, request: PlanRequest) -> Profile:
     if not profile.all_disturbed:
         return profile
     if request.ideal_machine:
-        raise OperationError(
-            f"{profile.recording or profile.name}: the machine disturbed every cycle of"
-            f" {profile.name}, but one at most: leave out --ideal-machine, or record again"
-        )
+        reason = f"the machine disturbed every cycle of {profile.name}, but one at most"
+        remedy = "leave out --ideal-machine, or record again"
+        raise OperationError(f"{profile.recording or profile.name}: {reason}: {remedy}")
     if request.percentile is not None:  # what takes longer has been left out
         return profile
     every = profile.every
@@ -365,17 +364,14 @@ def _shaped(
     values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
     if request.publication == "asynchronous":
         if profile.asynchronous is False:
-            raise InputError(
-                f"{last} has no thread that publishes for it: plan with --publication synchronous,"
-                " or record with rmw_fastrtps_cpp, RMW_FASTRTPS_PUBLICATION_MODE=ASYNCHRONOUS"
-            )
+            reason = f"{last} has no thread that publishes for it: plan with --publication"
+            reason += " synchronous, or record with rmw_fastrtps_cpp,"
+            raise InputError(f"{reason} RMW_FASTRTPS_PUBLICATION_MODE=ASYNCHRONOUS")
         values["output_depth"] = profile.output_depth
     if request.publication == "in-process" and profile.intra_process:
-        raise InputError(
-            f"subscribers of {profile.topics[-1]} get its messages inside the process of {last},"
-            " where no gate before DDS sees them: switch that off, or plan with --publication"
-            " synchronous and --node component"
-        )
+        reason = f"subscribers of {profile.topics[-1]} get its messages inside the process of"
+        reason += f" {last}, where no gate before DDS sees them: switch that off, or plan with"
+        raise InputError(f"{reason} --publication synchronous and --node component")
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it
     length = _slot_ns(profile, request)
@@ -468,9 +464,7 @@ def refuse_contradictions(request: PlanRequest, *, sinks: bool, modes: bool) -> 
     """Refuse wishes that nothing fulfils, with further ``sinks``, and ``modes`` measured or not."""
     if request.bands_of_modes == "found" and not (modes and request.policy == "shaped"):
         reason = "nothing says which mode was in force while latencies were measured"
-        raise InputError(
-            f"{reason}: add --mode-profile MODE=REC, or describe what `announces` them"
-        )
+        raise InputError(f"{reason}: add --mode-profile MODE=REC, or say what `announces` them")
     if request.epsilon_ns is not None and request.overrun_probability is not None:
         raise InputError("the margin is either given or covers a share: leave out one of both")
     if (share := request.overrun_probability) is not None and not 0 < share < 1:
@@ -529,10 +523,9 @@ def refuse_entangled(profiles: Sequence[Profile], policy: Policy, *, sinks: bool
             reason = f"{begin}, and slots of a sink count from the beginning of the chain"
             raise InputError(f"{reason}: name one behind the same callback, or plan one alone")
         if common := sorted(_waited_for(one, two) | _waited_for(two, one)):
-            raise InputError(
-                f"{begin}, and both need {', '.join(common)}: neither's cycles can start without"
-                " the other's. Begin both where all of it comes from, or plan one of the two alone"
-            )
+            reason = f"{begin}, and both need {', '.join(common)}: neither's cycles can start"
+            reason += " without the other's. Begin both where all of it comes from, or plan one of"
+            raise InputError(f"{reason} the two alone")
 
 
 def refuse_simulated(profiles: Sequence[Profile], request: PlanRequest) -> None:

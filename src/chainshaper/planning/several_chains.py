@@ -161,10 +161,9 @@ def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequ
         others = [one.name for one in every if one is not profile and core in one.core_of.values()]
         if core is None or not profile.interference_ns:
             raise
-        raise OperationError(
-            f"{profile.name} on core {core}, {duration_text(profile.interference_ns)} behind"
-            f" {' and '.join(others)}: {str(error).rstrip('.')}"
-        ) from error
+        behind = f"{duration_text(profile.interference_ns)} behind {' and '.join(others)}"
+        reason = str(error).rstrip(".")
+        raise OperationError(f"{profile.name} on core {core}, {behind}: {reason}") from error
 
 
 def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:

@@ -300,10 +300,9 @@ def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cyc
         if not any(plans.meet((one[0] + later, one[1] + later), two) for one, two in pairs)
     )
     if (end := later_ns + max(one.slots[-1][1] for one in own)) > cycle_ns:
-        raise OperationError(
-            f"{name} would be published until {duration_text(end)}, after the cycle of"
-            f" {duration_text(cycle_ns)}: use a shorter slot, or another core for an output"
-        )
+        reason = f"until {duration_text(end)}, after the cycle of {duration_text(cycle_ns)}"
+        remedy = "use a shorter slot, or another core for an output"
+        raise OperationError(f"{name} would be published {reason}: {remedy}")
     return later_ns
 
 
@@ -399,11 +398,9 @@ def server_per_callback(
     slots = _slots_in_sequence(callbacks, margin_ns)
     end = max(slot[1] for slot in slots)
     if end > plan.cycle_ns:
-        raise OperationError(
-            f"one slot per callback takes {duration_text(end)}, the cycle is"
-            f" {duration_text(plan.cycle_ns)}: shape the chain, plan with a smaller margin"
-            " (--epsilon), or move callbacks to another core"
-        )
+        reason = f"one slot per callback takes {duration_text(end)}, the cycle is"
+        reason += f" {duration_text(plan.cycle_ns)}: shape the chain, plan with a smaller margin"
+        raise OperationError(f"{reason} (--epsilon), or move callbacks to another core")
     last, (start, _) = callbacks[-1], slots[-1]
     servers = []
     for node in dict.fromkeys(callback.node for callback in callbacks):
