@@ -16,7 +16,7 @@ CP-SAT solver of OR-tools decides, which is exact as well but may run out of tim
 import math
 import random
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import combinations, product
@@ -57,18 +57,20 @@ class Timetable(NamedTuple):
     slots: dict[tuple[int, int], list[Slot]]
 
 
-def _timetable(plans: Sequence[Plan], alone: Iterable[tuple[tuple[int, int], int]]) -> Timetable:
-    """The slots of a chain, or of several that share servers, of which each counts once; and
-    ``alone``, where others must not run for so long (ns) after the cycle has begun.
+def _timetable(own: Sequence[Plan], plans: Sequence[Plan], alone: float | None) -> Timetable:
+    """The slots of a chain, or of several that share servers, of which each counts once; and of
+    better servers of all plans, which must not run for this share of the slot that it begins with.
     """
-    servers = {server.name: server for plan in plans for server in plan.servers}
+    named = {one.name: one for plan in own for one in plan.servers if not one.best_effort}
     slots: dict[tuple[int, int], list[Slot]] = {}
-    for server in servers.values():
-        if not server.best_effort:
-            slots.setdefault((server.core, server.priority), []).extend(server.slots)
-    for place, length_ns in alone:
-        slots.setdefault(place, []).append((0, length_ns))
-    return Timetable(" and ".join(map(chain_name, plans)), plans[0].cycle_ns, slots)
+    for server in named.values():
+        slots.setdefault((server.core, server.priority), []).extend(server.slots)
+    first = {one.core: one for one in named.values() if one.slots[0][0] == 0}
+    for core, best in sorted({(one.core, one.priority) for p in plans for one in p.servers}):
+        if alone is not None and core in first and best < first[core].priority:
+            length_ns = max(START_NS, int(alone * first[core].slots[0][1]))
+            slots.setdefault((core, best), []).append((0, length_ns))
+    return Timetable(" and ".join(map(chain_name, own)), own[0].cycle_ns, slots)
 
 
 def place_chains(
@@ -198,8 +200,7 @@ def with_offsets(
         if together is None:  # else it is known which begin at one callback, not only their names
             _refuse_same_beginning(one, two)
     together = together or [[k] for k in range(len(plans))]
-    own = [[plans[k] for k in one] for one in together]
-    tables = [_timetable(one, _alone(one, plans, alone)) for one in own]
+    tables = [_timetable([plans[k] for k in one], plans, alone) for one in together]
     found = _find_offsets(tables, time_limit_s, windows)
     offset_of = {k: found[number] for number, one in enumerate(together) for k in one}
     return tuple(revised(plan, offset_ns=offset_of[k]) for k, plan in enumerate(plans))
@@ -219,17 +220,6 @@ def with_windows(
     own = {n: at for n, (k, *_) in enumerate(together) if (at := windows_ns[k]) is not None}
     found = partial(with_offsets, plans, together=together, time_limit_s=time_limit_s, windows=own)
     return _longest_alone(found)
-
-
-def _alone(
-    own: Sequence[Plan], plans: Sequence[Plan], share: float | None
-) -> Iterator[tuple[tuple[int, int], int]]:
-    """Cores and priorities better than those with which a chain begins, and for how long (ns)."""
-    servers = [one for plan in own for one in plan.servers if not one.best_effort]
-    first = {one.core: one for one in servers if one.slots[0][0] == 0}
-    for core, best in sorted({(one.core, one.priority) for p in plans for one in p.servers}):
-        if share is not None and core in first and best < first[core].priority:
-            yield (core, best), max(START_NS, int(share * first[core].slots[0][1]))
 
 
 def _find_offsets(
