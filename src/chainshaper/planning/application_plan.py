@@ -163,12 +163,11 @@ def open_until_done(plan: ApplicationPlan, waits_ns: Sequence[int] = ()) -> Appl
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
     See :func:`chainshaper.planning.overruns.open_until_done`; slots that are planned for other
-    chains are left out, so that an overrun delays none of these; where that makes a server's slots
-    too many, it stays as planned. No such slot begins or ends while an output is due on the core:
-    whoever opens and closes servers would delay it. Of several chains, ``waits_ns`` is how long
-    before its cycle each one's timer expires: its thread waits, so that cycles start at their
-    offsets. So does the first stage of a pipeline, for slots of further stages to count from the
-    same instant.
+    chains are left out; where that makes a server's slots too many, it stays as planned. No such
+    slot begins or ends while an output is due on the core: whoever opens and closes servers would
+    delay it. ``waits_ns`` is how long before its cycle each chain's timer expires: of several
+    chains, and of the first stage of a pipeline, the thread waits, so that cycles start at their
+    offsets.
     """
     opened: dict[str, Server] = {}
     known_ns = waits_ns or [-WAITING_NS] * len(plan.chains)

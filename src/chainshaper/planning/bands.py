@@ -51,9 +51,8 @@ PARTICLES, ITERATIONS, OPTIONS = 100, 150, {"c1": 0.5, "c2": 0.3, "w": 0.9}
 def counts_and_mean(
     ordered_ns: NDArray[np.int64], ends_ns: NDArray[np.int64] | Sequence[int]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """How many of ascending latencies publish in each slot, and the average of eq. 5.
-
-    ``ends_ns`` ascend along the last axis; the last is not before the longest latency.
+    """How many of ascending latencies publish in each slot, and the average of eq. 5. Ends ascend
+    along the last axis; the last is not before the longest latency.
     """
     ends = np.asarray(ends_ns)
     counts = np.diff(np.searchsorted(ordered_ns, ends, side="right"), prepend=0, axis=-1)
@@ -228,10 +227,8 @@ def choose_bands(
 
 
 def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:
-    """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before.
-
-    An execution that is done earlier waits for it, any other publishes at once: the average falls
-    and the jitter grows as the start moves towards the shortest latency (end of section 4.1).
+    """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before:
+    the average falls and the jitter grows as it starts earlier (end of section 4.1).
     """
     start, end = _last_publish_slot(plan)
     if not 0 <= slot_start_ns <= start:
@@ -489,9 +486,8 @@ def place_by_swarm(problem: BandProblem, bands: int, seed: int | None = None) ->
 
 
 def place_randomly(problem: BandProblem, bands: int, seed: int | None = None) -> Placement:
-    """Place bands at random, every allowed placement on the grid being equally likely.
-
-    Raises OperationError: the grid is too coarse, or no draw of many respects the limits.
+    """Place bands at random, every allowed placement on the grid being equally likely. Raises
+    OperationError: the grid is too coarse, or no draw of many respects the limits.
     """
     _refuse_more_than_fit(problem, bands)
     if bands == 1:

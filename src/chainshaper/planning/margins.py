@@ -175,9 +175,8 @@ def covered_latency(
 ) -> int:
     """The shortest measured latency that covers all cycles but a share, with 95 % confidence (ns).
 
-    It is the k-th longest of n, with the largest k for which P(Bin(n, p) ≥ k) is 95 % at least; the
-    longest, where the sample is too small (:func:`cycles_needed`). What does not fit before
-    ``latest_ns`` cannot be covered: then it is the longest that does, or 0.
+    It is the k-th longest of n, with the largest k for which P(Bin(n, p) ≥ k) is 95 % at least, or
+    the longest of too small a sample; where that is behind ``latest_ns``, the longest that is not.
 
         >>> covered_latency(np.arange(1, 300), 0.01), covered_latency(np.arange(1, 601), 0.01)
         (299, 599)

@@ -26,9 +26,8 @@ ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls f
 
 
 def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
-    """How many cycles after its own the chain's output, or what ``node`` republishes, is due.
-
-    Under LET per callback, each topic is due a cycle after the one before it.
+    """How many cycles after its own the chain's output, or what ``node`` republishes, is due: under
+    LET per callback, each topic a cycle after the one before it.
     """
     if plan.policy == "let-per-chain":
         return 1
@@ -40,9 +39,8 @@ def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
 
 
 class Expected(NamedTuple):
-    """What is seen of outputs that gates let go as slots start, at ``leave_ns`` (all in ns).
-
-    A plan's prediction counts the ends of slots (eq. 5), the bound of what comes in an open one.
+    """What is seen of outputs that gates let go as slots start, at ``leave_ns`` (all in ns); a
+    plan's prediction counts the ends of slots (eq. 5), the bound of what comes in an open one.
     """
 
     leave_ns: tuple[int, ...]
@@ -64,10 +62,9 @@ def expected(plan: Plan) -> Expected | None:
 def output_lifespan(plan: Plan) -> int | None:
     """The lifespan (ns) by which DDS discards what overruns; None where it is not needed.
 
-    It is as short as it may be: an output in time waits at most until the end of the first slot,
-    or of the next slot when it just missed one; an overrun with latency l for the first slot of the
-    next cycle, CT + (x_1 − Δ) − l. So with one slot, overruns are discarded up to a latency of
-    CT − Δ. Under LET, where every output waits for the next cycle, age tells nothing.
+    An output in time waits at most until the end of the first slot, or of the next slot when it
+    just missed one; an overrun with latency l for the first slot of the next cycle, CT + (x_1 − Δ)
+    − l. Under LET, where every output waits for the next cycle, age tells nothing.
     """
     publisher = plan.chain.publisher
     if plan.overrun != "discard" or publisher is None or cycles_until_output(plan):

@@ -177,10 +177,8 @@ def opened_early(
     cycle_ns: int,
     room_ns: int = 0,
 ) -> tuple[Stage, ...]:
-    """The same stages in slots that open as soon as the first data may come, and close earlier.
-
-    ``steps_ns`` has a row per instance and a column per callback. The last slot leaves ``room_ns``
-    of its core to the publication, where it can.
+    """The same stages in slots that open as soon as the first data may come, and close earlier. The
+    last slot leaves ``room_ns`` of its core to the publication, where it can.
     """
     opened = list(stages)
     arrives = np.zeros(len(steps_ns), dtype=np.int64)

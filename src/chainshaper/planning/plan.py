@@ -5,10 +5,10 @@ integer nanoseconds, in fields that end in ``_ns``; in YAML the same keys stand 
 their values with a unit (``period: 100ms``). Slots are half-open and count from a cycle's start.
 
 A server may stop the thread of an asynchronous publisher (design 1, section 3.2.1), which shares
-locks with the rest of its process. With Fast DDS 2.14, three things are destructive and refused:
-a slot hardly longer than a send (0.25 ms; stopped in one, the thread has what every publisher
-needs); a thread that out-ranks its executor on the same core (it spins for the lock under which the
-executor hands a message over); and a history too shallow for what comes while it may not run.
+locks with its process. With Fast DDS 2.14, three things are destructive and refused: a slot hardly
+longer than a send (0.25 ms; stopped in one, the thread has what every publisher needs); a thread
+that out-ranks its executor on the same core (it spins for the lock under which that hands a message
+over); and a history too shallow for what comes while it may not run.
 """
 
 import re
@@ -268,9 +268,8 @@ class Adaptation(Part):
     """How slots follow the latencies of what runs (:class:`~chainshaper.planning.margins.Tail`).
 
     They move later when ``late`` times the promised share of the last ``window`` cycles would have
-    been late in them; earlier where that takes at least the share ``gain`` off the latency, which
-    must have been so for ``after`` cycles on end. None ends behind ``max_latency_ns`` (None: behind
-    the cycle).
+    been late in them; earlier where that has taken at least the share ``gain`` off the latency for
+    ``after`` cycles on end. None ends behind ``max_latency_ns`` (None: behind the cycle).
     """
 
     window: Annotated[int, Field(ge=500, le=1_000_000)] = 4_000
@@ -306,12 +305,11 @@ class BandPrediction(NamedTuple):
 class Plan(Part):
     """Servers and shaping nodes for one chain, with the evidence and the prediction.
 
-    ``cycle_ns`` is a whole multiple of the chain's period. Its cycles start ``offset_ns`` after the
-    instant from which those of all chains count. For ``anchor``, ``overrun``, ``into_open_slot``
-    and ``messages`` see :mod:`chainshaper.gate.decision`, for the next three
-    :mod:`chainshaper.values.plan_choices`. ``shaping_node`` serves the chain's output, unless the
-    publisher's own thread is gated; ``further_shaping_nodes`` serve other sinks, or topics inside a
-    chain (LET per callback). Without an ``adaptation`` slots follow the latencies as by default.
+    ``cycle_ns`` is a whole multiple of the chain's period; cycles start ``offset_ns`` after the
+    instant from which those of all chains count. For ``anchor`` to ``messages`` see
+    :mod:`chainshaper.gate.decision`, for the next three :mod:`chainshaper.values.plan_choices`.
+    ``shaping_node`` serves the chain's output, unless the publisher's own thread is gated;
+    ``further_shaping_nodes`` serve other sinks, or topics inside a chain (LET per callback).
     """
 
     format: Literal[1] = 1
@@ -359,9 +357,8 @@ def shaping_nodes(plan: Plan) -> list[ShapingNode]:
 
 
 def output_server(plan: Plan) -> Server | None:
-    """The server in whose slots the chain's output is published; None without shaping.
-
-    A plan from bare latencies names no threads, and its server ``output`` is meant.
+    """The server in whose slots the chain's output is published; None without shaping. A plan from
+    bare latencies names no threads: its server ``output`` is meant.
     """
     server = None
     if plan.shaping_node is not None:

@@ -276,7 +276,7 @@ def with_interference(
 
     ``groups`` are the places of chains that begin together. With ``at_once`` groups do not take
     turns: those of a shorter period run at a better priority. Where every callback has slots of
-    its own nothing is added: chains in turns do not delay each other, and others are not planned.
+    its own nothing is added.
     """
     if len(profiles) == 1 or wishes.policy in PER_CALLBACK:
         return list(profiles)

@@ -73,9 +73,7 @@ def plan_application(
 
 def with_own_names(plans: Sequence[Plan], together: Sequence[Sequence[int]] = ()) -> list[Plan]:
     """The plans, whose servers have names of their own: each had a ``chain``, and an ``output``.
-
-    Equal servers are one in chains that are in one group of ``together``, or whose cycles start at
-    the same instants.
+    Equal servers are one in chains of one group, or whose cycles start at the same instants.
     """
     group_of = {k: number for number, group in enumerate(together) for k in group}
     known, renamed = dict[str, tuple[object, Server]](), []

@@ -162,7 +162,6 @@ def _node_like(
 
 def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
     """The latencies' statistics, with the conditions they were taken under: Evidence's fields.
-
     Others may delay a cycle, but need not: the shortest is without that.
     """
     return Evidence(
@@ -231,10 +230,8 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | N
 
 @wrong_values_refused(Plan)
 def with_best_effort(chains: Sequence[Plan], core_of: Mapping[str, int]) -> list[Plan]:
-    """Plans whose first has a server on each core for these nodes, which are in none of the chains.
-
-    It is open all the time, and runs what no other server wants to run: R_m' of section 3.1, R_int
-    of section 5.1. Raises InputError: a node is in a server already.
+    """Plans whose first has a server on each core for these nodes, which are in none of the chains:
+    R_m' of section 3.1, R_int of section 5.1. Raises InputError: a node is in a server already.
     """
     first, *others = chains
     known = {
@@ -288,9 +285,8 @@ def with_executors(
 
 
 def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cycle_ns: int) -> int:
-    """How much later (ns) slots have to be to meet none of those taken on their core.
-
-    Raises OperationError: then they leave the cycle, and the output of that ``name`` with them.
+    """How much later (ns) slots have to be to meet none of those taken on their core. Raises
+    OperationError: then they leave the cycle, and the output of that ``name`` with them.
     """
     same_core = (pair for pair in product(own, taken) if pair[0].core == pair[1].core)
     pairs = [pair for one, other in same_core for pair in product(one.slots, other.slots)]
@@ -441,8 +437,8 @@ def _slots_in_sequence(callbacks: Sequence[CallbackTimes], margin_ns: int) -> li
 
 
 def let_per_chain(plan: Plan) -> Plan:
-    """Logical execution time for the chain as one task: its output leaves in a slot at the start of
-    the next cycle, so the latency is one period (section 5.3, table 5).
+    """Logical execution time for the chain as one task: its output leaves at the start of the next
+    cycle (section 5.3, table 5).
     """
     publishing, length = _one_slot(plan)
     if plan.evidence.min_latency_ns <= length:
@@ -460,9 +456,8 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     """Logical execution time for every callback: each one's output waits for the next cycle.
 
     ``topics`` are the outputs of the chain's callbacks in order, the chain's own last;
-    ``publishers`` their nodes, where known. Behind each topic a shaping node republishes at the
-    beginning of the next cycle, or the publishers' threads run then, where the plan gates one: as
-    many periods as there are callbacks (section 5.3, table 5).
+    ``publishers`` their nodes, where known. Behind each topic a shaping node republishes in the
+    next cycle, or the publishers' threads run then, where the plan gates one (5.3, table 5).
     """
     publishing, length = _one_slot(plan)
     last = plan.shaping_node
