@@ -197,8 +197,11 @@ def with_offsets(
         raise InputError("no plans to find offsets for: give one per chain")
     for one, two in combinations(plans, 2):
         refuse_common((chain_name(one), chain_name(two)), (one.chain.output, two.chain.output))
-        if together is None:  # else it is known which begin at one callback, not only their names
-            _refuse_same_beginning(one, two)
+        begins = [(plan.chain.spec or "").split("..")[0].strip() for plan in (one, two)]
+        # Where groups are given, it is known which begin at one callback, not only their names.
+        if together is None and begins[0] and begins[0] == begins[1]:
+            names = f"{chain_name(one)} and {chain_name(two)} begin at the same callback"
+            raise InputError(f"{names}: plan them together (--chain twice)")
     together = together or [[k] for k in range(len(plans))]
     tables = [_timetable([plans[k] for k in one], plans, alone) for one in together]
     found = _find_offsets(tables, time_limit_s, windows)
@@ -424,13 +427,6 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
 def chain_name(plan: Plan) -> str:
     """What a plan's chain is called in messages."""
     return plan.chain.spec or plan.chain.output or "a chain without a name"
-
-
-def _refuse_same_beginning(one: Plan, two: Plan) -> None:
-    begins = [(plan.chain.spec or "").split("..")[0].strip() for plan in (one, two)]
-    if begins[0] and begins[0] == begins[1]:
-        names = f"{chain_name(one)} and {chain_name(two)}"
-        raise InputError(f"{names} begin at the same callback: plan them together (--chain twice)")
 
 
 def refuse_common(names: tuple[str, str], outputs: tuple[str | None, str | None]) -> None:

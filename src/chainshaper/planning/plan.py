@@ -526,8 +526,11 @@ def _publisher_threads(plan: Plan) -> Wrong:
                 reason += f" stopped in a send{took}, it would block the whole process; make it"
                 reason += f" {duration_text(shortest)} or longer (--publish-slot)"
                 yield reason, *where, "slots", number
-        for node, other in product(nodes, plan.servers):
-            for slot in _out_ranked(plan, server, node, other):
+        worse = [s for s in plan.servers if s.core == server.core and s.priority > server.priority]
+        for node, other, slot in product(nodes, worse, server.slots):
+            runs_it = any(map(Thread(node=node).overlaps, other.threads))
+            late = (max(slot[0], plan.evidence.min_latency_ns), slot[1])  # nothing comes before
+            if runs_it and late[0] < late[1] and any(meet(late, one) for one in other.slots):
                 reason = f"the publisher thread of {node} would out-rank its executor, which server"
                 reason += f" {other.name!r} runs at priority {other.priority} in {slot_text(slot)},"
                 reason += f" and spin for its lock: write a number above {other.priority}, or move"
@@ -555,20 +558,6 @@ def _choices(plan: Plan) -> Wrong:
         if latest is not None and slot[1] > latest:
             reason = f"{duration_text(latest)}, but the slot {slot_text(slot)} ends behind it"
             yield f"{reason}: write more", "adaptation", "max_latency"
-
-
-def _out_ranked(plan: Plan, server: Server, node: str, other: Server) -> list[Slot]:
-    """Slots in which a node's publisher thread out-ranks its executor, if ``other`` runs that."""
-    if other.core != server.core or other.priority <= server.priority:
-        return []
-    if not any(map(Thread(node=node).overlaps, other.threads)):
-        return []
-    earliest = plan.evidence.min_latency_ns  # before, it has no output to hand over
-    return [
-        slot
-        for slot in server.slots
-        if any(max(slot[0], earliest, start) < min(slot[1], end) for start, end in other.slots)
-    ]
 
 
 def below_executors(servers: Sequence[Server]) -> tuple[Server, ...]:
