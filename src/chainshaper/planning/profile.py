@@ -266,11 +266,7 @@ def interference(own_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
 
 
 def with_interference(
-    profiles: Sequence[Profile],
-    groups: Sequence[Sequence[int]],
-    wishes: Wishes,
-    *,
-    at_once: bool,
+    profiles: Sequence[Profile], groups: Sequence[Sequence[int]], wishes: Wishes, *, at_once: bool
 ) -> list[Profile]:
     """The profiles with the latencies that the chains can have while all of them run.
 

@@ -29,13 +29,7 @@ from chainshaper.planning.cores import assign_cores
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import pipelined, stage_places
 from chainshaper.planning.plan import UNSHAPED, Evidence, Margin, Modes, Plan, Prediction, Slot
-from chainshaper.planning.profile import (
-    Profile,
-    alone,
-    deciding_cycles,
-    up_to,
-    with_interference,
-)
+from chainshaper.planning.profile import Profile, alone, deciding_cycles, up_to, with_interference
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy, Wishes
