@@ -116,7 +116,6 @@ WRONG_VALUES = [
     ("spin: 300us", "spin: 0.1ns", 24, "shaping_node.spin", "finer"),
     ("shares: [1]", "shares: [.nan]", 25, "predicted.shares[0]", "finite"),
     ("shares: [1]", "shares: 1", 25, "predicted.shares", "not a list"),
-    ("policy: shaped", "policy: fast", 12, "policy", "'shaped'"),
     ("format: 1", "format: 2", 26, "format", "should be 1"),
     ('spec: "/t1../t5"', "spec: 7", 13, "chain.spec", "7 is not a text"),
 ]
@@ -231,13 +230,10 @@ def test_overlap_is_judged_per_core_and_priority(tmp_path: Path) -> None:
         ("a: &x [1, 1]\nb: &y [*x, *x]\nc: [*y, *y]\n", ":1: b[0]: refers to this by a YAML"),
         ("[1]: 2\n", ":1: the file: a key here is a list or mapping: write a text"),
         ("chain: !!int ''\n", ":1: chain: '' is no !!int: write the value without a tag"),
-        ("chain: !!bool x\n", ":1: chain: 'x' is no !!bool"),
         ("chain: !!timestamp x\n", ":1: chain: 'x' is no !!timestamp"),
-        ("chain: !!float x\n", ":1: chain: 'x' is no !!float"),
         ("chain: !!python/object:os.system x\n", ":1: chain: 'x' is no !!python/object"),
         (f"chain: {10**30}\n", ":1: chain: a number of more than 64 bits"),
         ("chain: 9" + "9" * 5000 + "\n", "chain"),
-        ("epsilon: .nan\n", "epsilon"),
         ("chain: {period: 2020-01-01}\n", "'2020-01-01' is not a duration"),
     ],
 )
