@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.splicing.shaping_process import generic_package
+from chainshaper.splicing.shaping_process import cpp_package
 
 
 def compiled(source: Path, folder: Path, name: str = "g++") -> Path:
@@ -14,7 +14,7 @@ def compiled(source: Path, folder: Path, name: str = "g++") -> Path:
     compiler = shutil.which(name)
     if compiler is None:
         pytest.skip(f"{name} is not installed, so the gate in C++ cannot be compiled")
-    for path, text in generic_package().items():
+    for path, text in cpp_package().items():
         if path.endswith(".hpp"):
             (folder / path).parent.mkdir(parents=True, exist_ok=True)
             (folder / path).write_text(text)

@@ -33,12 +33,11 @@ class Outcome:
 
     left_ns: int | None
     release: Release
-    dropped: str | None
 
     @property
     def leave(self) -> int | str:
         """As the table has it."""
-        return self.dropped or self.left_ns or 0
+        return self.release.dropped or self.left_ns or 0
 
 
 def cases() -> list[Case]:
@@ -83,14 +82,14 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
                 steps.popleft()
                 queue.doubt_stamps(arrival)
             if (full := queue.arrive(b"", arrival, stamp, number)) is not None:
-                found[full.message.about] = Outcome(None, full.release, full.dropped)
+                found[full.message.about] = Outcome(None, full.release)
 
     while coming or queue.waiting:
         if not queue.waiting:
             now = max(now, coming[0][1][0])
             come_until(now)
         oldest = queue.waiting[0]
-        release, dropped = queue.decide()
+        release = queue.decide()
         if release.at_ns is not None:
             slept = release.at_ns > now
             now = max(now, release.at_ns)
@@ -99,14 +98,12 @@ def walk(case: Case, publishing_ns: int = PUBLISHING_NS) -> list[Outcome]:
                 continue
             now += case.late_ns * slept
             if queue.replaced(release, now):
-                dropped = "replaced"
+                release = release.dropping("replaced")
             elif case.gate.policy == "discard" and missed(case.gate, release, now):
-                release, dropped = replace(release, overrun="discard"), "discarded"
-        if dropped is not None:
-            release = replace(release, at_ns=None, slot=None)
-        found[oldest.about] = Outcome(None if dropped else now, release, dropped)
+                release = replace(release.dropping("discarded"), overrun="discard")
+        found[oldest.about] = Outcome(None if release.dropped else now, release)
         queue.leave(release, now)
-        now += 0 if dropped else publishing_ns
+        now += 0 if release.dropped else publishing_ns
         queue.free_ns = now
         come_until(now)
     return [found[number] for number in range(len(case.arrivals))]

@@ -9,7 +9,7 @@ from chainshaper.gate.decision import Outcome, Release, Shaper
 def decided(shaper: Shaper, payload: bytes, arrival_ns: int) -> Release:
     """What is decided about a message that comes then, before it is withdrawn."""
     shaper.arrive(payload, arrival_ns)
-    release, _ = shaper.queue.decide()
+    release = shaper.queue.decide()
     shaper.queue.leave(release, arrival_ns)
     return release
 

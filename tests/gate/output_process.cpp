@@ -23,7 +23,7 @@ void publish(char word, std::int64_t number) {
 chainshaper::Outcome<int> outcome(std::optional<chainshaper::Dropped> dropped,
                                   chainshaper::Maybe lost, bool late, std::int64_t latency_ns) {
   chainshaper::Outcome<int> made{};
-  made.dropped = dropped;
+  made.release.dropped = dropped;
   made.waiting.lost = lost;
   made.waiting.arrival_ns = latency_ns;
   if (late) made.release.overrun = chainshaper::Policy::wait;
@@ -36,6 +36,7 @@ struct Asked {
     chainshaper::Gate gate;
   } queue;
   std::function<void(const chainshaper::Release &, std::int64_t)> on_decision;
+  std::function<std::optional<chainshaper::Move>()> moved;
 
   void set_phase(std::int64_t phase_ns, std::int64_t) { std::cout << phase_ns; }
   void announce(const std::string & mode, std::int64_t) { std::cout << ' ' << mode; }
@@ -57,7 +58,7 @@ int main(int, char ** argv) {
       for (std::int64_t i = 0; i <= number; ++i)
         turn.count(outcome(static_cast<chainshaper::Dropped>(number), number, number % 2 == 1,
                            number));
-    turn.count(outcome({}, {}, false, turn.moved() ? turn.moved()->first : 77));
+    turn.count(outcome({}, {}, false, turn.moved() ? turn.moved()->second : 77));
     return 0;
   }
   const int inbox = socket(AF_INET, SOCK_DGRAM, 0);

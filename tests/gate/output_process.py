@@ -27,8 +27,9 @@ def outcome(
     dropped: str | None, lost: int | None, *, late: bool, latency_ns: int
 ) -> decision.Outcome:
     message = decision.Waiting(b"", latency_ns, None, 0, lost=lost)
-    release = decision.Release(None, 0, None, 0, "cycle", "wait" if late else None)
-    return decision.Outcome(message, release, 0, dropped)
+    treated = "wait" if late else None
+    release = decision.Release(None, 0, None, 0, "cycle", treated, dropped=dropped)
+    return decision.Outcome(message, release, 0)
 
 
 def main() -> None:

@@ -62,7 +62,6 @@ Gate read_gate() {
 struct Outcome {
   Maybe left_ns;
   Release release;
-  std::optional<Dropped> dropped;
 };
 
 // What the gate does without a clock; messages are their places in the order of coming.
@@ -95,7 +94,7 @@ void walk() {
         queue.doubt_stamps(arrivals[next].first);
       }
       const auto full = queue.arrive(next, arrivals[next].first, arrivals[next].second);
-      if (full) found[full->waiting.message] = {std::nullopt, full->release, full->dropped};
+      if (full) found[full->waiting.message] = {std::nullopt, full->release};
     }
   };
   while (next < arrivals.size() || !queue.waiting.empty()) {
@@ -104,7 +103,7 @@ void walk() {
       come_until(now);
     }
     const auto oldest = queue.waiting.front().message;
-    auto [release, dropped] = queue.decide();
+    auto release = queue.decide();
     if (release.at_ns) {
       const bool slept = *release.at_ns > now;
       now = std::max(now, *release.at_ns);
@@ -112,24 +111,19 @@ void walk() {
       if (queue.waiting.front().message != oldest) continue;
       now += slept ? late_ns : 0;
       if (queue.replaced(release, now)) {
-        dropped = Dropped::replaced;
+        release.drop(Dropped::replaced);
       } else if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, now)) {
         release.overrun = Policy::discard;
-        dropped = Dropped::discarded;
+        release.drop(Dropped::discarded);
       }
     }
-    if (dropped) {
-      release = withheld(release);
-      found[oldest] = {std::nullopt, release, dropped};
-    } else {
-      found[oldest] = {now, release, std::nullopt};
-    }
+    found[oldest] = {release.dropped ? std::nullopt : Maybe(now), release};
     queue.leave(release, now);
-    now += dropped ? 0 : publishing_ns;
+    now += release.dropped ? 0 : publishing_ns;
     queue.free_ns = now;
     come_until(now);
   }
-  for (const auto & [left_ns, release, dropped] : found) {
+  for (const auto & [left_ns, release] : found) {
     show(left_ns);
     show(release.at_ns);
     std::cout << ' ' << release.origin_ns;
@@ -137,7 +131,7 @@ void walk() {
     std::cout << ' ' << release.cycles_waited << ' ' << static_cast<int>(release.anchor);
     show(release.overrun);
     show(release.mode);
-    show(dropped);
+    show(release.dropped);
     std::cout << ' ' << release.moved_ns << '\n';
   }
 }

@@ -68,7 +68,7 @@ def as_answer(case: Case, outcome: Outcome) -> str:
         ANCHORS.index(release.anchor),
         "-" if release.overrun is None else LATE.index(release.overrun),
         "-" if release.mode is None else names.index(release.mode),
-        "-" if outcome.dropped is None else DROPPED.index(outcome.dropped),
+        "-" if release.dropped is None else DROPPED.index(release.dropped),
         release.moved_ns,
     ]
     return " ".join(map(str, words))
@@ -143,7 +143,7 @@ def _decide_alike(count: int, *command: str | Path) -> None:
             assert tuple(outcome.leave for outcome in outcomes) == case.leave, case.name
         for outcome in outcomes:
             assert next(answers) == as_answer(case, outcome), case
-            seen.add((outcome.release.overrun, outcome.dropped))
+            seen.add((outcome.release.overrun, outcome.release.dropped))
     assert next(answers, None) is None
     assert {overrun for overrun, _ in seen} == {None, *LATE}, "some treatment never occurred"
     assert {dropped for _, dropped in seen} == {None, *DROPPED}

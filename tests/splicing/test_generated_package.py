@@ -9,9 +9,8 @@ import pytest
 
 from chainshaper.splicing.shaping_process import (
     build_package,
-    generic_package,
+    cpp_package,
     message_type_named,
-    typed_package,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
@@ -26,8 +25,8 @@ def no_ros_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def package(name: str) -> dict[str, str]:
     if name == NAMES[0]:
-        return generic_package()
-    return typed_package(message_type_named(TYPE if name == NAMES[1] else "std_msgs/msg/Header"))
+        return cpp_package()
+    return cpp_package(message_type_named(TYPE if name == NAMES[1] else "std_msgs/msg/Header"))
 
 
 def written(folder: Path, name: str) -> Path:
@@ -37,8 +36,8 @@ def written(folder: Path, name: str) -> Path:
     return folder / name
 
 
-def test_the_typed_package_is_the_generic_one_but_for_what_names_its_type() -> None:
-    generic, files = generic_package(), package(NAMES[1])
+def test_the_cpp_package_is_the_generic_one_but_for_what_names_its_type() -> None:
+    generic, files = cpp_package(), package(NAMES[1])
     for path, text in {**generic, **files}.items():
         assert not path.endswith(".in")
         assert "@" not in text.replace("chainshaper@example.org", ""), path

@@ -170,7 +170,7 @@ def in_real_time(case: Case) -> bool:
 
 
 def expected(case: Case) -> list[tuple[Any, ...]]:
-    outcomes = ((one.dropped, one.release) for one in walk(case))
+    outcomes = ((one.release.dropped, one.release) for one in walk(case))
     return [
         (dropped, one.slot, one.cycles_waited, one.overrun, one.mode) for dropped, one in outcomes
     ]

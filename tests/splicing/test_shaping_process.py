@@ -60,7 +60,6 @@ def test_a_python_node_is_one_file_with_the_gate_of_the_live_workload(
     shaping, standby = (
         ShapingProcess(
             name=name,
-            namespace="/",
             command=("python3", str(tmp_path / f"{name}.py")),
             package=None,
             executable=None,
@@ -278,7 +277,7 @@ def test_every_release_is_rehearsed_twice_where_there_is_time(
         assert published == [shaping_node.EMPTY] * 2 * releases
     ready.get_ready(time.monotonic_ns())
     assert len(published) == 6, "there was no time left"
-    ready.relax()
+    ready.ask_for()
 
 
 @pytest.mark.parametrize(

@@ -8,18 +8,17 @@ of CLOCK_MONOTONIC and every ``cycle`` thereafter.
 An early message waits for its slot. One that comes **into an open slot** leaves ``at-once``, or in
 the ``next-slot``: then only what came before a slot's start leaves in it, and all at that instant.
 One behind the last slot it was due in, or without a next one, is an **overrun** (section 6):
-``wait`` for a slot of a later cycle, ``discard`` it, or ``publish`` it at once. Under logical
-execution time a message is due in a later cycle than its own, and leaves in none before.
+``wait`` for a slot of a later cycle, ``discard`` it, or ``publish`` it at once.
 
 Of several **messages** in a cycle leave ``all-in-order`` (the oldest is dropped where more than
 ``depth`` wait), the ``newest`` of those that wait, or the ``first`` that came. With **modes**
 (section 3.3) each mode has a slot of its own; a change is in force from the first cycle that begins
-after it, and ``late`` messages may also take the ``next-slot`` of their cycle. Slots that follow
-latencies are **moved**, all by the same time, from the first cycle that begins after an instant.
+after it. Slots that follow latencies are **moved**, all by the same time, from the first cycle that
+begins after an instant.
 
-Words, limits, the log's columns and the nodes' ROS parameters are stated here for the node in C++,
-too: `schema.hpp` is generated from them. Every gate runs `tests/gate_conformance.yaml`. Only the
-standard library is imported, since this is a part of the Python nodes' own files.
+`schema.hpp` of the node in C++ is generated from the words, limits, columns and parameters here.
+Every gate runs `tests/gate_conformance.yaml`. Only the standard library is imported, since this is
+a part of the Python nodes' own files.
 """
 
 import ctypes
@@ -30,6 +29,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import islice
 from typing import Any, Literal, TypeAlias, get_args
 
 Anchor: TypeAlias = Literal["stamp", "cycle"]
@@ -59,6 +59,11 @@ OTHERS_NS = 2_000_000  # an executor's other callbacks take less
 CHANGES = 64  # so many changes of the mode, or moves, reach back further than the oldest stamp
 
 
+def _one_of(key: str, word: str, known: Sequence[str]) -> None:
+    if word not in known:
+        raise ValueError(f"{key} {word!r}: choose one of {', '.join(known)}")
+
+
 @dataclass(frozen=True)
 class Modes:
     """Which of the gate's ``slots`` (by its place, from 0) the messages of each mode leave in.
@@ -75,8 +80,7 @@ class Modes:
         if self.default not in self.bands:
             choose = f"choose one of {', '.join(self.bands)}"
             raise ValueError(f"the default mode {self.default!r} has no band: {choose}")
-        if self.late not in LATE:
-            raise ValueError(f"late {self.late!r}: choose one of {', '.join(LATE)}")
+        _one_of("late", self.late, LATE)
 
 
 @dataclass(frozen=True)
@@ -87,9 +91,10 @@ class Gate:
     from each other and inside ``[0, cycle_ns)``. With the ``stamp`` anchor, ``phase_ns`` serves
     messages whose stamp is of no use: it is older than :data:`MAX_AGE_CYCLES`, or from the future.
 
-    A message is due in the cycle that it belongs to, or ``due_cycles`` later. With the ``cycle``
-    anchor it belongs to the cycle it arrives in, and is due in the next one at the latest: the data
-    of each callback came a cycle before. Raises ValueError: such a gate makes no sense.
+    A message is due in the cycle that it belongs to, or, under logical execution time,
+    ``due_cycles`` later, and leaves in none before. With the ``cycle`` anchor it belongs to the
+    cycle it arrives in, and is due in the next one at the latest: the data of each callback came a
+    cycle before. Raises ValueError: such a gate makes no sense.
     """
 
     slots: tuple[tuple[int, int], ...]
@@ -104,10 +109,10 @@ class Gate:
     into_open_slot: str = "at-once"
 
     def __post_init__(self) -> None:
-        words = {"anchor": ANCHORS, "overrun": OVERRUNS, "messages": MESSAGES}
-        for key, known in {**words, "into_open_slot": INTO_OPEN_SLOT}.items():
-            if (word := getattr(self, key)) not in known:
-                raise ValueError(f"{key} {word!r}: choose one of {', '.join(known)}")
+        _one_of("anchor", self.anchor, ANCHORS)
+        _one_of("overrun", self.overrun, OVERRUNS)
+        _one_of("messages", self.messages, MESSAGES)
+        _one_of("into_open_slot", self.into_open_slot, INTO_OPEN_SLOT)
         if self.depth < 1:
             raise ValueError(f"room for {self.depth} messages: a gate needs it for one at least")
         if self.due_cycles < 0:
@@ -119,13 +124,13 @@ class Gate:
         previous_end = 0
         for start, end in self.slots:
             if not previous_end <= start < end <= self.cycle_ns:
-                reason = "slots must ascend, not overlap and lie within the cycle"
-                raise ValueError(f"slot [{start}, {end}) ns: {reason}")
+                rule = "slots must ascend, not overlap and lie within the cycle"
+                raise ValueError(f"slot [{start}, {end}) ns: {rule}")
             previous_end = end
         for mode, band in ({} if self.modes is None else self.modes.bands).items():
             if not 0 <= band < len(self.slots):
-                last = len(self.slots) - 1
-                raise ValueError(f"mode {mode!r}: band {band}, but slots are numbered 0 to {last}")
+                known = f"slots are numbered 0 to {len(self.slots) - 1}"
+                raise ValueError(f"mode {mode!r}: band {band}, but {known}")
 
     def may_move(self, by_ns: int) -> bool:
         """Whether slots that are moved by so much lie within the cycle still."""
@@ -138,13 +143,10 @@ class Gate:
             return self.overrun
         return self.modes.late
 
-    def lets_out(
-        self, slot: tuple[int, int], cycle_start_ns: int, arrival_ns: int, ready_ns: int
-    ) -> bool:
-        """Whether a message may leave in a slot of a cycle, or before it begins."""
-        start, end = slot
-        in_time = self.into_open_slot == "at-once" or arrival_ns <= cycle_start_ns + start
-        return in_time and ready_ns < cycle_start_ns + end
+    def lets_out(self, slot: tuple[int, int], from_ns: int, arrival_ns: int, ready_ns: int) -> bool:
+        """Whether a message may leave in a slot of the cycle that begins then, or before it."""
+        in_time = self.into_open_slot == "at-once" or arrival_ns <= from_ns + slot[0]
+        return in_time and ready_ns < from_ns + slot[1]
 
     def counts_from(self, stamp_ns: int | None, arrival_ns: int) -> bool:
         """Whether a message's slots count from its stamp."""
@@ -158,7 +160,7 @@ class Gate:
 class Release:
     """The gate's decision for one message; times are ns of CLOCK_MONOTONIC."""
 
-    at_ns: int | None  # when it may leave (not after the arrival: at once; None: never)
+    at_ns: int | None  # when it may leave (not after the arrival: at once; None: it is dropped)
     origin_ns: int
     slot: int | None  # in which one that is, if in any
     cycles_waited: int  # after its own
@@ -166,14 +168,15 @@ class Release:
     overrun: str | None = None  # the policy that was applied to it; None: it came in time
     mode: str | None = None  # of its cycle; None: there are no modes
     moved_ns: int = 0  # by so much the slots of the cycle in which it leaves
+    dropped: str | None = None  # for that reason
 
     def start_ns(self, cycle_ns: int) -> int:
         """When the cycle starts in which the message leaves."""
         return self.origin_ns + self.cycles_waited * cycle_ns
 
-
-def _withheld(release: Release) -> Release:
-    return replace(release, at_ns=None, slot=None)
+    def dropping(self, reason: Dropped) -> "Release":
+        """The decision to drop the message instead."""
+        return replace(self, at_ns=None, slot=None, dropped=reason)
 
 
 def release_of(
@@ -205,7 +208,7 @@ def release_of(
         >>> release_of(gate, 1110, 1100, changes=[(1050, "highway")]).at_ns
         1120
     """
-    cycle_ns, modes = gate.cycle_ns, gate.modes
+    cycle_ns, modes, policy = gate.cycle_ns, gate.modes, gate.policy
     if stamp_ns is not None and gate.counts_from(stamp_ns, arrival_ns):
         origin, anchor, due = stamp_ns, "stamp", gate.due_cycles
     else:
@@ -219,23 +222,19 @@ def release_of(
         slots = slots[first : None if modes.late == "next-slot" else first + 1]
     ready = arrival_ns if ready_ns is None else max(arrival_ns, ready_ns)
     # A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
-    cycle = max(0, (ready - origin) // cycle_ns)
+    cycle = max(due, (ready - origin) // cycle_ns)
     moved = moved_at(moves, due_from := origin + due * cycle_ns)
-    known = (due_from + moved, arrival_ns, ready)
-    overran, policy = not gate.lets_out(slots[-1], *known), gate.policy
-    if overran and policy != "wait":
-        at_once = ready if policy == "publish" else None
-        return Release(at_once, origin, None, cycle, anchor, policy, mode, moved)
-    treated = "wait" if overran else None
-    if mode is not None and not overran and not gate.lets_out(slots[0], *known):
-        treated = "next-slot"
-    cycle = max(due, cycle)
+    if policy != "wait" and not gate.lets_out(slots[-1], due_from + moved, arrival_ns, ready):
+        at_once = Release(ready, origin, None, cycle, anchor, policy, mode, moved)
+        return at_once if policy == "publish" else at_once.dropping("discarded")
     while True:
         cycle_start = origin + cycle * cycle_ns
         moved = moved_at(moves, cycle_start)
         for number, slot in enumerate(slots, first):
             if gate.lets_out(slot, cycle_start + moved, arrival_ns, ready):
                 at = max(ready, cycle_start + moved + slot[0])
+                later = "next-slot" if mode is not None and number > first else None
+                treated = "wait" if cycle > due else later
                 return Release(at, origin, number, cycle, anchor, treated, mode, moved)
         cycle += 1
 
@@ -394,18 +393,17 @@ class Waiting:
     arrival_ns: int
     stamp_ns: int | None
     phase_ns: int
-    about: Any = None  # what its owner knows of it besides
+    about: Any = None  # what its owner knows of it: the source timestamp, in ROS 2 nodes
     lost: int | None = None  # how many, between the one before it and this one; None: not known
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a message: it may leave now, or was ``dropped``, for that reason."""
+    """What became of a message: it may leave now, or is dropped."""
 
     message: Waiting
     release: Release
     awake_ns: int  # when that was clear (CLOCK_MONOTONIC)
-    dropped: str | None = None
 
 
 class Queue:
@@ -418,8 +416,8 @@ class Queue:
         self.changes: deque[tuple[int, str]] = deque(maxlen=CHANGES)
         self.moves: deque[tuple[int, int]] = deque(maxlen=CHANGES)
         self.free_ns = 0  # when it is the turn of the oldest message, if it is there then
-        # The starts of the cycle that the oldest message, or another for it, leaves in, and of
-        # that in which one has left.
+        # When cycles start: the one that the oldest message, or another for it, leaves in, and
+        # the one in which the last has left.
         self._leaving: int | None = None
         self._left: int | None = None
         self._unsure_until_ns = 0
@@ -447,36 +445,31 @@ class Queue:
         if len(self.waiting) <= self.gate.depth:
             return None
         oldest = self.waiting.popleft()
-        release = _withheld(self._release(oldest, arrival_ns))
-        return Outcome(oldest, release, arrival_ns, "overflowed")
+        return Outcome(oldest, self._release(oldest, arrival_ns).dropping("overflowed"), arrival_ns)
 
-    def decide(self) -> tuple[Release, str | None]:
+    def decide(self) -> Release:
         """When the oldest message may leave, or why it never does."""
         oldest = self.waiting[0]
         ready = max(oldest.arrival_ns, self.free_ns)
         release = self._release(oldest, ready)
-        if release.at_ns is None:
-            return release, "discarded"
         if release.slot is None or self.gate.messages == "all-in-order":
-            return release, None
+            return release
         if self._left is not None and self._same_cycle(release, self._left):
             if self.gate.messages == "first":
-                return _withheld(release), "surplus"
+                return release.dropping("surplus")
             last_end = self._left + moved_at(self.moves, self._left) + self.gate.slots[-1][1]
             release = self._release(oldest, max(ready, last_end))
-            if release.at_ns is None:
-                return release, "discarded"
             if release.slot is None:
-                return replace(release, at_ns=ready), None
-        if self._leaving is None or not self._same_cycle(release, self._leaving):
+                return release if release.at_ns is None else replace(release, at_ns=ready)
+        if not self._same_cycle(release, self._leaving):
             self._leaving = release.start_ns(self.gate.cycle_ns)
-        return release, None
+        return release
 
     def replaced(self, release: Release, now_ns: int) -> bool:
         """Whether a newer message leaves for the oldest one, which was to leave like this."""
-        if self.gate.messages != "newest" or release.slot is None or self._leaving is None:
+        if self.gate.messages != "newest" or release.slot is None:
             return False
-        others = [self._release(newer, now_ns) for newer in list(self.waiting)[1:]]
+        others = (self._release(newer, now_ns) for newer in islice(self.waiting, 1, None))
         return any(one.slot is not None and self._same_cycle(one, self._leaving) for one in others)
 
     def leave(self, release: Release | None, now_ns: int) -> None:
@@ -494,9 +487,10 @@ class Queue:
             moves=self.moves,
         )
 
-    def _same_cycle(self, release: Release, start_ns: int) -> bool:
+    def _same_cycle(self, release: Release, start_ns: int | None) -> bool:
         """Stamps are not quite periodic: cycles are the same less than half a cycle apart."""
-        return 2 * abs(release.start_ns(self.gate.cycle_ns) - start_ns) < self.gate.cycle_ns
+        cycle_ns = self.gate.cycle_ns
+        return start_ns is not None and 2 * abs(release.start_ns(cycle_ns) - start_ns) < cycle_ns
 
 
 class Shaper:
@@ -504,8 +498,7 @@ class Shaper:
 
     Stamps are CLOCK_REALTIME, sleeping is CLOCK_MONOTONIC; the offset between the two is taken
     anew for every message, since the wall clock may be stepped. Messages under way during a step
-    (:meth:`Queue.doubt_stamps`) are anchored to the cycle instead, at the phase that the last good
-    stamp had.
+    are anchored to the cycle instead, at the phase that the last good stamp had.
 
     One shaper belongs to one thread, which does nothing else at the time of a release. Its owner
     sets what it calls: ``look`` has new messages :meth:`arrive`, while others wait, before each
@@ -585,7 +578,7 @@ class Shaper:
         queue = self.queue
         message, now = queue.waiting[0], time.monotonic_ns()
         self._turn_ns = now  # before, this thread was busy with the message before it
-        release, dropped = queue.decide()
+        release = queue.decide()
         self.on_decision(release, queue.phase_ns)
         if release.at_ns is not None:
             self._waited_ns = self._others_ran_ns()
@@ -599,44 +592,39 @@ class Shaper:
             if queue.waiting[0] is not message:
                 return None
             if queue.replaced(release, now):
-                release, dropped = _withheld(release), "replaced"
-        if release.at_ns is None:
-            queue.leave(release, now)
-            return Outcome(message, release, now, dropped)
-        if slept:
-            self.on_waking(release.at_ns)
-            if time.monotonic_ns() < release.at_ns:
-                # Awake in time: what other threads took before is of no consequence.
-                self._waited_ns = self._others_ran_ns()
-        awake = watch_until(release.at_ns)
-        if self.gate.policy == "discard" and missed(self.gate, release, awake):
-            release, dropped = replace(_withheld(release), overrun="discard"), "discarded"
-        queue.leave(release, awake)
-        return Outcome(message, release, awake, dropped)
+                release = release.dropping("replaced")
+        if release.at_ns is not None:
+            if slept:
+                self.on_waking(release.at_ns)
+                if time.monotonic_ns() < release.at_ns:
+                    # Awake in time: what other threads took before is of no consequence.
+                    self._waited_ns = self._others_ran_ns()
+            now = watch_until(release.at_ns)
+            if self.gate.policy == "discard" and missed(self.gate, release, now):
+                release = replace(release.dropping("discarded"), overrun="discard")
+        queue.leave(release, now)
+        return Outcome(message, release, now)
 
     def _look(self) -> None:
         now = time.monotonic_ns()
         self.look()
         self._looked_ns = now
 
-    def nothing_due(self) -> bool:
-        """Whether there is time for something else before the next release."""
+    def nothing_due(self, until_ns: int | None = None) -> bool:
+        """Whether there is time for something else, until an instant, before the next release."""
         if not self.queue.waiting:
             return True
-        at_ns = self.queue.decide()[0].at_ns
-        return at_ns is not None and at_ns > time.monotonic_ns() + self.spin_ns + OTHERS_NS
+        at_ns = self.queue.decide().at_ns
+        until_ns = time.monotonic_ns() + OTHERS_NS if until_ns is None else until_ns
+        return at_ns is not None and at_ns > until_ns + self.spin_ns
 
     def rest(self, published_ns: int, pause_ns: int) -> None:
         """Pause behind a publication, unless another message has to leave meanwhile."""
         self.queue.free_ns = published_ns
         self._look()
-        until = published_ns + pause_ns
-        if self.queue.waiting:
-            at_ns = self.queue.decide()[0].at_ns
-            if at_ns is None or at_ns - self.spin_ns <= until:
-                return
-        sleep_until(until)
-        self.queue.free_ns = time.monotonic_ns()
+        if self.nothing_due(published_ns + pause_ns):
+            sleep_until(published_ns + pause_ns)
+            self.queue.free_ns = time.monotonic_ns()
 
     def time_lost(self, release: Release, until_ns: int) -> int:
         """How much of the delay from a release until now, right after publishing, no thread used:
@@ -664,10 +652,9 @@ class Shaper:
 #
 # ``first``, the paper's: as they come, but none that "has not come after a certain time interval
 # with respect to the previous one" that passed. A whole period would halve an input that is a
-# little faster, so it is four fifths; and of each period only the first passes, since otherwise
-# five might in four periods. Periods follow each other, each from a fifth before its message is
-# due, so that behind a late message none is lost. After one in which none passed the next is in
-# time.
+# little faster, so it is four fifths; and only the first of each period passes. Periods follow each
+# other, each from a fifth before its message is due, so that behind a late message none is lost.
+# After one in which none passed the next is in time.
 
 Rule: TypeAlias = Literal["newest", "first"]
 RULES = get_args(Rule)

@@ -5,7 +5,7 @@ in force. For each one of the two is responsible, whenever either is killed, sto
 
 * The **lock** of a file says whether a shaping node is in force; the kernel frees it at the node's
   death. The node takes it with the first message that it receives, when its output is ready; the
-  standby takes it for as long as it publishes, and not at all while the node has it.
+  standby takes it for as long as it publishes.
 * The file itself is a **page** in memory that both map: which messages each of them has dealt with
   (by their source timestamps), and until when the node may take for the one that it holds.
 
@@ -14,10 +14,9 @@ standby publishes; what the standby has published, the node leaves out. What is 
 microseconds from a publication until it is noted, in which a death has it published again.
 
 Who has slots follow the latencies reads these in a third ring, and says there by how much slots are
-moved. They are so only while it has its own lock: however it ends, they go back.
+moved, for as long as it has a lock of its own: however it ends, they go back.
 
-Standard library only, as the gate; `handover.hpp` is the node's side in C++, with the same page,
-whose layout is filled in from here.
+Standard library only, as the gate; `handover.hpp`, the node's side in C++, has this layout.
 """
 
 import fcntl
@@ -73,7 +72,9 @@ RING = 1024
 RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings,
 TOPIC = 32 + 3 * RING  # and of the name
 TOPIC_BYTES = 256
-PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3  # the bytes of the file that are locked
+PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3
+"""The bytes of the file that are locked, for the rights to publish, to be the standby, to publish
+as the standby although the shaping node has the first, and to move slots."""
 _RINGS = {"released": RELEASED, "bypassed": BYPASSED, "measured": MEASURED}
 """Each has the name under which the numbers in it are counted."""
 _AT = {name: place for place, name in enumerate(FIELDS)}
@@ -159,9 +160,7 @@ class Page:
         self._numbers[_AT[field]] = value
 
     def look(self) -> None:
-        """Read how the page is now, for who only looks. ValueError: it has become shorter, or was
-        removed.
-        """
+        """Read the page anew, for who only looks. ValueError: it has become shorter, or is gone."""
         if not os.fstat(self._file).st_nlink:
             raise ValueError(f"{self.path} was removed")
         content = os.pread(self._file, _SIZE, 0)
@@ -172,6 +171,16 @@ class Page:
     def put(self, field: str, value: int) -> None:
         """Write a number of a page that is only looked at."""
         os.pwrite(self._file, value.to_bytes(8, sys.byteorder, signed=True), 8 * _AT[field])
+
+    def add(self, ring: str, value: int) -> None:
+        """Put a number into a ring, and count it."""
+        number = self[ring]
+        self._numbers[_RINGS[ring] + number % RING] = value
+        self[ring] = number + 1
+
+    def noted(self, ring: str) -> list[int]:
+        """The latest numbers of a ring, in no order."""
+        return self._numbers[_RINGS[ring] : _RINGS[ring] + RING].tolist()
 
     def latest(self, ring: str, since: int) -> list[int]:
         """The numbers of a ring behind the first ``since``, as far as they are there."""
@@ -194,9 +203,7 @@ class Page:
     # Locks of open files (F_OFD_…): several in one file, each visible without taking it.
 
     def lock(self, byte: int = PUBLISHING) -> bool:
-        """Take a right, if no process has it: to publish, to be the standby, to publish as the
-        standby although the shaping node has the first, or to move slots. It ends with the process.
-        """
+        """Take a right, if no process has it; it ends with the process."""
         try:
             self._ask(fcntl.F_OFD_SETLK, fcntl.F_WRLCK, byte)
         except BlockingIOError:
@@ -215,16 +222,6 @@ class Page:
         answer = fcntl.fcntl(self._file, command, struct.pack(_FLOCK, kind, 0, byte, 1, 0))
         return int(struct.unpack(_FLOCK, answer)[0])
 
-    def add(self, ring: str, value: int) -> None:
-        """Put a number into a ring, and count it."""
-        number = self[ring]
-        self._numbers[_RINGS[ring] + number % RING] = value
-        self[ring] = number + 1
-
-    def noted(self, ring: str) -> list[int]:
-        """The latest numbers of a ring, in no order."""
-        return self._numbers[_RINGS[ring] : _RINGS[ring] + RING].tolist()
-
     def close(self) -> None:
         """Give up the page, and with it whatever it has locked."""
         self._numbers.release()
@@ -238,25 +235,25 @@ class Turn:
     """
 
     def __init__(self, name: str, topic: str) -> None:
-        self._name, self._topic, self._gave_up = name, topic, False
-        self._move_back = False
+        self._name, self._topic = name, topic
+        self._gave_up = self._move_back = False
         self._open()
-        now = time.monotonic_ns()
-        if now - self.page["started_ns"] > AT_ONCE_NS:
-            self.page["failed_starts"] = 0
-        self.page["started_ns"] = now
-        self.page["starts"] += 1
-        self.page["failed_starts"] += 1
+        page, now = self.page, time.monotonic_ns()
+        if now - page["started_ns"] > AT_ONCE_NS:
+            page["failed_starts"] = 0
+        page["started_ns"] = now
+        page["starts"] += 1
+        page["failed_starts"] += 1
 
     def _open(self) -> None:
-        self.page, parent = open_page(self._name, self._topic), os.getppid()
+        page, parent = open_page(self._name, self._topic), os.getppid()
         # Phase and mode are one launch's. All launches have one parent in some containers, and of
         # systemd: there it is the same one if little time has passed.
-        idle_ns = abs(time.monotonic_ns() - self.page["until_ns"])
-        if parent != self.page["parent"] or idle_ns > AT_ONCE_NS:
-            self.page["mode"] = self.page["phase_known"] = 0
-        self.page["parent"] = parent
-        self._in_force = False
+        idle_ns = abs(time.monotonic_ns() - page["until_ns"])
+        if parent != page["parent"] or idle_ns > AT_ONCE_NS:
+            page["mode"] = page["phase_known"] = 0
+        page["parent"] = parent
+        self.page, self._in_force = page, False
         # Of the standby's messages: how many there were at the last look, and which.
         self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
 
@@ -310,8 +307,8 @@ class Turn:
         self.page["until_ns"] = time.monotonic_ns()
         self.page["failed_starts"] = 0
         if not self.page.is_current:
+            left = self.page
             with suppress(OSError):  # without a folder this page has to do
-                left = self.page
                 self._open()
                 self._move_back = left["moved_from_ns"] != 0
                 for one in left.noted("released"):  # a standby that lags has to know them
@@ -334,7 +331,7 @@ class Turn:
         """A message has been published or dropped: it counts, and its latency to its arrival."""
         message, release = outcome.message, outcome.release
         self.page.add("measured", message.arrival_ns - release.origin_ns)
-        self.page[outcome.dropped or "published"] += 1
+        self.page[release.dropped or "published"] += 1
         self.page["lost_by_dds"] += message.lost or 0
         self.page["late"] += release.overrun is not None
 
@@ -424,9 +421,9 @@ class Standby:
 
     def _follow(self) -> None:
         """Go to the new page, where this one was removed and the shaping node has left it."""
-        if not self.page.is_current and not self.page.is_locked():
+        left = self.page
+        if not left.is_current and not left.is_locked():
             with suppress(OSError):
-                left = self.page
                 self._forget()  # a new page knows of nothing
                 self._open()
                 left.close()
@@ -437,10 +434,12 @@ class Standby:
         while True:
             with self._mutex:  # the page may be left meanwhile
                 holder, left_ms = self.page["holder"], self._patience_left_ms()
-            poll, died = select.poll(), -1 if holder == gone else _end_of(holder)
+            poll, died = select.poll(), -1
             poll.register(self._woken, select.POLLIN)
-            if died >= 0:
-                poll.register(died, select.POLLIN)
+            with suppress(OSError):  # there is no such process
+                if holder not in (0, gone):
+                    died = os.pidfd_open(holder)
+                    poll.register(died, select.POLLIN)
             ended = (died, select.POLLIN) in poll.poll(left_ms)
             with suppress(BlockingIOError):
                 os.read(self._woken, 4096)
@@ -529,11 +528,3 @@ def _is_alive(pid: int) -> bool:
     except OSError:
         return False
     return pid > 0
-
-
-def _end_of(pid: int) -> int:
-    """A descriptor that becomes readable when a process ends; -1: there is no such process."""
-    try:
-        return os.pidfd_open(pid) if pid else -1
-    except OSError:
-        return -1

@@ -1,12 +1,9 @@
 """Splicing the shaping node into a described application (paper, section 3.2.2, Design 2).
 
-What the Republisher Editor does to a launch file is done here to the description of the live
-workload: the publisher's output topic is remapped to ``…_tmp``, and a node that subscribes to
-that topic and republishes on the original one is added. Subscribers notice nothing.
-
-Where the plan gates the publisher's own thread instead (section 3.2.1, Design 1), no node is
-added: the application is compared with what the plan takes it for, and its output gets the
-lifespan by which DDS discards what overran.
+The publisher's output topic is remapped to ``…_tmp``, and a node that subscribes to that topic and
+republishes on the original one is added. Where the plan gates the publisher's own thread instead
+(section 3.2.1, Design 1), the application is compared with what the plan takes it for, and its
+output gets the lifespan by which DDS discards what overran.
 """
 
 from chainshaper.gate.decision import SAME
@@ -38,11 +35,6 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
     application = _placed(at_offsets(application, joint), joint)
     for chain in joint.chains:
         application = _with_chain(application, chain)
-    _refuse_strange_nodes(application, joint)
-    return application
-
-
-def _refuse_strange_nodes(application: Application, joint: ApplicationPlan) -> None:
     own = {*map(node_name, application.nodes)}
     planned = {thread.node for server in joint.servers for thread in server.threads}
     if strange := planned - own - {node.thread.node for node in joint.shaping_nodes}:
@@ -51,6 +43,7 @@ def _refuse_strange_nodes(application: Application, joint: ApplicationPlan) -> N
             f" (its nodes: {', '.join(sorted(own))}): correct the plan, or plan from a recording of"
             " this application"
         )
+    return application
 
 
 def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
@@ -59,11 +52,13 @@ def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
     InputError: the application lacks a chain of the plan, or it has another period there.
     """
     for chain in joint.chains:
-        name, timer = origin_timer(application, chain.chain.spec)
-        if timer.timer_ns != chain.chain.period_ns:
+        (name, timer), period_ns = (
+            origin_timer(application, chain.chain.spec),
+            chain.chain.period_ns,
+        )
+        if timer.timer_ns != period_ns:
             raise InputError(
-                "the plan is for a chain with the period"
-                f" {duration_text(chain.chain.period_ns)}, but"
+                f"the plan is for a chain with the period {duration_text(period_ns)}, but"
                 f" {chain.chain.spec or application.chain} of {application.name!r} has"
                 f" {duration_text(timer.timer_ns or 0)}: plan again from a recording of this"
                 " application"

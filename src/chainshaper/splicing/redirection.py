@@ -5,8 +5,8 @@
 for whatever reason it is started: `Executable.prepare` has made the command line of a process, and
 `get_composable_node_load_request` the request to a container (Humble to Rolling). Behind both,
 rules are added for the nodes that are meant, each bound to the node's name (``ndt:/pose:=…``).
-`LoadComposableNodes._load_node` sends such a request; behind that of a publisher whose shaping node
-is a component, one for the shaping node goes to the same container.
+`LoadComposableNodes._load_node` sends such a request; where the shaping node is a component, one
+for it follows that of the publisher.
 
 ROS 2 follows the first rule that matches a name, and does not match the result again (upstream:
 `rcl_remap_first_match`). So a rule that leads to the topic is preceded by ours for the same name,
@@ -29,7 +29,6 @@ DISCOVERY_S = 5.0  # how long before that it begins to listen for who publishes 
 
 _DRY_RUN = "chainshaper_dry_run"
 _RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
-_NOT_RUNNING = "no node {} runs"
 _NOT_LOADED = (
     "no launch file has a container load {}, and its shaping node is a component (what `ros2 "
     "component load` loads cannot be redirected: load it in a launch file; if it is a process, "
@@ -117,7 +116,7 @@ class Redirect:
         if elsewhere:
             return f"nothing was redirected: {_names(elsewhere)} has another topic in place of it"
         if lacking:
-            what = _NOT_RUNNING if self.component is None else _NOT_LOADED
+            what = "no node {} runs" if self.component is None else _NOT_LOADED
             what = what.format(_names(lacking))
             return f"nothing was redirected: {what}; started were {_names(self.others)}"
         if self.kind == "subscription":
@@ -149,21 +148,19 @@ def redirecting(
     """
     base = node.rpartition("/")[2]
     added: list[tuple[int, str]] = []
-    there, matches = False, set()
+    leads: dict[str, str] = {}
     for place, rule in enumerate(rules):
         found = _RULE.fullmatch(rule)
         if found is None or found[1] not in (None, base) or found[2].startswith("__"):
             continue
-        match, leads_to = expanded(found[2], node), expanded(found[3], node)
-        if match in matches:
-            continue
-        matches.add(match)
-        there = there or leads_to == target
-        if leads_to == topic:
-            added.append((place, f"{base}:{found[2]}:={target}"))
-    if topic not in matches:
+        match = expanded(found[2], node)
+        if match not in leads:
+            leads[match] = expanded(found[3], node)
+            if leads[match] == topic:
+                added.append((place, f"{base}:{found[2]}:={target}"))
+    if topic not in leads:
         added.append((len(rules), f"{base}:{topic}:={target}"))
-    return added if added or there else None
+    return added if added or target in leads.values() else None
 
 
 def expanded(name: str, node: str) -> str:
@@ -224,10 +221,9 @@ def redirect_request(request: Any, redirects: Sequence[Redirect]) -> list[Redire
 
     Returns the redirects that added some.
     """
-    found = []
+    found, given = [], (request.node_name, request.node_namespace)
     for redirect in redirects:
         rules = list(request.remap_rules)
-        given = request.node_name, request.node_namespace
         added = redirect.see(rules, request.plugin_name, given=given)
         for number, rule in reversed(added):
             rules.insert(number, rule)
@@ -248,8 +244,7 @@ def component_request(component: dict[str, Any], publisher: Any, context: Any) -
     request.package_name, request.plugin_name = component["package"], component["plugin"]
     request.node_name, request.node_namespace = component["name"], "/"
     request.remap_rules = [f"{match}:={target}" for match, target in component["remappings"]]
-    files = [Path(component["parameters"])]
-    found = to_parameters_list(context, request.node_name, "/", files)
+    found = to_parameters_list(context, component["name"], "/", [Path(component["parameters"])])
     request.parameters = [one.to_parameter_msg() for one in found]
     same = (one for one in publisher.extra_arguments if one.name == "use_intra_process_comms")
     request.extra_arguments = list(same)

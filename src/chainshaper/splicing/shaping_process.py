@@ -35,9 +35,7 @@ from chainshaper.values.plan_choices import STANDBY, NodeKind
 OF_ONE_TYPE = ("typed", "component")
 _SOURCES = Path(__file__).parents[2]
 _NODES = Path(__file__).parent / "nodes"
-
-RESPAWN = {"respawn": True, "respawn_delay": 0.1}
-"""What a launch file says of every added process; the delay (s): it may end at once each time."""
+_RESPAWNING = _NODES / "python/respawning.py"
 
 SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half a cycle
 
@@ -51,35 +49,40 @@ class ShapingProcess:
     """
 
     name: str
-    namespace: str
     command: tuple[str, ...] | None
     package: str | None
     executable: str | None
     parameters_file: Path  # of ROS 2
-    remappings: tuple[tuple[str, str], ...]  # such as ("input", "/t5_tmp")
-    standby: "ShapingProcess | None" = None  # passes its output on meanwhile
+    remappings: tuple[tuple[str, str], ...] = ()  # such as ("input", "/t5_tmp")
     plugin: str | None = None
+    standby: "ShapingProcess | None" = None  # passes its output on meanwhile
 
     @property
     def command_line(self) -> list[str]:
         """The command with name, remaps and parameters as ROS arguments behind it."""
-        rules = [("__node", self.name), ("__ns", self.namespace), *self.remappings]
+        rules = [("__node", self.name), ("__ns", "/"), *self.remappings]
         remaps = [word for match, target in rules for word in ("-r", f"{match}:={target}")]
         parameters = ["--params-file", str(self.parameters_file)]
         return [*(self.command or ()), "--ros-args", *remaps, *parameters]
+
+    @property
+    def action(self) -> dict[str, Any]:
+        """The arguments of launch's `ExecuteProcess`, or of `Node`."""
+        # It may end at once each time: without a delay (s) that takes a core.
+        common = {"name": self.name, "output": "screen", "respawn": True, "respawn_delay": 0.1}
+        if self.command is not None:
+            return {"cmd": self.command_line, **common}
+        own = {"package": self.package, "executable": self.executable, "namespace": "/"}
+        parameters = {"parameters": [str(self.parameters_file)]}
+        return {**own, **parameters, "remappings": [*self.remappings], **common}
 
     @property
     def component(self) -> dict[str, Any] | None:
         """What is needed to have a container load it (`redirection.component_request`)."""
         if self.plugin is None:
             return None
-        return {
-            "package": self.package,
-            "plugin": self.plugin,
-            "name": self.name,
-            "remappings": self.remappings,
-            "parameters": str(self.parameters_file),
-        }
+        own = {"package": self.package, "plugin": self.plugin, "name": self.name}
+        return {**own, "remappings": self.remappings, "parameters": str(self.parameters_file)}
 
 
 def write_shaping_process(
@@ -105,12 +108,9 @@ def write_shaping_process(
             f"the {kind} shaping node is generated for one type, and that of {node.output} is not "
             "known: name it, as `ros2 topic type` prints it, or choose the kind cpp"
         )
-    remappings = (("input", node.input), ("output", node.output))
-    standby = f"{node.name}{STANDBY}"
+    topics = (("input", node.input), ("output", node.output))
     process, files = _process(
-        *(kind, "shaping_node", node.name, folder),
-        remappings=remappings,
-        message_type=message_type,
+        kind, "shaping_node", node.name, folder, topics, message_type=message_type
     )
     parameters = shaping_parameters(plan, node, log)
     parameters["handover"] = _page_name(node, log or folder)
@@ -118,14 +118,15 @@ def write_shaping_process(
         given = {name: value for name, value in parameters.items() if value != []}  # of no type
         _write(into or folder, {**files, f"{node.name}.yaml": _yaml(given)})
         return process
-    beside, files_beside = _process("python", "standby", standby, folder, remappings=remappings)
+    standby = f"{node.name}{STANDBY}"
+    beside, files_beside = _process("python", "standby", standby, folder, topics)
     of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
         "shaping_node": node.name,
         "fallback": plan.fallback,
         # A node that runs only in its server's slots may get to a message a cycle later.
         "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS)
         + (plan.cycle_ns if plan.shaping_thread == "in-slots" else 0),
-        "server_cores": _server_cores(plan),
+        "server_cores": sorted({server.core for server in plan.servers}),
         "log": "" if log is None else str(log.with_stem(standby).absolute()),
     }
     files |= {f"{node.name}.yaml": _yaml(parameters), f"{standby}.yaml": _yaml(of_standby)}
@@ -234,12 +235,8 @@ def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[
         "log": "" if log is None else str(log.absolute()),
     }
     if node.receivers:
-        parameters["server_cores"] = _server_cores(plan)
+        parameters["server_cores"] = sorted({server.core for server in plan.servers})
     return parameters
-
-
-def _server_cores(plan: Plan) -> list[int]:
-    return sorted({server.core for server in plan.servers})
 
 
 def _process(
@@ -247,32 +244,27 @@ def _process(
     executable: str,
     name: str,
     folder: Path,
-    *,
     remappings: tuple[tuple[str, str], ...] = (),
+    *,
     message_type: str | None = None,
 ) -> tuple[ShapingProcess, dict[str, str]]:
     """A process with its program's files, by their paths below the folder."""
-    folder, command, package, plugin = folder.absolute(), None, None, None
+    folder = folder.absolute()
+    parameters = folder / f"{name}.yaml"
     if kind == "python":
-        command = ("python3", str(folder / f"{name}.py"))
         files = {f"{name}.py": python_node(executable)}
         if executable != "standby":  # that stands beside one that has it
-            files["respawning.py"] = _respawning()
-    else:
-        known = message_type_named(message_type) if kind in OF_ONE_TYPE and message_type else None
-        package = GENERIC_PACKAGE if known is None else known.node_package
-        component = kind == "component"
-        plugin = f"{package}::ShapingNode" if component else None
-        filled = generic_package() if known is None else typed_package(known, component=component)
-        files = {f"{package}/{path}": text for path, text in filled.items()}
-    runs = None if package is None or plugin is not None else executable
-    parameters = folder / f"{name}.yaml"
-    made = ShapingProcess(name, "/", command, package, runs, parameters, remappings, plugin=plugin)
-    return made, files
-
-
-def _respawning() -> str:
-    return (_NODES / "python/respawning.py").read_text(encoding="utf-8")
+            files["respawning.py"] = _RESPAWNING.read_text(encoding="utf-8")
+        command = ("python3", str(folder / f"{name}.py"))
+        return ShapingProcess(name, command, None, None, parameters, remappings), files
+    known = message_type_named(message_type) if kind in OF_ONE_TYPE and message_type else None
+    package, component = GENERIC_PACKAGE if known is None else known.node_package, None
+    if kind == "component":
+        component = f"{package}::ShapingNode"
+    filled = cpp_package(known, component=component is not None)
+    runs = executable if component is None else None
+    process = ShapingProcess(name, None, package, runs, parameters, remappings, component)
+    return process, {f"{package}/{path}": text for path, text in filled.items()}
 
 
 def _yaml(parameters: dict[str, Any]) -> str:
@@ -363,7 +355,7 @@ def gate_library() -> Path:
     """
     sources = [_NODES / name for name in _GATE_SOURCES]
     programs = [str(path) for path in sources if path.suffix == ".cpp"]
-    headers = {path: text for path, text in generic_package().items() if path.endswith(".hpp")}
+    headers = {path: text for path, text in cpp_package().items() if path.endswith(".hpp")}
 
     def build(folder: Path) -> Path:
         _write(folder, {**headers, "exported.map": _EXPORTED})
@@ -452,49 +444,38 @@ def _message_folders(package: str) -> list[Path]:
     return [Path(prefix) / "share" / package / "msg" for prefix in prefixes]
 
 
-def generic_package() -> dict[str, str]:
-    """The files of the package for all types: paths inside it, and their text."""
-    files = _filled(GENERIC_PACKAGE, "topics of any type", ["std_msgs"], "shaping_node throttler")
-    del files["include/message.hpp"]
-    return files
-
-
-def typed_package(message_type: MessageType, *, component: bool = False) -> dict[str, str]:
-    """The files of the package generated for one type: paths inside it, and their text."""
-    package, name = message_type.package, message_type.full_name
-    messages = sorted({"std_msgs", package})  # the modes of the system are a std_msgs/String
-    files = _filled(
-        *(message_type.node_package, name, messages, "" if component else "shaping_node"),
-        TYPE=name,
-        HEADER=f"{package}/msg/{message_type.snake_name}.hpp",
-        CLASS=f"{package}::msg::{message_type.name}",
-    )
-    del files["src/throttler.cpp"]
-    return files
-
-
-def _filled(
-    project: str, shaped: str, messages: list[str], nodes: str, **values: str
-) -> dict[str, str]:
-    """The files of a package, with the templates among them, ``….in``, filled in."""
-    values |= _schema() | {
-        "PROJECT": project,
-        "FOR": shaped,
-        "NODES": nodes,
+def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -> dict[str, str]:
+    """The files of the package for one type, or for all: paths inside it, and their text."""
+    # The modes of the system are a std_msgs/String.
+    messages = sorted({"std_msgs", *([] if shaped is None else [shaped.package])})
+    depends = [*messages, "rclcpp_components"] if component else messages
+    values = _schema() | {
+        "PROJECT": GENERIC_PACKAGE,
+        "FOR": "topics of any type",
+        "NODES": "shaping_node throttler",
+        "COMPONENT": str(component).upper(),
         "FIND_MESSAGES": "\n".join(f"find_package({name} REQUIRED)" for name in messages),
         "MESSAGE_TARGETS": " ".join(f"${{{name}_TARGETS}}" for name in messages),
-        "COMPONENT": "FALSE" if nodes else "TRUE",
-        "DEPENDS": "\n".join(
-            f"  <depend>{name}</depend>"
-            for name in (*messages, *(() if nodes else ("rclcpp_components",)))
-        ),
+        "DEPENDS": "\n".join(f"  <depend>{name}</depend>" for name in depends),
     }
-    files = {"scripts/respawning": _respawning()}
+    left_out = "include/message.hpp"
+    if shaped is not None:
+        left_out = "src/throttler.cpp"
+        values |= {
+            "PROJECT": shaped.node_package,
+            "FOR": shaped.full_name,
+            "NODES": "" if component else "shaping_node",
+            "TYPE": shaped.full_name,
+            "HEADER": f"{shaped.package}/msg/{shaped.snake_name}.hpp",
+            "CLASS": f"{shaped.package}::msg::{shaped.name}",
+        }
+    files = {"scripts/respawning": _RESPAWNING.read_text(encoding="utf-8")}
     for path in sorted((_NODES / "cpp").rglob("*.*")):
         text = path.read_text(encoding="utf-8")
         if path.suffix == ".in":
             text = re.sub("@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
         files[str(path.relative_to(_NODES / "cpp")).removesuffix(".in")] = text
+    del files[left_out]
     return files
 
 

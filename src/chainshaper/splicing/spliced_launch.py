@@ -1,10 +1,8 @@
 """A folder with the launch file that splicing writes: whole or absent, and known as ours.
 
 Beside the launch file stand what redirects topics (:mod:`.redirection`) and the nodes that are
-added; the user's launch files stay where they are. A manifest, `splice.json`, names every file with
-its hash, so that the folder can be replaced or removed again as long as it is unchanged. What
-running and building leave there does not count as a change: Python's caches, logs of the shaping
-nodes, colcon's folders.
+added. A manifest, `splice.json`, names every file with its hash, so that the folder can be replaced
+or removed again as long as it is unchanged, but for what running and building leave there.
 """
 
 import hashlib
@@ -22,7 +20,7 @@ from typing import Any
 
 from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
-from chainshaper.splicing.shaping_process import RESPAWN, ShapingProcess
+from chainshaper.splicing.shaping_process import ShapingProcess
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import folder_beside, open_to_all
 from chainshaper.values.yaml_file import read_text
@@ -147,17 +145,13 @@ def launch_text(
     ``words`` are the files, or `ros2 run …`; what is launched gets the ``environment`` as well.
     """
     run = [{"cmd": [*words], "output": "screen"}] if is_run(words) else []
-    every = [
-        one
-        for process in processes
-        for one in (process, process.standby)
-        if one is not None and one.plugin is None
-    ]
+    every = [one for process in processes for one in (process, process.standby)]
+    actions = [one.action for one in every if one is not None and one.plugin is None]
     what = executable_of(words) or ", ".join(Path(word).name for word in words)
     return _TEXT.format(
         what=re.sub(r"[^\w., -]", "_", what),  # a file's name cannot end the text it stands in
         files=pformat([] if run else list(words), width=96),
-        processes=pformat([*map(_keywords, every), *run], width=96, sort_dicts=False),
+        processes=pformat([*actions, *run], width=96, sort_dicts=False),
         redirects=pformat([one.values() for one in redirects], width=96, sort_dicts=False),
         environment=pformat(dict(environment), width=96, sort_dicts=False),
     )
@@ -177,21 +171,6 @@ def executable_of(words: Sequence[str]) -> str | None:
         return None
     behind = words[_behind_options(words) :]
     return Path(behind[1]).name if len(behind) > 1 else None
-
-
-def _keywords(process: ShapingProcess) -> dict[str, Any]:
-    """Arguments of launch's `ExecuteProcess`, or of `Node`."""
-    common = {"name": process.name, "output": "screen", **RESPAWN}
-    if process.command is not None:
-        return {"cmd": process.command_line, **common}
-    return {
-        "package": process.package,
-        "executable": process.executable,
-        "namespace": process.namespace,
-        "parameters": [str(process.parameters_file)],
-        "remappings": list(process.remappings),
-        **common,
-    }
 
 
 def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str]:

@@ -324,7 +324,7 @@ class NodeProcess:
             number_of("anchor", release.anchor),
             number_of("overrun", release.overrun),
             ABSENT if release.mode is None else modes.index(release.mode),
-            number_of("dropped", outcome.dropped),
+            number_of("dropped", release.dropped),
             release.moved_ns,
         )
 

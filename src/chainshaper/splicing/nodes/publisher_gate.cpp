@@ -263,8 +263,6 @@ private:
     // Where cycles begin is found while the application runs.
     if (const auto phase = turn_ ? turn_->asked_phase_ns() : std::nullopt)
       shaper_.set_phase(*phase, monotonic_ns());
-    if (const auto moved = turn_ ? turn_->moved() : std::nullopt)
-      shaper_.move_slots(moved->first, moved->second);
     while (oldest != nullptr) {
       Message message(oldest);
       oldest = oldest->next;
@@ -292,8 +290,7 @@ private:
     const auto key = oldest.message->stamp;
     if (turn_) turn_->take(key);
     const auto outcome = shaper_.hold();
-    Maybe published_ns;
-    Maybe stalled_ns;
+    Maybe published_ns, stalled_ns;
     if (outcome && outcome->release.at_ns) {
       publish(*outcome->waiting.message);
       published_ns = monotonic_ns();
@@ -339,11 +336,15 @@ private:
 // The outputs of this process, in the order of their making; room is given back, but never moved.
 std::array<std::atomic<Output *>, 32> outputs;
 
-Output * output_of(const RmwPublisher * publisher) {
+template <typename Is>
+Output * find_output(Is is) {
   for (const auto & one : outputs)
-    if (Output * const output = one; output != nullptr && output->publisher == publisher)
-      return output;
+    if (Output * const output = one; output != nullptr && is(*output)) return output;
   return nullptr;
+}
+
+Output * output_of(const RmwPublisher * publisher) {
+  return find_output([=](const Output & one) { return one.publisher == publisher; });
 }
 
 // A child of fork() has none of our threads, so nothing of it is shaped.
@@ -387,11 +388,10 @@ EXPORTED RmwPublisher * rmw_create_publisher(const RmwNode * node, const void * 
 }
 
 EXPORTED int rmw_destroy_publisher(RmwNode * node, RmwPublisher * publisher) {
+  Output * const output = output_of(publisher);
   for (auto & one : outputs)
-    if (Output * const output = one; output != nullptr && output->publisher == publisher) {
-      one = nullptr;
-      delete output;
-    }
+    if (output != nullptr && one == output) one = nullptr;
+  delete output;
   return RMW(rmw_destroy_publisher)(node, publisher);
 }
 
@@ -448,12 +448,9 @@ EXPORTED void ros_trace_rcl_publisher_init(const void * handle, const void * nod
 }
 
 EXPORTED void ros_trace_rcl_publish(const void * handle, const void * message) {
-  for (const auto & one : outputs)
-    if (const Output * const output = one; output != nullptr && output->rcl_publisher() == handle) {
-      EMIT(rcl_publish, output->input_handle(), message);
-      return;
-    }
-  EMIT(rcl_publish, handle, message);
+  const auto is = [=](const Output & one) { return one.rcl_publisher() == handle; };
+  const Output * const output = find_output(is);
+  EMIT(rcl_publish, output == nullptr ? handle : output->input_handle(), message);
 }
 
 // A thread of real-time priority that waits for a mutex hands its priority on to the thread that has

@@ -1,6 +1,5 @@
 """What the nodes have in common on the side of ROS 2: parameters, topics, trace points, real-time
-scheduling, and the log of a gate. Written for rclpy of Humble to Rolling; where they differ, it is
-said.
+scheduling, and the log of a gate. Written for rclpy of Humble to Rolling.
 """
 
 import atexit
@@ -21,17 +20,12 @@ from contextlib import suppress
 from typing import Any
 
 import rclpy
+from rclpy import qos as policies
 from rclpy.clock import Clock, ClockType
 from rclpy.executors import ExternalShutdownException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.qos import (
-    QoSDurabilityPolicy,
-    QoSHistoryPolicy,
-    QoSLivelinessPolicy,
-    QoSProfile,
-    QoSReliabilityPolicy,
-)
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.subscription import Subscription
 from rclpy.utilities import get_rmw_implementation_identifier
 
@@ -93,22 +87,17 @@ def offered_by(info: Any, node: Node) -> QoSProfile:
     keep the last ``output_depth``.
     """
     offered = info.qos_profile
-    known = {
-        "history": (QoSHistoryPolicy.KEEP_ALL, QoSHistoryPolicy.KEEP_LAST),
-        "reliability": (QoSReliabilityPolicy.BEST_EFFORT, QoSReliabilityPolicy.RELIABLE),
-        "durability": (QoSDurabilityPolicy.TRANSIENT_LOCAL, QoSDurabilityPolicy.VOLATILE),
-        "liveliness": (QoSLivelinessPolicy.MANUAL_BY_TOPIC, QoSLivelinessPolicy.AUTOMATIC),
-    }
-    return QoSProfile(
-        depth=offered.depth or parameters_of(node).output_depth,
-        lifespan=offered.lifespan,
-        deadline=offered.deadline,
-        liveliness_lease_duration=offered.liveliness_lease_duration,
-        **{
-            name: either if getattr(offered, name) == either else usual
-            for name, (either, usual) in known.items()
-        },
-    )
+    alike = ("lifespan", "deadline", "liveliness_lease_duration")
+    known = {name: getattr(offered, name) for name in alike}
+    for name, kind, either, usual in (
+        ("history", policies.QoSHistoryPolicy, "KEEP_ALL", "KEEP_LAST"),
+        ("reliability", policies.QoSReliabilityPolicy, "BEST_EFFORT", "RELIABLE"),
+        ("durability", QoSDurabilityPolicy, "TRANSIENT_LOCAL", "VOLATILE"),
+        ("liveliness", policies.QoSLivelinessPolicy, "MANUAL_BY_TOPIC", "AUTOMATIC"),
+    ):
+        there = getattr(offered, name) == kind[either]
+        known[name] = kind[either if there else usual]
+    return QoSProfile(depth=offered.depth or parameters_of(node).output_depth, **known)
 
 
 def asked_of(offered: QoSProfile, depth: int = 0) -> QoSProfile:
@@ -405,8 +394,8 @@ class GateLog:
         """
         release, message = outcome.release, outcome.message
         self._rows += 1
-        if outcome.dropped is not None:
-            self._lost[outcome.dropped] += 1
+        if release.dropped is not None:
+            self._lost[release.dropped] += 1
         if message.lost:
             self._lost["lost by DDS"] += message.lost
         if self._pipe is not None:
@@ -415,7 +404,7 @@ class GateLog:
                 *(outcome.awake_ns, self._process, core, message.about, message.arrival_ns),
                 *(release.origin_ns, release.at_ns, release.slot, release.cycles_waited),
                 *(release.anchor, release.overrun, release.mode, published, stalled),
-                *(outcome.dropped, message.lost, self._rows, release.moved_ns),
+                *(release.dropped, message.lost, self._rows, release.moved_ns),
             )
             line = ",".join("" if value is None else str(value) for value in values) + "\n"
             try:

@@ -49,8 +49,7 @@ class Readiness:
 
     The chain has run since the last publication, so its code and data have left the processor's
     caches. Shortly before each release a message without receivers goes the way of the real one
-    through ROS 2 and DDS, and a datagram to ourselves that through the network stack: p99.5 from
-    the release to `rmw_publish` was 55 µs with it, 163 without.
+    through ROS 2 and DDS, and a datagram to ourselves that through the network stack.
 
     While `/dev/cpu_dma_latency` is open, cores wake up within the microseconds written there
     (Documentation/power/pm_qos_interface.rst).
@@ -79,7 +78,7 @@ class Readiness:
 
     def get_ready(self, release_ns: int) -> None:
         """For a release at that time of CLOCK_MONOTONIC, as far as there is time left for it."""
-        self._ask_for(self.AWAKE)
+        self.ask_for(self.AWAKE)
         if self._delivery_core is not None:
             self._delivery_core.clear_until(release_ns + self._pause_ns)
         for _ in range(2):  # the second time all that the first has loaded is in order
@@ -90,11 +89,8 @@ class Readiness:
                 self._to_itself.send(EMPTY)
                 self._to_itself.recv(len(EMPTY))
 
-    def relax(self) -> None:
-        """The message is delivered: cores may sleep."""
-        self._ask_for(self.AS_USUAL)
-
-    def _ask_for(self, latency: bytes) -> None:
+    def ask_for(self, latency: bytes = AS_USUAL) -> None:
+        """How fast cores wake up from now on; by default they may sleep."""
         if self._latency >= 0:
             os.write(self._latency, latency)
 
@@ -119,7 +115,7 @@ def turn_of(node: Node, name: str) -> Turn | None:
     """What is agreed with the standby on the page of this name; None: the node is alone.
 
     After several nodes that failed at once this one waits, so that starting over and over does not
-    take a core. To be called before anything that may fail.
+    take a core: to be called before anything that may fail.
     """
     if not name:
         return None
@@ -154,11 +150,10 @@ class Shaping:
         info = wait_for_publisher(node, "input")
         depth, offered, asked = room_of(node, info)
         gate = parameters.gate(depth)
-        self._modes = [] if gate.modes is None else list(gate.modes.bands)
         self._shaper = Shaper(gate, parameters.spin_ns)
         self._shaper.on_waking, self._shaper.look = self._readiness.get_ready, self._look
         if self._turn is not None:
-            self._go_on(self._turn)
+            self._go_on(self._turn, [] if gate.modes is None else list(gate.modes.bands))
         self._number: int | None = None  # the publisher's, of the last message
         self._its_turn = False  # of the oldest message
         node.add_on_set_parameters_callback(self._parameters_set)
@@ -173,21 +168,21 @@ class Shaping:
         self._take = take_event(self._input)
         self._await_receivers(node, publisher)
 
-    def _go_on(self, turn: Turn) -> None:
+    def _go_on(self, turn: Turn, modes: list[str]) -> None:
         """Have cycles begin where they did for the node before this one, in its mode; the standby
         sees each decision.
         """
 
         def decided(release: Release, phase_ns: int) -> None:
-            mode = 0 if release.mode is None else self._modes.index(release.mode) + 1
+            mode = 0 if release.mode is None else modes.index(release.mode) + 1
             turn.hold(release.at_ns, phase_ns, mode)
 
         self._shaper.moved, self._shaper.on_decision = turn.moved, decided
         if turn.phase_ns is not None:  # from now on, not the next cycle
             now = time.monotonic_ns() - self._shaper.gate.cycle_ns
             self._shaper.set_phase(turn.phase_ns, now)
-        if 0 < (mode := turn.page["mode"]) <= len(self._modes):
-            self._shaper.switch(self._modes[mode - 1], 0)
+        if 0 < (mode := turn.page["mode"]) <= len(modes):
+            self._shaper.switch(modes[mode - 1], 0)
 
     def _parameters_set(self, parameters: Any) -> Any:
         """``phase_ns`` may be set while the node runs, in force from the next cycle on."""
@@ -247,7 +242,7 @@ class Shaping:
         if outcome is None:
             return
         if turn is not None and turn.was_bypassed(key):
-            self._readiness.relax()
+            self._readiness.ask_for()
             return
         published = stalled = None
         if outcome.release.at_ns is not None:
@@ -263,7 +258,7 @@ class Shaping:
         if published is not None:
             stalled = self._shaper.time_lost(outcome.release, outcome.awake_ns)
             self._shaper.rest(published, self._pause_ns)
-        self._readiness.relax()
+        self._readiness.ask_for()
         self._note(outcome, published, stalled)
         if not self._shaper.queue.waiting:
             gc.collect()  # here is time for it; all that is older is frozen

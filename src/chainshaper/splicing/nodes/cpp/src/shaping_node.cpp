@@ -10,7 +10,6 @@
 #include <filesystem>
 #include <set>
 #include <thread>
-#include <type_traits>
 
 #include "chainshaper_shaping/gate_log.hpp"
 #include "chainshaper_shaping/handover.hpp"
@@ -34,29 +33,23 @@ using Pointer = std::unique_ptr<Message>;
 using Pointer = std::shared_ptr<Message>;
 #endif
 
-template <typename T, typename = void>
-struct HasStamp : std::false_type {};
-
-template <typename T>
-struct HasStamp<T, std::void_t<decltype(std::declval<T>().header.stamp.nanosec)>> : std::true_type {
-};
-
 // The stamp of a message's header; none if it is zero, or the type has no header.
 template <typename T>
-chainshaper::Maybe stamp_of([[maybe_unused]] const T & message) {
-  if constexpr (HasStamp<T>::value) {
-    const auto & stamp = message.header.stamp;
-    if (stamp.sec != 0 || stamp.nanosec != 0)
-      return stamp.sec * std::int64_t{1'000'000'000} + stamp.nanosec;
-  }
+auto stamp_of(const T & message, int) -> decltype(message.header.stamp.nanosec, chainshaper::Maybe()) {
+  const auto & stamp = message.header.stamp;
+  if (stamp.sec == 0 && stamp.nanosec == 0) return std::nullopt;
+  return stamp.sec * std::int64_t{1'000'000'000} + stamp.nanosec;
+}
+
+template <typename T>
+chainshaper::Maybe stamp_of(const T &, long) {  // NOLINT(runtime/int)
   return std::nullopt;
 }
 
 auto make_publisher(rclcpp::Node & node, const std::string & type, const rclcpp::QoS & qos) {
-  if (type != chainshaper::message_type) {
+  if (type != chainshaper::message_type)
     throw std::invalid_argument("this node was made for " + std::string(chainshaper::message_type) +
                                 ", but its input is " + type + ": generate it again for that type");
-  }
   return node.create_publisher<Message>("output", qos);
 }
 
@@ -114,7 +107,7 @@ using Input = rclcpp::GenericSubscription;
 using Pointer = std::shared_ptr<Message>;
 constexpr bool input_tells_takes = chainshaper::serialized_tells_takes;
 
-chainshaper::Maybe stamp_of(const Message & message) {
+chainshaper::Maybe stamp_of(const Message & message, int) {
   const auto & bytes = message.get_rcl_serialized_message();
   return chainshaper::origin_of(bytes.buffer, bytes.buffer_length);
 }
@@ -218,10 +211,9 @@ public:
     shaper_.look = [this] { look(); };
     if (turn_) turn_->go_on(shaper_);
     const auto & log = parameters_.log;
-    if (!log.empty() && !log_.open_file(log, parameters_.log_bytes)) {
+    if (!log.empty() && !log_.open_file(log, parameters_.log_bytes))
       RCLCPP_WARN(node.get_logger(), "no log is written to %s: %s", log.c_str(),
                   std::strerror(errno));
-    }
     phase_ =
         node.add_on_set_parameters_callback([this](const std::vector<rclcpp::Parameter> & changed) {
           const std::lock_guard<std::mutex> locked(asking_);  // the executor may be another one
@@ -233,15 +225,13 @@ public:
           return result;
         });
     const auto depth = shaper_.queue.gate.depth;
-    const bool latched =
-        offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
+    const auto most = std::max<std::size_t>(depth, schema::reader_depth);
+    const bool latched = offer.publisher.durability() == rclcpp::DurabilityPolicy::TransientLocal;
     output_ = make_publisher(node, offer.type,
                              latched ? offer.publisher : deeper(offer.publisher, depth));
     options_.callback_group = group;
     listen_to_modes();
-    const auto asked =
-        deeper(offer.subscription, std::max<std::size_t>(schema::reader_depth, depth));
-    input_ = subscribe(node, offer.type, asked, options_,
+    input_ = subscribe(node, offer.type, deeper(offer.subscription, most), options_,
                        [this](Pointer message, const rclcpp::MessageInfo & info) {
                          shape(std::move(message), info);
                        });
@@ -313,12 +303,8 @@ private:
     }
     auto outcome = shaper_.hold();
     if (!outcome) return;
-    if (turn_ && turn_->was_bypassed(key)) {
-      readiness_.relax();
-      return;
-    }
-    Maybe published_ns;
-    Maybe stalled_ns;
+    if (turn_ && turn_->was_bypassed(key)) return readiness_.ask_for();
+    Maybe published_ns, stalled_ns;
     if (outcome->release.at_ns) {
       try {
         publish(*output_, outcome->waiting.message);
@@ -333,7 +319,7 @@ private:
       stalled_ns = shaper_.time_lost(*outcome);
       shaper_.rest(*published_ns, parameters_.pause_ns);
     }
-    readiness_.relax();
+    readiness_.ask_for();
     note(*outcome, published_ns, stalled_ns);
   }
 
@@ -350,14 +336,12 @@ private:
   }
 
   void arrive(Pointer message, const rmw_message_info_t & info, bool waited) {
-    const auto stamp = stamp_of(*message);
+    const auto stamp = stamp_of(*message, 0);
     const bool within = info.from_intra_process;  // without anything else of DDS
     if (const std::unique_lock<std::mutex> ours(asking_, std::try_to_lock); ours && asked_phase_) {
       shaper_.set_phase(asked_phase_->first, asked_phase_->second);
       asked_phase_.reset();
     }
-    if (const auto moved = turn_ ? turn_->moved() : std::nullopt)
-      shaper_.move_slots(moved->first, moved->second);
     const auto before = shaper_.overflowed.size();
     shaper_.arrive(std::move(message), stamp, within ? Maybe() : Maybe(info.source_timestamp),
                    waited, within ? Maybe() : missing_before(info));

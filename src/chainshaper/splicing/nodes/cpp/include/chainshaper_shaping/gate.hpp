@@ -94,7 +94,8 @@ inline std::int64_t moved_at(const std::deque<Move> & moves, std::int64_t cycle_
   return found == moves.rend() ? 0 : found->second;
 }
 
-// The decision for one message. No `at_ns`: never; no `slot`: in none; no `overrun`: in time.
+// The decision for one message. No `at_ns`: never, it is `dropped`; no `slot`: in none; no
+// `overrun`: in time.
 struct Release {
   Maybe at_ns;
   std::int64_t origin_ns;
@@ -104,35 +105,41 @@ struct Release {
   std::optional<Policy> overrun;
   std::optional<std::size_t> mode;
   std::int64_t moved_ns{0};  // the slots of the cycle in which it leaves
+  std::optional<Dropped> dropped{};
 
   std::int64_t start_ns(std::int64_t cycle_ns) const {
     return origin_ns + cycles_waited * cycle_ns;
+  }
+
+  void drop(Dropped reason) {
+    at_ns.reset();
+    slot.reset();
+    dropped = reason;
   }
 };
 
 // Throws std::invalid_argument for a gate that makes no sense.
 inline void check(const Gate & gate) {
-  if (gate.cycle_ns <= 0 || gate.slots.empty() || gate.due_cycles < 0 || gate.depth == 0) {
-    throw std::invalid_argument(
-        "a gate needs a cycle, at least one slot, no negative delay, and room for a message");
-  }
+  const auto & slots = gate.slots;
+  bool sound = gate.cycle_ns > 0 && !slots.empty() && gate.due_cycles >= 0 && gate.depth > 0;
   std::int64_t previous_end = 0;
-  for (const auto & slot : gate.slots) {
-    if (slot.start < previous_end || slot.end <= slot.start || slot.end > gate.cycle_ns)
-      throw std::invalid_argument("slots must ascend, not overlap and lie within the cycle");
-    previous_end = slot.end;
+  for (const auto & [start, end] : slots) {
+    sound = sound && previous_end <= start && start < end && end <= gate.cycle_ns;
+    previous_end = end;
   }
-  if (!gate.modes) return;
-  const auto & bands = gate.modes->bands;
-  if (bands.empty() || bands.size() != gate.modes->names.size() ||
-      gate.modes->initial >= bands.size() ||
-      *std::max_element(bands.begin(), bands.end()) >= gate.slots.size()) {
-    throw std::invalid_argument("each mode needs the number of one of the slots");
+  if (gate.modes) {
+    const auto & [names, bands, initial, late] = *gate.modes;
+    sound = sound && bands.size() == names.size() && initial < bands.size();
+    for (const auto band : bands) sound = sound && band < slots.size();
   }
+  if (!sound)
+    throw std::invalid_argument(
+        "a gate needs a cycle, slots in it that ascend and do not overlap, one of them for each "
+        "mode, no negative delay, and room for a message");
 }
 
 // The gate that a node's parameters describe, with room for so many messages. Throws
-// std::invalid_argument where they describe none.
+// std::invalid_argument for a word that there is not.
 inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   const auto one_of = [](const auto & words, const std::string & word) {
     if (const auto place = place_of(words, word)) return *place;
@@ -157,7 +164,6 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
                        one_of(parameters.mode_names, parameters.mode_default),
                        static_cast<Policy>(one_of(policy_names, parameters.mode_late))};
   }
-  check(gate);
   return gate;
 }
 
@@ -197,36 +203,28 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   }
   const std::int64_t ready = std::max(arrival_ns, ready_ns);
   // A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
-  std::int64_t cycle = std::max<std::int64_t>(0, (ready - origin) / cycle_ns);
+  std::int64_t cycle = std::max(due, (ready - origin) / cycle_ns);
   const std::int64_t due_from = origin + due * cycle_ns;
   std::int64_t moved = moved_at(moves, due_from);
-  const bool overran = !gate.lets_out(gate.slots[last - 1], due_from + moved, arrival_ns, ready);
   const Policy policy = gate.policy();
-  if (overran && policy != Policy::wait) {
-    const Maybe at_once = policy == Policy::publish ? Maybe(ready) : std::nullopt;
-    return {at_once, origin, std::nullopt, cycle, anchor, policy, mode, moved};
+  if (policy != Policy::wait &&
+      !gate.lets_out(gate.slots[last - 1], due_from + moved, arrival_ns, ready)) {
+    Release late{ready, origin, std::nullopt, cycle, anchor, policy, mode, moved};
+    if (policy == Policy::discard) late.drop(Dropped::discarded);
+    return late;
   }
-  std::optional<Policy> treated;
-  if (overran)
-    treated = Policy::wait;
-  else if (mode && !gate.lets_out(gate.slots[first], due_from + moved, arrival_ns, ready))
-    treated = Policy::next_slot;
-  for (cycle = std::max(due, cycle);; ++cycle) {
+  for (;; ++cycle) {
     moved = moved_at(moves, origin + cycle * cycle_ns);
     const std::int64_t cycle_start = origin + cycle * cycle_ns + moved;
     for (std::size_t slot = first; slot < last; ++slot) {
-      if (gate.lets_out(gate.slots[slot], cycle_start, arrival_ns, ready)) {
-        const std::int64_t at = std::max(ready, cycle_start + gate.slots[slot].start);
-        return {at, origin, slot, cycle, anchor, treated, mode, moved};
-      }
+      if (!gate.lets_out(gate.slots[slot], cycle_start, arrival_ns, ready)) continue;
+      std::optional<Policy> treated;
+      if (mode && slot > first) treated = Policy::next_slot;
+      if (cycle > due) treated = Policy::wait;
+      const std::int64_t at = std::max(ready, cycle_start + gate.slots[slot].start);
+      return {at, origin, slot, cycle, anchor, treated, mode, moved};
     }
   }
-}
-
-inline Release withheld(Release release) {
-  release.at_ns.reset();
-  release.slot.reset();
-  return release;
 }
 
 inline bool missed(const Gate & gate, const Release & release, std::int64_t now_ns) {
@@ -277,7 +275,6 @@ struct Outcome {
   Waiting<Message> waiting;
   Release release;
   std::int64_t awake_ns;
-  std::optional<Dropped> dropped;
 };
 
 template <typename Message>
@@ -299,28 +296,28 @@ public:
         {std::move(message), arrival_ns, stamp_ns, phase_ns, source_timestamp, lost, number_++});
     if (gate.counts_from(stamp_ns, arrival_ns)) phase_ns = *stamp_ns % gate.cycle_ns;
     if (waiting.size() <= gate.depth) return std::nullopt;
-    const Release release = withheld(release_at(waiting.front(), arrival_ns));
-    return Outcome<Message>{take_oldest(), release, arrival_ns, Dropped::overflowed};
+    Release release = release_at(waiting.front(), arrival_ns);
+    release.drop(Dropped::overflowed);
+    return Outcome<Message>{take_oldest(), release, arrival_ns};
   }
 
-  std::pair<Release, std::optional<Dropped>> decide() {
+  Release decide() {
     const auto & oldest = waiting.front();
     const std::int64_t ready_ns = std::max(oldest.arrival_ns, free_ns);
     Release release = release_at(oldest, ready_ns);
-    if (!release.at_ns) return {release, Dropped::discarded};
-    if (!release.slot || gate.messages == Messages::all_in_order) return {release, std::nullopt};
+    if (!release.slot || gate.messages == Messages::all_in_order) return release;
     if (same_cycle(release, left_)) {
-      if (gate.messages == Messages::first) return {withheld(release), Dropped::surplus};
+      if (gate.messages == Messages::first) {
+        release.drop(Dropped::surplus);
+        return release;
+      }
       const std::int64_t last_end = *left_ + moved_at(moves, *left_) + gate.slots.back().end;
       release = release_at(oldest, std::max(ready_ns, last_end));
-      if (!release.at_ns) return {release, Dropped::discarded};
-      if (!release.slot) {
-        release.at_ns = ready_ns;
-        return {release, std::nullopt};
-      }
+      if (release.at_ns && !release.slot) release.at_ns = ready_ns;
+      if (!release.slot) return release;
     }
     if (!same_cycle(release, leaving_)) leaving_ = release.start_ns(gate.cycle_ns);
-    return {release, std::nullopt};
+    return release;
   }
 
   bool replaced(const Release & release, std::int64_t now_ns) const {
@@ -391,10 +388,8 @@ inline std::int64_t clock_ns(clockid_t clock) {
 inline std::int64_t monotonic_ns() { return clock_ns(CLOCK_MONOTONIC); }
 
 inline void sleep_until(std::int64_t deadline_ns) {
-  deadline_ns = std::max<std::int64_t>(0, deadline_ns);
-  timespec request{};
-  request.tv_sec = static_cast<time_t>(deadline_ns / 1'000'000'000);
-  request.tv_nsec = static_cast<long>(deadline_ns % 1'000'000'000);  // NOLINT(runtime/int)
+  const auto [seconds, rest] = std::lldiv(std::max<std::int64_t>(0, deadline_ns), 1'000'000'000);
+  const timespec request{static_cast<time_t>(seconds), static_cast<long>(rest)};  // NOLINT
   while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &request, nullptr) == EINTR) continue;
 }
 
@@ -422,26 +417,22 @@ inline bool set_core(std::int64_t core) {
 template <typename Warn>
 void schedule(const Parameters & parameters, Warn warn) {
   if (parameters.fifo_priority > 0 && !set_fifo(parameters.fifo_priority))
-    warn(
-      "SCHED_FIFO is refused",
-      "give the user an rtprio limit of 98, or the container cpu.rt_runtime_us");
+    warn("SCHED_FIFO is refused",
+         "give the user an rtprio limit of 98, or the container cpu.rt_runtime_us");
   if (parameters.core >= 0 && !set_core(parameters.core))
     warn("core " + std::to_string(parameters.core) + " is refused", "name another in the plan");
 }
 
 inline std::int64_t clock_offset() {
-  std::int64_t best_width = std::numeric_limits<std::int64_t>::max();
-  std::int64_t best = 0;
-  for (int attempt = 0; attempt < 5 && best_width >= 2'000; ++attempt) {
+  // How long it took, and what was found; a longer bracket means that something came between.
+  std::pair<std::int64_t, std::int64_t> best{std::numeric_limits<std::int64_t>::max(), 0};
+  for (int attempt = 0; attempt < 5 && best.first >= 2'000; ++attempt) {
     const std::int64_t before = monotonic_ns();
     const std::int64_t realtime = clock_ns(CLOCK_REALTIME);
     const std::int64_t after = monotonic_ns();
-    if (after - before < best_width) {  // a longer bracket means that something came between
-      best_width = after - before;
-      best = realtime - (before + after) / 2;
-    }
+    best = std::min(best, {after - before, realtime - (before + after) / 2});
   }
-  return best;
+  return best.second;
 }
 
 // A gate at work; `Message` is what the queue holds. Its owner sets the functions that it calls.
@@ -464,10 +455,9 @@ public:
 
   // Nothing where that is where the slots are, or they would leave the cycle.
   void move_slots(std::int64_t by_ns, std::int64_t from_ns) {
-    auto & moves = queue.moves;
-    if (by_ns == (moves.empty() ? 0 : moves.back().second) || !queue.gate.may_move(by_ns)) return;
-    moves.emplace_back(from_ns, by_ns);
-    if (moves.size() > schema::changes) moves.pop_front();
+    const auto & moves = queue.moves;
+    if (by_ns != (moves.empty() ? 0 : moves.back().second) && queue.gate.may_move(by_ns))
+      remember(queue.moves, {from_ns, by_ns});
   }
 
   // False: there is no mode like it.
@@ -475,11 +465,9 @@ public:
     const auto & modes = queue.gate.modes;
     const auto mode = modes ? place_of(modes->names, name) : std::nullopt;
     if (!mode) return false;
-    auto & changes = queue.changes;
-    if (*mode != (changes.empty() ? modes->initial : changes.back().second)) {
-      changes.emplace_back(now_ns, *mode);
-      if (changes.size() > schema::changes) changes.pop_front();
-    }
+    const auto & changes = queue.changes;
+    if (*mode != (changes.empty() ? modes->initial : changes.back().second))
+      remember(queue.changes, {now_ns, *mode});
     return true;
   }
 
@@ -488,10 +476,8 @@ public:
   void arrive(Message message, Maybe stamp_ns, Maybe source_timestamp = {}, bool waited = false,
               Maybe lost = {}) {
     const std::int64_t offset = clock_offset();
-    const bool stepped = std::abs(offset - offset_) > schema::step_ns;
-    offset_ = offset;
-    Maybe origin;
-    if (stamp_ns) origin = *stamp_ns - offset;
+    const bool stepped = std::abs(offset - std::exchange(offset_, offset)) > schema::step_ns;
+    if (stamp_ns) *stamp_ns -= offset;
     std::int64_t arrival_ns = monotonic_ns();
     if (stepped) queue.doubt_stamps(arrival_ns);
     if (waited && source_timestamp && !stepped)
@@ -500,7 +486,8 @@ public:
       queue.phase_ns = next_phase_->second;
       next_phase_.reset();
     }
-    auto full = queue.arrive(std::move(message), arrival_ns, origin, source_timestamp, lost);
+    if (const auto move = moved()) move_slots(move->second, move->first);
+    auto full = queue.arrive(std::move(message), arrival_ns, stamp_ns, source_timestamp, lost);
     if (full) overflowed.push_back(std::move(*full));
   }
 
@@ -509,7 +496,7 @@ public:
     const std::uint64_t number = queue.waiting.front().number;
     std::int64_t now = monotonic_ns();
     turn_ns_ = now;  // before, this thread was busy with the message before it
-    auto [release, dropped] = queue.decide();
+    Release release = queue.decide();
     on_decision(release, queue.phase_ns);
     bool slept = false;
     if (release.at_ns) {
@@ -522,41 +509,28 @@ public:
       }
       if (!slept && queue.gate.messages == Messages::newest) look_again();
       if (queue.waiting.front().number != number) return std::nullopt;
-      if (queue.replaced(release, now)) {
-        release = withheld(release);
-        dropped = Dropped::replaced;
+      if (queue.replaced(release, now)) release.drop(Dropped::replaced);
+    }
+    if (release.at_ns) {
+      if (slept) on_waking(*release.at_ns);
+      // Awake in time: what other threads took before is of no consequence.
+      if (slept && monotonic_ns() < *release.at_ns) waited_ns_ = others_ran_ns();
+      now = watch_until(*release.at_ns);
+      if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, now)) {
+        release.drop(Dropped::discarded);
+        release.overrun = Policy::discard;
       }
     }
-    if (!release.at_ns) return Outcome<Message>{queue.leave(release, now), release, now, dropped};
-    if (slept) {
-      on_waking(*release.at_ns);
-      // Awake in time: what other threads took before is of no consequence.
-      if (monotonic_ns() < *release.at_ns) waited_ns_ = others_ran_ns();
-    }
-    const std::int64_t awake = watch_until(*release.at_ns);
-    if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, awake)) {
-      release = withheld(release);
-      release.overrun = Policy::discard;
-      dropped = Dropped::discarded;
-    }
-    return Outcome<Message>{queue.leave(release, awake), release, awake, dropped};
+    return Outcome<Message>{queue.leave(release, now), release, now};
   }
 
-  bool nothing_due() {
-    if (queue.waiting.empty()) return true;
-    const auto at_ns = queue.decide().first.at_ns;
-    return at_ns && *at_ns > monotonic_ns() + spin_ns_ + schema::others_ns;
-  }
+  bool nothing_due() { return nothing_due(monotonic_ns() + schema::others_ns); }
 
   void rest(std::int64_t published_ns, std::int64_t pause_ns) {
     queue.free_ns = published_ns;
     look_again();
-    const std::int64_t until = published_ns + pause_ns;
-    if (!queue.waiting.empty()) {
-      const auto at_ns = queue.decide().first.at_ns;
-      if (!at_ns || *at_ns - spin_ns_ <= until) return;
-    }
-    sleep_until(until);
+    if (!nothing_due(published_ns + pause_ns)) return;
+    sleep_until(published_ns + pause_ns);
     queue.free_ns = monotonic_ns();
   }
 
@@ -570,10 +544,23 @@ public:
   Queue<Message> queue;
   std::vector<Outcome<Message>> overflowed;  // since the owner has emptied it
   std::function<void()> look = [] {};
+  std::function<std::optional<Move>()> moved = [] { return std::nullopt; };
   std::function<void(std::int64_t)> on_waking = [](std::int64_t) {};
   std::function<void(const Release &, std::int64_t)> on_decision = [](const auto &...) {};
 
 private:
+  bool nothing_due(std::int64_t until_ns) {
+    if (queue.waiting.empty()) return true;
+    const auto at_ns = queue.decide().at_ns;
+    return at_ns && *at_ns > until_ns + spin_ns_;
+  }
+
+  template <typename Known>
+  static void remember(std::deque<Known> & all, Known one) {
+    all.push_back(one);
+    if (all.size() > schema::changes) all.pop_front();
+  }
+
   void look_again() {
     const std::int64_t now = monotonic_ns();
     look();

@@ -44,19 +44,17 @@ public:
   template <typename Message>
   void write(const Gate & gate, const Outcome<Message> & outcome, Maybe published_ns = {},
              Maybe stalled_ns = {}) {
-    const auto & [waiting, release, awake_ns, why] = outcome;
+    const auto & [waiting, release, awake_ns] = outcome;
     ++rows;
-    if (why) ++dropped[static_cast<std::size_t>(*why)];
+    if (release.dropped) ++dropped[static_cast<std::size_t>(*release.dropped)];
     lost_by_dds += static_cast<std::size_t>(waiting.lost.value_or(0));
     if (!writer_.joinable()) return;
     line_.clear();
     row(awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
         waiting.arrival_ns, release.origin_ns, release.at_ns, release.slot, release.cycles_waited,
-        anchor_names[static_cast<std::size_t>(release.anchor)],
-        release.overrun ? policy_names[static_cast<std::size_t>(*release.overrun)] : "",
+        anchor_names[static_cast<std::size_t>(release.anchor)], word(policy_names, release.overrun),
         release.mode ? gate.modes->names[*release.mode].c_str() : "", published_ns, stalled_ns,
-        why ? dropped_names[static_cast<std::size_t>(*why)] : "", waiting.lost, rows,
-        release.moved_ns);
+        word(dropped_names, release.dropped), waiting.lost, rows, release.moved_ns);
     line_.back() = '\n';  // in place of the last comma
     if (::write(ends_[1], line_.data(), line_.size()) != static_cast<ssize_t>(line_.size()))
       ++unlogged;
@@ -117,6 +115,11 @@ private:
       const int cut = ftruncate(file, before);
     close(file);
     return true;
+  }
+
+  template <typename Words, typename Word>
+  static const char * word(const Words & words, const std::optional<Word> & one) {
+    return one ? words[static_cast<std::size_t>(*one)] : "";
   }
 
   // The values of the columns, in the order of `log_header`.

@@ -23,19 +23,18 @@ public:
       : path_(folder + "/" + name) {
     const int flags = O_RDWR | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK | (make ? O_CREAT : 0);
     file_ = open(path_.c_str(), flags, 0600);
+    std::string problem = file_ < 0 ? std::strerror(errno) : "not a file of this user";
     struct stat found{};
-    const bool ours = file_ >= 0 && fstat(file_, &found) == 0 && S_ISREG(found.st_mode) &&
-                      found.st_uid == geteuid();
-    // Memory that a full file system does not have later would be a SIGBUS.
-    const int lacking = ours ? posix_fallocate(file_, 0, size) : 0;
-    if (ours && lacking == 0)
-      memory_ = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_SHARED, file_, 0);
+    if (file_ >= 0 && fstat(file_, &found) == 0 && S_ISREG(found.st_mode) &&
+        found.st_uid == geteuid()) {
+      // Memory that a full file system does not have later would be a SIGBUS.
+      errno = posix_fallocate(file_, 0, size);
+      if (errno == 0) memory_ = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_SHARED, file_, 0);
+      problem = std::strerror(errno);
+    }
     if (memory_ == MAP_FAILED) {
-      const bool by_system = ours || file_ < 0;
-      const std::string reason =
-          by_system ? std::strerror(lacking != 0 ? lacking : errno) : "not a file of this user";
       if (file_ >= 0) close(file_);
-      throw std::runtime_error(path_ + ": " + reason);
+      throw std::runtime_error(path_ + ": " + problem);
     }
     inode_ = found.st_ino;
     auto * const text = static_cast<char *>(memory_) + 8 * schema::topic;
@@ -88,10 +87,8 @@ public:
 
   // The latest messages of the ring at this place, ascending.
   std::vector<std::int64_t> noted(std::size_t ring) const {
-    std::vector<std::int64_t> found;
-    found.reserve(schema::ring);
-    for (std::size_t place = 0; place < schema::ring; ++place)
-      found.push_back(get(ring + place));
+    std::vector<std::int64_t> found(schema::ring);
+    for (auto & one : found) one = get(ring++);
     std::sort(found.begin(), found.end());
     return found;
   }
@@ -99,14 +96,7 @@ public:
 private:
   static constexpr off_t size = 8 * schema::topic + schema::topic_bytes;
 
-  static struct flock region(off_t byte) {
-    struct flock wanted{};
-    wanted.l_type = F_WRLCK;
-    wanted.l_whence = SEEK_SET;
-    wanted.l_start = byte;
-    wanted.l_len = 1;
-    return wanted;
-  }
+  static struct flock region(off_t byte) { return {F_WRLCK, SEEK_SET, byte, 1, 0}; }
 
   std::string path_;
   int file_;
@@ -121,13 +111,9 @@ inline std::string text_in_environment(const char * name) {
 
 // Where pages are, the best place first: of root, of a login session, of any user.
 inline std::vector<std::string> page_folders() {
-  std::vector<std::string> folders;
-  const auto session = text_in_environment("XDG_RUNTIME_DIR");
-  if (geteuid() == 0)
-    folders.push_back("/run/chainshaper/outputs");
-  else if (!session.empty())
-    folders.push_back(session + "/chainshaper/outputs");
-  folders.push_back("/dev/shm/chainshaper-" + std::to_string(geteuid()));
+  const auto session = geteuid() == 0 ? "/run" : text_in_environment("XDG_RUNTIME_DIR");
+  std::vector<std::string> folders{"/dev/shm/chainshaper-" + std::to_string(geteuid())};
+  if (!session.empty()) folders.insert(folders.begin(), session + "/chainshaper/outputs");
   return folders;
 }
 
@@ -173,8 +159,7 @@ public:
         in_process_(in_process) {
     page_ = opened();
     const auto now = monotonic_ns();
-    if (now - page_->get(Field::started_ns) > schema::at_once_ns)
-      page_->set(Field::failed_starts, 0);
+    if (now - page_->get(Field::started_ns) > schema::at_once_ns) page_->set(Field::failed_starts, 0);
     page_->set(Field::started_ns, now);
     page_->add(Field::starts);
     page_->add(Field::failed_starts);
@@ -191,9 +176,10 @@ public:
   }
 
   // Have cycles of a gate begin where they did for the one before it in the same launch, in its mode;
-  // the page shows each decision.
+  // the page shows each decision, and says how slots are to be moved.
   template <typename Shaper>
   void go_on(Shaper & shaper) {
+    shaper.moved = [this] { return moved(); };
     shaper.on_decision = [this](const Release & release, std::int64_t phase_ns) {
       hold(release.at_ns, phase_ns, release.mode);
     };
@@ -269,22 +255,22 @@ public:
     return page_->get(Field::asked_phase_ns);
   }
 
-  // By how much slots are to be moved, and from when on; none: as they are.
-  std::optional<std::pair<std::int64_t, std::int64_t>> moved() {
-    if (std::exchange(move_back_, false)) return std::make_pair(std::int64_t{0}, monotonic_ns());
+  // How slots are to be moved; none: as they are.
+  std::optional<Move> moved() {
     const auto since = page_->get(Field::moved_from_ns);
     const auto by = page_->get(Field::moved_ns);
-    if (since == 0 || since != page_->get(Field::moved_from_ns)) return std::nullopt;
-    if (!page_->is_locked(schema::moving)) return std::make_pair(std::int64_t{0}, monotonic_ns());
-    return std::make_pair(by, since);
+    const bool back = std::exchange(move_back_, false);
+    if (!back && (since == 0 || since != page_->get(Field::moved_from_ns))) return std::nullopt;
+    if (back || !page_->is_locked(schema::moving)) return Move{monotonic_ns(), 0};
+    return Move{since, by};
   }
 
   template <typename Message>
   void count(const Outcome<Message> & outcome) {
-    const auto & [message, release, awake_ns, dropped] = outcome;
+    const auto & [message, release, awake_ns] = outcome;
+    const auto & why = release.dropped;  // reasons stand in the page in their order
     page_->note(Field::measured, schema::measured, message.arrival_ns - release.origin_ns);
-    // Reasons stand in the page in their order.
-    page_->add(dropped ? Field::replaced + static_cast<std::size_t>(*dropped) : Field::published);
+    page_->add(why ? Field::replaced + static_cast<std::size_t>(*why) : Field::published);
     page_->add(Field::lost_by_dds, message.lost.value_or(0));
     page_->add(Field::late, release.overrun ? 1 : 0);
   }
@@ -328,8 +314,7 @@ private:
 
   bool is_acknowledged(std::int64_t key) const {
     const auto bypassed = page_->noted(schema::bypassed);
-    return page_->get(Field::acknowledged) == key ||
-           std::binary_search(bypassed.begin(), bypassed.end(), key);
+    return page_->get(Field::acknowledged) == key || place_of(bypassed, key);
   }
 
   std::string name_;

@@ -90,10 +90,9 @@ inline std::optional<Offer> wait_for_publisher(rclcpp::Node & node, const std::s
   for (bool said = false; goes_on(); said = true) {
     const auto found = node.get_publishers_info_by_topic(topic);
     if (!found.empty() && !found[0].topic_type().empty()) {
-      if (found.size() > 1) {
+      if (found.size() > 1)
         RCLCPP_WARN(node.get_logger(), "%s has %zu publishers: the QoS of the first is copied",
                     name.c_str(), found.size());
-      }
       const Offer offer = offer_of(found[0], depth);
       RCLCPP_INFO(node.get_logger(), "%s is published by %s/%s as %s", name.c_str(),
                   found[0].node_namespace() == "/" ? "" : found[0].node_namespace().c_str(),
@@ -200,11 +199,9 @@ private:
 
 #endif
 
-inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(rclcpp::Node & node,
-                                                                   const std::string & topic,
-                                                                   const std::string & type,
-                                                                   const rclcpp::QoS & qos,
-                                                                   Taken taken) {
+inline rclcpp::GenericSubscription::SharedPtr subscribe_serialized(
+    rclcpp::Node & node, const std::string & topic, const std::string & type,
+    const rclcpp::QoS & qos, Taken taken) {
 #if RCLCPP_VERSION_GTE(25, 0, 0)
   return node.create_generic_subscription(topic, type, qos, taken);
 #else

@@ -65,12 +65,11 @@ public:
         empty_(serialized_empty.size()),
         to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
         latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC)) {
-    if (latency_ < 0) {
+    if (latency_ < 0)
       RCLCPP_WARN(node.get_logger(),
                   "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
                   "regularly; run as root, or give the user the right to write it",
                   std::strerror(errno));
-    }
     if (delivery_core) delivery_core_.emplace(*delivery_core);
     auto & message = empty_.get_rcl_serialized_message();
     std::memcpy(message.buffer, serialized_empty.data(), serialized_empty.size());
@@ -106,18 +105,16 @@ public:
     }
   }
 
-  // The message is delivered: cores may sleep, as if nothing had been asked for.
-  void relax() const { ask_for(-1); }
+  // How fast cores wake up (us); -1: they may sleep, as if nothing had been asked for.
+  void ask_for(std::int32_t latency_us = -1) const {
+    if (latency_ >= 0) [[maybe_unused]]
+      const auto written = write(latency_, &latency_us, sizeof(latency_us));
+  }
 
 private:
   static constexpr std::array<std::uint8_t, 5> serialized_empty{0, 1, 0, 0, 0};
   // A rehearsal is not begun later before a release than this: the first may take most of it.
   static constexpr std::int64_t rehearsal_ns = 400'000;
-
-  void ask_for(std::int32_t latency_us) const {
-    if (latency_ >= 0) [[maybe_unused]]
-      const auto written = write(latency_, &latency_us, sizeof(latency_us));
-  }
 
   std::int64_t pause_ns_;
   std::optional<ClearCore> delivery_core_;
