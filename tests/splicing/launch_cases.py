@@ -13,8 +13,6 @@ import yaml
 
 from chainshaper.planning import Plan, plan_shaping
 
-__all__ = ["CASES", "NDT", "PACKAGES", "ROBOTS", "Case", "plan_for"]
-
 LAUNCH_FILES = Path(__file__).parent / "launch_files"
 PACKAGES = LAUNCH_FILES / "_packages"
 NDT = '<launch>\n  <node pkg="l" exec="n" name="ndt"/>\n</launch>\n'

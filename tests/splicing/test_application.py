@@ -12,10 +12,12 @@ from chainshaper import shape_application
 from chainshaper.planning import Plan, plan_shaping, publish_slots
 from chainshaper.planning.overruns import Writer
 from chainshaper.planning.plan import revised
-from chainshaper.planning.shaping import let_per_callback, let_per_chain
+from chainshaper.planning.shaping import let_per_callback
 from chainshaper.splicing.application import splice_application, writers_of
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import Application, NodeDescription, TopicDescription
+
+NODES = ("first", "second", "third")
 
 
 @pytest.fixture
@@ -34,16 +36,18 @@ def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
     (callback,) = shaping.callbacks
     assert (callback.subscription, callback.publishes) == ("/t3_tmp", ("/t3",))
     assert (shaping.core, shaping.priority) == (EXECUTOR_CORE, 84)
-    assert callback.gate is not None
-    assert callback.gate.slots == publish_slots(plan)
-    assert (callback.gate.cycle_ns, callback.gate.anchor) == (50_000_000, "stamp")
-    assert (callback.gate.spin_ns, callback.gate.pause_ns) == (1_000_000, 2_000_000)
+    gate = known(callback.gate)
+    assert (gate.slots, gate.cycle_ns) == (publish_slots(plan), 50_000_000)
+    assert (gate.anchor, gate.spin_ns, gate.pause_ns) == ("stamp", 1_000_000, 2_000_000)
     asynchronous = TopicDescription(publication="asynchronous")
     assert spliced.topic("/t3_tmp") == spliced.topic("/t3") == asynchronous
     for name in ("first", "second", "actuator"):
         assert spliced.nodes[name] == application.nodes[name]
     assert (spliced.chain, spliced.seed) == (application.chain, application.seed)
     assert Application.model_validate(spliced.model_dump()) == spliced
+    for overrun in ("wait", "discard", "publish"):
+        treated = splice_application(application, revised(plan, overrun=overrun))
+        assert known(treated.nodes["chainshaper_t3"].callbacks[0].gate).overrun == overrun
 
 
 def _changed(plan: Plan, **changes: object) -> Plan:
@@ -69,10 +73,16 @@ def test_a_plan_that_does_not_fit_is_refused(
         splice_application(application, _changed(plan, **changes))
 
 
-def test_a_plan_without_a_shaping_node_is_refused(application: Application, plan: Plan) -> None:
+def test_what_has_no_shaping_node_or_two_publishers_is_refused(
+    application: Application, plan: Plan
+) -> None:
     bare = plan_shaping(np.array([5_000_000, 20_000_000]), plan.cycle_ns)
     with pytest.raises(InputError, match="no `shaping_node`, so there is nothing to splice"):
         splice_application(application, bare)
+    nodes = {**application.nodes, "fourth": application.nodes["third"]}
+    both = application.model_copy(update={"nodes": nodes})
+    with pytest.raises(InputError, match="which third, fourth of the application publishes"):
+        splice_application(both, plan)
 
 
 def _asynchronous(**changes: Any) -> Plan:
@@ -83,22 +93,12 @@ def _asynchronous(**changes: Any) -> Plan:
         **{
             "output": "/t3",
             "publisher": "/third",
-            "nodes": ("/first", "/second", "/third"),
+            "nodes": tuple(f"/{node}" for node in NODES),
             "publication": "asynchronous",
             "publish_slot_ns": 10_000_000,
             **changes,
         },
     )
-
-
-def test_how_overruns_are_treated_goes_with_the_gate(application: Application, plan: Plan) -> None:
-    for overrun in ("wait", "discard", "publish"):
-        spliced = splice_application(application, revised(plan, overrun=overrun))
-        gate = known(spliced.nodes["chainshaper_t3"].callbacks[0].gate)
-        assert (gate.overrun, gate.due_cycles) == (overrun, 0)
-    let = splice_application(application, let_per_chain(plan))
-    gate = known(let.nodes["chainshaper_t3"].callbacks[0].gate)
-    assert gate.due_cycles == 1
 
 
 def test_a_gated_publisher_needs_no_node_and_discards_by_a_lifespan(
@@ -116,17 +116,13 @@ def test_a_gated_publisher_needs_no_node_and_discards_by_a_lifespan(
     assert shortest.lifespan_ns == 9_000_000, "the application's own is stricter"
 
 
-def test_a_gated_publisher_has_to_publish_asynchronously(tmp_path: Path) -> None:
+def test_a_gated_publisher_has_to_publish_asynchronously(
+    application: Application, tmp_path: Path
+) -> None:
+    writers = [Writer(f"/{node}", f"/t{n}", 10, n == 3) for n, node in enumerate(NODES, start=1)]
+    assert writers_of(application) == writers
     with pytest.raises(InputError, match="/third publishes /t3 synchronously"):
         splice_application(small_chain(tmp_path), _asynchronous())
-
-
-def test_who_writes_what_is_read_off_the_description(application: Application) -> None:
-    assert writers_of(application) == [
-        Writer("/first", "/t1", 10, False),
-        Writer("/second", "/t2", 10, False),
-        Writer("/third", "/t3", 10, True),
-    ]
 
 
 def test_every_topic_of_let_per_callback_gets_a_gate_of_its_own(
@@ -147,13 +143,6 @@ def test_every_topic_of_let_per_callback_gets_a_gate_of_its_own(
     }
     published = [topic for _, callback in spliced.callbacks() for topic in callback.publishes]
     assert sorted(published) == ["/t1", "/t1_tmp", "/t2", "/t2_tmp", "/t3", "/t3_tmp"]
-
-
-def test_an_output_that_two_nodes_publish_is_refused(application: Application, plan: Plan) -> None:
-    nodes = {**application.nodes, "fourth": application.nodes["third"]}
-    both = application.model_copy(update={"nodes": nodes})
-    with pytest.raises(InputError, match="which third, fourth of the application publishes"):
-        splice_application(both, plan)
 
 
 def test_a_plan_is_for_its_own_chain_also_where_the_application_names_another(

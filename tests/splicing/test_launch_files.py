@@ -44,23 +44,11 @@ def redirects(spliced: Splicing) -> dict[str, tuple[str, tuple[str, ...]]]:
 
 
 @pytest.fixture
-def robot(tmp_path: Path) -> Path:
-    path = tmp_path / "robot.launch.xml"
-    path.write_text(NDT)
-    return path
-
-
-@pytest.fixture
 def recording(tmp_path: Path) -> Recording:
     """One in which a player publishes two inputs, and one node subscribes to each."""
-    return recorded(
-        tmp_path,
-        *[
-            (node, topic, kind)
-            for topic in ("/rear", "/front")
-            for node, kind in (("/player", "publisher"), ("/fusion", "subscription"))
-        ],
-    )
+    ends = {"/player": "publisher", "/fusion": "subscription"}.items()
+    every = [(node, topic, kind) for topic in ("/rear", "/front") for node, kind in ends]
+    return recorded(tmp_path, *every)
 
 
 @pytest.mark.parametrize("name", ROBOTS)
@@ -81,6 +69,11 @@ def test_the_user_s_file_is_included_as_it_is(name: str, tmp_path: Path) -> None
         "added": ("/chainshaper_pose", "/chainshaper_pose_standby"),
     }
     assert "+++ " + str(tmp_path / "out/robot.launch.py") in spliced.diff
+    other = tmp_path / "sensing.launch.yaml"
+    other.write_text("launch: []\n")
+    both = splice_launch_files(PLAN, [tmp_path / name, other, tmp_path / name], tmp_path / "out")
+    assert both.launch == dict.fromkeys([tmp_path / name, other], tmp_path / "out/robot.launch.py")
+    assert launched(both)["LAUNCH_FILES"] == [str(tmp_path / name), str(other)]
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="g++ compiles the gate")
@@ -111,23 +104,18 @@ def test_a_gate_in_the_publisher_s_process_adds_no_node_and_redirects_nothing(ro
 def test_both_nodes_are_started_with_their_files_and_again_when_they_end(
     robot: Path, folder: str
 ) -> None:
-    spliced = splice_launch_files(PLAN, [robot], robot.parent / folder)
     nodes = robot.parent / folder / "shaping_nodes"
-    for process in launched(spliced)["PROCESSES"]:
+    same = {"output": "screen", "respawn": True, "respawn_delay": 0.1}
+    for process in launched(splice_launch_files(PLAN, [robot], robot.parent / folder))["PROCESSES"]:
         name, words = process["name"], process["cmd"]
-        assert (process["respawn"], process["respawn_delay"]) == (True, 0.1)
+        assert process.items() >= same.items()
         assert words[:2] == ["python3", str(nodes / f"{name}.py")]
         assert words[-2:] == ["--params-file", str(nodes / f"{name}.yaml")]
         assert {"__ns:=/", f"__node:={name}", "input:=/pose_tmp", "output:=/pose"} <= {*words}
         assert all(Path(word).is_file() for word in (words[1], words[-1]))
-
-
-def test_a_package_s_node_is_started_with_its_parameters_and_remaps(robot: Path) -> None:
-    spliced = splice_launch_files(PLAN, [robot], robot.parent / "out", node="cpp")
+    spliced = splice_launch_files(PLAN, [robot], robot.parent / folder, node="cpp")
     node, standby = launched(spliced)["PROCESSES"]
-    nodes = robot.parent / "out/shaping_nodes"
     assert (nodes / node["package"] / "package.xml").is_file()
-    same = {"output": "screen", "respawn": True, "respawn_delay": 0.1}
     assert standby.items() >= same.items()
     assert node == {
         "package": "chainshaper_shaping",
@@ -169,14 +157,6 @@ def test_what_a_node_costs_where_messages_are_not_copied_is_said() -> None:
     assert zero_copy_lost(plan, "component") == []
 
 
-def test_several_launch_files_are_launched_together(robot: Path) -> None:
-    other = robot.with_name("sensing.launch.yaml")
-    other.write_text("launch: []\n")
-    spliced = splice_launch_files(PLAN, [robot, other, robot], robot.parent / "out")
-    assert spliced.launch == dict.fromkeys([robot, other], robot.parent / "out/robot.launch.py")
-    assert launched(spliced)["LAUNCH_FILES"] == [str(robot), str(other)]
-
-
 def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
     words = ["ros2", "run", "l", "n", "--ros-args", "-r", "__node:=ndt"]
     spliced = splice_launch_files(PLAN, words, tmp_path / "out")
@@ -193,9 +173,13 @@ def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [["--prefix", "/usr/bin/time"], ["--prefix=nice -n 5"], ["-h", "--prefix", "a b"]]
+    ("options", "executable"),
+    [
+        (["--prefix", "/usr/bin/time"], "n"),
+        (["--prefix=nice -n 5"], "scripts/n.py"),
+        (["-h", "--prefix", "a b"], "/opt/n"),
+    ],
 )
-@pytest.mark.parametrize("executable", ["n", "scripts/n.py", "/opt/n"])
 def test_options_of_ros2_run_are_not_what_it_starts(
     tmp_path: Path, options: list[str], executable: str
 ) -> None:
@@ -243,16 +227,6 @@ def test_all_shaping_nodes_of_a_plan_are_spliced(robot: Path, known: str) -> Non
     assert redirects(spliced) == wanted
 
 
-def test_a_recording_knows_the_type_and_a_standby_is_no_second_publisher(robot: Path) -> None:
-    names = ("/ndt", "/chainshaper_pose_standby")
-    endpoints = [(name, "/pose", "publisher") for name in names]
-    seen = recorded(robot.parent, *endpoints, type_="std_msgs/msg/Header")
-    out = robot.parent / "out"
-    spliced = splice_launch_files(PLAN, [robot], out, node="typed", recording=seen)
-    assert spliced.processes[0].package == "shaping_std_msgs_header"
-    assert redirects(spliced) == {"/pose": ("/pose_tmp", ("/ndt",))}
-
-
 @pytest.mark.parametrize("distribution", ["jazzy", "lyrical"])
 @pytest.mark.parametrize("node", ["python", "typed"])
 @pytest.mark.parametrize("field", ["uint8[] data  # bytes", "uint8[4] data"])
@@ -264,12 +238,18 @@ def test_a_node_that_would_get_no_message_is_refused(
     definition.parent.mkdir(parents=True)
     definition.write_text(f"float32 x\n{field}\n")
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"/elsewhere:{robot.parent}")
-    ends = [("/ndt", "/pose", "publisher")]
+    # Its standby is no second publisher.
+    ends = [(name, "/pose", "publisher") for name in ("/ndt", "/chainshaper_pose_standby")]
     known = {"rmw": "rmw_fastrtps_cpp", "distribution": distribution}
     seen = recorded(robot.parent, *ends, type_="robot_msgs/msg/Cloud", **known)
     refused = (node, distribution, field[:7]) == ("python", "lyrical", "uint8[]")
     with pytest.raises(InputError, match="use --node typed") if refused else nullcontext():
-        splice_launch_files(PLAN, [robot], robot.parent / "out", node=node, recording=seen)
+        spliced = splice_launch_files(
+            PLAN, [robot], robot.parent / "out", node=node, recording=seen
+        )
+        assert redirects(spliced) == {"/pose": ("/pose_tmp", ("/ndt",))}
+        package = "shaping_robot_msgs_cloud" if node == "typed" else None
+        assert spliced.processes[0].package == package
 
 
 def test_an_input_reaches_its_subscribers_by_way_of_one_throttler(
@@ -356,20 +336,16 @@ def test_a_plan_that_shapes_nothing_or_does_not_know_the_publisher_is_refused(ro
     assert not (robot.parent / "out").exists()
 
 
-@pytest.mark.parametrize(
-    ("topic", "with_recording", "message"),
-    [
-        ("/rear", False, "who subscribes to /rear is not known: name a recording"),
-        ("/side", True, "to these topics nodes do: /front, /rear"),
-    ],
-)
 def test_what_cannot_be_throttled_is_named_and_nothing_written(
-    topic: str, with_recording: bool, message: str, robot: Path, recording: Recording
+    robot: Path, recording: Recording
 ) -> None:
-    known = recording if with_recording else None
-    one = REAR.model_copy(update={"topic": topic})
-    with pytest.raises(InputError, match=message):
-        splice_throttlers([one], [robot], robot.parent / "out", recording=known)
+    side = REAR.model_copy(update={"topic": "/side"})
+    for one, known, message in (
+        (REAR, None, "who subscribes to /rear is not known: name a recording"),
+        (side, recording, "to these topics nodes do: /front, /rear"),
+    ):
+        with pytest.raises(InputError, match=message):
+            splice_throttlers([one], [robot], robot.parent / "out", recording=known)
     assert not (robot.parent / "out").exists()
 
 
@@ -415,11 +391,10 @@ def test_a_package_and_the_name_of_a_file_anywhere_in_it(share: Path) -> None:
     ]
 
 
-def test_a_path_needs_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    Path("robot.launch.xml").touch()
-    command = parse_launch_command(["ros2", "launch", "robot.launch.xml", "speed:=3"])
-    assert command.file == tmp_path / "robot.launch.xml"
+def test_a_path_needs_no_package(robot: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(robot.parent)
+    command = parse_launch_command(["ros2", "launch", robot.name, "speed:=3"])
+    assert command.file == robot
     assert command.with_file(Path("/c.xml")) == ["ros2", "launch", "/c.xml", "speed:=3"]
 
 
@@ -432,15 +407,12 @@ def test_a_path_needs_no_package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         (["ros2", "launch", "other", "all.launch.py"], "other: neither a launch file nor a pack"),
         (["ros2", "launch", "robot"], "no launch file given: `ros2 launch robot FILE`"),
         (["ros2", "launch", "robot", "a.launch.py"], "robot has no launch file a.launch.py in /"),
+        (["ros2", "launch", "robot", "two.launch.py"], "2 files .*launch/two.* or .*/old/two"),
     ],
 )
 def test_what_cannot_be_launched_is_said(share: Path, words: list[str], said: str) -> None:
+    (share / "old").mkdir()
+    for folder in ("old", "launch"):
+        (share / folder / "two.launch.py").touch()
     with pytest.raises(InputError, match=said):
         parse_launch_command(words)
-
-
-def test_two_files_of_one_name_are_told_apart_by_their_path(share: Path) -> None:
-    (share / "old").mkdir()
-    (share / "old/all.launch.py").touch()
-    with pytest.raises(InputError, match=r"has 2 files .*launch/all.launch.py or .*old/all"):
-        parse_launch_command(["ros2", "launch", "robot", "all.launch.py"])

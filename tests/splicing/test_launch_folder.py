@@ -1,6 +1,5 @@
 """The folder of a spliced launch file: whole or absent, replaced or removed only while ours."""
 
-import shutil
 from pathlib import Path
 from unittest import mock
 
@@ -10,13 +9,6 @@ from launch_cases import NDT, plan_for
 from chainshaper import Plan, Splicing, splice_launch_files, undo_splice
 from chainshaper.planning.plan import revised
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
-
-
-@pytest.fixture
-def robot(tmp_path: Path) -> Path:
-    path = tmp_path / "robot.launch.xml"
-    path.write_text(NDT)
-    return path
 
 
 @pytest.fixture
@@ -37,26 +29,17 @@ def _tree(folder: Path) -> dict[str, bytes]:
     }
 
 
-def test_in_it_are_a_launch_file_the_shaping_nodes_and_a_manifest(spliced: Splicing) -> None:
-    assert set(_tree(spliced.folder)) == {
-        "redirection.py",
-        "robot.launch.py",
-        "shaping_nodes/chainshaper_pose.py",
-        "shaping_nodes/chainshaper_pose.yaml",
-        "shaping_nodes/chainshaper_pose_standby.py",
-        "shaping_nodes/chainshaper_pose_standby.yaml",
-        "shaping_nodes/respawning.py",
-        "splice.json",
-    }
-    logs = spliced.folder / "logs"
-    assert spliced.logs == (logs / "chainshaper_pose.csv", logs / "chainshaper_pose_standby.csv")
-    assert spliced.logs[0].parent.is_dir(), "the node makes no folder for its log"
-    assert str(spliced.logs[0]) in spliced.processes[0].parameters_file.read_text()
-
-
 def test_undo_removes_all_of_it_with_what_running_and_building_left(
     spliced: Splicing, robot: Path
 ) -> None:
+    nodes = ("chainshaper_pose", "chainshaper_pose_standby")
+    assert {*_tree(spliced.folder)} == {
+        *("redirection.py", "robot.launch.py", "shaping_nodes/respawning.py", "splice.json"),
+        *(f"shaping_nodes/{name}.{end}" for name in nodes for end in ("py", "yaml")),
+    }
+    assert spliced.logs == tuple(spliced.folder / "logs" / f"{name}.csv" for name in nodes)
+    assert spliced.logs[0].parent.is_dir(), "the node makes no folder for its log"
+    assert str(spliced.logs[0]) in spliced.processes[0].parameters_file.read_text()
     for name in ("__pycache__/a.pyc", "logs/chainshaper_pose.csv", "shaping_nodes/build/a/b"):
         path = spliced.folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -70,14 +53,7 @@ def test_undo_removes_all_of_it_with_what_running_and_building_left(
 
 
 @pytest.mark.parametrize(
-    "name",
-    [
-        "robot.launch.py",
-        "redirection.py",
-        "shaping_nodes/chainshaper_pose.yaml",
-        "mine.txt",
-        "mine/logs/a.csv",
-    ],
+    "name", ["robot.launch.py", "shaping_nodes/chainshaper_pose.yaml", "mine/logs/a.csv"]
 )
 def test_what_the_user_changed_or_added_is_neither_removed_nor_replaced(
     spliced: Splicing, robot: Path, plan: Plan, name: str
@@ -86,12 +62,10 @@ def test_what_the_user_changed_or_added_is_neither_removed_nor_replaced(
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text("mine")
     before = _tree(spliced.folder)
-
     with pytest.raises(InputError, match=f"{name} was changed or added .* not removed: move away"):
         undo_splice(spliced.folder)
     with pytest.raises(InputError, match=f"{name} was changed or added since .* not overwritten"):
         splice_launch_files(plan, [robot], spliced.folder)
-
     assert _tree(spliced.folder) == before
 
 
@@ -104,12 +78,10 @@ def test_a_folder_that_is_not_ours_is_left_alone(
     (folder / "a").touch()
     if manifest is not None:
         (folder / "splice.json").write_text(manifest)
-
     with pytest.raises(InputError, match="was not written by `chainshaper splice`, so it is not r"):
         undo_splice(folder)
     with pytest.raises(InputError, match="was not written by `chainshaper splice`, so it is not o"):
         splice_launch_files(plan, [robot], folder)
-
     assert (folder / "a").exists()
 
 
@@ -161,7 +133,7 @@ def test_the_older_folder_comes_back_where_the_new_one_cannot_take_its_place(
 def test_a_copy_whose_original_is_gone_names_the_original(
     spliced: Splicing, robot: Path, plan: Plan, tmp_path: Path
 ) -> None:
-    shutil.move(robot, tmp_path / "elsewhere.launch.xml")
+    robot.unlink()
     with pytest.raises(InputError, match=r"robot\.launch\.xml: cannot be read \(No such file"):
         splice_launch_files(plan, [spliced.folder / "robot.launch.py"], tmp_path / "again")
 

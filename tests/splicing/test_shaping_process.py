@@ -1,7 +1,6 @@
 """What is written for a shaping node, and the Python node at work on a stand-in for rclpy."""
 
 import ast
-import importlib
 import os
 import signal
 import sys
@@ -10,9 +9,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
-from unittest.mock import MagicMock
 
 import pytest
 from known import known
@@ -140,20 +137,15 @@ def test_every_parameter_is_documented() -> None:
     assert [name for name in vars(NodeParameters()) if f"`{name}`" not in text] == sorted(throttled)
 
 
-def test_a_gate_with_modes_is_the_same_behind_its_parameters(
-    tmp_path: Path, plan: Plan, node: ShapingNode
-) -> None:
+def test_a_gate_with_modes_is_the_same_behind_its_parameters(plan: Plan, node: ShapingNode) -> None:
     gate = gate_of(banded(plan), node)
-    assert NodeParameters(**gate_parameters(gate, "/mode")).gate() == gate
-    parameters = parameters_of(write_shaping_process(banded(plan), node, "cpp", tmp_path))
+    parameters = gate_parameters(gate, "/mode")
+    assert NodeParameters(**parameters).gate() == gate
     assert parameters["slots_ns"] == [bound for slot in SLOTS for bound in slot]
-    assert {key: value for key, value in parameters.items() if key.startswith("mode")} == {
-        "mode_topic": "/mode",
-        "mode_names": ["city", "highway"],
-        "mode_slots": [1, 0],  # the places of their slots
-        "mode_default": "city",
-        "mode_late": "next-slot",
-    }
+    modes = {key: value for key, value in parameters.items() if key.startswith("mode")}
+    names = {"mode_names": ["city", "highway"], "mode_slots": [1, 0]}  # the places of their slots
+    usual = {"mode_topic": "/mode", "mode_default": "city", "mode_late": "next-slot"}
+    assert modes == names | usual
 
 
 def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(plan: Plan) -> None:
@@ -164,29 +156,26 @@ def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(plan: Plan)
 
 
 @pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
-def test_writing_again_changes_nothing(
-    tmp_path: Path, plan: Plan, node: ShapingNode, kind: Any, monkeypatch: pytest.MonkeyPatch
+def test_writing_again_changes_nothing_and_what_is_there_is_not_overwritten(
+    tmp_path: Path, plan: Plan, node: ShapingNode, kind: NodeKind, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
-    written: dict[Path, bytes] = {}
-    for _ in range(2):
+
+    def files() -> dict[Path, bytes]:
         process = write_shaping_process(
             plan, node, kind, tmp_path, message_type="sensor_msgs/msg/Image"
         )
-        files = {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
-        assert files == (written or files)
-        written = files
-    assert not [path for path in written if path.name.endswith(".partial")]
-    packages = {"cpp": "chainshaper_shaping", "typed": "shaping_sensor_msgs_image"}
-    assert process.package == packages.get(kind)
-    assert process.executable == ("shaping_node" if kind in packages else None)
+        packages = {"cpp": "chainshaper_shaping", "typed": "shaping_sensor_msgs_image"}
+        assert process.package == packages.get(kind)
+        assert process.executable == ("shaping_node" if kind in packages else None)
+        return {path: path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()}
 
-
-def test_what_is_there_is_not_overwritten(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
-    (tmp_path / "chainshaper_t3.yaml").write_text("mine")
+    assert files() == files()
+    parameters = tmp_path / "chainshaper_t3.yaml"
+    parameters.write_text("mine")
     with pytest.raises(InputError, match=r"chainshaper_t3\.yaml exists already with another"):
-        write_shaping_process(plan, node, "python", tmp_path)
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"], "nothing half-written"
+        files()
+    assert parameters.read_text() == "mine"
 
 
 def test_what_cannot_be_written_is_named(full_disk: Path, plan: Plan, node: ShapingNode) -> None:
@@ -258,28 +247,6 @@ def test_messages_leave_unchanged_inside_their_slot(tmp_path: Path, plan: Plan) 
     assert any(before < one["time"] < release for before, release in between for one in rehearsed)
 
 
-def test_every_release_is_rehearsed_twice_where_there_is_time(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    parts = ("clock", "executors", "node", "parameter", "qos", "subscription", "utilities")
-    messages = ("rcl_interfaces", "rcl_interfaces.msg", "std_msgs", "std_msgs.msg")
-    for module in ("rclpy", *(f"rclpy.{part}" for part in parts), *messages):
-        monkeypatch.setitem(sys.modules, module, MagicMock())
-    shaping_node = importlib.import_module("chainshaper.splicing.nodes.python.shaping_node")
-    published: list[bytes] = []
-    node = SimpleNamespace(
-        create_publisher=lambda *_: SimpleNamespace(publish=published.append),
-        get_logger=lambda: SimpleNamespace(warning=lambda _: None),
-    )
-    ready = shaping_node.Readiness(node, None, 0)
-    for releases in (1, 2, 3):
-        ready.get_ready(time.monotonic_ns() + 60_000 * MS)
-        assert published == [shaping_node.EMPTY] * 2 * releases
-    ready.get_ready(time.monotonic_ns())
-    assert len(published) == 6, "there was no time left"
-    ready.ask_for()
-
-
 @pytest.mark.parametrize(
     ("offered", "publisher"),
     [
@@ -299,8 +266,13 @@ def test_every_release_is_rehearsed_twice_where_there_is_time(
 def test_the_output_is_offered_as_the_original_was(
     tmp_path: Path, plan: Plan, offered: dict[str, Any], publisher: dict[str, Any]
 ) -> None:
-    known = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": {**RELIABLE, **offered}}]}
-    with at_work(plan, tmp_path, known) as run:
+    known = [{"type": "sensor_msgs/msg/Image", "qos": {**RELIABLE, **offered}}]
+    with at_work(plan, tmp_path, {"/t3_tmp": known * 2}) as run:
+        assert run.logged[:3] == [
+            "waiting for a publisher of /t3_tmp",
+            "/t3_tmp has 2 publishers: the QoS of the first is copied",
+            "/t3_tmp is published by /ns/node5 as sensor_msgs/msg/Image",
+        ]
         made = next(words for words in run.said if "publisher" in words)
         asked = next(words for words in run.said if "subscription" in words)
     assert (made["publisher"], made["type"]) == ("/t3", "Image")
@@ -312,15 +284,6 @@ def test_the_output_is_offered_as_the_original_was(
         assert asked["qos"][same] == made["qos"][same], "else the two do not match"
     assert asked["qos"]["depth"] == READER_DEPTH, "what has no room in the gate, the gate drops"
     assert "lifespan" not in asked["qos"]
-
-
-def test_it_waits_for_the_publisher_and_says_so(tmp_path: Path, plan: Plan) -> None:
-    with at_work(plan, tmp_path, {"/t3_tmp": PUBLISHERS["/t3_tmp"] * 2}) as run:
-        assert run.logged[:3] == [
-            "waiting for a publisher of /t3_tmp",
-            "/t3_tmp has 2 publishers: the QoS of the first is copied",
-            "/t3_tmp is published by /ns/node5 as sensor_msgs/msg/Image",
-        ]
 
 
 @pytest.mark.parametrize(
@@ -341,28 +304,6 @@ def test_it_stops_cleanly(
     assert run.said[-1] == {"event": "shutdown"}
 
 
-def test_what_overran_is_discarded_and_noted(tmp_path: Path, plan: Plan) -> None:
-    with at_work(revised(plan, overrun="discard"), tmp_path) as run:
-        run.send(stamped(age_ns=45 * MS))
-        run.end()
-    assert not run.published
-    (row,) = read_gate_log(tmp_path / "gate.csv").rows(named=True)
-    assert (row["overrun"], row["anchor"], row["source_timestamp"]) == ("discard", "stamp", 1)
-    assert (row["release"], row["slot"], row["published"]) == (None, None, None)
-
-
-def test_the_phase_of_the_cycle_can_be_set_while_it_runs(tmp_path: Path, plan: Plan) -> None:
-    with at_work(revised(plan, anchor="cycle"), tmp_path) as run:
-        for phase in (0, 13 * MS):
-            run.tell(set=["phase_ns", phase])
-            time.sleep(0.1)  # it is in force from the next cycle on
-            run.send(stamped())
-            run.hear_published()
-        run.end()
-    origins = read_gate_log(tmp_path / "gate.csv")["origin"]
-    assert [origin % (50 * MS) for origin in origins] == [0, 13 * MS]
-
-
 def test_without_its_log_core_or_class_it_works_on_and_says_so(tmp_path: Path, plan: Plan) -> None:
     no_core = {"core": 1023}  # is refused to all
     with at_work(plan, tmp_path, change=no_core, log=tmp_path / "nowhere/gate.csv") as run:
@@ -373,12 +314,6 @@ def test_without_its_log_core_or_class_it_works_on_and_says_so(tmp_path: Path, p
         assert any(said in text for text in run.logged)
     realtime = policy == os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
     assert any("SCHED_FIFO is refused" in text for text in run.logged) != realtime
-
-
-def test_parameters_that_make_no_gate_are_named(tmp_path: Path, plan: Plan) -> None:
-    with at_work(plan, tmp_path, change={"cycle_ns": 5}, spinning=False) as run:
-        assert run.end() == 1
-    assert any("slots must ascend" in text for text in run.logged)
 
 
 def test_cores_stay_awake_from_before_the_slot_until_the_message_is_delivered(
@@ -429,9 +364,7 @@ def test_the_throttler_publishes_what_is_newest_and_counts_the_rest(tmp_path: Pa
     assert any("nothing new for /rear" in text for text in run.logged)
     timers = [words for words in run.said if "timer" in words]
     assert [int(words["timer"] * 1e9) for words in timers] == [period] * 2
-    # Made just after the phase, however busy the machine is: a timer keeps the phase at which it
-    # was made.
-    for words in timers:
+    for words in timers:  # a timer keeps the phase at which it was made
         assert (words["time"] - phase) % period < period // 4
     assert {words["clock"] for words in timers} == {3}, "CLOCK_MONOTONIC"
 
@@ -456,18 +389,16 @@ def test_by_the_papers_rule_the_first_message_of_a_period_is_published_as_it_com
     assert not any("timer" in words for words in run.said)
 
 
-def test_the_throttler_is_in_the_cpp_package_too(tmp_path: Path) -> None:
-    process = write_throttler({"/raw": "/scan"}, 100 * MS, "cpp", tmp_path, core=1)
+def test_a_throttler_needs_topics_and_a_period_and_is_in_the_cpp_package_too(
+    tmp_path: Path,
+) -> None:
+    topics = {"/raw": "/scan"}
+    for wrong, period in (({}, 1), (topics, 0)):
+        with pytest.raises(InputError, match="needs topics and a period"):
+            write_throttler(wrong, period, "python", tmp_path)
+    with pytest.raises(InputError, match="`first` has no phase"):
+        write_throttler(topics, 1, "python", tmp_path, rule="first", phase_ns=1)
+    process = write_throttler(topics, 100 * MS, "cpp", tmp_path, core=1)
     assert (process.package, process.executable) == ("chainshaper_shaping", "throttler")
     assert (tmp_path / "chainshaper_shaping" / "src" / "throttler.cpp").is_file()
     assert parameters_of(process)["core"] == 1
-
-
-@pytest.mark.parametrize(("topics", "period"), [({}, 1), ({"/raw": "/scan"}, 0)])
-def test_a_throttler_needs_topics_and_a_period(
-    tmp_path: Path, topics: dict[str, str], period: int
-) -> None:
-    with pytest.raises(InputError, match="needs topics and a period"):
-        write_throttler(topics, period, "python", tmp_path)
-    with pytest.raises(InputError, match="`first` has no phase"):
-        write_throttler({"/raw": "/scan"}, 1, "python", tmp_path, rule="first", phase_ns=1)

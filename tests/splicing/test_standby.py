@@ -239,6 +239,7 @@ def test_a_node_that_fails_at_once_waits_longer_each_time_and_says_so(
             assert run.end() == 1
         said = f"has failed {failed} times: starting in 0.5 s"
         assert any(said in text for text in run.logged) == (failed == 3)
+        assert any("slots must ascend" in text for text in run.logged) == (failed >= 2)
 
 
 def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cannot(
