@@ -80,3 +80,10 @@ def plan_for(publisher: str, output: str) -> Plan:
         nodes=(publisher,),
         core=0,
     )
+
+
+def robot_file(tmp_path: Path) -> Path:
+    """A launch file of one node, ``/ndt``."""
+    path = tmp_path / "robot.launch.xml"
+    path.write_text(NDT)
+    return path

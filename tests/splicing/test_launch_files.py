@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 from bare_recordings import recorded
-from launch_cases import NDT, ROBOTS, plan_for
+from launch_cases import NDT, ROBOTS, plan_for, robot_file
 from node_run import parameters_of
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
@@ -27,6 +27,8 @@ MS = 1_000_000
 REAR = ThrottledInput(topic="/rear", period_ns=100 * MS)
 FRONT = ThrottledInput(topic="/front", period_ns=100 * MS)
 PLAN = plan_for("/ndt", "/pose")
+
+robot = pytest.fixture(robot_file)
 
 
 def launched(spliced: Splicing) -> dict[str, Any]:

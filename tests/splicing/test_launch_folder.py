@@ -4,11 +4,13 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from launch_cases import NDT, plan_for
+from launch_cases import NDT, plan_for, robot_file
 
 from chainshaper import Plan, Splicing, splice_launch_files, undo_splice
 from chainshaper.planning.plan import revised
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+
+robot = pytest.fixture(robot_file)
 
 
 @pytest.fixture
