@@ -40,16 +40,14 @@ class Output:
     """An output with its two processes, a publisher before it and a subscriber behind it."""
 
     command: dict[str, list[str]]
-    sender: socket.socket = field(
-        default_factory=lambda: socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    )
     running: dict[str, "subprocess.Popen[bytes]"] = field(default_factory=dict)
     ports: dict[str, int] = field(default_factory=dict)
-    came: list[tuple[str, int, float]] = field(default_factory=list)
+    came: list[tuple[str, int]] = field(default_factory=list)
     sent: int = 0
 
     def __post_init__(self) -> None:
         self.reading, self.writing = os.pipe()
+        self.sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
 
     def start(self, what: str) -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -58,13 +56,13 @@ class Output:
         command = [*self.command[what], what, "t5", str(self.ports[what]), str(HOLD_NS)]
         self.running[what] = subprocess.Popen(command, stdout=self.writing)
 
-    def kill(self, what: str) -> None:
-        self.running[what].kill()
-        self.running[what].wait()
+    def kill(self, *every: str) -> None:
+        for what in every or self.running:
+            self.running[what].kill()
+            self.running[what].wait()
 
     def restart(self, *every: str) -> None:
-        for what in every:
-            self.kill(what)
+        self.kill(*every)
         for what in every:
             self.start(what)
         for what in every:
@@ -82,11 +80,10 @@ class Output:
         while (left := until - time.monotonic()) > 0:
             if select.select([self.reading], [], [], left)[0]:
                 record = os.read(self.reading, 9)
-                number = int.from_bytes(record[1:], "little")
-                self.came.append((chr(record[0]), number, time.monotonic()))
+                self.came.append((chr(record[0]), int.from_bytes(record[1:], "little")))
 
     def await_ready(self, what: str) -> None:
-        while not any((word, n) == ("R", self.running[what].pid) for word, n, _ in self.came):
+        while ("R", self.running[what].pid) not in self.came:
             self.send()
 
     def send_many(self, count: int) -> None:
@@ -103,10 +100,10 @@ class Output:
 
     @property
     def numbers(self) -> list[int]:
-        return [number for word, number, _ in self.came if word in "SB"]
+        return self.by("SB")
 
-    def by(self, word: str) -> list[int]:
-        return [number for found, number, _ in self.came if found == word]
+    def by(self, words: str) -> list[int]:
+        return [number for found, number in self.came if found in words]
 
 
 @pytest.fixture(scope="module")
@@ -133,9 +130,7 @@ def output(program: list[str], folder: Path) -> Iterator[Output]:
             made.await_ready(what)
         yield made
     finally:
-        for process in made.running.values():
-            process.kill()
-            process.wait()
+        made.kill()
 
 
 def test_a_node_that_is_killed_at_random_loses_doubles_and_reorders_nothing(output: Output) -> None:
@@ -197,9 +192,7 @@ def test_a_standby_that_is_stopped_with_the_lock_silences_no_node(program: list[
         output.check(begun)
         assert page.is_locked(), "the node is in force"
     finally:
-        for process in output.running.values():
-            process.kill()
-            process.wait()
+        output.kill()
 
 
 def test_when_both_are_killed_nothing_comes_twice_and_either_goes_on(output: Output) -> None:
@@ -297,20 +290,6 @@ def test_starting_over_and_over_takes_longer_each_time_until_a_message_is_dealt_
     assert Turn("t5", "/t5").wait_s == 0, "that was long ago"
 
 
-def test_a_node_that_starts_again_goes_on_where_cycles_began(folder: Path) -> None:
-    turn = Turn("t5", "/t5")
-    assert turn.phase_ns is None
-    assert turn.take(1)
-    turn.hold(None, 12_345, 2)
-    again = Turn("t5", "/t5")
-    assert (again.phase_ns, again.page["mode"], again.page.topic) == (12_345, 2, "/t5")
-    seen = Page(str(folder), "t5.0.v3")  # by who only looks
-    assert (seen["starts"], seen.topic) == (2, "/t5")
-    (folder / "other").write_bytes(b"short")
-    with pytest.raises(ValueError, match="no page"):
-        Page(str(folder), "other")
-
-
 def test_only_a_node_of_the_same_launch_goes_on_in_its_cycle_and_mode(
     folder: Path, program: list[str]
 ) -> None:
@@ -370,8 +349,9 @@ def test_a_folder_that_is_not_ours_alone_is_not_used(
     elif how == "file":
         folder.touch()
     else:
-        folder.mkdir()
-        folder.chmod(0o777 if how == "mode" else 0o700)
+        folder.mkdir(mode=0o700)
+    if how == "mode":
+        folder.chmod(0o777)
     if how == "foreign page":
         (folder / "t5.0.v3").touch()
     if how in ("owner", "foreign page"):

@@ -34,24 +34,14 @@ def get_rmw_implementation_identifier() -> str:
     return os.environ.get("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
 
 
-class QoSHistoryPolicy(IntEnum):
-    SYSTEM_DEFAULT, KEEP_LAST, KEEP_ALL, UNKNOWN = range(4)
-
-
-class QoSReliabilityPolicy(IntEnum):
-    SYSTEM_DEFAULT, RELIABLE, BEST_EFFORT, UNKNOWN = range(4)
-
-
-class QoSDurabilityPolicy(IntEnum):
-    SYSTEM_DEFAULT, TRANSIENT_LOCAL, VOLATILE, UNKNOWN = range(4)
-
-
-class QoSLivelinessPolicy(IntEnum):
-    SYSTEM_DEFAULT, AUTOMATIC, _, MANUAL_BY_TOPIC, UNKNOWN = range(5)
-
-
-class ClockType(IntEnum):
-    STEADY_TIME = 3
+_USUAL = "SYSTEM_DEFAULT"
+QoSHistoryPolicy = IntEnum("QoSHistoryPolicy", [_USUAL, "KEEP_LAST", "KEEP_ALL"], start=0)
+QoSReliabilityPolicy = IntEnum("QoSReliabilityPolicy", [_USUAL, "RELIABLE", "BEST_EFFORT"], start=0)
+_DURABILITIES = [_USUAL, "TRANSIENT_LOCAL", "VOLATILE"]
+QoSDurabilityPolicy = IntEnum("QoSDurabilityPolicy", _DURABILITIES, start=0)
+_LIVELINESSES = [_USUAL, "AUTOMATIC", "_", "MANUAL_BY_TOPIC"]
+QoSLivelinessPolicy = IntEnum("QoSLivelinessPolicy", _LIVELINESSES, start=0)
+ClockType = IntEnum("ClockType", ["STEADY_TIME"], start=3)
 
 
 class _Record(SimpleNamespace):

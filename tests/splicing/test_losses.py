@@ -97,17 +97,6 @@ def test_bursts_leave_as_planned_and_the_rest_is_counted(
     assert rows_missing(rows) == (0, 0)
 
 
-def test_what_the_history_can_hold_leaves_and_nothing_is_lost(tmp_path: Path, plan: Plan) -> None:
-    """Ten times the cycle's rate, beside which the slot is open half of the time."""
-    log, count = tmp_path / "gate.csv", 60
-    with at_work(plan, tmp_path, log) as run:
-        sent = send(run, count, pause_s=0.005)
-        rows = wait_for_rows(log, count)
-        run.end()
-    assert len(sent) == len(run.published) + rows["dropped"].count()
-    assert rows["lost"].sum() == 0
-
-
 def test_what_dds_lost_before_the_gate_is_counted(tmp_path: Path, plan: Plan) -> None:
     log = tmp_path / "gate.csv"
     with at_work(plan, tmp_path, log) as run:

@@ -170,10 +170,8 @@ def in_real_time(case: Case) -> bool:
 
 
 def expected(case: Case) -> list[tuple[Any, ...]]:
-    outcomes = ((one.release.dropped, one.release) for one in walk(case))
-    return [
-        (dropped, one.slot, one.cycles_waited, one.overrun, one.mode) for dropped, one in outcomes
-    ]
+    releases = [outcome.release for outcome in walk(case)]
+    return [(o.dropped, o.slot, o.cycles_waited, o.overrun, o.mode) for o in releases]
 
 
 def test_it_does_what_the_table_of_all_gates_says(run: Callable[..., Run]) -> None:
@@ -213,22 +211,18 @@ def test_tracers_see_a_node_behind_the_publisher_which_waits_for_nothing(
     (other, unshaped, shaped) = done.of("trace", "rcl_publisher_init")
     assert [line[5] for line in (other, unshaped, shaped)] == ["/other", "/t5_tmp", "/t5"]
     assert unshaped[3] != shaped[3]  # the application's node, and ours
-    node, subscription = (
-        done.of("trace", "rcl_node_init")[0],
-        done.of("trace", "rcl_subscription_init")[0],
+    (node,), (subscription,) = (
+        done.of("trace", f"rcl_{what}_init") for what in ("node", "subscription")
     )
     assert f"0x{node[2]}" == shaped[3]
     assert subscription[3] == node[2]
     # What was published unshaped is what our callback takes, between its start and end.
     sent = [line[4] for line in done.of("trace", "rmw_publish")]
+    traced = ("rmw_take", "callback_start", "callback_end")
     order = [
-        f"{line[1]} {line[4]}"
-        if line[1] == "rmw_take"
-        else line[1]
-        if line[0] == "trace"
-        else line[0]
+        " ".join((line[1], *line[4:5] * (line[1] == "rmw_take"))) if line[0] == "trace" else line[0]
         for line in done.lines
-        if line[1] in ("rmw_take", "callback_start", "callback_end") or line[0] == "serialized"
+        if line[1] in traced or line[0] == "serialized"
     ]
     each = ("callback_start", "serialized", "callback_end")
     assert len(sent) == 4
@@ -258,19 +252,15 @@ def test_on_humble_a_message_is_stamped_behind_the_event_of_its_publication(
         assert 0 < stamp - int(event[5]) < 20 * MS
 
 
-def test_a_message_that_is_serialized_already_waits_like_any_other(run: Callable[..., Run]) -> None:
-    done = run({"/t5": SLOT}, [at(20 * MS, stamp=0, what="serialized"), at(30 * MS, stamp=0)])
-    assert done.written() == [0, 1]
-    assert all(row["slot"] == 0 for row in done.logs["/t5"])
-
-
-def test_no_message_of_an_output_is_loaned_so_that_it_can_wait(run: Callable[..., Run]) -> None:
-    loaned = [at(20 * MS, number, stamp=0, what="loaned") for number in (0, 1)]
-    done = run({"/t5": SLOT}, loaned)
+def test_what_is_serialized_already_or_would_be_loaned_waits_like_any_other(
+    run: Callable[..., Run],
+) -> None:
+    loaned = [at(ns * MS, number, 0, "loaned") for number, ns in enumerate((20, 21))]
+    done = run({"/t5": SLOT}, [*loaned, at(30 * MS, stamp=0, what="serialized")])
     assert [line[1] for line in done.of("borrowed")] == ["0", "3"]  # unsupported
     assert len(done.of("loaned", "/other")) == 1
-    assert done.written() == [1]
-    assert done.logs["/t5"][0]["slot"] == 0
+    assert done.written() == [1, 2]
+    assert all(row["slot"] == 0 for row in done.logs["/t5"])
     assert done.errors.count("no messages are loaned") == 1
 
 

@@ -19,12 +19,7 @@ from chainshaper.gate.handover import Page, open_page
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
-from chainshaper.splicing.shaped_outputs import (
-    FollowedOutput,
-    ask_phase,
-    find_outputs,
-    output_text,
-)
+from chainshaper.splicing.shaped_outputs import FollowedOutput, ask_phase, find_outputs, output_text
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process
 from chainshaper.values.errors import OperationError
 
@@ -135,8 +130,8 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
 
 @pytest.mark.parametrize(
     ("changes", "dropped"),
-    [({"depth": 20}, 0), ({"depth": 3}, 5), ({"overrun": "discard", "slots_ns": [0, 1]}, 8)],
-    ids=["room", "overflowed", "discarded"],
+    [({"depth": 3}, 5), ({"overrun": "discard", "slots_ns": [0, 1]}, 8)],
+    ids=["overflowed", "discarded"],
 )
 def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
     tmp_path: Path, plan: Plan, changes: dict[str, Any], dropped: int
@@ -196,6 +191,9 @@ def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
         for number in range(3):
             say(number, standby)
         wait_for(lambda: outputs(tmp_path)[0].messages == 3, "all to be counted")
+        ours, servers = os.sched_getaffinity(0), {server.core for server in plan.servers}
+        assert os.sched_getaffinity(standby.process.pid) == (ours - servers or ours)
+        assert os.sched_getscheduler(standby.process.pid) == os.SCHED_OTHER
         (output,) = outputs(tmp_path)
         assert output.state == "silent"
         assert "3 messages were not published" in output_text(output)
@@ -259,17 +257,6 @@ def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cann
             shaping.hear_published()
             assert any("nothing can be agreed" in text for text in shaping.logged)
         assert standby.process.poll() is None, "it is there"
-
-
-def test_the_standby_leaves_the_cores_of_servers_alone(tmp_path: Path, plan: Plan) -> None:
-    _, beside = written(plan, tmp_path)
-    servers = {server.core for server in plan.servers}
-    with running_node(beside, tmp_path) as standby:
-        say(1, standby)
-        standby.hear_published()
-        ours = os.sched_getaffinity(0)
-        assert os.sched_getaffinity(standby.process.pid) == (ours - servers or ours)
-        assert os.sched_getscheduler(standby.process.pid) == os.SCHED_OTHER
 
 
 def test_pages_of_others_are_looked_at_without_trust(
