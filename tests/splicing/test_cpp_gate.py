@@ -4,6 +4,7 @@ import random
 import shutil
 import struct
 import subprocess
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -38,40 +39,37 @@ def as_text(case: Case) -> str:
     """A case as the driver reads it; modes are named by their numbers."""
     gate, modes = case.gate, case.gate.modes
     names = [] if modes is None else list(modes.bands)
-    words: list[int | str] = [ANCHORS.index(gate.anchor), gate.phase_ns]
-    words += [LATE.index(gate.overrun), gate.due_cycles]
-    words += [MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns]
-    words += [INTO_OPEN_SLOT.index(gate.into_open_slot)]
-    words += [len(gate.slots), *(bound for slot in gate.slots for bound in slot)]
-    words += [len(names)]
+    words: list[int | str] = [
+        *(ANCHORS.index(gate.anchor), gate.phase_ns, LATE.index(gate.overrun), gate.due_cycles),
+        *(MESSAGES.index(gate.messages), gate.depth, gate.cycle_ns),
+        *(INTO_OPEN_SLOT.index(gate.into_open_slot), len(gate.slots)),
+        *(bound for slot in gate.slots for bound in slot),
+        len(names),
+    ]
     if modes is not None:
         words += [*modes.bands.values(), names.index(modes.default), LATE.index(modes.late)]
     words += [len(case.changes)]
     words += [word for time, mode in case.changes for word in (time, names.index(mode))]
     words += [len(case.moves), *(word for move in case.moves for word in move)]
-    words += [len(case.steps), *case.steps]
-    words += [PUBLISHING_NS, case.late_ns, len(case.arrivals)]
+    words += [len(case.steps), *case.steps, PUBLISHING_NS, case.late_ns, len(case.arrivals)]
     words += [word for arrival, stamp in case.arrivals for word in (arrival, _or_dash(stamp))]
     return " ".join(map(str, words))
 
 
 def as_answer(case: Case, outcome: Outcome) -> str:
     """What becomes of a message, as the driver prints it."""
-    release = outcome.release
+    release, dash = outcome.release, _or_dash
     names = [] if case.gate.modes is None else list(case.gate.modes.bands)
     words = [
-        _or_dash(outcome.left_ns),
-        _or_dash(release.at_ns),
-        release.origin_ns,
-        _or_dash(release.slot),
-        release.cycles_waited,
-        ANCHORS.index(release.anchor),
-        "-" if release.overrun is None else LATE.index(release.overrun),
-        "-" if release.mode is None else names.index(release.mode),
-        "-" if release.dropped is None else DROPPED.index(release.dropped),
-        release.moved_ns,
+        *(dash(outcome.left_ns), dash(release.at_ns), release.origin_ns, dash(release.slot)),
+        *(release.cycles_waited, ANCHORS.index(release.anchor), _place(LATE, release.overrun)),
+        *(_place(names, release.mode), _place(DROPPED, release.dropped), release.moved_ns),
     ]
     return " ".join(map(str, words))
+
+
+def _place(words: Sequence[str], word: str | None) -> int | str:
+    return "-" if word is None else words.index(word)
 
 
 def _or_dash(value: int | None) -> int | str:

@@ -193,17 +193,6 @@ def test_options_of_ros2_run_are_not_what_it_starts(
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
-def test_splicing_again_or_from_the_spliced_one_gives_the_same(robot: Path) -> None:
-    out = robot.parent / "out"
-    first = splice_launch_files(PLAN, [robot], out)
-    text = (out / "robot.launch.py").read_text()
-    for given in ([robot], [*first.launch.values()]):
-        again = splice_launch_files(PLAN, given, out)
-        assert again.diff == first.diff
-        assert (out / "robot.launch.py").read_text() == text
-    assert f"spliced from its original, {robot}" in again.notes[0]
-
-
 def with_further_node(plan: Plan, output: str, publisher: str | None = None) -> Plan:
     """The plan with a shaping node for another topic, in slots of its own."""
     assert plan.shaping_node is not None
@@ -257,17 +246,16 @@ def test_a_node_that_would_get_no_message_is_refused(
 def test_an_input_reaches_its_subscribers_by_way_of_one_throttler(
     robot: Path, recording: Recording
 ) -> None:
-    out = robot.parent / "out"
-    spliced = splice_throttlers([REAR, FRONT], [robot], out, recording=recording)
+    spliced = splice_throttlers([REAR, FRONT], [robot], robot.parent / "out", recording=recording)
     (process,) = launched(spliced)["PROCESSES"]  # one throttler, as in the paper
     assert process["name"] == "chainshaper_throttler"
-    wanted = {topic: (f"{topic}_throttled", ("/fusion",)) for topic in ("/rear", "/front")}
+    topics = ["/rear", "/front"]
+    throttled = [f"{topic}_throttled" for topic in topics]
+    wanted = {topic: (end, ("/fusion",)) for topic, end in zip(topics, throttled, strict=True)}
     assert redirects(spliced) == wanted
     assert {one["kind"] for one in launched(spliced)["REDIRECTS"]} == {"subscription"}
-    parameters = parameters_of(spliced.processes[0])
-    assert parameters["inputs"] == ["/rear", "/front"]
-    assert parameters["outputs"] == ["/rear_throttled", "/front_throttled"]
-    assert (parameters["period_ns"], parameters["fifo_priority"]) == (100 * MS, 85)
+    known = {"inputs": topics, "outputs": throttled, "period_ns": 100 * MS, "fifo_priority": 85}
+    assert parameters_of(spliced.processes[0]).items() >= known.items()
 
 
 def test_inputs_of_other_periods_or_rules_have_a_throttler_of_their_own(robot: Path) -> None:
@@ -284,14 +272,16 @@ def test_inputs_of_other_periods_or_rules_have_a_throttler_of_their_own(robot: P
     assert launched(spliced)["PROCESSES"][0]["executable"] == "throttler"
 
 
-def test_a_plan_is_spliced_into_the_throttled_launch_file(
+def test_a_plan_is_spliced_into_the_throttled_launch_file_and_again_from_its_own(
     robot: Path, recording: Recording
 ) -> None:
     out = robot.parent / "throttled"
     throttled = splice_throttlers([REAR], [robot], out, recording=recording)
     text = (out / "robot.launch.py").read_text()
     shaped = splice_launch_files(PLAN, [*throttled.launch.values()], robot.parent / "shaped")
-    again = splice_launch_files(PLAN, [*shaped.launch.values()], robot.parent / "again")
+    again = splice_launch_files(PLAN, [*shaped.launch.values()], robot.parent / "shaped")
+    assert again.diff == shaped.diff
+    assert f"spliced from its original, {out / 'robot.launch.py'}" in again.notes[0]
     for spliced in (shaped, again):
         assert launched(spliced)["LAUNCH_FILES"] == [str(out / "robot.launch.py")]
         assert list(redirects(spliced)) == ["/pose"]
@@ -306,7 +296,6 @@ def test_a_plan_is_spliced_into_the_throttled_launch_file(
         ("a.launch.xml", b"<robot/>", "a.launch.xml: no launch file"),
         ("a.launch.yaml", b"robot: 1\n", "a.launch.yaml: no launch file"),
         ("a.launch.py", b"print('hello')\n", "a.launch.py: no launch file"),
-        ("a.launch", b"nothing", "a.launch: no launch file"),
         ("a.txt", NDT.encode(), "a launch file's name ends in .py, .xml, .yaml, .yml or .launch"),
         ("a.launch.xml", b"<launch>\xff</launch>", "1: not a text in UTF-8"),
         ("a.launch.xml", None, "a.launch.xml: cannot be read .No such file"),

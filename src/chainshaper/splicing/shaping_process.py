@@ -109,29 +109,25 @@ def write_shaping_process(
             "known: name it, as `ros2 topic type` prints it, or choose the kind cpp"
         )
     topics = (("input", node.input), ("output", node.output))
-    process, files = _process(
-        kind, "shaping_node", node.name, folder, topics, message_type=message_type
-    )
-    parameters = shaping_parameters(plan, node, log)
-    parameters["handover"] = _page_name(node, log or folder)
-    if process.plugin is not None:  # it ends with its publisher, and a standby's copy costs one
-        given = {name: value for name, value in parameters.items() if value != []}  # of no type
-        _write(into or folder, {**files, f"{node.name}.yaml": _yaml(given)})
-        return process
-    standby = f"{node.name}{STANDBY}"
-    beside, files_beside = _process("python", "standby", standby, folder, topics)
-    of_standby = {name: parameters[name] for name in ("handover", "output_depth", "depth")} | {
-        "shaping_node": node.name,
-        "fallback": plan.fallback,
-        # A node that runs only in its server's slots may get to a message a cycle later.
-        "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS)
-        + (plan.cycle_ns if plan.shaping_thread == "in-slots" else 0),
-        "server_cores": sorted({server.core for server in plan.servers}),
-        "log": "" if log is None else str(log.with_stem(standby).absolute()),
-    }
-    files |= {f"{node.name}.yaml": _yaml(parameters), f"{standby}.yaml": _yaml(of_standby)}
-    _write(into or folder, {**files, **files_beside})
-    return replace(process, standby=beside)
+    parameters = shaping_parameters(plan, node, log) | {"handover": _page_name(node, log or folder)}
+    shaped = message_type_named(message_type) if kind in OF_ONE_TYPE and message_type else None
+    process, files = _process(kind, "shaping_node", node.name, folder, parameters, topics, shaped)
+    if process.plugin is None:  # a component ends with its publisher
+        name = f"{node.name}{STANDBY}"
+        same = {key: parameters[key] for key in ("handover", "output_depth", "depth")}
+        of_standby = same | {
+            "shaping_node": node.name,
+            "fallback": plan.fallback,
+            # A node that runs only in its server's slots may get to a message a cycle later.
+            "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS)
+            + (plan.cycle_ns if plan.shaping_thread == "in-slots" else 0),
+            "server_cores": sorted({server.core for server in plan.servers}),
+            "log": "" if log is None else str(log.with_stem(name).absolute()),
+        }
+        standby, others = _process("python", "standby", name, folder, of_standby, topics)
+        process, files = replace(process, standby=standby), files | others
+    _write(into or folder, files)
+    return process
 
 
 def zero_copy_lost(plan: ApplicationPlan, kind: NodeKind) -> list[str]:
@@ -197,8 +193,8 @@ def write_throttler(
         "fifo_priority": fifo_priority or 0,
         "output_depth": depth,
     }
-    process, files = _process(kind, "throttler", name, folder)
-    _write(into or folder, {**files, f"{name}.yaml": _yaml(parameters)})
+    process, files = _process(kind, "throttler", name, folder, parameters)
+    _write(into or folder, files)
     return process
 
 
@@ -239,37 +235,35 @@ def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[
     return parameters
 
 
-def _process(
+def _process(  # noqa: PLR0917 - all of a process
     kind: NodeKind,
     executable: str,
     name: str,
     folder: Path,
+    parameters: dict[str, Any],
     remappings: tuple[tuple[str, str], ...] = (),
-    *,
-    message_type: str | None = None,
+    shaped: "MessageType | None" = None,
 ) -> tuple[ShapingProcess, dict[str, str]]:
-    """A process with its program's files, by their paths below the folder."""
-    folder = folder.absolute()
-    parameters = folder / f"{name}.yaml"
+    """A process with its files, by their paths below the folder."""
+    file, plugin = folder.absolute() / f"{name}.yaml", None
+    if kind == "component":  # a list without elements has no type
+        parameters = {key: value for key, value in parameters.items() if value != []}
+    # The name or namespace that a launch file gives the node may be another one.
+    text = yaml.safe_dump({"/**": {"ros__parameters": parameters}}, sort_keys=False)
+    files = {file.name: text}
     if kind == "python":
-        files = {f"{name}.py": python_node(executable)}
+        files[f"{name}.py"] = python_node(executable)
         if executable != "standby":  # that stands beside one that has it
             files["respawning.py"] = _RESPAWNING.read_text(encoding="utf-8")
-        command = ("python3", str(folder / f"{name}.py"))
-        return ShapingProcess(name, command, None, None, parameters, remappings), files
-    known = message_type_named(message_type) if kind in OF_ONE_TYPE and message_type else None
-    package, component = GENERIC_PACKAGE if known is None else known.node_package, None
+        command = ("python3", str(file.with_suffix(".py")))
+        return ShapingProcess(name, command, None, None, file, remappings), files
+    package = GENERIC_PACKAGE if shaped is None else shaped.node_package
     if kind == "component":
-        component = f"{package}::ShapingNode"
-    filled = cpp_package(known, component=component is not None)
-    runs = executable if component is None else None
-    process = ShapingProcess(name, None, package, runs, parameters, remappings, component)
-    return process, {f"{package}/{path}": text for path, text in filled.items()}
-
-
-def _yaml(parameters: dict[str, Any]) -> str:
-    # The name or namespace that a launch file gives the node may be another one.
-    return yaml.safe_dump({"/**": {"ros__parameters": parameters}}, sort_keys=False)
+        plugin = f"{package}::ShapingNode"
+    filled = cpp_package(shaped, component=plugin is not None)
+    files |= {f"{package}/{path}": text for path, text in filled.items()}
+    runs = executable if plugin is None else None
+    return ShapingProcess(name, None, package, runs, file, remappings, plugin), files
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
