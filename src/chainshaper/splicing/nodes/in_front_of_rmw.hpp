@@ -44,11 +44,7 @@ struct RmwQos {
   std::size_t depth;
   int reliability;
   int durability;
-  std::uint64_t deadline[2];
-  std::uint64_t lifespan[2];
-  int liveliness;
-  std::uint64_t liveliness_lease[2];
-  bool avoid_ros_namespace_conventions;
+  std::uint64_t others[16];  // more than any version has; 0: as usual
 };
 enum { keep_last = 1, reliable = 1, best_available_reliability = 4 };
 enum { volatile_durability = 2, best_available_durability = 4 };
@@ -56,8 +52,7 @@ enum { volatile_durability = 2, best_available_durability = 4 };
 struct Allocator {
   void * (*allocate)(std::size_t, void *);
   void (*deallocate)(void *, void *);
-  void * (*reallocate)(void *, std::size_t, void *);
-  void * (*zero_allocate)(std::size_t, std::size_t, void *);
+  void * others[2];
   void * state;
 };
 

@@ -26,11 +26,8 @@ using namespace chainshaper;  // NOLINT
 // Emits an event of ros2_tracing, whose arguments are all integers or pointers.
 template <typename... Values>
 void emit(void * event, Values... values) {
-  using Emit = void (*)(std::uintptr_t, std::uintptr_t, std::uintptr_t, std::uintptr_t,
-                        std::uintptr_t);
-  std::array<std::uintptr_t, 5> all{std::uintptr_t(values)...};
-  if (event != nullptr)
-    reinterpret_cast<Emit>(event)(all[0], all[1], all[2], all[3], all[4]);
+  using Emit = void (*)(std::conditional_t<true, std::uintptr_t, Values>...);
+  if (event != nullptr) reinterpret_cast<Emit>(event)(std::uintptr_t(values)...);
 }
 #define EMIT(name, ...) \
   do { \
@@ -111,15 +108,13 @@ public:
   template <typename Announced>
   void read(Announced announced) {
     const auto take = RMW(rmw_take_serialized_message_with_info);
-    for (bool taken = subscription_ != nullptr; taken;) {
+    while (subscription_ != nullptr) {
       Serialized text;
       MessageInfo info{};
-      taken = false;
-      if (take(subscription_, &text.bytes, &taken, &info, nullptr) != 0) return;
-      const auto now = monotonic_ns();
-      const auto sent = info.source_timestamp;
+      bool taken = false;
+      if (take(subscription_, &text.bytes, &taken, &info, nullptr) != 0 || !taken) return;
+      const auto now = monotonic_ns(), sent = info.source_timestamp;
       const auto at = sent > 0 ? std::min(now, sent - clock_offset()) : now;
-      if (!taken) continue;
       if (const auto mode = text_of(text.bytes.buffer, text.bytes.length)) announced(*mode, at);
     }
   }
@@ -185,10 +180,9 @@ public:
   int take(const void * ros_message, Fill fill) {
     auto message = std::make_unique<Serialized>();
     // Where the event has no stamp, a message's publication is the last one before its stamp.
-    const bool first = is_humble();
-    if (first) emit_write(&rmw_input_, ros_message, 0);
+    if (is_humble()) emit_write(&rmw_input_, ros_message, 0);
     message->stamp = next_stamp();
-    if (!first) emit_write(&rmw_input_, ros_message, message->stamp);
+    if (!is_humble()) emit_write(&rmw_input_, ros_message, message->stamp);
     if (const int failed = fill(message->bytes)) return failed;
     Serialized * const own = message.release();
     own->next = arrived_.load(std::memory_order_relaxed);
@@ -252,24 +246,18 @@ private:
   void look() {
     if (over_) throw Over();
     read_modes();
-    Serialized * newest = arrived_.exchange(nullptr);
-    Serialized * oldest = nullptr;
-    while (newest != nullptr) {
-      Serialized * const before = newest->next;
-      newest->next = oldest;
-      oldest = newest;
-      newest = before;
-    }
+    std::vector<Message> all;  // the newest first
+    for (auto * one = arrived_.exchange(nullptr); one != nullptr; one = one->next)
+      all.emplace_back(one);
+    shaper_.follow_moves();
     // Where cycles begin is found while the application runs.
     if (const auto phase = turn_ ? turn_->asked_phase_ns() : std::nullopt)
       shaper_.set_phase(*phase, monotonic_ns());
-    while (oldest != nullptr) {
-      Message message(oldest);
-      oldest = oldest->next;
-      const auto & [bytes, stamp, next] = *message;
+    for (auto one = all.rbegin(); one != all.rend(); ++one) {
+      const auto & [bytes, stamp, next] = **one;
       const auto origin = origin_of(bytes.buffer, bytes.length);
       const auto source = stamp;
-      shaper_.arrive(std::move(message), origin, source, true, 0);
+      shaper_.arrive(std::move(*one), origin, source, true, 0);
     }
   }
 

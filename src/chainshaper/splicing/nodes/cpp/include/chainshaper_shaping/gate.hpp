@@ -460,6 +460,10 @@ public:
       remember(queue.moves, {from_ns, by_ns});
   }
 
+  void follow_moves() {
+    if (const auto move = moved()) move_slots(move->second, move->first);
+  }
+
   // False: there is no mode like it.
   bool announce(const std::string & name, std::int64_t now_ns) {
     const auto & modes = queue.gate.modes;
@@ -486,7 +490,7 @@ public:
       queue.phase_ns = next_phase_->second;
       next_phase_.reset();
     }
-    if (const auto move = moved()) move_slots(move->second, move->first);
+    follow_moves();
     auto full = queue.arrive(std::move(message), arrival_ns, stamp_ns, source_timestamp, lost);
     if (full) overflowed.push_back(std::move(*full));
   }
