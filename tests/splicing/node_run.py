@@ -29,16 +29,9 @@ SLOTS = ((15 * MS, 25 * MS), (30 * MS, 45 * MS))
 STAND_IN = Path(__file__).parent / "rclpy_stand_in.py"
 
 # As rmw_cyclonedds tells it of a publisher: neither its history nor its depth is known.
-RELIABLE = {
-    "history": 3,
-    "depth": 0,
-    "reliability": 1,
-    "durability": 2,
-    "lifespan": "infinite",
-    "deadline": "infinite",
-    "liveliness": 1,
-    "liveliness_lease_duration": "infinite",
-}
+RELIABLE = {"history": 3, "depth": 0, "reliability": 1, "durability": 2, "liveliness": 1} | (
+    dict.fromkeys(("lifespan", "deadline", "liveliness_lease_duration"), "infinite")
+)
 PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
 
 
@@ -89,12 +82,8 @@ class NodeRun:
 
     def hear_published(self, payload: bytes | None = None) -> None:
         """Wait until it publishes the output: anything, or that."""
-        self.hear(
-            lambda words: (
-                words.get("published") == "/t3"
-                and payload in (None, bytes.fromhex(words["payload"]))
-            )
-        )
+        wanted = {"published": "/t3"} | ({} if payload is None else {"payload": payload.hex()})
+        self.hear(lambda words: words.items() >= wanted.items())
 
     @property
     def published(self) -> list[bytes]:
@@ -160,15 +149,9 @@ def running_node(
     script = Path(process.command[1])
     text = script.read_text().replace("/run/chainshaper/outputs", str(folder / "outputs"))
     script.write_text(text)
-    arguments = [f"{match}:={target}" for match, target in process.remappings]
+    rules = [f"{match}:={target}" for match, target in process.remappings]
     child = subprocess.Popen(
-        [
-            sys.executable,
-            *process.command[1:],
-            "--params-file",
-            process.parameters_file,
-            *arguments,
-        ],
+        [sys.executable, script, "--params-file", process.parameters_file, *rules],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

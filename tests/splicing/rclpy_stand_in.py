@@ -34,14 +34,13 @@ def get_rmw_implementation_identifier() -> str:
     return os.environ.get("RMW_IMPLEMENTATION", "rmw_cyclonedds_cpp")
 
 
-_USUAL = "SYSTEM_DEFAULT"
-QoSHistoryPolicy = IntEnum("QoSHistoryPolicy", [_USUAL, "KEEP_LAST", "KEEP_ALL"], start=0)
-QoSReliabilityPolicy = IntEnum("QoSReliabilityPolicy", [_USUAL, "RELIABLE", "BEST_EFFORT"], start=0)
-_DURABILITIES = [_USUAL, "TRANSIENT_LOCAL", "VOLATILE"]
-QoSDurabilityPolicy = IntEnum("QoSDurabilityPolicy", _DURABILITIES, start=0)
-_LIVELINESSES = [_USUAL, "AUTOMATIC", "_", "MANUAL_BY_TOPIC"]
-QoSLivelinessPolicy = IntEnum("QoSLivelinessPolicy", _LIVELINESSES, start=0)
-ClockType = IntEnum("ClockType", ["STEADY_TIME"], start=3)
+QoSHistoryPolicy = IntEnum("QoSHistoryPolicy", "DEFAULT KEEP_LAST KEEP_ALL", start=0)
+QoSReliabilityPolicy = IntEnum("QoSReliabilityPolicy", "DEFAULT RELIABLE BEST_EFFORT", start=0)
+QoSDurabilityPolicy = IntEnum("QoSDurabilityPolicy", "DEFAULT TRANSIENT_LOCAL VOLATILE", start=0)
+QoSLivelinessPolicy = IntEnum(
+    "QoSLivelinessPolicy", "DEFAULT AUTOMATIC MANUAL_BY_NODE MANUAL_BY_TOPIC", start=0
+)
+ClockType = IntEnum("ClockType", "STEADY_TIME", start=3)
 
 
 class _Record(SimpleNamespace):
@@ -52,11 +51,8 @@ class _Record(SimpleNamespace):
 QoSProfile = Clock = SetParametersResult = DiagnosticStatus = KeyValue = String = _Record
 
 
-class Parameter(SimpleNamespace):
-    """A name and a value; upstream's first argument has a position."""
-
-    def __init__(self, name: str, *, value: Any) -> None:
-        super().__init__(name=name, value=value)
+def Parameter(name: str, *, value: Any) -> _Record:  # noqa: N802 - upstream's name
+    return _Record(name=name, value=value)
 
 
 class Subscription:
@@ -69,17 +65,14 @@ class Subscription:
             WITH_MESSAGE_INFO = 1
 
 
-class DiagnosticArray(SimpleNamespace):
+class DiagnosticArray:
     """Of diagnostic_msgs.msg."""
 
     def __init__(self, status: list[_Record]) -> None:
-        super().__init__(status=status, header=SimpleNamespace(stamp=None))
+        self.status, self.header = status, SimpleNamespace(stamp=None)
 
 
-class Image: ...
-
-
-class Empty: ...
+Image, Empty = type("Image", (), {}), type("Empty", (), {})
 
 
 def _say(**what: Any) -> None:
@@ -216,13 +209,13 @@ class Node:
         self.subscriptions: dict[str, SimpleNamespace] = {}
         self.timers: list[Callable[[], None]] = []
         self.handle = SimpleNamespace(pointer=NODE)
-        self.on_set: Callable[[list[Parameter]], object] = lambda _: None
+        self.on_set: Callable[[list[Any]], object] = lambda _: None
+        self.get_logger, self.count_subscribers = Logger, lambda _: 1
+        self.get_clock = lambda: SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
+        self.destroy_node = lambda: None
 
-    def get_parameter_or(self, name: str, otherwise: Parameter) -> Parameter:
+    def get_parameter_or(self, name: str, otherwise: Any) -> Any:
         return Parameter(name, value=self._parameters.get(name, otherwise.value))
-
-    def get_logger(self) -> Logger:
-        return Logger()
 
     def resolve_topic_name(self, topic: str) -> str:
         return str(self._names.get(topic, topic))
@@ -230,21 +223,11 @@ class Node:
     def get_publishers_info_by_topic(self, topic: str) -> list[SimpleNamespace]:
         self._looks += 1
         found = self._publishers.get(self.resolve_topic_name(topic), [])
+        node = {"node_name": "node5", "node_namespace": "/ns"}
         return [
-            SimpleNamespace(
-                node_name="node5",
-                node_namespace="/ns",
-                topic_type=info["type"],
-                qos_profile=SimpleNamespace(**info["qos"]),
-            )
+            SimpleNamespace(**node, topic_type=info["type"], qos_profile=_Record(**info["qos"]))
             for info in (found if self._looks > 1 else [])
         ]
-
-    def count_subscribers(self, _: str) -> int:
-        return 1
-
-    def get_clock(self) -> SimpleNamespace:
-        return SimpleNamespace(now=lambda: SimpleNamespace(to_msg=lambda: "now"))
 
     def create_publisher(self, message_type: type, topic: str, qos: Any) -> Publisher:
         topic = self.resolve_topic_name(topic)
@@ -254,13 +237,7 @@ class Node:
         return Publisher(topic)
 
     def create_subscription(
-        self,
-        message_type: type,
-        topic: str,
-        callback: Callable[..., None],
-        qos: Any,
-        *,
-        raw: bool = False,
+        self, message_type: type, topic: str, callback: Any, qos: Any, *, raw: bool = False
     ) -> SimpleNamespace:
         topic = self.resolve_topic_name(topic)
         _say(subscription=topic, type=message_type.__name__, qos=vars(qos), raw=raw)
@@ -279,8 +256,6 @@ class Node:
 
     def add_on_set_parameters_callback(self, callback: Callable[..., object]) -> None:
         self.on_set = callback
-
-    def destroy_node(self) -> None: ...
 
 
 for _name in (

@@ -321,23 +321,20 @@ def _write_rows(path: str, header: bytes, most_bytes: int) -> None:
 
     def append(text: bytes) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        file = os.open(path, flags, 0o644)
-        try:
-            size = os.fstat(file).st_size
-            if size > len(header) and size + len(text) > most_bytes // 2:
-                os.replace(path, path + ".1")  # noqa: PTH105 - there is little to import here
-                os.close(file)
-                file, size = os.open(path, flags, 0o644), 0
-            whole = text if size else header + text
-            try:
-                written = os.write(file, whole)
-            except OSError:
-                written = 0
-            if written < len(whole):
-                os.ftruncate(file, size)
-                raise OSError
-        finally:
-            os.close(file)
+        with os.fdopen(os.open(path, flags, 0o644), "ab", 0) as file:
+            size = file.tell()
+            if size <= len(header) or size + len(text) <= most_bytes // 2:
+                whole = text if size else header + text
+                try:
+                    written = file.write(whole)
+                except OSError:
+                    written = 0
+                if written < len(whole):
+                    file.truncate(size)
+                    raise OSError
+                return
+        os.replace(path, path + ".1")  # noqa: PTH105 - there is little to import here
+        append(text)
 
     rest, received = b"", b"\n"
     while received:

@@ -85,8 +85,7 @@ private:
     for (;;) {
       const auto size = read(ends_[0], received.data(), received.size());
       if (size == 0 || (size < 0 && errno != EINTR)) return;
-      if (size < 0) continue;
-      lines.append(received.data(), static_cast<std::size_t>(size));
+      lines.append(received.data(), static_cast<std::size_t>(std::max<ssize_t>(0, size)));
       const auto whole = lines.rfind('\n') + 1;
       append(lines.substr(0, whole));
       lines.erase(0, whole);
@@ -96,18 +95,15 @@ private:
   // Adds whole lines only; what cannot be written is missing. A file that would have more than half
   // of `most_bytes_` becomes `….1`; one that has been removed is made anew. Whether it is there.
   bool append(const std::string & lines) {
-    const auto opened = [this] {
-      return open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK, 0644);
-    };
-    int file = opened();
+    const int file =
+        open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK, 0644);
     if (file < 0) return false;
-    std::int64_t before = lseek(file, 0, SEEK_END);
+    const std::int64_t before = lseek(file, 0, SEEK_END);
     const auto header = static_cast<std::int64_t>(std::strlen(schema::log_header));
     if (before > header && before + static_cast<std::int64_t>(lines.size()) > most_bytes_ / 2 &&
         std::rename(path_.c_str(), (path_ + ".1").c_str()) == 0) {
       close(file);
-      if ((file = opened()) < 0) return false;
-      before = 0;
+      return append(lines);
     }
     const std::string whole = (before == 0 ? schema::log_header : "") + lines;
     if (::write(file, whole.data(), whole.size()) != static_cast<ssize_t>(whole.size()))
