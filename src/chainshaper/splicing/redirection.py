@@ -197,8 +197,7 @@ def redirect_command(
             redirect.others.append(label)
             continue
         places = list(_places(parts))
-        rules = [parts[place + 1] for place in places]
-        added = redirect.see(rules, label, action)
+        added = redirect.see([parts[place + 1] for place in places], label, action)
         changed = changed or bool(added)
         for number, rule in reversed(added):
             if number < len(places):
@@ -283,28 +282,22 @@ def launch_description(
     ``environment`` is loaded before those that are loaded anyway. Arguments that the files require
     are declared here too, because launch wants to see them handed on.
     """
-    from launch import LaunchContext, LaunchDescription, LaunchDescriptionSource
-    from launch.actions import (
-        DeclareLaunchArgument,
-        ExecuteProcess,
-        IncludeLaunchDescription,
-        OpaqueFunction,
-        SetEnvironmentVariable,
-    )
+    from launch import LaunchContext, LaunchDescription, LaunchDescriptionSource, actions
     from launch.launch_description_sources import AnyLaunchDescriptionSource
     from launch.substitutions import LaunchConfiguration
     from launch_ros.actions import Node
 
-    within = DeclareLaunchArgument(
+    within = actions.DeclareLaunchArgument(
         WITHIN,
         default_value=str(WITHIN_S),
         description="after how many seconds a topic that was not redirected ends the launch",
     )
-    actions: list[Any] = [within, OpaqueFunction(function=_begin, args=[redirects])]
+    every: list[Any] = [within, actions.OpaqueFunction(function=_begin, args=[redirects])]
     for name, value in environment.items():
         others = os.environ.get(name, "") if name == "LD_PRELOAD" else ""
-        actions.append(SetEnvironmentVariable(name, f"{value}:{others}" if others else value))
-    actions += [(Node if "package" in one else ExecuteProcess)(**one) for one in processes]
+        whole = f"{value}:{others}" if others else value
+        every.append(actions.SetEnvironmentVariable(name, whole))
+    every += [(Node if "package" in one else actions.ExecuteProcess)(**one) for one in processes]
     for file in files:
         description = AnyLaunchDescriptionSource(file).get_launch_description(LaunchContext())
         declared = description.get_launch_arguments_with_include_launch_description_actions()
@@ -312,11 +305,11 @@ def launch_description(
         for one, includes in declared:
             required = one.default_value is None and not one._conditionally_included
             if includes is None and required:
-                actions.append(DeclareLaunchArgument(one.name, description=one.description))
+                every.append(actions.DeclareLaunchArgument(one.name, description=one.description))
                 handed_on.append((one.name, LaunchConfiguration(one.name)))
         source = LaunchDescriptionSource(description, file, "spliced launch file")
-        actions.append(IncludeLaunchDescription(source, launch_arguments=handed_on))
-    return LaunchDescription(actions)
+        every.append(actions.IncludeLaunchDescription(source, launch_arguments=handed_on))
+    return LaunchDescription(every)
 
 
 def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:

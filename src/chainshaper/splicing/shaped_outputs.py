@@ -56,12 +56,11 @@ def find_outputs(folders: Iterable[str] | None = None) -> tuple[ShapedOutput, ..
     """
     pages: list[tuple[str, str, dict[int, int]]] = []
     if folders is None:
-        folders = [*page_folders()]
+        pages, folders = _in_containers(), [*page_folders()]
         if os.geteuid() == 0:
-            others = {str(path) for path in Path("/run/user").glob("*/chainshaper/outputs")}
-            others |= {str(path) for path in Path("/dev/shm").glob("chainshaper-*")}  # noqa: S108
-            folders += sorted(others - {*folders})
-        pages = _in_containers()
+            others = [*Path("/run/user").glob("*/chainshaper/outputs")]
+            others += Path("/dev/shm").glob("chainshaper-*")  # noqa: S108
+            folders += sorted({*map(str, others)} - {*folders})
     for folder in folders:
         with suppress(OSError):
             pages += [(folder, name, {}) for name in sorted(os.listdir(folder))]  # noqa: PTH208
@@ -129,8 +128,8 @@ def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
 
 
 def _page_of(topic: str, pids: Collection[int]) -> Page:
-    found = [one for one in find_outputs() if one.topic == topic and one.shaping_node]
-    found = [one for one in found if not pids or one.shaping_node in pids]
+    of_topic = [one for one in find_outputs() if one.topic == topic and one.shaping_node]
+    found = [one for one in of_topic if not pids or one.shaping_node in pids]
     if len(found) != 1:
         raise OperationError(
             f"slots of {topic} cannot follow: {len(found) or 'no'} gates publish it now that show"
@@ -201,10 +200,11 @@ def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
     if not holder and not standby:
         return []
     since = page["bypassing_since_ns"] if standby else 0
-    alone: OutputState = "in process" if page["in_process"] else "no standby"
-    state: OutputState = "shaped" if standby else alone
+    state: OutputState = "in process" if page["in_process"] else "no standby"
     if since or not holder:
         state = "silent" if page["silent"] else "bypassed"
+    elif standby:
+        state = "shaped"
     counts = {why: page[why.replace(" ", "_").lower()] for why in (*DROPPED, "lost by DDS")}
     return [
         ShapedOutput(
