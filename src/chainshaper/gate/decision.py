@@ -22,7 +22,9 @@ a part of the Python nodes' own files.
 """
 
 import ctypes
+import errno
 import os
+import struct
 import threading
 import time
 from collections import deque
@@ -324,12 +326,12 @@ def origin_of(payload: bytes) -> int | None:
     """
     if len(payload) < 12:
         return None
-    order: Literal["little", "big"] = "little" if payload[1] & 1 else "big"
-    seconds = int.from_bytes(payload[4:8], order, signed=True)
-    nanoseconds = int.from_bytes(payload[8:12], order)
-    if (seconds == 0 and nanoseconds == 0) or nanoseconds >= 1_000_000_000:
+    order = "<" if payload[1] & 1 else ">"
+    seconds, nanoseconds = struct.unpack_from(f"{order}iI", payload, 4)
+    if nanoseconds >= 1_000_000_000:
         return None
-    return seconds * 1_000_000_000 + nanoseconds
+    stamp: int = seconds * 1_000_000_000 + nanoseconds
+    return stamp or None
 
 
 def text_of(payload: bytes) -> str | None:
@@ -345,22 +347,16 @@ def text_of(payload: bytes) -> str | None:
 # Clocks ------------------------------------------------------------------------------------------
 
 
-class _Timespec(ctypes.Structure):
-    _fields_ = (("tv_sec", ctypes.c_long), ("tv_nsec", ctypes.c_long))
-
-
-_libc = ctypes.CDLL(None, use_errno=True)
-_TIMER_ABSTIME, _EINTR = 1, 4
+_libc = ctypes.CDLL(None)
+_TIMER_ABSTIME = 1
 
 
 def sleep_until(deadline_ns: int) -> None:
     """Sleep until an instant of CLOCK_MONOTONIC, however late the sleep itself begins."""
-    request = ctypes.byref(_Timespec(*divmod(max(0, deadline_ns), 1_000_000_000)))
-    error = _EINTR  # a signal ends the sleep early; the deadline stays the same
-    while error == _EINTR:
-        error = _libc.clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, request, None)
-    if error:
-        raise OSError(error, f"clock_nanosleep: {os.strerror(error)}")
+    until = (ctypes.c_long * 2)(*divmod(max(0, deadline_ns), 1_000_000_000))  # a timespec
+    # A signal ends the sleep early (EINTR); the deadline stays the same.
+    while _libc.clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, until, None) == errno.EINTR:
+        pass
 
 
 def watch_until(deadline_ns: int) -> int:
