@@ -191,12 +191,12 @@ def release_of(
     phase_ns: int | None = None,
     moves: Sequence[tuple[int, int]] = (),
 ) -> Release:
-    """Decide when a message that arrived at ``arrival_ns`` may leave (ns of CLOCK_MONOTONIC).
+    """Decide when a message may leave; times are ns of CLOCK_MONOTONIC.
 
-    ``stamp_ns`` is its origin, None if it has none; ``changes`` are the modes that were announced,
-    each with the time, ascending. It leaves at ``ready_ns`` at the earliest, where others are
-    before it. ``phase_ns`` stands for the gate's own. ``moves`` are from when on slots are moved,
-    ascending, and by how much from where the gate has them.
+    ``stamp_ns`` is its origin, if it has one; ``changes`` are the modes that were announced, each
+    with the time, ascending. It leaves at ``ready_ns`` at the earliest, where others are before it.
+    ``phase_ns`` stands for the gate's own. ``moves`` are from when on slots are moved, ascending,
+    and by how much from where the gate has them.
 
         >>> gate = Gate(slots=((60, 61),), cycle_ns=100)
         >>> release_of(gate, arrival_ns=1040, stamp_ns=1000).at_ns      # early: it waits
@@ -492,9 +492,9 @@ class Queue:
 class Shaper:
     """A gate at work: holds each message until its release, and minds the clocks.
 
-    Stamps are CLOCK_REALTIME, sleeping is CLOCK_MONOTONIC; the offset between the two is taken
-    anew for every message, since the wall clock may be stepped. Messages under way during a step
-    are anchored to the cycle instead, at the phase that the last good stamp had.
+    Stamps are CLOCK_REALTIME, and the wall clock may be stepped: its offset is taken anew for every
+    message. Messages under way during a step are anchored to the cycle instead, at the phase that
+    the last good stamp had.
 
     One shaper belongs to one thread, which does nothing else at the time of a release. Its owner
     sets what it calls: ``look`` has new messages :meth:`arrive`, while others wait, before each
@@ -649,8 +649,7 @@ class Shaper:
 # ``first``, the paper's: as they come, but none that "has not come after a certain time interval
 # with respect to the previous one" that passed. A whole period would halve an input that is a
 # little faster, so it is four fifths; and only the first of each period passes. Periods follow each
-# other, each from a fifth before its message is due, so that behind a late message none is lost.
-# After one in which none passed the next is in time.
+# other, each from a fifth before its message is due: behind a late message none is lost.
 
 Rule: TypeAlias = Literal["newest", "first"]
 RULES = get_args(Rule)

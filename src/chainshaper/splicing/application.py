@@ -25,11 +25,9 @@ from chainshaper.workload.description import (
 
 
 def splice_application(application: Application, plan: Plan | ApplicationPlan) -> Application:
-    """The application as the plan wants it to run; the given one is left as it is.
+    """The application as the plan wants it to run, with chains at its offsets, as a new one.
 
-    The timers that start chains expire when their cycles start: so much after the common start as
-    the plan's offsets say. Raises InputError: the plan shapes nothing, or does not fit the
-    application.
+    Raises InputError: the plan shapes nothing, or does not fit the application.
     """
     joint = whole(plan)
     application = _placed(at_offsets(application, joint), joint)
@@ -47,7 +45,7 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
 
 
 def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
-    """The application with timers that start chains expiring at the chains' offsets.
+    """The application with timers that expire at the offsets of the chains that they start.
 
     InputError: the application lacks a chain of the plan, or it has another period there.
     """

@@ -1,12 +1,11 @@
 """Redirects topics of nodes while `ros2 launch` starts them, in the Python of ROS 2.
 
-`splice` writes this file beside the launch file that loads it, so it needs the standard library,
-`launch` and `launch_ros` only. Two functions of these know a node's name and remap rules in full,
-for whatever reason it is started: `Executable.prepare` has made the command line of a process, and
-`get_composable_node_load_request` the request to a container (Humble to Rolling). Behind both,
-rules are added for the nodes that are meant, each bound to the node's name (``ndt:/pose:=…``).
-`LoadComposableNodes._load_node` sends such a request; where the shaping node is a component, one
-for it follows that of the publisher.
+This file is written beside the launch file that loads it: it needs the standard library, `launch`
+and `launch_ros` only. Two functions of these know a node's name and remap rules in full (Humble to
+Rolling): `Executable.prepare` has made the command line of a process, and
+`get_composable_node_load_request` the request to a container. Behind both, rules are added for the
+nodes that are meant, each bound to the node's name (``ndt:/pose:=…``). Where the shaping node is a
+component, a request for it follows that of the publisher.
 
 ROS 2 follows the first rule that matches a name, and does not match the result again (upstream:
 `rcl_remap_first_match`). So a rule that leads to the topic is preceded by ours for the same name,
@@ -405,10 +404,8 @@ def dry_run(
     arguments: dict[str, str],
     folder: str,
 ) -> list[dict[str, Any]]:
-    """Carry out launch files in a folder without starting a process.
-
-    For each redirect: who would be redirected, and what is wrong with that. Timers fire at once,
-    and what event handlers would start is started.
+    """Carry out launch files in a folder without starting a process: who would be redirected, and
+    what is wrong with that. Timers fire at once, and what event handlers would start is started.
     """
     import asyncio
 

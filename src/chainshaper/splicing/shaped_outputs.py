@@ -1,7 +1,5 @@
-"""Which outputs are shaped on this machine at the moment, and which go around their shaping node.
-
-Shaping nodes and their standbys share a page of memory for each output
-(:mod:`chainshaper.gate.handover`). Here it is only looked at: nothing is locked or changed.
+"""Which outputs are shaped on this machine at the moment, and which go around their shaping node:
+what their pages of memory say (:mod:`chainshaper.gate.handover`).
 """
 
 import os

@@ -1,10 +1,9 @@
 """The shaping node of a plan as a ROS 2 process: its files, and what a launch file has to start.
 
-Four kinds do the same: ``python`` needs no building, ``cpp`` is one package for all types,
-``typed`` is the paper's package (section 4.2), generated for one type, and ``component`` is that as
-a component, for the container of the output's publisher. All read the same parameters, which say
-what the plan says, and write the same log. So does the gate in the publisher's process, for plans
-with ``in_process``: a library that stands in front of rmw.
+Four kinds do the same, with the same parameters and log: ``python`` needs no building, ``cpp`` is
+one package for all types, ``typed`` is the paper's package (section 4.2), generated for one type,
+and ``component`` is that as a component, for the container of the output's publisher. So does the
+gate in the publisher's process, for plans with ``in_process``: a library in front of rmw.
 """
 
 import ast
@@ -97,9 +96,9 @@ def write_shaping_process(
 ) -> ShapingProcess:
     """Write a shaping node of a plan into ``folder``; what a launch file has to start.
 
-    ``message_type`` is the type of the chain's output, such as ``sensor_msgs/msg/Image``, for which
-    ``typed`` and ``component`` are generated. ``log`` is where the node notes what it did with each
-    message. Files that are to be moved to ``folder`` later are written ``into`` another one. Raises
+    ``message_type`` is the output's, such as ``sensor_msgs/msg/Image``, for which ``typed``
+    and ``component`` are generated. ``log`` is where the node notes what it did with each message.
+    Files that are to be moved to ``folder`` later are written ``into`` another one. Raises
     InputError: a file is there with another content; no type for a kind that needs one, or none
     that there is. OperationError: a file cannot be written.
     """
@@ -174,10 +173,9 @@ def write_throttler(
 
     Each of the ``topics`` is republished on the one it maps to, once every ``period_ns``: by the
     ``rule`` ``newest`` at ``phase_ns`` after multiples of it on CLOCK_MONOTONIC, by ``first`` as it
-    comes (:mod:`chainshaper.gate.decision`). ``depth`` is the history of the publishers where
-    that of the originals is not known; ``into`` as for a shaping process. Raises InputError: no
-    topics or period, ``first`` with a phase, or another file is there. OperationError: a file
-    cannot be written.
+    comes. ``depth`` is the history of the publishers where that of the originals is not known;
+    ``into``, and errors, as for a shaping process; InputError also: no topics or period, or
+    ``first`` with a phase.
     """
     if not topics or period_ns <= 0:
         raise InputError("a throttler needs topics and a period longer than nothing")

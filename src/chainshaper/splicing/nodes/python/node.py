@@ -152,10 +152,8 @@ def become_realtime(node: Node) -> None:
 
 
 def run(name: str, set_up: Callable[[Node], Callable[[], bool]], *, realtime: bool = True) -> None:
-    """Run a node until it is interrupted.
-
-    ``set_up`` makes its endpoints. What it returns is called behind each callback, and says
-    whether it wants to be called again although nothing has come.
+    """Run a node until it is interrupted: ``set_up`` makes its endpoints. What it returns is called
+    behind each callback, and says whether it wants to be called again although nothing has come.
     """
     rclpy.init()
     # What is in the parameter file, is declared.
@@ -303,8 +301,7 @@ def publish_function(publisher: Any) -> Callable[[bytes], None]:
 #
 # A process of its own writes the file, so that neither a slow disk nor a full one can delay the
 # gate: that only puts a line into a pipe, and goes on without it where the pipe is full. What is in
-# the pipe is written although the gate is killed. Rows are numbered, so that missing ones can be
-# counted.
+# the pipe is written although the gate is killed. Missing rows show by their numbers.
 
 LOG_HEADER = f"{','.join(LOG_COLUMNS)}\n".encode()
 SAID_EVERY_NS = 10_000_000_000
@@ -348,10 +345,7 @@ def _write_rows(path: str, header: bytes, most_bytes: int) -> None:
 
 
 class GateLog:
-    """What a gate did, a row per message, and the sums of what it lost.
-
-    The file is the node's parameter ``log``; without one there are only the sums.
-    """
+    """What a gate did, a row per message if there is a file, and the sums of what it lost."""
 
     def __init__(self, node: Node) -> None:
         parameters = parameters_of(node)

@@ -1,9 +1,9 @@
 """The latency-shaping node, for messages of any type (paper, section 3.2.2).
 
-What it receives on ``input`` it republishes on ``output``, byte for byte, in the slots of its
-server. It has one thread, which receives, holds, publishes, rests so that the message is delivered
-although this thread out-ranks others, and only then notes what it did. What comes meanwhile it
-takes, too: it waits at the gate, and a callback is executed for it when it is its turn.
+It republishes on ``output`` what it receives on ``input``, byte for byte, in the slots of its
+server. Its one thread receives, holds, publishes, rests so that the message is delivered although
+this thread out-ranks others, and only then notes what it did. What comes meanwhile waits at the
+gate, and a callback is executed for it when it is its turn.
 """
 
 import gc
@@ -114,8 +114,7 @@ def listen_to_modes(node: Node, shaper: Shaper, topic: str) -> None:
 def turn_of(node: Node, name: str) -> Turn | None:
     """What is agreed with the standby on the page of this name; None: the node is alone.
 
-    After several nodes that failed at once this one waits, so that starting over and over does not
-    take a core: to be called before anything that may fail.
+    To be called before what may fail: one that follows several that failed at once waits here.
     """
     if not name:
         return None
@@ -194,8 +193,7 @@ class Shaping:
     def _await_receivers(self, node: Node, publisher: Any) -> None:
         """Leave the output to the standby, if there is one, until its receivers know this node too.
 
-        What is published before is lost to them. How far discovery has come at the other side
-        cannot be seen: it is given a little longer.
+        How far discovery has come at the other side cannot be seen: it is given a little longer.
         """
         topic, give_up = node.resolve_topic_name("output"), time.monotonic() + DISCOVERY_S
         page = None if self._turn is None else self._turn.page

@@ -2,9 +2,8 @@
 
 It publishes what the shaping node receives on the same output, byte for byte and at once, while
 no shaping node is in force (:mod:`chainshaper.gate.handover`). With the fallback ``silence`` it
-publishes nothing, and counts what does not come. Either way it says so: in its log, with the
-columns of the gate's, by a warning, and on `/diagnostics` where diagnostic_msgs is installed. It
-runs in the ordinary class, and on no core that has a server where there is another.
+only counts what does not come. Either way it says so: in a log like the gate's, by a warning, and
+on `/diagnostics` where diagnostic_msgs is installed. It runs in the ordinary class.
 """
 
 import importlib

@@ -1,10 +1,9 @@
 """The throttler, for chains whose input is not quite periodic (paper, section 5.1).
 
 Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place, by a ``rule``
-of :mod:`chainshaper.gate.decision`. Times of ``newest`` are ``phase_ns`` after multiples of
-``period_ns`` on CLOCK_MONOTONIC. Where none came nothing is published, and where several came the
-older ones are dropped; both are counted, and said at the end. ``first`` is periodic only behind the
-paper's server, a slot of 2 ms in every cycle; a timer is so on every kernel.
+of :mod:`chainshaper.gate.decision`. What is dropped, and how often nothing had come, is said at the
+end. ``first`` is periodic only behind the paper's server, a slot of 2 ms in every cycle; the timer
+of ``newest`` is so on every kernel.
 """
 
 import atexit
