@@ -175,34 +175,10 @@ void write_log(const std::string & path, std::int64_t most_bytes, int rows) {
   }
 }
 
-// Cycles of 4 s are to begin 2 s from now instead: when one begins before that is in force (counted
-// from where one did), and behind it (counted from where the first was to). In ms.
-void moved_phase() {
-  Gate gate;
-  gate.cycle_ns = 4'000'000'000;
-  gate.slots = {{0, gate.cycle_ns}};
-  gate.anchor = Anchor::cycle;
-  Shaper<int> shaper(gate, 0);
-  const std::int64_t now = monotonic_ns();
-  const std::int64_t moved = now + 2'000'000'000;
-  shaper.set_phase(moved % gate.cycle_ns, now);
-  const auto origin = [&] {
-    shaper.arrive(0, std::nullopt);
-    return shaper.hold()->release.origin_ns;
-  };
-  std::cout << origin() % gate.cycle_ns / 1'000'000 << "\n";
-  sleep_until(moved);
-  std::cout << (origin() - moved) / 1'000'000 << "\n";
-}
-
 }  // namespace
 
 int main(int argc, char ** argv) {
   const std::string what = argc > 1 ? argv[1] : "";
-  if (what == "--phase") {
-    moved_phase();
-    return 0;
-  }
   if (what == "--origins") {
     show_origins();
     return 0;

@@ -101,21 +101,23 @@ def test_the_same_again_leaves_the_folder_and_another_plan_replaces_it(
     assert [path.name for path in robot.parent.iterdir() if path.name.startswith(".")] == []
 
 
-def test_an_empty_folder_may_be_filled_but_it_needs_a_parent(
-    tmp_path: Path, robot: Path, plan: Plan
+def test_an_empty_folder_may_be_filled_but_it_needs_a_parent_and_the_original(
+    spliced: Splicing, tmp_path: Path, robot: Path, plan: Plan
 ) -> None:
     (tmp_path / "empty").mkdir()
     assert splice_launch_files(plan, [robot], tmp_path / "empty").folder == tmp_path / "empty"
     assert (tmp_path / "empty/robot.launch.py").is_file()
     with pytest.raises(InputError, match="no such folder to write spliced into"):
         splice_launch_files(plan, [robot], tmp_path / "no" / "spliced")
+    robot.unlink()
+    with pytest.raises(InputError, match=r"robot\.launch\.xml: cannot be read \(No such file"):
+        splice_launch_files(plan, [spliced.folder / "robot.launch.py"], tmp_path / "again")
 
 
 def test_the_older_folder_comes_back_where_the_new_one_cannot_take_its_place(
     spliced: Splicing, robot: Path, plan: Plan
 ) -> None:
-    before = _tree(spliced.folder)
-    rename = Path.rename
+    before, rename = _tree(spliced.folder), Path.rename
 
     def failing(source: Path, target: Path) -> Path:
         if ".partial-" in source.name:
@@ -127,17 +129,8 @@ def test_the_older_folder_comes_back_where_the_new_one_cannot_take_its_place(
         pytest.raises(OperationError, match=r"cannot be written: .*Input/output error"),
     ):
         splice_launch_files(revised(plan, overrun="discard"), [robot], spliced.folder)
-
     assert _tree(spliced.folder) == before
     assert [path.name for path in robot.parent.iterdir() if path.name.startswith(".")] == []
-
-
-def test_a_copy_whose_original_is_gone_names_the_original(
-    spliced: Splicing, robot: Path, plan: Plan, tmp_path: Path
-) -> None:
-    robot.unlink()
-    with pytest.raises(InputError, match=r"robot\.launch\.xml: cannot be read \(No such file"):
-        splice_launch_files(plan, [spliced.folder / "robot.launch.py"], tmp_path / "again")
 
 
 def test_a_folder_that_cannot_be_written_leaves_nothing(

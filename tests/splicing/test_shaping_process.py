@@ -30,7 +30,6 @@ from chainshaper.gate import decision as gate
 from chainshaper.gate.decision import READER_DEPTH, NodeParameters, gate_parameters
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import ShapingNode, revised
-from chainshaper.planning.shaping import let_per_callback
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
     ShapingProcess,
@@ -38,7 +37,7 @@ from chainshaper.splicing.shaping_process import (
     write_shaping_process,
     write_throttler,
 )
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import NodeKind
 
 MS = 1_000_000
@@ -148,13 +147,6 @@ def test_a_gate_with_modes_is_the_same_behind_its_parameters(plan: Plan, node: S
     assert modes == names | usual
 
 
-def test_under_let_each_topic_is_due_a_cycle_after_the_one_before_it(plan: Plan) -> None:
-    plan = let_per_callback(plan, ("/t1", "/t2", "/t3"))
-    nodes = (*plan.further_shaping_nodes, known(plan.shaping_node))
-    due = {node.output: gate_of(plan, node).due_cycles for node in nodes}
-    assert due == {"/t1": 1, "/t2": 2, "/t3": 3}
-
-
 @pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
 def test_writing_again_changes_nothing_and_what_is_there_is_not_overwritten(
     tmp_path: Path, plan: Plan, node: ShapingNode, kind: NodeKind, monkeypatch: pytest.MonkeyPatch
@@ -176,11 +168,6 @@ def test_writing_again_changes_nothing_and_what_is_there_is_not_overwritten(
     with pytest.raises(InputError, match=r"chainshaper_t3\.yaml exists already with another"):
         files()
     assert parameters.read_text() == "mine"
-
-
-def test_what_cannot_be_written_is_named(full_disk: Path, plan: Plan, node: ShapingNode) -> None:
-    with pytest.raises(OperationError, match=r"cannot be written: No space left"):
-        write_shaping_process(plan, node, "python", full_disk / "new")
 
 
 def test_a_typed_node_needs_a_type(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:

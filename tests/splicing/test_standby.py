@@ -262,9 +262,12 @@ def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cann
 def test_pages_of_others_are_looked_at_without_trust(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    folder = tmp_path / "outputs"
-    monkeypatch.setattr("chainshaper.gate.handover.page_folders", lambda: iter([str(folder)]))
-    good, bad = open_page("good", "/t5"), open_page("bad", "/t5\x1b[31m")
+    """Another robot, in another domain, has an output of the same name."""
+    folder, topic = tmp_path / "outputs", f"/of_{os.getpid()}"
+    for module in ("gate.handover", "splicing.shaped_outputs"):
+        name = f"chainshaper.{module}.page_folders"
+        monkeypatch.setattr(name, lambda: iter([str(folder), str(tmp_path / "missing")]))
+    good, bad = open_page("good", topic), open_page("bad", f"{topic}\x1b[31m")
     assert find_outputs([str(folder)]) == (), "none of their processes lives"
     for page in (good, bad):
         assert page.lock()
@@ -273,29 +276,16 @@ def test_pages_of_others_are_looked_at_without_trust(
     (folder / "link").symlink_to(good.path)
     os.mkfifo(folder / "fifo")
     (output,) = find_outputs([str(folder), str(tmp_path / "missing")])
-    assert (output.topic, output.state) == ("/t5", "no standby")
+    assert (output.topic, output.state) == (topic, "no standby")
     assert "it falls silent when that ends" in output_text(output)
-
-
-def test_an_output_is_that_of_the_processes_that_are_meant_and_of_its_page_s_owner(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Another robot, in another domain, has an output of the same name."""
-    folder = tmp_path / "outputs"
-    monkeypatch.setattr("chainshaper.gate.handover.page_folders", lambda: iter([str(folder)]))
-    monkeypatch.setattr("chainshaper.splicing.shaped_outputs.page_folders", lambda: [str(folder)])
-    topic = f"/of_{os.getpid()}"
-    page = open_page("t5", topic)
-    assert page.lock()
-    page["holder"] = os.getpid()
     FollowedOutput(topic, {1, os.getpid()}).close()
     FollowedOutput(topic).close()
     with pytest.raises(OperationError, match="no gates publish it now"):
         ask_phase(topic, {1}, 5)
     if os.geteuid():
         pytest.skip("giving files to another user takes root")
-    os.chown(folder, 65534, -1)
-    os.chown(page.path, 65534, -1)
+    for path in (folder, good.path):
+        os.chown(path, 65534, -1)
     assert find_outputs([str(folder)]) == (), "root's process is named on another user's page"
 
 
