@@ -43,7 +43,6 @@ void emit_write(const void * publisher, const void * message, std::int64_t stamp
     EMIT(rmw_publish, publisher, message, stamp);
 }
 
-// A message as it is sent.
 class Serialized {
 public:
   Serialized() { bytes.allocator = RMW(rcutils_get_default_allocator)(); }
@@ -61,7 +60,6 @@ public:
 };
 using Message = std::unique_ptr<Serialized>;
 
-// A block of the file.
 struct Settings {
   explicit Settings(const Block & values) {
     output = first_of(values, "output"), input = first_of(values, "input");
@@ -242,7 +240,6 @@ private:
     }
   }
 
-  // Take all that has come, and what has changed.
   void look() {
     if (over_) throw Over();
     read_modes();
@@ -270,7 +267,6 @@ private:
     });
   }
 
-  // The oldest message leaves, or is dropped.
   void serve() {
     const auto & oldest = shaper_.queue.waiting.front();
     EMIT(rmw_take, &rmw_subscription_, oldest.message.get(), oldest.message->stamp, true);

@@ -23,7 +23,6 @@
 
 namespace chainshaper {
 
-// A number, or none.
 using Maybe = std::optional<std::int64_t>;
 
 // A half-open interval, counted from the anchor.
@@ -82,7 +81,6 @@ struct Gate {
   }
 };
 
-// A mode that was announced, and when.
 using Change = std::pair<std::int64_t, std::size_t>;
 
 // From when on slots are moved, and by how much from where the gate has them.
@@ -118,7 +116,6 @@ struct Release {
   }
 };
 
-// Throws std::invalid_argument for a gate that makes no sense.
 inline void check(const Gate & gate) {
   const auto & slots = gate.slots;
   bool sound = gate.cycle_ns > 0 && !slots.empty() && gate.due_cycles >= 0 && gate.depth > 0;
@@ -173,7 +170,6 @@ inline std::size_t depth_of(const Parameters & parameters, std::size_t history) 
   return std::max<std::size_t>(schema::depth, history);
 }
 
-// As Python's: never negative.
 inline std::int64_t modulo(std::int64_t value, std::int64_t cycle_ns) {
   const std::int64_t rest = value % cycle_ns;
   return rest < 0 ? rest + cycle_ns : rest;
@@ -241,7 +237,6 @@ inline std::uint32_t word_at(const std::uint8_t * payload, std::size_t at) {
   return value;
 }
 
-// The header stamp of a serialized message in ns of its clock; none if it is zero or short.
 inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
   if (size < 12) return std::nullopt;
   const std::int64_t seconds = static_cast<std::int32_t>(word_at(payload, 4));
@@ -250,7 +245,6 @@ inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
   return seconds * 1'000'000'000 + nanoseconds;
 }
 
-// The text of a serialized std_msgs/String; none where the bytes are none.
 inline std::optional<std::string> text_of(const std::uint8_t * payload, std::size_t size) {
   if (size < 8) return std::nullopt;
   const std::size_t length = word_at(payload, 4);  // with the final NUL
@@ -284,7 +278,6 @@ public:
     check(this->gate);
   }
 
-  // The wall clock was stepped: stamps are of no use until what is under way has come.
   void doubt_stamps(std::int64_t now_ns) {
     unsure_until_ns_ = now_ns + (gate.due_cycles + 1) * gate.cycle_ns;
   }
@@ -453,7 +446,6 @@ public:
     next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
   }
 
-  // Nothing where that is where the slots are, or they would leave the cycle.
   void move_slots(std::int64_t by_ns, std::int64_t from_ns) {
     const auto & moves = queue.moves;
     if (by_ns != (moves.empty() ? 0 : moves.back().second) && queue.gate.may_move(by_ns))
@@ -464,7 +456,6 @@ public:
     if (const auto move = moved()) move_slots(move->second, move->first);
   }
 
-  // False: there is no mode like it.
   bool announce(const std::string & name, std::int64_t now_ns) {
     const auto & modes = queue.gate.modes;
     const auto mode = modes ? place_of(modes->names, name) : std::nullopt;
@@ -538,7 +529,6 @@ public:
     queue.free_ns = monotonic_ns();
   }
 
-  // Of a message that was released.
   std::int64_t time_lost(const Outcome<Message> & outcome) {
     const std::int64_t others = others_ran_ns() - waited_ns_;
     const std::int64_t since_ns = std::max(*outcome.release.at_ns, turn_ns_);

@@ -39,8 +39,6 @@ public:
     return opened;
   }
 
-  // `published_ns` is when publishing returned, `stalled_ns` for how long the machine stood still
-  // behind the release; none for a message that was dropped.
   template <typename Message>
   void write(const Gate & gate, const Outcome<Message> & outcome, Maybe published_ns = {},
              Maybe stalled_ns = {}) {
@@ -60,7 +58,6 @@ public:
       ++unlogged;
   }
 
-  // What is lost so far, in words; empty: nothing.
   std::string losses() const {
     std::string said;
     const auto add = [&](std::size_t count, const char * why) {
@@ -118,7 +115,6 @@ private:
     return one ? words[static_cast<std::size_t>(*one)] : "";
   }
 
-  // The values of the columns, in the order of `log_header`.
   template <typename... Values>
   void row(const Values &... values) {
     static_assert(sizeof...(values) == schema::log_columns);

@@ -51,7 +51,6 @@ public:
     close(file_);
   }
 
-  // The number at a place; another process writes there as well.
   std::int64_t get(std::size_t place) const {
     return __atomic_load_n(static_cast<const std::int64_t *>(memory_) + place, __ATOMIC_SEQ_CST);
   }
@@ -78,14 +77,12 @@ public:
     return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
   }
 
-  // Put a number into the ring at this place.
   void note(std::size_t count, std::int64_t ring, std::int64_t value) {
     const auto number = get(count);
     set(static_cast<std::size_t>(ring + number % schema::ring), value);
     set(count, number + 1);
   }
 
-  // The latest messages of the ring at this place, ascending.
   std::vector<std::int64_t> noted(std::size_t ring) const {
     std::vector<std::int64_t> found(schema::ring);
     for (auto & one : found) one = get(ring++);
@@ -117,7 +114,6 @@ inline std::vector<std::string> page_folders() {
   return folders;
 }
 
-// A folder that is ours alone, made where there is none.
 inline void check_private(const std::string & folder) {
   mkdir(folder.substr(0, folder.rfind('/')).c_str(), 0755);
   mkdir(folder.c_str(), 0700);
@@ -128,8 +124,6 @@ inline void check_private(const std::string & folder) {
     throw std::runtime_error(folder + ": it is not a folder of this user alone (mode 0700)");
 }
 
-// The page of an output: the one that is there, or else a new one. Throws where no folder is ours
-// alone.
 inline std::unique_ptr<Page> open_page(const std::string & name, const std::string & topic,
                                        const std::vector<std::string> & folders) {
   const auto domain = std::to_string(std::atoi(text_in_environment("ROS_DOMAIN_ID").c_str()));
@@ -167,7 +161,6 @@ public:
 
   bool has_standby() const { return page_->is_locked(schema::standing_by); }
 
-  // How many nodes before this one have failed, shortly one after the other.
   std::int64_t failed_before() const { return page_->get(Field::failed_starts) - 1; }
 
   double wait_s() const {
@@ -198,7 +191,6 @@ public:
     return !was_bypassed(key);
   }
 
-  // The message is released then, if ever; cycles begin at `phase_ns`, and its cycle has this mode.
   void hold(Maybe until_ns, std::int64_t phase_ns, std::optional<std::size_t> mode = std::nullopt) {
     page_->set(Field::mode, mode ? static_cast<std::int64_t>(*mode) + 1 : 0);
     if (until_ns) page_->set(Field::until_ns, *until_ns);
@@ -244,7 +236,6 @@ public:
     }
   }
 
-  // A message that was received has no room any more, and is never published.
   void drop(std::int64_t key) { page_->note(Field::released, schema::released, key); }
 
   // Where cycles are asked to begin, once each time; none: as they do.
@@ -255,7 +246,6 @@ public:
     return page_->get(Field::asked_phase_ns);
   }
 
-  // How slots are to be moved; none: as they are.
   std::optional<Move> moved() {
     const auto since = page_->get(Field::moved_from_ns);
     const auto by = page_->get(Field::moved_ns);

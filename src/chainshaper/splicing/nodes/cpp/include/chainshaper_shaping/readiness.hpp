@@ -31,7 +31,6 @@ public:
     sem_destroy(&more_);
   }
 
-  // Clear the core from now until that time of CLOCK_MONOTONIC.
   void clear_until(std::int64_t time_ns) {
     until_ns_ = time_ns;
     sem_post(&more_);
@@ -89,7 +88,6 @@ public:
       if (file >= 0) close(file);
   }
 
-  // For a release at that time of CLOCK_MONOTONIC, as far as there is time left for it.
   void get_ready(std::int64_t release_ns) {
     ask_for(0);
     if (delivery_core_) delivery_core_->clear_until(release_ns + pause_ns_);
