@@ -15,6 +15,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from unittest.mock import MagicMock
 
 from chainshaper.gate import decision, handover
 
@@ -36,9 +37,11 @@ def main() -> None:
     folder, what, name, port, hold = sys.argv[1:]
     handover.page_folders = lambda: iter([folder])
     if what == "starting":
-        turn = handover.Turn(name, "/t5")
-        if turn.phase_ns is not None or turn.page["mode"]:
-            print(turn.phase_ns, ("city", "highway")[turn.page["mode"] - 1])  # noqa: T201
+        modes, asked = decision.Modes({"city": 0, "highway": 0}, "city"), list[object]()
+        shaper = MagicMock(gate=decision.Gate(((0, 1),), 2, modes=modes))
+        shaper.set_phase = shaper.switch = lambda what, _: asked.append(what)
+        handover.Turn(name, "/t5").go_on(shaper)
+        print(*asked)  # noqa: T201
         return
     if what == "counting":
         turn = handover.Turn(name, "/t5")

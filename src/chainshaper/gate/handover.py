@@ -32,7 +32,7 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from chainshaper.gate.decision import DROPPED, Outcome, Waiting
+from chainshaper.gate.decision import DROPPED, Outcome, Release, Shaper, Waiting
 
 FIELDS = (
     "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
@@ -258,15 +258,26 @@ class Turn:
         self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
 
     @property
-    def phase_ns(self) -> int | None:
-        """Where cycles began for the shaping node before this one, if that is the same launch's."""
-        return self.page["phase_ns"] if self.page["phase_known"] else None
-
-    @property
     def wait_s(self) -> float:
         """For how long to wait before starting: nodes before this one have failed at once."""
         failed = self.page["failed_starts"] - 1 - BACK_OFF_AFTER
         return 0.0 if failed < 0 else min(10.0, 0.5 * 2**failed)
+
+    def go_on(self, shaper: Shaper) -> None:
+        """Have cycles of a gate begin where they did for the one before it in the same launch, in
+        its mode; the page shows each decision, and says how slots are to be moved.
+        """
+        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.bands]
+
+        def decided(release: Release, phase_ns: int) -> None:
+            mode = 0 if release.mode is None else modes.index(release.mode) + 1
+            self.hold(release.at_ns, phase_ns, mode)
+
+        shaper.moved, shaper.on_decision = self.moved, decided
+        if self.page["phase_known"]:  # from now on, not the next cycle
+            shaper.set_phase(self.page["phase_ns"], time.monotonic_ns() - shaper.gate.cycle_ns)
+        if 0 < (mode := self.page["mode"]) <= len(modes):
+            shaper.switch(modes[mode - 1], 0)
 
     def take(self, key: int | None) -> bool:
         """Whether a message that was received is this node's to deal with."""

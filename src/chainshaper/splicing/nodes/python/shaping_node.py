@@ -21,7 +21,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from std_msgs.msg import Empty, String
 
 from chainshaper.gate.clear_core import ClearCore
-from chainshaper.gate.decision import Outcome, Release, Shaper, clock_offset
+from chainshaper.gate.decision import Outcome, Shaper, clock_offset
 from chainshaper.gate.handover import STANDING_BY, Turn
 from chainshaper.splicing.nodes.python.node import (
     HUMBLE,
@@ -148,11 +148,10 @@ class Shaping:
         parameters.gate()  # one that makes no sense is refused before its input is there
         info = wait_for_publisher(node, "input")
         depth, offered, asked = room_of(node, info)
-        gate = parameters.gate(depth)
-        self._shaper = Shaper(gate, parameters.spin_ns)
+        self._shaper = Shaper(parameters.gate(depth), parameters.spin_ns)
         self._shaper.on_waking, self._shaper.look = self._readiness.get_ready, self._look
         if self._turn is not None:
-            self._go_on(self._turn, [] if gate.modes is None else list(gate.modes.bands))
+            self._turn.go_on(self._shaper)
         self._number: int | None = None  # the publisher's, of the last message
         self._its_turn = False  # of the oldest message
         node.add_on_set_parameters_callback(self._parameters_set)
@@ -166,22 +165,6 @@ class Shaping:
         self._input = create_subscription(node, self._type, "input", shape, asked, raw=True)
         self._take = take_event(self._input)
         self._await_receivers(node, publisher)
-
-    def _go_on(self, turn: Turn, modes: list[str]) -> None:
-        """Have cycles begin where they did for the node before this one, in its mode; the standby
-        sees each decision.
-        """
-
-        def decided(release: Release, phase_ns: int) -> None:
-            mode = 0 if release.mode is None else modes.index(release.mode) + 1
-            turn.hold(release.at_ns, phase_ns, mode)
-
-        self._shaper.moved, self._shaper.on_decision = turn.moved, decided
-        if turn.phase_ns is not None:  # from now on, not the next cycle
-            now = time.monotonic_ns() - self._shaper.gate.cycle_ns
-            self._shaper.set_phase(turn.phase_ns, now)
-        if 0 < (mode := turn.page["mode"]) <= len(modes):
-            self._shaper.switch(modes[mode - 1], 0)
 
     def _parameters_set(self, parameters: Any) -> Any:
         """``phase_ns`` may be set while the node runs, in force from the next cycle on."""
