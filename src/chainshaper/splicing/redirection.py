@@ -46,12 +46,7 @@ class Started:
     label: str
     named: bool  # by the launch; else ROS 2 follows the rules if the executable is of that name
     rules: Sequence[str]  # that were added
-    action: Any = None  # a process's
-
-    @property
-    def runs(self) -> bool:
-        """Whether it has not ended, as far as launch knows."""
-        return getattr(self.action, "return_code", None) is None
+    action: Any = None  # a process's, which knows when that has ended
 
 
 @dataclass
@@ -107,7 +102,8 @@ class Redirect:
 
         A node that launch runs under its name need not have the target yet, but runs once only.
         """
-        running = [one.node for one in self.started if one.named and one.runs]
+        run = [one for one in self.started if getattr(one.action, "return_code", None) is None]
+        running = [one.node for one in run if one.named]
         if twice := [node for node in self.nodes if running.count(node) > 1]:
             return f"more was redirected than meant: {_names(twice)} was started more than once"
         lacking = [node for node in self.nodes if node not in {*on_target, *running}]
@@ -314,24 +310,21 @@ def launch_description(
 def _begin(context: Any, redirects: Sequence[Redirect]) -> list[Any] | None:
     """Redirect from here on, and see whether all is right when the application runs."""
     from launch.actions import OpaqueFunction, TimerAction
+    from launch_ros.ros_adapters import get_ros_node
+
+    def listen(context: Any) -> None:
+        get_ros_node(context)  # who takes part in ROS 2 for a while knows its graph
 
     redirect_from_now_on(redirects)
     if hasattr(context.locals, _DRY_RUN):
         return None
     within_s = float(context.launch_configurations.get(WITHIN, WITHIN_S))
-    listen = OpaqueFunction(function=_listen)
+    begin = OpaqueFunction(function=listen)
     check = OpaqueFunction(function=_check, args=[redirects])
     return [
-        TimerAction(period=max(0.0, within_s - DISCOVERY_S), actions=[listen]),
+        TimerAction(period=max(0.0, within_s - DISCOVERY_S), actions=[begin]),
         TimerAction(period=within_s, actions=[check]),
     ]
-
-
-def _listen(context: Any) -> None:
-    """Take part in ROS 2, so that its graph is known when it is asked for."""
-    from launch_ros.ros_adapters import get_ros_node
-
-    get_ros_node(context)
 
 
 def redirect_from_now_on(redirects: Sequence[Redirect]) -> None:

@@ -106,13 +106,9 @@ def output_text(output: ShapedOutput) -> str:
     if output.published or lost:
         text += f"; so far {output.published} messages published, {output.late} late{lost}"
     if output.moved_ns:
-        text += f"; its slots {moved_text(output.moved_ns)}"
+        sign = "-" if output.moved_ns < 0 else "+"
+        text += f"; its slots are moved by {sign}{duration_text(abs(output.moved_ns))}"
     return text
-
-
-def moved_text(moved_ns: int) -> str:
-    """``are moved by +2ms``."""
-    return f"are moved by {'-' if moved_ns < 0 else '+'}{duration_text(abs(moved_ns))}"
 
 
 def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
@@ -182,19 +178,18 @@ class FollowedOutput:
         self._page.close()
 
 
-def _user_of(pid: int) -> int | None:
-    """The real user of a process, None if there is none: any user may write its id into a page."""
-    try:
-        return next(iter(status_field(read_proc(f"/proc/{pid}/status"), "Uid")), None)
-    except OSError:
-        return None
+def _is_of(pid: int, user: int) -> bool:
+    """Whether a process has that real user: any user may write its id into a page."""
+    with suppress(OSError):
+        return status_field(read_proc(f"/proc/{pid}/status"), "Uid")[:1] == [user]
+    return False
 
 
 def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
     holder = page["holder"] if page.is_locked() else 0
     standby = page["standby"] if page.is_locked(STANDING_BY) else 0
     holder, standby = pid_of.get(holder, holder), pid_of.get(standby, standby)
-    holder = holder if _user_of(holder) == page.owner else 0
+    holder = holder if _is_of(holder, page.owner) else 0
     if not holder and not standby:
         return []
     since = page["bypassing_since_ns"] if standby else 0
