@@ -45,9 +45,15 @@ def parameters_of(node: Node) -> NodeParameters:
     return NodeParameters(**known)
 
 
-def threads_have_names() -> bool:
-    """Whether `apply` knows the threads that deliver. Fast DDS names them from 2.13 on (Jazzy)."""
-    return not (HUMBLE and get_rmw_implementation_identifier().startswith("rmw_fastrtps"))
+def delivery_core(taken: list[int]) -> int | None:
+    """Where DDS threads deliver the output: the first core that is ours to use and has no server.
+
+    None: the plan names no server's core, since it leaves receivers alone; or, with Fast DDS before
+    2.13 (Jazzy), they have no names, so no priority there, and would wait while the core is clear.
+    """
+    nameless = HUMBLE and get_rmw_implementation_identifier().startswith("rmw_fastrtps")
+    ours = os.sched_getaffinity(0) - set(taken)
+    return min(ours, default=None) if taken and not nameless else None
 
 
 def wait(seconds: float) -> None:

@@ -27,13 +27,13 @@ from chainshaper.splicing.nodes.python.node import (
     HUMBLE,
     GateLog,
     create_subscription,
+    delivery_core,
     message_class,
     parameters_of,
     publish_function,
     room_of,
     run,
     take_event,
-    threads_have_names,
     wait,
     wait_for_publisher,
 )
@@ -139,12 +139,7 @@ class Shaping:
         self._turn = turn_of(node, parameters.handover)
         self._log = GateLog(node)
         self._pause_ns = parameters.pause_ns
-        # DDS threads deliver the output on the first core that is ours to use and has no server;
-        # where the plan leaves receivers alone it does not name its servers' cores. Threads without
-        # names have no priority there, and would wait until it is clear no more.
-        taken = set(parameters.server_cores) if threads_have_names() else None
-        core = min(os.sched_getaffinity(0) - taken, default=None) if taken else None
-        self._readiness = Readiness(node, core, self._pause_ns)
+        self._readiness = Readiness(node, delivery_core(parameters.server_cores), self._pause_ns)
         parameters.gate()  # one that makes no sense is refused before its input is there
         info = wait_for_publisher(node, "input")
         depth, offered, asked = room_of(node, info)
@@ -257,12 +252,11 @@ class Shaping:
 
     def _arrive(self, payload: bytes, info: dict[str, int], *, waited: bool) -> None:
         source, number = info.get("source_timestamp"), info.get("publication_sequence_number")
-        last, self._number = self._number, number
-        lost = None if number is None else 0
-        if number is not None and last is not None:
-            lost = max(0, number - last - 1)  # a publisher that is started again counts anew
-        now = time.monotonic_ns()
-        overflowed, before = self._shaper.overflowed, len(self._shaper.overflowed)
+        last, self._number, lost = self._number, number, None
+        if number is not None:  # a publisher that is started again counts anew
+            lost = 0 if last is None else max(0, number - last - 1)
+        now, overflowed = time.monotonic_ns(), self._shaper.overflowed
+        before = len(overflowed)
         self._shaper.arrive(payload, now, source if waited else None, source, lost)
         if self._turn is None or len(overflowed) == before:
             return

@@ -60,19 +60,14 @@ def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
     publisher = node.create_publisher(messages.DiagnosticArray, "/diagnostics", 10)
 
     def report() -> None:
-        page = standby.page
-        level, text = 0, "shaped"
+        page, level, text = standby.page, 0, "shaped"
         if since := page["bypassing_since_ns"]:
             level, word = 1 + page["silent"], ("bypassed", "silent")[page["silent"]]
             seconds = (time.monotonic_ns() - since) / 1e9
             count = page["bypassed"] - page["bypassed_before"]
             text = f"{word} for {seconds:.1f} s, {count} messages"
-        values = {
-            "output": page.topic,
-            "shaping node": shaping_node,
-            "starts": page["starts"],
-            "messages without it": page["bypassed"],
-        }
+        values = {"output": page.topic, "shaping node": shaping_node, "starts": page["starts"]}
+        values["messages without it"] = page["bypassed"]
         pairs = [messages.KeyValue(key=key, value=str(value)) for key, value in values.items()]
         about = {"name": f"chainshaper: {page.topic}", "message": text, "hardware_id": ""}
         status = messages.DiagnosticStatus(level=bytes([level]), values=pairs, **about)
@@ -115,15 +110,11 @@ def set_up(node: Node) -> Callable[[], bool]:
         back = what.startswith("is back")
         logger.warning(f"{shaping_node} {what}" + ("" if back else f": {topic}: {until}"))
 
+    own = (parameters.handover, topic, publish, changed, parameters.patience_ns, asked.depth)
     standby = None
     while standby is None:
         try:
-            standby = Standby(
-                *(parameters.handover, topic, publish, changed),
-                patience_ns=parameters.patience_ns,
-                depth=asked.depth,
-                silent=silent,
-            )
+            standby = Standby(*own, silent=silent)
         except OSError as error:
             logger.error(f"{topic} falls silent when {shaping_node} does: {error}")
             wait(10.0)
