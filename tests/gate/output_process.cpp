@@ -48,7 +48,7 @@ int main(int, char ** argv) {
   chainshaper::Turn turn(argv[3], "/t5", {argv[1]});
   if (std::string(argv[2]) == "starting") {
     Asked asked;
-    asked.queue.gate.modes = chainshaper::Modes{{"city", "highway"}, {0, 0}};
+    asked.queue.gate.modes = {"city", "highway"};
     turn.go_on(asked);
     return 0;
   }

@@ -48,13 +48,12 @@ Gate read_gate() {
     gate.slots.push_back({start, number()});
   }
   if (const auto modes = number(); modes > 0) {
-    gate.modes.emplace();
     for (auto mode = 0; mode < modes; ++mode) {
-      gate.modes->names.push_back("mode" + std::to_string(mode));
-      gate.modes->bands.push_back(static_cast<std::size_t>(number()));
+      gate.modes.push_back("mode" + std::to_string(mode));
+      gate.bands.push_back(static_cast<std::size_t>(number()));
     }
-    gate.modes->initial = static_cast<std::size_t>(number());
-    gate.modes->late = static_cast<Policy>(number());
+    gate.first_mode = static_cast<std::size_t>(number());
+    gate.late = static_cast<Policy>(number());
   }
   return gate;
 }
@@ -151,7 +150,10 @@ void write_log(const std::string & path, std::int64_t most_bytes, int rows) {
   gate.slots = {{300'000'000, 400'000'000}};
   gate.cycle_ns = 1'000'000'000;
   gate.overrun = Policy::discard;
-  gate.modes = Modes{{"city", "highway"}, {0, 0}, 1, Policy::discard};
+  gate.modes = {"city", "highway"};
+  gate.bands = {0, 0};
+  gate.first_mode = 1;
+  gate.late = Policy::discard;
   Shaper<int> shaper(gate, 0);
   {
     GateLog log;

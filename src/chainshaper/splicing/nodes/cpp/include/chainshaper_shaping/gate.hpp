@@ -38,14 +38,7 @@ std::optional<std::size_t> place_of(const Words & words, const Word & word) {
   return static_cast<std::size_t>(found - words.begin());
 }
 
-// Modes are numbered in the order of `names`; `bands` has the place of each one's slot.
-struct Modes {
-  std::vector<std::string> names;
-  std::vector<std::size_t> bands;
-  std::size_t initial{0};
-  Policy late{Policy::wait};
-};
-
+// Modes are numbered in their order; `bands` has the place of each one's slot.
 struct Gate {
   std::vector<Slot> slots;
   std::int64_t cycle_ns{0};
@@ -53,7 +46,10 @@ struct Gate {
   std::int64_t phase_ns{0};
   Policy overrun{Policy::wait};
   std::int64_t due_cycles{0};
-  std::optional<Modes> modes{};
+  std::vector<std::string> modes;
+  std::vector<std::size_t> bands;
+  std::size_t first_mode{0};
+  Policy late{Policy::wait};
   Messages messages{Messages::all_in_order};
   std::size_t depth{schema::depth};
   Entry into_open_slot{Entry::at_once};
@@ -62,9 +58,7 @@ struct Gate {
     return slots.front().start + by_ns >= 0 && slots.back().end + by_ns <= cycle_ns;
   }
 
-  Policy policy() const {
-    return modes && modes->late != Policy::next_slot ? modes->late : overrun;
-  }
+  Policy policy() const { return modes.empty() || late == Policy::next_slot ? overrun : late; }
 
   bool lets_out(const Slot & slot, std::int64_t cycle_start_ns, std::int64_t arrival_ns,
                 std::int64_t ready_ns) const {
@@ -118,17 +112,14 @@ struct Release {
 
 inline void check(const Gate & gate) {
   const auto & slots = gate.slots;
-  bool sound = gate.cycle_ns > 0 && !slots.empty() && gate.due_cycles >= 0 && gate.depth > 0;
+  bool sound = gate.cycle_ns > 0 && !slots.empty() && gate.due_cycles >= 0 && gate.depth > 0 &&
+               gate.bands.size() == gate.modes.size();
   std::int64_t previous_end = 0;
   for (const auto & [start, end] : slots) {
     sound = sound && previous_end <= start && start < end && end <= gate.cycle_ns;
     previous_end = end;
   }
-  if (gate.modes) {
-    const auto & [names, bands, initial, late] = *gate.modes;
-    sound = sound && bands.size() == names.size() && initial < bands.size();
-    for (const auto band : bands) sound = sound && band < slots.size();
-  }
+  for (const auto band : gate.bands) sound = sound && band < slots.size();
   if (!sound)
     throw std::invalid_argument(
         "a gate needs a cycle, slots in it that ascend and do not overlap, one of them for each "
@@ -155,11 +146,10 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   gate.depth = depth;
   gate.into_open_slot = static_cast<Entry>(one_of(entry_names, parameters.into_open_slot));
   if (!parameters.mode_topic.empty()) {
-    const auto & slots = parameters.mode_slots;
-    gate.modes = Modes{parameters.mode_names,
-                       {slots.begin(), slots.end()},
-                       one_of(parameters.mode_names, parameters.mode_default),
-                       static_cast<Policy>(one_of(policy_names, parameters.mode_late))};
+    gate.modes = parameters.mode_names;
+    gate.bands.assign(parameters.mode_slots.begin(), parameters.mode_slots.end());
+    gate.first_mode = one_of(gate.modes, parameters.mode_default);
+    gate.late = static_cast<Policy>(one_of(policy_names, parameters.mode_late));
   }
   return gate;
 }
@@ -190,12 +180,12 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   std::optional<std::size_t> mode;
   std::size_t first = 0;
   std::size_t last = gate.slots.size();
-  if (gate.modes) {
+  if (!gate.modes.empty()) {
     const auto before = [origin](const Change & change) { return change.first <= origin; };
     const auto announced = std::find_if(changes.rbegin(), changes.rend(), before);
-    mode = announced == changes.rend() ? gate.modes->initial : announced->second;
-    first = gate.modes->bands[*mode];
-    if (gate.modes->late != Policy::next_slot) last = first + 1;
+    mode = announced == changes.rend() ? gate.first_mode : announced->second;
+    first = gate.bands[*mode];
+    if (gate.late != Policy::next_slot) last = first + 1;
   }
   const std::int64_t ready = std::max(arrival_ns, ready_ns);
   // A stamp slightly from the future puts the arrival before its own cycle: cycle 0 still.
@@ -457,11 +447,10 @@ public:
   }
 
   bool announce(const std::string & name, std::int64_t now_ns) {
-    const auto & modes = queue.gate.modes;
-    const auto mode = modes ? place_of(modes->names, name) : std::nullopt;
+    const auto mode = place_of(queue.gate.modes, name);
     if (!mode) return false;
     const auto & changes = queue.changes;
-    if (*mode != (changes.empty() ? modes->initial : changes.back().second))
+    if (*mode != (changes.empty() ? queue.gate.first_mode : changes.back().second))
       remember(queue.changes, {now_ns, *mode});
     return true;
   }

@@ -51,7 +51,7 @@ public:
     row(awake_ns, getpid(), syscall(SYS_gettid), sched_getcpu(), waiting.source_timestamp,
         waiting.arrival_ns, release.origin_ns, release.at_ns, release.slot, release.cycles_waited,
         anchor_names[static_cast<std::size_t>(release.anchor)], word(policy_names, release.overrun),
-        release.mode ? gate.modes->names[*release.mode].c_str() : "", published_ns, stalled_ns,
+        release.mode ? gate.modes[*release.mode].c_str() : "", published_ns, stalled_ns,
         word(dropped_names, release.dropped), waiting.lost, rows, release.moved_ns);
     line_.back() = '\n';  // in place of the last comma
     if (::write(ends_[1], line_.data(), line_.size()) != static_cast<ssize_t>(line_.size()))

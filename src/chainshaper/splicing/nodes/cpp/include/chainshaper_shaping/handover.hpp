@@ -180,8 +180,7 @@ public:
     if (page_->get(Field::phase_known) != 0)  // from now on, not the next cycle
       shaper.set_phase(page_->get(Field::phase_ns), monotonic_ns() - gate.cycle_ns);
     const auto mode = static_cast<std::size_t>(page_->get(Field::mode));  // from 1; 0: none
-    if (gate.modes && mode > 0 && mode <= gate.modes->names.size())
-      shaper.announce(gate.modes->names[mode - 1], 0);
+    if (mode > 0 && mode <= gate.modes.size()) shaper.announce(gate.modes[mode - 1], 0);
   }
 
   bool take(std::int64_t key) {
