@@ -108,7 +108,6 @@ class Output:
 
 @pytest.fixture(scope="module")
 def in_cpp(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The shaping node in C++."""
     return compiled(PROCESS.with_suffix(".cpp"), tmp_path_factory.mktemp("cpp"))
 
 

@@ -34,7 +34,6 @@ def test_an_instant_is_waited_for_unless_it_has_passed(wait: Callable[[int], obj
 
 
 def _signalled(handler: Callable[[int, FrameType | None], object], sleep_ns: int) -> None:
-    """Sleep so long, and get a signal meanwhile."""
     previous = signal.signal(signal.SIGUSR1, handler)
     timer = threading.Timer(0.005, signal.pthread_kill, (threading.get_ident(), signal.SIGUSR1))
     try:

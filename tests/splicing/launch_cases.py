@@ -34,8 +34,6 @@ ROBOTS = {
 
 @dataclass(frozen=True)
 class Case:
-    """One folder of `launch_files/`."""
-
     folder: Path
     publisher: str
     output: str
@@ -83,7 +81,6 @@ def plan_for(publisher: str, output: str) -> Plan:
 
 
 def robot_file(tmp_path: Path) -> Path:
-    """A launch file of one node, ``/ndt``."""
     path = tmp_path / "robot.launch.xml"
     path.write_text(NDT)
     return path

@@ -41,7 +41,6 @@ def leaving_in(plan: Plan, *slots: tuple[int, int], **changes: Any) -> Plan:
 
 
 def banded(plan: Plan) -> Plan:
-    """Two slots, one for each mode."""
     modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
     return leaving_in(plan, *SLOTS, modes=modes)
 
@@ -71,13 +70,11 @@ class NodeRun:
         self._lines.put(None)
 
     def tell(self, **what: Any) -> None:
-        """Give it a line."""
         assert self.process.stdin is not None
         self.process.stdin.write(json.dumps(what) + "\n")
         self.process.stdin.flush()
 
     def send(self, payload: bytes, source: int | None = 1, **more: Any) -> None:
-        """Give it a message of its input."""
         self.tell(topic="/t3_tmp", payload=payload.hex(), source=source, **more)
 
     def hear_published(self, payload: bytes | None = None) -> None:
@@ -87,17 +84,14 @@ class NodeRun:
 
     @property
     def published(self) -> list[bytes]:
-        """What it has published on the output."""
         found = [words["payload"] for words in self.said if words.get("published") == "/t3"]
         return [bytes.fromhex(payload) for payload in found]
 
     @property
     def logged(self) -> list[str]:
-        """The texts of its log output."""
         return [words["log"] for words in self.said if "log" in words]
 
     def hear(self, wanted: Callable[[dict[str, Any]], bool]) -> dict[str, Any]:
-        """The next thing it says that is wanted."""
         while (line := self._lines.get(timeout=30)) is not None:
             if wanted(words := self._heard(line)):
                 return words
@@ -174,7 +168,6 @@ def running_node(
 
 
 def outputs(folder: Path) -> tuple[ShapedOutput, ...]:
-    """The outputs of the nodes that run in a folder."""
     return find_outputs([str(folder / "outputs"), str(folder / "chainshaper" / "outputs")])
 
 

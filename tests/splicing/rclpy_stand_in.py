@@ -66,8 +66,6 @@ class Subscription:
 
 
 class DiagnosticArray:
-    """Of diagnostic_msgs.msg."""
-
     def __init__(self, status: list[_Record]) -> None:
         self.status, self.header = status, SimpleNamespace(stamp=None)
 

@@ -86,7 +86,6 @@ def test_what_has_no_shaping_node_or_two_publishers_is_refused(
 
 
 def _asynchronous(**changes: Any) -> Plan:
-    """A plan that gates the publisher thread of the small chain's last node."""
     return plan_shaping(
         np.array([5_000_000, 20_000_000]),
         50_000_000,

@@ -32,7 +32,6 @@ robot = pytest.fixture(robot_file)
 
 
 def launched(spliced: Splicing) -> dict[str, Any]:
-    """The values in the launch file, by their names."""
     (file,) = set(spliced.launch.values())
     return {
         statement.targets[0].id: ast.literal_eval(statement.value)
@@ -358,7 +357,6 @@ ROS2 = "/opt/ros/jazzy/bin/ros2"
 
 @pytest.fixture
 def share(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The share folder of a package `robot` in the environment, with one launch file."""
     index = tmp_path / "install/share/ament_index/resource_index/packages"
     index.mkdir(parents=True)
     (index / "robot").touch()

@@ -56,7 +56,6 @@ def wait_until_counted(folder: Path, count: int) -> None:
 
 
 def wait_for_rows(log: Path, count: int) -> pl.DataFrame:
-    """The log, when it has so many rows."""
     wait_for(lambda: log.exists() and read_gate_log(log).height >= count, f"{count} rows in {log}")
     return read_gate_log(log)
 

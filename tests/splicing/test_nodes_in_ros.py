@@ -43,14 +43,12 @@ COUNT = 30
 
 @pytest.fixture(autouse=True, scope="module")
 def in_ros_environment() -> Iterator[None]:
-    """Everything that is started here is started in a ROS 2 environment."""
     with mock.patch.dict(os.environ, ros2_environment()):
         yield
 
 
 @pytest.fixture(scope="module")
 def workspace(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Path:
-    """A folder with both packages, built once."""
     if shutil.which("colcon") is None:
         pytest.skip("colcon is not on the PATH, so no package can be built")
     folder = tmp_path_factory.mktemp("workspace")
@@ -62,7 +60,6 @@ def workspace(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Path:
 
 @pytest.fixture
 def place(kind: NodeKind, request: pytest.FixtureRequest) -> Path | None:
-    """Where the package of a kind is built."""
     return None if kind == "python" else request.getfixturevalue("workspace")
 
 

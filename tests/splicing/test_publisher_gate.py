@@ -52,7 +52,6 @@ class Run:
         return [line for line in self.lines if line[: len(words)] == [*words]]
 
     def written(self, topic: str = "/t5") -> list[int]:
-        """The numbers of the messages that were sent serialized, in their order."""
         return [int(line[2]) for line in self.of("serialized", topic)]
 
 

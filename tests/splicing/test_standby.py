@@ -50,7 +50,6 @@ def both(
 
 
 def came(run: NodeRun) -> list[int]:
-    """The numbers of the messages that a node has published."""
     return [payload[-1] for payload in run.published]
 
 
@@ -75,7 +74,6 @@ def take_over(number: int, folder: Path, shaping: NodeRun) -> None:
 
 
 def diagnosed(standby: NodeRun) -> tuple[int, str]:
-    """The state of the output, as the standby publishes it."""
     standby.tell(tick=1)
     report = standby.hear(lambda words: "diagnostics" in words)
     assert report["diagnostics"] == "chainshaper: /t3"

@@ -44,7 +44,6 @@ class Launched:
 
     @property
     def output(self) -> ShapedOutput | None:
-        """The state of its output."""
         found = [one for one in find_outputs() if f".{DOMAIN}.v" in one.page]
         return next((one for one in found if one.topic == "/t5"), None)
 
@@ -55,7 +54,6 @@ class Launched:
 
 
 def plan() -> Plan:
-    """Every output 50 ms after its stamp."""
     return plan_shaping(
         np.array([5_000_000, 49_000_000]),
         100_000_000,

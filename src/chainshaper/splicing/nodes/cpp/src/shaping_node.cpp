@@ -35,7 +35,8 @@ using Pointer = std::shared_ptr<Message>;
 
 // The stamp of a message's header; none if it is zero, or the type has no header.
 template <typename T>
-auto stamp_of(const T & message, int) -> decltype(message.header.stamp.nanosec, chainshaper::Maybe()) {
+auto stamp_of(const T & message, int)
+    -> decltype(message.header.stamp.nanosec, chainshaper::Maybe()) {
   const auto & stamp = message.header.stamp;
   if (stamp.sec == 0 && stamp.nanosec == 0) return std::nullopt;
   return stamp.sec * std::int64_t{1'000'000'000} + stamp.nanosec;

@@ -153,7 +153,8 @@ public:
         in_process_(in_process) {
     page_ = opened();
     const auto now = monotonic_ns();
-    if (now - page_->get(Field::started_ns) > schema::at_once_ns) page_->set(Field::failed_starts, 0);
+    if (now - page_->get(Field::started_ns) > schema::at_once_ns)
+      page_->set(Field::failed_starts, 0);
     page_->set(Field::started_ns, now);
     page_->add(Field::starts);
     page_->add(Field::failed_starts);
