@@ -348,14 +348,15 @@ def text_of(payload: bytes) -> str | None:
 
 
 _libc = ctypes.CDLL(None)
-_TIMER_ABSTIME = 1
 
 
 def sleep_until(deadline_ns: int) -> None:
     """Sleep until an instant of CLOCK_MONOTONIC, however late the sleep itself begins."""
     until = (ctypes.c_long * 2)(*divmod(max(0, deadline_ns), 1_000_000_000))  # a timespec
-    # A signal ends the sleep early (EINTR); the deadline stays the same.
-    while _libc.clock_nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, until, None) == errno.EINTR:
+    absolute = (
+        1  # TIMER_ABSTIME: a signal ends the sleep early (EINTR), the deadline stays the same
+    )
+    while _libc.clock_nanosleep(time.CLOCK_MONOTONIC, absolute, until, None) == errno.EINTR:
         pass
 
 

@@ -349,8 +349,9 @@ class Turn:
     def _come_into_force(self, key: int | None) -> bool:
         page, give_up = self.page, time.monotonic_ns() + GIVE_UP_NS
         while not page.lock():
-            if page["holder"] != os.getpid() and _is_alive(page["holder"]):  # another shaping node
-                return False
+            holder = page["holder"]
+            if holder not in (0, os.getpid()) and os.path.exists(f"/proc/{holder}"):  # noqa: PTH110
+                return False  # another shaping node is in force
             if self._gave_up or time.monotonic_ns() > give_up:
                 self._gave_up = True  # the standby was stopped while it published
                 break
@@ -444,7 +445,11 @@ class Standby:
         gone = 0  # a process stays readable as one that has ended until its parent takes note
         while True:
             with self._mutex:  # the page may be left meanwhile
-                holder, left_ms = self.page["holder"], self._patience_left_ms()
+                self._forget()
+                holder = self.page["holder"]
+                left_ms = -1 if holder else 1000
+                if self._pending:
+                    left_ms = max(1, (self._due_ns() - time.monotonic_ns()) // 1_000_000 + 1)
             poll, died = select.poll(), -1
             poll.register(self._woken, select.POLLIN)
             with suppress(OSError):  # there is no such process
@@ -460,12 +465,6 @@ class Standby:
             if ended:
                 gone = holder
                 time.sleep(0.001)  # another node with its lock is about to say so
-
-    def _patience_left_ms(self) -> int:
-        self._forget()
-        if not self._pending:
-            return -1 if self.page["holder"] else 1000
-        return max(1, (self._due_ns() - time.monotonic_ns()) // 1_000_000 + 1)
 
     def _due_ns(self) -> int:
         """When the shaping node is too late with what it has to do."""
@@ -531,11 +530,3 @@ class Standby:
             passed = self.page["bypassed"] - self.page["bypassed_before"]
             after_s = (time.monotonic_ns() - since) / 1e9
             self._changed(f"is back after {after_s:.2f} s, in which {passed} messages came")
-
-
-def _is_alive(pid: int) -> bool:
-    try:
-        os.kill(pid, 0)
-    except OSError:
-        return False
-    return pid > 0

@@ -36,8 +36,6 @@ _SOURCES = Path(__file__).parents[2]
 _NODES = Path(__file__).parent / "nodes"
 _RESPAWNING = _NODES / "python/respawning.py"
 
-SHORTEST_PATIENCE_NS = 10_000_000  # a node later than that hangs, or than half a cycle
-
 
 @dataclass(frozen=True)
 class ShapingProcess:
@@ -117,8 +115,8 @@ def write_shaping_process(
         of_standby = same | {
             "shaping_node": node.name,
             "fallback": plan.fallback,
-            # A node that runs only in its server's slots may get to a message a cycle later.
-            "patience_ns": max(plan.cycle_ns // 2, SHORTEST_PATIENCE_NS)
+            # A node later than that hangs; in its server's slots only, it may be a cycle later.
+            "patience_ns": max(plan.cycle_ns // 2, 10_000_000)
             + (plan.cycle_ns if plan.shaping_thread == "in-slots" else 0),
             "server_cores": sorted({server.core for server in plan.servers}),
             "log": "" if log is None else str(log.with_stem(name).absolute()),

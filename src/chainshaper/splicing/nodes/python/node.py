@@ -310,7 +310,6 @@ def publish_function(publisher: Any) -> Callable[[bytes], None]:
 # the pipe is written although the gate is killed. Missing rows show by their numbers.
 
 LOG_HEADER = f"{','.join(LOG_COLUMNS)}\n".encode()
-SAID_EVERY_NS = 10_000_000_000
 
 
 def _write_rows(path: str, header: bytes, most_bytes: int) -> None:
@@ -409,7 +408,7 @@ class GateLog:
             except OSError:
                 self._lost["not in the log"] += 1
         now = time.monotonic_ns()
-        if self._lost == self._said or (self._said_ns and now - self._said_ns < SAID_EVERY_NS):
+        if self._lost == self._said or (self._said_ns and now - self._said_ns < 10_000_000_000):
             return
         self._said_ns, self._said = now, self._lost.copy()
         lost = ", ".join(f"{count} {why}" for why, count in self._lost.items())

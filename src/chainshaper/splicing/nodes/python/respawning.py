@@ -14,8 +14,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-DELAY_S = 0.1
-
 
 def main() -> int:
     """Run the program of the command line until this process is to end; the last exit code."""
@@ -36,7 +34,7 @@ def main() -> int:
         if asked:
             return child.returncode
         sys.stderr.write(f"{sys.argv[1]} ended with code {child.returncode}: it is started again\n")
-        time.sleep(DELAY_S)
+        time.sleep(0.1)  # it may end at once each time
 
 
 if __name__ == "__main__":

@@ -32,14 +32,6 @@ from chainshaper.splicing.nodes.python.node import (
 )
 
 
-def leave_cores(taken: set[int]) -> None:
-    """Leave these cores to others, with all threads, where there are more."""
-    ours = os.sched_getaffinity(0) - taken
-    for thread in Path("/proc/self/task").iterdir() if ours else ():
-        with suppress(OSError):
-            os.sched_setaffinity(int(thread.name), ours)
-
-
 def watch(node: Node, standby: Standby) -> None:
     """Look after the shaping node; a standby that cannot is of no use, and is started again."""
     try:
@@ -82,7 +74,10 @@ def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
 def set_up(node: Node) -> Callable[[], bool]:
     """Make the node's endpoints, and begin to watch."""
     parameters = parameters_of(node)
-    leave_cores(set(parameters.server_cores))
+    ours = os.sched_getaffinity(0) - set(parameters.server_cores)
+    for thread in Path("/proc/self/task").iterdir() if ours else ():  # servers have the others
+        with suppress(OSError):
+            os.sched_setaffinity(int(thread.name), ours)
     silent, shaping_node = parameters.fallback == "silence", parameters.shaping_node
     log, logger = GateLog(node), node.get_logger()
     info = wait_for_publisher(node, "input")
