@@ -129,9 +129,9 @@ public:
   Output(Settings settings, const RmwNode * node, const RmwPublisher * publisher,
          const void * type_support, std::size_t depth)
       : publisher(publisher),
+        type_support(type_support),
         settings_(std::move(settings)),
         node_(node),
-        type_support_(type_support),
         shaper_(gate_of(settings_.parameters, depth), settings_.parameters.spin_ns) {
     shaper_.look = [this] { look(); };
     show();
@@ -167,10 +167,9 @@ public:
     EMIT(rclcpp_subscription_init, &subscription_handle_, &subscription_);
     EMIT(rclcpp_subscription_callback_added, &subscription_, &callback_);
     EMIT(rclcpp_callback_register, &callback_, "chainshaper::gate");
-    rcl_publisher_ = rcl_publisher;
+    this->rcl_publisher = rcl_publisher;
   }
 
-  const void * rcl_publisher() const { return rcl_publisher_; }
   const void * input_handle() const { return &input_handle_; }
 
   // In the thread that publishes; it waits for nothing. `fill` serializes the message. rmw's code.
@@ -189,9 +188,9 @@ public:
     return 0;
   }
 
-  const void * type_support() const { return type_support_; }
-
   const RmwPublisher * const publisher;
+  const void * const type_support;
+  const void * rcl_publisher{nullptr};
 
 private:
   // A page shows what becomes of the output; no standby looks at it. Cycles begin where they did for
@@ -290,7 +289,7 @@ private:
   }
 
   void publish(const Serialized & message) {
-    EMIT(rcl_publish, rcl_publisher_, &message.bytes);
+    EMIT(rcl_publish, rcl_publisher, &message.bytes);
     // Before Jazzy rmw has no trace point on the way of serialized messages.
     if (is_humble()) emit_write(publisher, &message.bytes, 0);
     const int code = RMW(rmw_publish_serialized_message)(publisher, &message.bytes, nullptr);
@@ -300,8 +299,6 @@ private:
 
   const Settings settings_;
   const RmwNode * node_;
-  const void * type_support_;
-  const void * rcl_publisher_{nullptr};
   // What traces call the things that are not there: addresses of their own.
   char node_handle_, rmw_node_, input_handle_, rmw_input_, subscription_handle_, rmw_subscription_,
       subscription_, callback_;
@@ -382,7 +379,7 @@ EXPORTED int rmw_destroy_publisher(RmwNode * node, RmwPublisher * publisher) {
 EXPORTED int rmw_publish(const RmwPublisher * publisher, const void * message, void * allocation) {
   if (Output * const output = output_of(publisher))
     return output->take(message, [&](Bytes & bytes) {
-      return RMW(rmw_serialize)(message, output->type_support(), &bytes);
+      return RMW(rmw_serialize)(message, output->type_support, &bytes);
     });
   return RMW(rmw_publish)(publisher, message, allocation);
 }
@@ -432,7 +429,7 @@ EXPORTED void ros_trace_rcl_publisher_init(const void * handle, const void * nod
 }
 
 EXPORTED void ros_trace_rcl_publish(const void * handle, const void * message) {
-  const auto is = [=](const Output & one) { return one.rcl_publisher() == handle; };
+  const auto is = [=](const Output & one) { return one.rcl_publisher == handle; };
   const Output * const output = find_output(is);
   EMIT(rcl_publish, output == nullptr ? handle : output->input_handle(), message);
 }

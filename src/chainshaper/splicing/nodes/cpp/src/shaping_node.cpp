@@ -371,9 +371,8 @@ private:
     const std::int64_t now = monotonic_ns();
     if (said_ns_ != 0 && now - said_ns_ < 10'000'000'000) return;
     const std::string losses = log_.losses();
-    if (losses == said_) return;
+    if (losses == std::exchange(said_, losses)) return;
     RCLCPP_WARN(node_.get_logger(), "of %zu messages so far: %s", log_.rows, losses.c_str());
-    said_ = losses;
     said_ns_ = now;
   }
 

@@ -101,16 +101,12 @@ private:
   ino_t inode_{};
 };
 
-inline std::string text_in_environment(const char * name) {
-  const char * const text = std::getenv(name);
-  return text == nullptr ? "" : text;
-}
-
 // Where pages are, the best place first: of root, of a login session, of any user.
 inline std::vector<std::string> page_folders() {
-  const auto session = geteuid() == 0 ? "/run" : text_in_environment("XDG_RUNTIME_DIR");
+  const char * const session = geteuid() == 0 ? "/run" : std::getenv("XDG_RUNTIME_DIR");
   std::vector<std::string> folders{"/dev/shm/chainshaper-" + std::to_string(geteuid())};
-  if (!session.empty()) folders.insert(folders.begin(), session + "/chainshaper/outputs");
+  if (session != nullptr && *session != '\0')
+    folders.insert(folders.begin(), std::string(session) + "/chainshaper/outputs");
   return folders;
 }
 
@@ -126,8 +122,9 @@ inline void check_private(const std::string & folder) {
 
 inline std::unique_ptr<Page> open_page(const std::string & name, const std::string & topic,
                                        const std::vector<std::string> & folders) {
-  const auto domain = std::to_string(std::atoi(text_in_environment("ROS_DOMAIN_ID").c_str()));
-  const auto file = name + "." + domain + ".v" + std::to_string(schema::version);
+  const char * const domain = std::getenv("ROS_DOMAIN_ID");
+  const auto file = name + "." + std::to_string(domain == nullptr ? 0 : std::atoi(domain)) + ".v" +
+                    std::to_string(schema::version);
   std::string problem = "no folder";
   for (const bool make : {false, true}) {
     for (const auto & folder : folders) {
@@ -297,14 +294,10 @@ private:
     page_->set(Field::holder, getpid());
     // A standby still deals with what came before this node's first message.
     const bool listening = page_->get(Field::listening) > 0 && !gave_up_;
-    while (listening && has_standby() && !is_acknowledged(key) && monotonic_ns() < give_up)
+    while (listening && has_standby() && monotonic_ns() < give_up &&
+           page_->get(Field::acknowledged) != key && !place_of(page_->noted(schema::bypassed), key))
       sleep_until(monotonic_ns() + 200'000);
     return true;
-  }
-
-  bool is_acknowledged(std::int64_t key) const {
-    const auto bypassed = page_->noted(schema::bypassed);
-    return page_->get(Field::acknowledged) == key || place_of(bypassed, key);
   }
 
   std::string name_;
