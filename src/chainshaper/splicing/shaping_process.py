@@ -109,7 +109,7 @@ def write_shaping_process(
     parameters = shaping_parameters(plan, node, log) | {"handover": _page_name(node, log or folder)}
     shaped = message_type_named(message_type) if kind in OF_ONE_TYPE and message_type else None
     process, files = _process(kind, "shaping_node", node.name, folder, parameters, topics, shaped)
-    if process.plugin is None:  # a component ends with its publisher
+    if process.plugin is None:  # that ends with its publisher, and a standby would cost a copy
         name = f"{node.name}{STANDBY}"
         same = {key: parameters[key] for key in ("handover", "output_depth", "depth")}
         of_standby = same | {
