@@ -37,7 +37,7 @@ from chainshaper.splicing.shaping_process import (
     write_shaping_process,
     write_throttler,
 )
-from chainshaper.values.errors import InputError
+from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import NodeKind
 
 MS = 1_000_000
@@ -168,6 +168,11 @@ def test_writing_again_changes_nothing_and_what_is_there_is_not_overwritten(
     with pytest.raises(InputError, match=r"chainshaper_t3\.yaml exists already with another"):
         files()
     assert parameters.read_text() == "mine"
+
+
+def test_what_cannot_be_written_is_named(full_disk: Path, plan: Plan, node: ShapingNode) -> None:
+    with pytest.raises(OperationError, match=r"cannot be written: No space left"):
+        write_shaping_process(plan, node, "python", full_disk / "new")
 
 
 def test_a_typed_node_needs_a_type(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
