@@ -283,22 +283,21 @@ def _write(folder: Path, files: dict[str, str]) -> None:
 def python_node(executable: str) -> str:
     """The one file of a Python node: the gate as it is, what it needs of ROS 2, and the node."""
     parts: dict[Path, str] = {}
-    _add_part(_NODES / "python" / f"{executable}.py", parts)
+
+    def add(path: Path) -> None:  # without its imports of ours, behind the files that these name
+        text = path.read_text(encoding="utf-8")
+        lines = text.splitlines(keepends=True)
+        for statement in reversed(ast.parse(text).body):
+            module = getattr(statement, "module", None) or ""
+            if isinstance(statement, ast.ImportFrom) and module.startswith("chainshaper."):
+                del lines[statement.lineno - 1 : statement.end_lineno]
+                imported = _SOURCES / f"{module.replace('.', '/')}.py"
+                if imported not in parts:
+                    add(imported)
+        parts[path] = "".join(lines)
+
+    add(_NODES / "python" / f"{executable}.py")
     return "#!/usr/bin/env python3\n" + "\n\n".join(parts.values())
-
-
-def _add_part(path: Path, parts: dict[Path, str]) -> None:
-    """Add the text of a file without its imports of ours, behind the files that these name."""
-    text = path.read_text(encoding="utf-8")
-    lines = text.splitlines(keepends=True)
-    for statement in reversed(ast.parse(text).body):
-        module = getattr(statement, "module", None) or ""
-        if isinstance(statement, ast.ImportFrom) and module.startswith("chainshaper."):
-            del lines[statement.lineno - 1 : statement.end_lineno]
-            imported = _SOURCES / f"{module.replace('.', '/')}.py"
-            if imported not in parts:
-                _add_part(imported, parts)
-    parts[path] = "".join(lines)
 
 
 # Gates in the processes that publish and subscribe ------------------------------------------------

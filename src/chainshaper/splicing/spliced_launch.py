@@ -31,7 +31,7 @@ LOGS = "logs"
 _FORMAT = 1
 _DERIVED = {LOGS, *(f"{NODES}/{name}" for name in ("build", "install", "log"))}
 _WITH_VALUE = ("--launch-prefix", "--launch-prefix-filter", "--prefix")
-_SIGNS = {  # what the text of a launch file has in it, by the end of its name
+_SIGNS = {  # a mistaken file lacks this, by the end of its name; launch alone reads it
     ".py": "generate_launch_description",
     ".xml": "<launch",
     **dict.fromkeys((".yaml", ".yml"), r"(?m)^[\s'\"{]*launch\b"),
@@ -187,29 +187,26 @@ def original_words(words: Sequence[str], *, throttled: bool = False) -> list[str
         manifest = _manifest(file.parent)
         ours = manifest is not None and file.name in manifest["copies"]
         if manifest is None or not ours or (throttled and manifest["throttled"]):
-            _check_launch_file(file)
-            found.append(str(file))
-        else:
-            copied = original_words(manifest["copies"][file.name], throttled=throttled)
-            if is_run(copied) and len(words) > 1:
+            if file.suffix not in _SIGNS:
                 raise InputError(
-                    f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it"
-                    " into another folder, or write a launch file that starts it"
+                    f"{file}: a launch file's name ends in .py, .xml, .yaml, .yml or .launch: give"
+                    " one"
                 )
-            found += copied
+            if not re.search(_SIGNS[file.suffix], read_text(file, "what `ros2 launch` starts")):
+                raise InputError(
+                    f"{file}: no launch file: it has no `launch`, or no"
+                    " `generate_launch_description`"
+                )
+            found.append(str(file))
+            continue
+        copied = original_words(manifest["copies"][file.name], throttled=throttled)
+        if is_run(copied) and len(words) > 1:
+            raise InputError(
+                f"{file} stands for `{' '.join(copied)}`, which is spliced alone: splice it into"
+                " another folder, or write a launch file that starts it"
+            )
+        found += copied
     return list(dict.fromkeys(found)) if not is_run(found) else found
-
-
-def _check_launch_file(path: Path) -> None:
-    """Look at a launch file as far as a mistaken one would be noticed; launch alone reads it."""
-    if path.suffix not in _SIGNS:
-        raise InputError(
-            f"{path}: a launch file's name ends in .py, .xml, .yaml, .yml or .launch: give one"
-        )
-    if not re.search(_SIGNS[path.suffix], read_text(path, "what `ros2 launch` starts")):
-        raise InputError(
-            f"{path}: no launch file: it has no `launch`, or no `generate_launch_description`"
-        )
 
 
 def usable(folder: Path) -> Path:
