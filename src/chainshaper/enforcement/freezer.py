@@ -5,11 +5,11 @@ and closes these by freezing them (DESIGN section 6). A thread sees nothing of i
 except that ``epoll_wait``, ``recvmsg`` with a timeout, ``sigtimedwait`` and ``semtimedop`` return
 EINTR. What a gated thread creates is born in its server, and put back with it.
 
-Groups need no line each in the journal: their names say which process made them and for which
-server; and they are made directly beneath those from which threads came, where these go back to.
+Groups need no line each in the journal: their names say whose they are and for which server, and
+they stand directly beneath those from which threads came, where these go back to.
 
-Dispatchers write their numbers to memory of the owner, reached through its descriptors. Not to a
-file on a disk: a store to a mapped page that is being written back waits for 0.1 s and more.
+Dispatchers write their numbers to memory of the owner, reached through its descriptors: in a file
+on a disk, a store to a page that is being written back waits for 0.1 s and more.
 """
 
 import contextlib
@@ -34,7 +34,7 @@ from chainshaper.enforcement.servers import (
     server_named,
 )
 from chainshaper.linux import cgroups
-from chainshaper.linux.own_processes import end_in_words, module_command
+from chainshaper.linux.own_processes import end_in_words, start_module
 from chainshaper.linux.runs import DISPATCHER, Journal, note_process
 from chainshaper.linux.threads import has_ended, living_processes, start_of
 from chainshaper.values.errors import OperationError, PlatformError
@@ -53,9 +53,7 @@ _LOOK_S = 0.002
 
 @dataclass(frozen=True)
 class FreezerRun:
-    """The servers that are enforced, id and start of the owner, the path of its counters while it
-    lives.
-    """
+    """The servers in force, id and start of their owner, and, while it lives, the counters."""
 
     owner: tuple[int, int]
     table: ServerTable
@@ -83,12 +81,9 @@ def groups_of(run: FreezerRun | None, core: int | None = None) -> tuple[Path, ..
     if run is None:
         return ()
     whose = (*map(str, run.owner), run.page.name)
-    places = [number for number, one in enumerate(run.table.servers) if one.core == core]
-    return tuple(
-        folder
-        for folder, name in _all_groups()
-        if name.group(1, 2, 3) == whose and (core is None or int(name[4]) in places)
-    )
+    places = [k for k, one in enumerate(run.table.servers) if core in (None, one.core)]
+    own = ((path, int(name[4])) for path, name in _all_groups() if name.group(1, 2, 3) == whose)
+    return tuple(path for path, place in own if place in places)
 
 
 def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
@@ -98,8 +93,7 @@ def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
     if not (groups := _all_groups()):
         return ()
     known = {run.owner for journal in journals if (run := run_of(journal)) is not None}
-    owners = known.union(living_processes())
-    strays = []
+    owners, strays = known.union(living_processes()), []
     for folder, name in groups:
         pid = int(name[1])
         started = start_of(pid, pid) if name[2] is None else int(name[2])
@@ -143,22 +137,18 @@ def restore_mount() -> None:
             cgroups.restore_mount()
 
 
-def _numbers(*names: str) -> list[tuple[str, type[ctypes.c_int64]]]:
-    return [(name, ctypes.c_int64) for name in names]
-
-
 class CoreNumbers(ctypes.Structure):
     """``beats`` move as long as the dispatcher does; ``acknowledged`` is its last command.
     Guardians write ``let_go``, when (ns) they thawed the threads of one that hangs, and ``silent``.
     """
 
-    _fields_ = _numbers("beats", "acknowledged", "let_go", "silent")
+    _fields_ = [(name, ctypes.c_int64) for name in ("beats", "acknowledged", "let_go", "silent")]
 
 
 class ServerNumbers(ctypes.Structure):
     """Slots, late entries, longest lateness (ns), overruns (-1: unknown)."""
 
-    _fields_ = _numbers("slots", "late", "longest", "overruns")
+    _fields_ = [(name, ctypes.c_int64) for name in ("slots", "late", "longest", "overruns")]
 
 
 class CounterPage:
@@ -189,17 +179,16 @@ class Anchoring:
 
 def first_anchoring(anchor_ns: int, cycle_ns: int, earliest_ns: int) -> Anchoring:
     """The first start of a cycle at or after ``earliest_ns``; before it nothing is enforced."""
-    begin = anchor_ns + -((anchor_ns - earliest_ns) // cycle_ns) * cycle_ns
+    begin = earliest_ns + (anchor_ns - earliest_ns) % cycle_ns
     return Anchoring(begin, begin)
 
 
 def next_anchoring(
     in_force: Anchoring, anchor_ns: int, cycle_ns: int, earliest_ns: int
 ) -> Anchoring:
-    """From the anchoring in force to another anchor, at the first end of a cycle that allows it.
-
-    No thread slips between: the last cycle is cut short, or all servers wait, closed, for the first
-    of the new ones, whichever is shorter. Worked by hand, cycle time 100, cycles at 0, 100, …:
+    """To another anchor at the first end of a cycle that allows it: the last cycle is cut short or,
+    if that is shorter, all servers wait, closed, for the first new one. Worked by hand, cycle time
+    100, cycles at 0, 100, …:
 
         >>> next_anchoring(Anchoring(0, 0), 30, 100, 950)       # wait, closed, from 1000 to 1030
         Anchoring(begin_ns=1030, end_ns=1000)
@@ -218,9 +207,8 @@ def next_anchoring(
 class Freezer(BackEnd):
     """A table of servers in force by freezing; see :class:`BackEnd` for what each method does.
 
-    Making one starts a dispatcher per core; ``go_on`` is called again and again while something is
-    waited for, and may raise. Raises OperationError: a dispatcher does not start. PlatformError: a
-    core is missing.
+    Making one starts a dispatcher per core; ``go_on`` is called while something is waited for, and
+    may raise. Raises OperationError: a dispatcher does not start. PlatformError: no such core.
     """
 
     def __init__(
@@ -236,7 +224,7 @@ class Freezer(BackEnd):
         self._command = 0
         self._sent: dict[int, int] = {}
         self._released = False
-        self._dispatchers: dict[int, subprocess.Popen[str]] = {}
+        self._dispatchers: dict[int, subprocess.Popen[bytes]] = {}
         self._ends: dict[int, str] = {}
         self._memory = os.memfd_create("counters")
         os.truncate(self._memory, 8 + 64 * len(table.servers))  # there are not more cores
@@ -246,7 +234,13 @@ class Freezer(BackEnd):
         try:
             journal.note(FREEZER, **{**asdict(self._run), "page": str(page)})
             for core in sorted({server.core for server in table.servers}):
-                self._dispatchers[core] = self._start_dispatcher(core)
+                process = self._dispatchers[core] = start_module(
+                    "chainshaper.enforcement.slot_dispatcher",
+                    *(str(journal.path), str(core)),
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.DEVNULL,
+                )
+                note_process(journal, DISPATCHER, process.pid, core)
             self._await(_START_S, "start", lambda core: self._page.cores[core].beats > 0)
         except BaseException:
             self._end()
@@ -304,7 +298,7 @@ class Freezer(BackEnd):
 
     def members(self) -> dict[str, tuple[int, ...]]:
         """The living threads of every server, those that were born there included."""
-        found: dict[str, tuple[int, ...]] = {server.name: () for server in self._table.servers}
+        found = dict.fromkeys((server.name for server in self._table.servers), tuple[int, ...]())
         for folder, server in self._groups.items():
             found[server] += cgroups.threads_in(folder)
         return found
@@ -327,8 +321,7 @@ class Freezer(BackEnd):
         """See :meth:`BackEnd.failure`. A lost thread leaves the others enforced."""
         if self._released:
             return None
-        # Threads are let go when a dispatcher is lost: that is looked at last.
-        lost = self._lost()
+        lost = self._lost()  # first: threads are let go when a dispatcher is lost
         return self._dispatcher_failure() or lost
 
     def release(self) -> None:
@@ -343,19 +336,6 @@ class Freezer(BackEnd):
             left = self._end()
         if left:
             raise OperationError("; ".join(left))
-
-    def _start_dispatcher(self, core: int) -> "subprocess.Popen[str]":
-        command = module_command("chainshaper.enforcement.slot_dispatcher")
-        process = subprocess.Popen(
-            [*command, str(self._journal.path), str(core)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            text=True,
-            start_new_session=True,
-        )
-        note_process(self._journal, DISPATCHER, process.pid, core)
-        return process
 
     def _await(self, within_s: float, what: str, done: Callable[[int], bool]) -> None:
         """Wait until all cores' dispatchers have done something; ``what`` is for messages."""
@@ -372,19 +352,15 @@ class Freezer(BackEnd):
                 time.sleep(_LOOK_S)
 
     def _dispatcher_failure(self) -> str | None:
-        for core, process in self._dispatchers.items():
-            if core not in self._ends and process.poll() is not None:
-                self._ends[core] = self._end_of_dispatcher(core)
-        return next(iter(self._ends.values()), None)
-
-    def _end_of_dispatcher(self, core: int) -> str:
         """Why a dispatcher has ended: what it said, or what was done to it."""
-        process = self._dispatchers[core]
-        if self._page.cores[core].silent:
-            return f"the dispatcher of core {core} hung, or was stopped"
-        said = "; ".join(process.stderr.read().splitlines()) if process.stderr else ""
-        ended = f"the dispatcher of core {core} {end_in_words(process.returncode)}"
-        return f"{ended}: {said}" if said else ended
+        for core, process in self._dispatchers.items():
+            if core in self._ends or process.poll() is None:
+                continue
+            said = process.stderr.read().decode(errors="replace") if process.stderr else ""
+            why = end_in_words(process.returncode) + ": " * bool(said)
+            why = "hung, or was stopped" if self._page.cores[core].silent else why
+            self._ends[core] = f"the dispatcher of core {core} {why}{'; '.join(said.splitlines())}"
+        return next(iter(self._ends.values()), None)
 
     def _lost(self) -> str | None:
         """A thread that runs freely. A service or container that ends takes its groups with it."""
@@ -417,9 +393,8 @@ class Freezer(BackEnd):
         self._await(_ANSWER_S, "answer", lambda c: numbers[c].acknowledged >= sent.get(c, 0))
 
     def _end(self) -> tuple[str, ...]:
-        """Put threads and groups back, and end the dispatchers; what is left, in sentences.
-
-        In this order: should we be killed in between, the dispatchers are there to finish it.
+        """Put threads and groups back, then end the dispatchers, who would finish it should we be
+        killed in between; what is left, in sentences.
         """
         self._page.released.value = 1
         left = restore(self._run)

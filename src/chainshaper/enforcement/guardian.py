@@ -27,7 +27,7 @@ from pathlib import Path
 from chainshaper.enforcement.freezer import CounterPage, groups_of, run_of, thaw
 from chainshaper.enforcement.undoing import claim_run, strange_lines, undo_run
 from chainshaper.linux import cgroups, runs
-from chainshaper.linux.own_processes import module_command, what_happened
+from chainshaper.linux.own_processes import start_module, what_happened
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import become_fifo, set_thread_name
 from chainshaper.linux.threads import open_process
@@ -64,14 +64,8 @@ class Guardians:
             lost.communicate()
             self.processes.remove(lost)
         while len(self.processes) < _HOW_MANY:
-            process = subprocess.Popen(
-                [*module_command(__name__), str(self.journal.path.parent)],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
-            )
-            self.processes.append(process)
+            folder = str(self.journal.path.parent)
+            self.processes.append(start_module(__name__, folder, stderr=subprocess.DEVNULL))
 
     def await_ready(self, go_on: Callable[[], None] = lambda: None) -> None:
         """Until they watch; ``go_on`` may raise. Raises OperationError: one does not start."""

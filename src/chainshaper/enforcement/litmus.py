@@ -9,9 +9,8 @@ reservations, and each thread moves by itself: for the two milliseconds that a c
 runs freely. Threads are attached one by one, after those of DDS exist, since what a thread creates
 runs in its reservation, too; they are detached by giving them another class.
 
-Intervals are written half-open, `[2,86)`, since `resctl` takes `[2,86] [86,87]` for overlapping.
-They must ascend. A table counts from time zero of CLOCK_MONOTONIC; another anchor is reached by
-turning the slots.
+Intervals are half-open, since `resctl` takes `[2,86] [86,87]` for overlapping, ascend, and count
+from time zero of CLOCK_MONOTONIC: another anchor turns the slots.
 
 Upstream: liblitmus, `bin/resctl.c`, `doc/howto-use-resctl.md`, `doc/table-driven-scheduling.md`;
 LITMUS^RT, `litmus/reservations/alloc.c`.
@@ -59,9 +58,8 @@ def missing(proc: Path = _PROC) -> str | None:
 class Litmus(BackEnd):
     """A table of servers in force as reservations; see :class:`.servers.BackEnd`.
 
-    Nothing is changed before :meth:`arm`. Raises PlatformError: the kernel is not LITMUS^RT, or its
-    tools are not installed. OperationError: others use the plugin. InputError: the table has what
-    LITMUS^RT cannot do.
+    Raises PlatformError: the kernel is not LITMUS^RT, or its tools are not installed.
+    OperationError: others use the plugin. InputError: the table has what LITMUS^RT cannot do.
     """
 
     def __init__(self, table: ServerTable, journal: Journal, proc: Path = _PROC) -> None:
@@ -156,30 +154,23 @@ def _active_plugin(proc: Path) -> str:
 
 def _run(command: Command) -> None:
     """Run a command of LITMUS^RT's; its complaint becomes ours."""
+    text = f"`{' '.join(command)}`"
+    run = partial(subprocess.run, env=tool_environment(), timeout=_COMMAND_S, check=False)
     try:
-        done = subprocess.run(
-            command,
-            env=tool_environment(),
-            capture_output=True,
-            text=True,
-            check=False,
-            timeout=_COMMAND_S,
-        )
+        done = run(command, capture_output=True, text=True)
     except (OSError, subprocess.TimeoutExpired) as error:
-        raise OperationError(f"`{' '.join(command)}` cannot be run: {error}") from error
+        raise OperationError(f"{text} cannot be run: {error}") from error
     if done.returncode:
         said = (done.stderr + done.stdout).strip().splitlines()
         reason = said[0] if said else f"exit code {done.returncode}"
-        raise OperationError(f"`{' '.join(command)}`: {reason}; `dmesg` has LITMUS^RT's own words")
+        raise OperationError(f"{text}: {reason}; `dmesg` has LITMUS^RT's own words")
 
 
 def litmus_commands(
     table: ServerTable, members: Mapping[str, Sequence[int | str]], anchor_ns: int
 ) -> tuple[Command, ...]:
-    """All commands that put a table in force, in order; ``members`` are thread ids by server.
-
-    What stands for a thread that does not run yet may be a text. Raises InputError: the table has
-    what LITMUS^RT cannot do.
+    """All commands that put a table in force, in order; ``members`` are thread ids by server, or
+    texts for threads that do not run yet. Raises InputError: LITMUS^RT cannot do it.
     """
     ids, servers = _reservation_ids(table), table.servers
     create = (create_command(ids[s.name], s, table.cycle_ns, anchor_ns) for s in servers)

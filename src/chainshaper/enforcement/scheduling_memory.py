@@ -3,12 +3,11 @@
 Putting back looks at each aspect of a thread (:mod:`chainshaper.linux.scheduling`) by itself: one
 that is as we set it goes back to what it was; one that another program has changed since is left.
 
-Threads inherit class and cores from those that create them. What an application starts while it is
-changed is put back as well, if it is the application's beyond doubt: in a process of the journal
-(the same id *and* start), or one that descends from these, or did at two looks in a row; or in a
-cgroup of the run. What of these started after the change, and has what we gave to its family, gets
-its parent's original. All others are strangers, and so is a daemon whose parent ended before
-these: :func:`look_alikes` names them, and they are left alone.
+Threads inherit class and cores from those that create them. What starts while its application is
+changed gets its parent's original back, if it has what we gave to its family, and is the
+application's beyond doubt: in a process of the journal (the same id *and* start), or one that
+descends from these, or did at two looks in a row; or in a cgroup of the run. All others, such as a
+daemon whose parent ended before, are left alone: :func:`look_alikes` names them.
 """
 
 import os
@@ -31,7 +30,6 @@ from chainshaper.linux.scheduling import (
     set_state,
     state_from_json,
     state_of,
-    state_text,
     with_aspect,
 )
 from chainshaper.linux.threads import (
@@ -64,7 +62,6 @@ class Change:
 
     @property
     def identity(self) -> tuple[int, int]:
-        """As :attr:`Thread.identity`."""
         return (self.tid, self.started)
 
 
@@ -88,18 +85,14 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
                 else "run as root or with CAP_SYS_NICE, or as the user of that process with an"
                 " rtprio limit of 98"
             )
-            refused = f"{_whose(thread)} may not be given {state_text(target)}: {remedy}"
+            refused = f"{thread.text} may not be given {target.text}: {remedy}"
             raise PlatformError(refused) from error
         except OSError as error:
             raise OperationError(_refused(thread, target, error)) from error
 
 
-def _whose(thread: Thread | Change) -> str:
-    return f"thread {thread.tid} ({thread.comm}) of process {thread.pid}"
-
-
-def _refused(thread: Thread | Change, target: SchedulingState, error: OSError) -> str:
-    return f"{_whose(thread)}: the kernel refuses {state_text(target)}: {error.strerror}"
+def _refused(thread: Thread, target: SchedulingState, error: OSError) -> str:
+    return f"{thread.text}: the kernel refuses {target.text}: {error.strerror}"
 
 
 def note_scheduling(
@@ -122,7 +115,7 @@ def note_scheduling(
             continue  # its id belongs to another thread by now
         if before.scheduling_class.policy == SCHED_DEADLINE:
             raise OperationError(
-                f"{_whose(thread)} runs under SCHED_DEADLINE, which is left alone: take it out of "
+                f"{thread.text} runs under SCHED_DEADLINE, which is left alone: take it out of "
                 f"the plan, or give it another class first (`chrt --other --pid 0 {thread.tid}`)"
             )
         earlier = known.get(thread.identity)
@@ -194,7 +187,7 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         return
     remembered, refused = remembered_threads(journal), dict[int, str]()
 
-    def give_back(thread: Thread | Change, family: list[Change]) -> bool:
+    def give_back(thread: Thread, family: list[Change]) -> bool:
         try:
             now = target = state_of(thread.tid)
             target = _given_back(now, family)
@@ -207,8 +200,8 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         return now != target
 
     for one in reversed(remembered):
-        if start_of(one.pid, one.tid) == one.started:
-            give_back(one, [one])
+        if (thread := find_thread(one.tid)) is not None and thread.identity == one.identity:
+            give_back(thread, [one])
     for _ in range(_GENERATIONS if remembered else 0):
         # What starts threads all the time may have started one before it was reached itself.
         changed = [give_back(*born) for born in _born_of(journal, remembered, groups)]
@@ -235,8 +228,8 @@ def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...
             continue
         if any(now in one.given and thread.started >= one.changed_at for one in remembered):
             found.append(
-                f"thread {thread.tid} ({thread.comm}) is left as it is: {state_text(now)}; if it is"
-                f" the application's, which nothing shows, `chrt --other --pid 0 {thread.tid}`"
+                f"{thread.text} is left as it is: {now.text}; if it is the application's, which"
+                f" nothing shows, `chrt --other --pid 0 {thread.tid}`"
             )
     return tuple(found)
 

@@ -3,16 +3,14 @@
     python -m chainshaper.enforcement.slot_dispatcher JOURNAL CORE
 
 It sleeps until a boundary, writes ``1`` to the ``cgroup.freeze`` of what closes and then ``0`` to
-that of what opens, and sleeps again. It runs on the core that it gates, above everything there:
-the timer interrupt alone takes the core from a thread whose slot has ended, so a slot is left
-exactly. But the next thread runs only when the dispatcher sleeps again, so between waking and
-sleeping it does nothing that can wait. All else is done at **ticks** between boundaries, not before
-an output has left that waits for one: counting, the owner's commands on the standard input, and
-looking for overruns.
+that of what opens, and sleeps again. It runs on the core that it gates, above everything there: the
+timer interrupt alone takes the core from a thread whose slot has ended, so a slot is left exactly.
+The next thread runs only when the dispatcher sleeps again, so all that can wait is done at
+**ticks** between boundaries: counting, the owner's commands on the standard input, and looking for
+overruns.
 
-It thaws its threads however it ends, and ends when the owner is gone. Only SIGKILL and SIGSTOP
-prevent that, which is what guardians are for. Should those be gone together with the owner, it
-undoes the whole run.
+It ends when the owner is gone, and thaws its threads however it ends; against SIGKILL and SIGSTOP
+there are guardians. Should those be gone together with the owner, it undoes the whole run.
 """
 
 import contextlib
@@ -71,7 +69,6 @@ def boundaries_of(
     >>> [(b.offset_ns, set(b.open)) for b in boundaries_of(10, (((0, 4),), ((4, 10),)))]
     [(0, {0}), (4, {1})]
     """
-
     offsets = {0} | {edge % cycle_ns for own in slots for slot in own for edge in slot}
     found = []
     for at in sorted(offsets):
@@ -270,11 +267,11 @@ class Dispatcher:
 
 
 def overrun(groups: Iterable[int]) -> bool | None:
-    """Whether a frozen thread was computing when it was stopped, at the end of its slot.
+    """Whether a frozen thread was computing when it was stopped, at the end of its slot: in user
+    mode, which is -1 in ``/proc/TID/syscall``; one inside a system call passes for one that waits.
+    None: one has not reached the freezer yet, for want of the core.
 
-    ``groups`` are open ``cgroup.threads`` files. ``/proc/TID/syscall`` shows where a thread was; -1
-    is user mode. One caught inside a system call passes for one that waits. None when one has not
-    reached the freezer yet, for want of the core. Raises PermissionError: not to be seen by us.
+    ``groups`` are open ``cgroup.threads`` files. Raises PermissionError: not to be seen by us.
     """
     undecided = False
     for group in groups:
@@ -294,17 +291,14 @@ def overrun(groups: Iterable[int]) -> bool | None:
 
 
 def _become_real_time(core: int) -> None:
-    """Highest class, if it is permitted, then the core. Raises PlatformError: no such core.
-
-    In this order: where a SCHED_FIFO thread spins, SCHED_OTHER would not run again.
-    """
-    become_fifo(PRIORITY)
+    """Highest class, if it is permitted, then the core. Raises PlatformError: no such core."""
+    become_fifo(PRIORITY)  # first: where a SCHED_FIFO thread spins, SCHED_OTHER would not run again
     try:
         os.sched_setaffinity(0, {core})
     except OSError as error:
         raise PlatformError(
             f"core {core}, which a server of the plan asks for, is not available "
-            f"({os.strerror(error.errno or 0)}): name another core in the plan"
+            f"({error.strerror}): name another core in the plan"
         ) from error
     lock_memory()
     stop_garbage_collection()

@@ -4,30 +4,25 @@ The paper's Thread Allocator (section 4.2). Evidence for a thread's role, the st
 callbacks that a recording saw it run; its name, by DDS; its place: executors spin on the main
 thread unless the program arranges it otherwise.
 
-On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6):
+On a stock kernel the order of servers is an order of SCHED_FIFO priorities (DESIGN section 6). From
+the most urgent:
 
-* DDS threads stand above all servers, on other cores where there are any: what they deliver must
-  not wait for what it is delivered to. Those that receive stand above the others; where the output
-  is received, they have the first of these cores. Zenoh's router is treated alike;
-* servers stand below 88 in the order of their own priority, smaller first;
-* threads of one server stand in the order in which the plan names their nodes: the chain's from its
-  beginning on, then those of branches that it waits for. At one priority, callbacks that become
-  ready at once would run in the order in which DDS happens to deliver, another one after each
-  start, and what was profiled would say little of what follows. Where priorities are too few for
-  all, the last of a server share one. Where slots are made of what single callbacks took, all but
-  the first share one, as they did while that was measured
-  (:attr:`~chainshaper.planning.application_plan.ApplicationPlan.most_urgent_first`). Turns
-  (SCHED_RR) are counted over all callbacks of a thread and end within one, which then waits for the
-  whole callback of another: there are none, unless the plan wants them;
-* who receives what a shaping node publishes stands below all servers, on the shaping node's core,
-  or, of several chains, whose servers keep that core busy, on the first core without servers;
-* an asynchronous publisher stands below every other thread of its process on its core: it spins on
-  the writer's lock, and above them would never let them release it;
-* the thread by which Fast DDS sends what synchronous writers could not (`dds.asyn.N.0`) has the
-  fair class, on the cores of DDS threads: it spins while another thread has or wants a writer's
-  lock (`FlowControllerImpl::run`), and above that thread, on its core, would do so for ever;
-* what a plan has in a best-effort server comes behind all these, on the server's core, under the
-  fair class (SCHED_OTHER). All others are left alone.
+* DDS threads and Zenoh's router, on cores without servers where there are any: what they deliver
+  must not wait for its receiver. Those that receive come first; where the output is received, they
+  have the first of these cores;
+* servers, below 88, in the order of their own priority; threads of one server in the order in which
+  the plan names their nodes: at one priority, callbacks that become ready at once would run in the
+  order in which DDS happens to deliver. Where priorities are too few, the last of a server share
+  one; where slots are made of what single callbacks took, all but the first do, as while that was
+  measured (:attr:`~chainshaper.planning.application_plan.ApplicationPlan.most_urgent_first`). Turns
+  (SCHED_RR), only if the plan wants them, end within a callback, which then waits for another;
+* who receives what a shaping node publishes, on the shaping node's core, or, of several chains,
+  whose servers keep that core busy, on the first core without servers;
+* an asynchronous publisher, below every other thread of its process on its core: it spins on the
+  writer's lock, and above them would never let them release it;
+* the thread by which Fast DDS sends what synchronous writers could not (`dds.asyn.N.0`), under the
+  fair class, on the cores of DDS threads, since it spins on the same locks
+  (`FlowControllerImpl::run`), and what is in best-effort servers. All others are left alone.
 """
 
 import time
@@ -147,20 +142,20 @@ def allocate(
     ]
     wanted = {process.pid for process in processes}
     chosen = [one for one in _with_unique_names(identified) if one.process.pid in wanted]
-    guesses = [
+    notes = [
         f"process {one.process.pid} is called {one.nodes[0]} after its program, which is a guess: "
         "name its recording, or start it with `--ros-args -r __node:=NAME`"
         for one in chosen
         if one.nodes_known_by == "program's name" and one.nodes and one.nodes[0] not in ROUTERS
     ]
-    ambiguities = [
-        _ambiguous(name, [one.process.pid for one in claimants])
-        for name, claimants in _claims(chosen).items()
+    notes += [_ambiguous(name, pids) for name, pids in _claims(chosen).items()]
+    notes += [
+        f"process {one.process.pid} of {', '.join(one.nodes)}: {IN_ORDER}"
+        for one in chosen
+        if one.in_order
     ]
-    in_order = [one for one in chosen if one.in_order]
-    notes = (f"process {o.process.pid} of {', '.join(o.nodes)}: {IN_ORDER}" for o in in_order)
     threads = tuple(thread for one in chosen for thread in _threads_of(one))
-    return Allocation(threads, (*guesses, *ambiguities, *notes, *_limits(chosen)))
+    return Allocation(threads, (*notes, *_limits(chosen)))
 
 
 def _ambiguous(node: str, pids: Iterable[int]) -> str:
@@ -177,8 +172,8 @@ def _limits(identified: Iterable[_Identified]) -> Iterator[str]:
         if one.nodes and (limit := middleware_limit(one.process)) is not None:
             found.setdefault(limit, set()).update(one.nodes)
     for limit, nodes in found.items():
-        more = ", …" if len(nodes) > _MOST_NAMED else ""
-        yield f"{', '.join(sorted(nodes)[:_MOST_NAMED])}{more}: {MIDDLEWARE_LIMITS[limit]}"
+        more = ["…"] * (len(nodes) > _MOST_NAMED)
+        yield f"{', '.join(sorted(nodes)[:_MOST_NAMED] + more)}: {MIDDLEWARE_LIMITS[limit]}"
 
 
 def with_gates(found: Allocation, nodes: Iterable[ShapingNode]) -> Allocation:
@@ -212,37 +207,35 @@ def strangers_text(
         if process.user not in users
         and (names := [n for n in _own_words(process)[0] if nodes is None or n in nodes])
     ]
+    if not found:
+        return None
     more = f" and {len(found) - _MOST_NAMED} more" if len(found) > _MOST_NAMED else ""
     named = f"{', '.join(found[:_MOST_NAMED])}{more}"
-    return (
-        f"{LEFT_ALONE}{named}; to take them for nodes, name their user (--user)" if found else None
-    )
+    return f"{LEFT_ALONE}{named}; to take them for nodes, name their user (--user)"
 
 
 def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identified:
     named = named_nodes(process.command)
-    match = next((seen for seen in recorded if _is_same(process, named, seen)), None)
     nodes, known_by = _own_words(process)
-    if match is not None:
-        known = {thread.tid: thread for thread in match.threads}
-        if match.numbered_here:
-            inner = {one.tid: one.inner_tid for one in process.threads}
-            known = {inner[tid]: one for tid, one in known.items() if tid in inner}
-        nodes, known_by = (match.nodes, "recording") if match.nodes else (nodes, known_by)
-        main = all(thread.role != "executor" for thread in match.threads)
-        return _Identified(process, nodes, known_by, known, main_executes=main)
-    earlier = next((seen for seen in recorded if nodes and set(nodes) <= set(seen.nodes)), None)
-    if earlier is None and (earlier := _same_program(nodes, named, recorded)) is not None:
-        nodes, known_by = earlier.nodes, "recording"
-    if earlier is None:
+    itself = next((seen for seen in recorded if _is_same(process, named, seen)), None)
+    namesake = next((seen for seen in recorded if nodes and set(nodes) <= set(seen.nodes)), None)
+    run = itself or namesake or _same_program(nodes, named, recorded)
+    if run is None:
         return _Identified(process, nodes, known_by)
-    # A container's command line names the container only; an earlier run tells its components.
-    if named and set(named) < set(earlier.nodes):
-        nodes, known_by = earlier.nodes, "recording"
-    like = _in_order(process, earlier)
-    executing = [thread.tid for thread in earlier.threads if thread.role == "executor"]
-    main = not executing or earlier.pid in executing
-    return _Identified(process, nodes, known_by, like, bool(like), main)
+    # A container's command line does not name its components, others' no node at all.
+    knows_better = itself or not namesake or (named and set(named) < set(run.nodes))
+    if knows_better and run.nodes:
+        nodes, known_by = run.nodes, "recording"
+    if itself is None:
+        known = _in_order(process, run)
+    elif run.numbered_here:
+        inner = {one.tid: one.inner_tid for one in process.threads}
+        known = {inner[one.tid]: one for one in run.threads if one.tid in inner}
+    else:
+        known = {one.tid: one for one in run.threads}
+    executing = [one.tid for one in run.threads if one.role == "executor"]
+    main = not executing or run.pid in executing
+    return _Identified(process, nodes, known_by, known, itself is None and bool(known), main)
 
 
 def _same_program(
@@ -251,11 +244,11 @@ def _same_program(
     """The one earlier run of a program that names its nodes in its code, by its main thread."""
     if named or not guess:
         return None
-    comm = guess[0][1:][:_COMM_LENGTH]
+    main = guess[0][1:][:_COMM_LENGTH]
     runs = [
         seen
         for seen in recorded
-        if seen.nodes and any((one.tid, one.comm) == (seen.pid, comm) for one in seen.threads)
+        if seen.nodes and any((one.tid, one.comm) == (seen.pid, main) for one in seen.threads)
     ]
     return runs[0] if len(runs) == 1 else None
 
@@ -266,19 +259,19 @@ def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedT
     A program starts its threads in one order, so those of one name are the same by turns, once
     there are as many. It is asked for executors beside the main thread only.
     """
-    executing = [thread for thread in earlier.threads if thread.role == "executor"]
-    if all(thread.tid == earlier.pid for thread in executing):
-        return {}
+    executing = [one for one in earlier.threads if one.role == "executor"]
     found: dict[int, RecordedThread] = {}
-    for name in {thread.comm for thread in executing}:
-        before = {one.tid: one for one in earlier.threads if one.comm == name}
+    if all(one.tid == earlier.pid for one in executing):
+        return found
+    for name in {one.comm for one in executing}:
+        before = [one for one in earlier.threads if one.comm == name]
         now = [one.inner_tid for one in process.threads if one.comm == name]
         if len(before) != len(now):
             return {}
         # Ids ascend, and begin again at the lowest that is free.
         now.sort(key=lambda tid: (tid < process.inner_pid, tid))
-        tids = sorted(before, key=lambda tid: (tid < earlier.pid, tid))
-        found |= {tid: before[its] for tid, its in zip(now, tids, strict=True)}
+        before.sort(key=lambda one: (one.tid < earlier.pid, one.tid))
+        found |= zip(now, before, strict=True)
     return found
 
 
@@ -302,13 +295,13 @@ def _is_same(process: Process, named: tuple[str, ...], seen: RecordedProcess) ->
     return not (named and seen.nodes) or not set(named).isdisjoint(seen.nodes)
 
 
-def _claims(identified: Iterable[_Identified]) -> dict[str, list[_Identified]]:
+def _claims(identified: Iterable[_Identified]) -> dict[str, list[int]]:
     """The names that several processes have, with these."""
-    claims: dict[str, list[_Identified]] = {}
+    claims: dict[str, list[int]] = {}
     for one in identified:
         for name in one.nodes:
-            claims.setdefault(name, []).append(one)
-    return {name: claimants for name, claimants in claims.items() if len(claimants) > 1}
+            claims.setdefault(name, []).append(one.process.pid)
+    return {name: pids for name, pids in claims.items() if len(pids) > 1}
 
 
 def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
@@ -316,12 +309,12 @@ def _with_unique_names(identified: list[_Identified]) -> list[_Identified]:
     if none does, is the innermost (`ros2 run` and the like start it).
     """
     parent_of = {one.process.pid: one.process.parent for one in identified}
+    participants = {one.process.pid for one in identified if one.process.participates}
     carried = set[tuple[int, str]]()
-    for name, claimants in _claims(identified).items():
-        pids = {one.process.pid for one in claimants}
-        node = {one.process.pid for one in claimants if one.process.participates}
-        node = node or {pid for pid in pids if not (descendants(parent_of, pid) - {pid}) & pids}
-        carried |= {(pid, name) for pid in pids - node}
+    for name, pids in _claims(identified).items():
+        innermost = {pid for pid in pids if descendants(parent_of, pid).intersection(pids) == {pid}}
+        node = participants.intersection(pids) or innermost
+        carried |= {(pid, name) for pid in pids if pid not in node}
     return [
         one._replace(nodes=tuple(n for n in one.nodes if (one.process.pid, n) not in carried))
         for one in identified
@@ -371,9 +364,9 @@ def server_members(
         for one in found:
             if (home := homes.setdefault(one.thread.identity, server.name)) != server.name:
                 raise OperationError(
-                    f"thread {one.thread.tid} ({one.thread.comm}) executes {', '.join(one.nodes)}, "
-                    f"which the plan has in the servers {home} and {server.name}: put them into "
-                    "one server, or start them as processes of their own"
+                    f"{one.thread.text} executes {', '.join(one.nodes)}, which the plan has in the"
+                    f" servers {home} and {server.name}: put them into one server, or start them"
+                    " as processes of their own"
                 )
         members[server.name] = tuple({one.thread.identity: one for one in found}.values())
     return members
@@ -382,7 +375,6 @@ def server_members(
 def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThread]:
     """The threads that a plan means. Raises OperationError: as :func:`server_members`."""
     owners = [one for one in allocation.threads if planned.node in one.nodes]
-    found = [one for one in owners if one.thread.role == planned.role]
     pids = sorted({one.thread.pid for one in owners})
     if len(pids) > 1:
         raise OperationError(_ambiguous(planned.node, pids))
@@ -393,6 +385,8 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
             f"{', '.join(known) or 'no node'}; start it with `--ros-args -r __node:=NAME`, or name "
             "a recording of it" + (f"; {allocation.strangers}" if allocation.strangers else "")
         )
+    process = f"process {pids[0]} of node {planned.node}"
+    found = [one for one in owners if one.thread.role == planned.role]
     if not found:
         what = "executor: name a recording of this very process (--recording)"
         if planned.role == "publisher":
@@ -401,18 +395,15 @@ def threads_for(planned: PlannedThread, allocation: Allocation) -> list[NodeThre
                 " is ASYNCHRONOUS: plan with --publication synchronous"
             )
         raise OperationError(
-            f"process {pids[0]} of node {planned.node} has no thread that is known to be its "
-            f"{what}, or see `chainshaper threads {pids[0]}`"
+            f"{process} has no thread that is known to be its {what}, or see "
+            f"`chainshaper threads {pids[0]}`"
         )
-    if not planned.callbacks:
-        return found
     wanted = {(planned.node, name) for name in planned.callbacks}
-    own = [one for one in found if not wanted.isdisjoint(one.callbacks)]
+    own = [one for one in found if not wanted.isdisjoint(one.callbacks)] if wanted else found
     if not own:
-        known = sorted({name for one in found for node, name in one.callbacks})
+        known = sorted({name for one in found for _, name in one.callbacks})
         raise OperationError(
-            f"process {pids[0]} of node {planned.node}: which of its threads runs "
-            f"{', '.join(planned.callbacks)} is not known"
+            f"{process}: which of its threads runs {', '.join(planned.callbacks)} is not known"
             + (f" (known are those that run {', '.join(known)})" if known else "")
             + ": name a recording of it, or of an earlier run of the same program (--recording)"
         )
@@ -432,9 +423,9 @@ def server_priorities(sizes: Mapping[int, int]) -> dict[int, tuple[int, ...]]:
         most -= 1
     found, best = dict[int, tuple[int, ...]](), _BEST_SERVER_PRIORITY
     for rank in sorted(sizes):
-        lowest = best - min(sizes[rank], most) + 1
-        found[rank] = tuple(range(best, lowest - 1, -1))
-        best = lowest - 1 - _BELOW
+        below = best - min(sizes[rank], most)
+        found[rank] = tuple(range(best, below, -1))
+        best = below - _BELOW
     return found
 
 
@@ -511,13 +502,12 @@ def scheduling_around(
 ) -> tuple[WantedScheduling, ...]:
     """What the threads of servers, and the others of their processes, shall get.
 
-    ``members`` are by server's name, and within a server in the ``order`` of their nodes, the most
+    ``members`` are by server's name, within a server in the ``order`` of their nodes, the most
     urgent first; others come behind these, and share a priority. ``receivers`` are nodes that
-    receive an output, and the core for that: the processes of their executors, which stand below
-    all servers, are treated alike. An executor that is real-time already, on cores of no server,
-    stays as it is: its other callbacks were placed there, too. With ``take_turns``, servers of one
-    priority share it by turns. DDS threads leave the cores of all servers or, where these are all
-    that there are, those to be ``clear``.
+    receive an output, and the core for their executors; one that is real-time already, on cores of
+    no server, stays as it is: its other callbacks were placed there. With ``take_turns``, servers
+    of one priority share it by turns. DDS threads leave the cores of all servers or, where these
+    are all that there are, those to be ``clear``.
 
     Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
     InputError: see :func:`server_priorities`.
@@ -535,24 +525,22 @@ def scheduling_around(
         return Scheduling(own[min(place, len(own) - 1)], (server.core,), take_turns)
 
     own = [
-        WantedScheduling(
-            member, wanted_in(its, member), its.name, f"server priority {its.priority}"
-        )
+        WantedScheduling(one, wanted_in(its, one), its.name, f"server priority {its.priority}")
         for its in sorted(servers, key=lambda one: one.priority)
-        for member in members[its.name]
+        for one in members[its.name]
     ]
-    in_servers = {one.thread.thread.identity for one in own}
-    below = max(1, min(map(min, priorities.values()), default=DDS_PRIORITY) - 1 - _BELOW)
-    receiving = [
-        WantedScheduling(one, Scheduling(below, (core,)), None, _RECEIVES)
-        for one in allocation.threads
-        if one.thread.role == "executor" and one.thread.identity not in in_servers
-        for core in [receivers[node] for node in one.nodes if node in receivers][:1]
-    ]
-    receiving_pids = {one.thread.thread.pid for one in receiving}
+    planned = {one.thread.thread.identity for one in own}
     busy = {server.core for server in servers}
-    receiving = [one for one in receiving if not _placed_already(one, busy)]
-    planned = in_servers | {one.thread.thread.identity for one in receiving}
+    below = max(1, min(map(min, priorities.values()), default=DDS_PRIORITY) - 1 - _BELOW)
+    receiving, receiving_pids = list[WantedScheduling](), set[int]()
+    for one in allocation.threads:
+        core = next((receivers[node] for node in one.nodes if node in receivers), None)
+        if one.thread.role != "executor" or one.thread.identity in planned or core is None:
+            continue
+        receiving_pids.add(one.thread.pid)
+        if one.thread.priority in (0, below) or not busy.isdisjoint(one.thread.cores):
+            receiving.append(WantedScheduling(one, Scheduling(below, (core,)), None, _RECEIVES))
+    planned |= {one.thread.thread.identity for one in receiving}
     free_cores = tuple(sorted(set(available_cores) - busy))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
     concerned = receiving_pids | {one.thread.thread.pid for one in own}
@@ -571,20 +559,12 @@ def scheduling_around(
     )
 
 
-def _placed_already(one: WantedScheduling, busy: set[int]) -> bool:
-    """Whether a thread has a real-time priority, not the one that we would give, on other cores."""
-    thread = one.thread.thread
-    return thread.priority not in (0, one.wanted.priority) and busy.isdisjoint(thread.cores)
-
-
 def _beside(
     one: NodeThread, own: Sequence[WantedScheduling], cores: tuple[int, ...], receives_output: bool
 ) -> WantedScheduling | None:
-    """What a thread in no server shall get, in a process that has one in a server.
-
-    DDS threads stand above all servers, but for the one that spins on the locks of others; where no
-    core is left to them they stay where they are.
-    Others, of no class of their own, leave the core of a publisher, which would outrank them.
+    """What a thread in no server shall get, in a process that has one in a server. DDS threads stay
+    where they are if no core is left to them; others, of no class of their own, leave the core of a
+    publisher, which would outrank them.
     """
     thread = one.thread
     if thread.kind == "resend":
@@ -608,9 +588,9 @@ def _beside(
     elsewhere = cores if inherits else elsewhere
     if not elsewhere:
         raise OperationError(
-            f"thread {thread.tid} ({thread.comm}) of process {thread.pid} may run on core "
-            f"{min(shared)} only, where the process's asynchronous publisher would outrank it and "
-            "never let it release the writer's lock: let it run on another core too (`taskset`)"
+            f"{thread.text} may run on core {min(shared)} only, where the process's asynchronous"
+            " publisher would outrank it and never let it release the writer's lock: let it run on"
+            " another core too (`taskset`)"
         )
     reason = "not on the core of its process's asynchronous publisher"
     return WantedScheduling(one, Scheduling(0 if inherits else None, elsewhere), None, reason)
@@ -619,14 +599,14 @@ def _beside(
 def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> WantedScheduling:
     """A publisher below the other threads of its process on its core."""
     core = (publisher.wanted.cores or (None,))[0]
-    siblings = [
+    siblings = (
         one.wanted.priority - 1
         for one in wanted
         if one.thread.thread.pid == publisher.thread.thread.pid
         and one.thread.thread.role != "publisher"
         and one.wanted.priority is not None
         and core in (one.wanted.cores or one.thread.thread.cores)
-    ]
+    )
     below = max(1, min(siblings, default=99))
     if below >= (publisher.wanted.priority or 0):
         return publisher
@@ -640,10 +620,9 @@ def left_by_back_end(
 ) -> tuple[WantedScheduling, ...]:
     """What threads get from us where a back end schedules its servers' threads itself.
 
-    Under sched_ext and LITMUS^RT these need no priority, and under sched_ext may have none, since
-    the kernel runs real-time threads above it. ``free`` threads, which no back end keeps in their
-    slots, stand above them with what is wanted. A receiver would stand there too, instead of
-    below: it is left as it is.
+    These need no priority, and under sched_ext may have none, since the kernel runs real-time
+    threads above it. So ``free`` threads, which no back end keeps in their slots, stand above them;
+    a receiver would, instead of below: it is left as it is.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)

@@ -1,9 +1,9 @@
 """Runs from their claim to their end: which cores and nodes, what they say, and undoing them.
 
-Two plans never govern the same core or node, since their slots contradict each other: each run
-claims its own in its journal, under a lock of the folder of all runs. A run that is in force is
-asked to end; one whose owner is gone, or does not react, is undone from its journal, by whichever
-process is left. Where the journal itself is gone, cgroups of ours are found by their names.
+Two plans never govern the same core or node: each run claims its own in its journal, under a lock
+of the folder of all runs. A run that is in force is asked to end; one whose owner is gone, or does
+not react, is undone from its journal, by whichever process is left. Where the journal itself is
+gone, cgroups of ours are found by their names.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from chainshaper.enforcement.scheduling_memory import (
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters
 from chainshaper.linux import cgroups, own_processes, runs
 from chainshaper.linux.runs import Journal, find_journals, locked, process_of
-from chainshaper.linux.scheduling import state_of, state_text
+from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import find_thread, open_process
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError, PlatformError
@@ -138,11 +138,12 @@ def claim_run(
 ) -> Journal:
     """Begin a run that governs these cores and nodes: the journal for all that it changes.
 
-    While another run begins, ``go_on`` is called again and again, and may raise. Raises
-    OperationError: a living run governs one of them, a crashed one cannot be undone, or one that
-    begins does not get on with it. PlatformError: nothing may be written to the folder.
+    ``go_on`` is called while another run begins, and may raise. Raises OperationError: a living run
+    governs one of them, a crashed one cannot be undone, or one that begins does not get on with it.
+    PlatformError: nothing may be written to the folder.
     """
     base = runs.journals_folder() if folder is None else folder
+    wanted: dict[str, set[Any]] = {"core": set(cores), "node": set(nodes)}
 
     def waiting(waited_s: float) -> None:
         go_on()
@@ -164,31 +165,27 @@ def claim_run(
             ) from error
         for other in find_journals(base):
             shared = " and ".join(
-                f"{kind} {', '.join(map(str, sorted(both)))}"
-                for its_cores, its_nodes in other.read(CLAIMS, _read_claim)
-                for kind, both in (
-                    ("core", its_cores.intersection(cores)),
-                    ("node", its_nodes.intersection(nodes)),
-                )
-                if both
+                f"{kind} {', '.join(map(str, sorted(claimed & wanted[kind])))}"
+                for claim in other.read(CLAIMS, _read_claim)
+                for kind, claimed in claim.items()
+                if claimed & wanted[kind]
             )
-            owner = other.owner
-            if owner is None and (shared or not other.entries(CLAIMS)):
-                if left := undo_run(other):
-                    why = "; ".join(left)
-                    raise OperationError(f"the crashed run {other.name} cannot be undone: {why}")
-            elif shared:
+            if (owner := other.owner) is not None and shared:
                 raise OperationError(
                     f"the run {other.name} of process {owner} governs {shared} already: end it "
                     f"first (`chainshaper release {other.name}`)"
                 )
+            is_in_the_way = owner is None and (shared or not other.entries(CLAIMS))
+            if is_in_the_way and (left := undo_run(other)):
+                why = "; ".join(left)
+                raise OperationError(f"the crashed run {other.name} cannot be undone: {why}")
         journal = runs.open_journal(base)
         journal.note(CLAIMS, cores=sorted(cores), nodes=sorted(nodes))
         return journal
 
 
-def _read_claim(entry: Mapping[str, Any]) -> tuple[set[int], set[str]]:
-    return set(map(int, entry["cores"])), set(map(str, entry["nodes"]))
+def _read_claim(entry: Mapping[str, Any]) -> dict[str, set[Any]]:
+    return {"core": set(map(int, entry["cores"])), "node": set(map(str, entry["nodes"]))}
 
 
 _READERS: Mapping[str, Callable[[Mapping[str, Any]], object]] = {
@@ -250,10 +247,8 @@ def _wait_for_end(journal: Journal) -> bool:
 
 
 def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
-    """Undo what a run has changed; what could not be undone, in sentences.
-
-    The run is removed, if its owner is gone or asks for it. It stays where something is left, so
-    that it can be tried again, and where its journal has lines that say nothing.
+    """Undo what a run has changed; what could not be undone, in sentences. If its owner is gone or
+    asks for it, the run is removed, unless something is left, or its journal has strange lines.
     """
     left: list[str] = []
     with contextlib.ExitStack() as stack:
@@ -325,27 +320,23 @@ def remove_run(journal: Journal) -> None:
 
 
 def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple[str, ...]]:
-    """Dissolve :func:`.stray_groups`: their threads run again, and it is mounted as before.
-
-    Returns the groups that are gone, and what could not be put back, since nothing says any more
-    what was there.
+    """Dissolve :func:`.stray_groups`: their threads run again, and it is mounted as before. Returns
+    the groups that are gone, and what could not be put back, since nothing says what was there.
     """
     gone, left = [], []
     for folder in freezer.stray_groups(journals):
         tids = cgroups.threads_in(folder)
-        why = cgroups.dissolve(folder)
-        if why is None:
+        if (why := cgroups.dissolve(folder)) is None:
             gone.append(folder)
         else:
             left.append(why)
-        for thread in filter(None, map(find_thread, tids)):
-            if thread.priority == 0:
-                continue
+        real_time = (one for one in map(find_thread, tids) if one is not None and one.priority)
+        for thread in real_time:
             with contextlib.suppress(ProcessLookupError):
                 left.append(
-                    f"thread {thread.tid} ({thread.comm}) of process {thread.pid} runs on under "
-                    f"{state_text(state_of(thread.tid))}, and what it had before is not known: "
-                    f"`chrt --other --pid 0 {thread.tid}`, `taskset -pc CORES {thread.tid}`"
+                    f"{thread.text} runs on under {state_of(thread.tid).text}, and what it had"
+                    f" before is not known: `chrt --other --pid 0 {thread.tid}`,"
+                    f" `taskset -pc CORES {thread.tid}`"
                 )
     freezer.restore_mount()
     if left and cgroups.moves_are_quick():

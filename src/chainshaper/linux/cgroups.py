@@ -27,16 +27,8 @@ _BEFORE = "trusted.chainshaper.mount"
 """Attribute of the hierarchy's root: its mount options before runs of ours. All of these share it,
 and none can lose it: it is in the kernel's memory, as the option is."""
 _REMOUNT = 32
-_MOUNT_FLAGS = {
-    "rw": 0,
-    "ro": 1,
-    "nosuid": 2,
-    "nodev": 4,
-    "noexec": 8,
-    "noatime": 1 << 10,
-    "nodiratime": 1 << 11,
-    "relatime": 1 << 21,
-}
+_MOUNT_FLAGS = {"rw": 0, "ro": 1, "nosuid": 2, "nodev": 4, "noexec": 8}
+_MOUNT_FLAGS |= {"noatime": 1 << 10, "nodiratime": 1 << 11, "relatime": 1 << 21}
 """Of mount(2); an option that is none of them is the file system's own."""
 _ATTEMPTS = 3
 _THREADED_CONTROLLERS = {"cpu", "cpuset", "perf_event", "pids"}
@@ -52,7 +44,7 @@ def mount_point() -> Path:
 
 
 def mount_options() -> str:
-    """The options of the version 2 hierarchy's mount. Raises PlatformError: it is not mounted."""
+    """The options of that mount. Raises PlatformError: there is none."""
     return _mount()[1]
 
 

@@ -4,8 +4,8 @@ A process of ours often has more rights than whoever fills the folder that it is
 Python is isolated (``-I``), and gets back our package, and behind all other folders those of the
 libraries that it needs, if root and we alone can change them.
 
-The user's command, such as `ros2 launch …`, gets a session of its own: Ctrl-C then reaches us
-alone. It ends by SIGINT to its whole process group, then by SIGTERM, then by SIGKILL.
+All have sessions of their own: Ctrl-C reaches us alone. The user's command, such as `ros2 launch
+…`, ends by SIGINT to its whole process group, then by SIGTERM, then by SIGKILL.
 """
 
 import contextlib
@@ -60,13 +60,19 @@ def module_command(module: str, libraries: Sequence[str] = ()) -> list[str]:
             )
         package = ""  # whoever installed this Python has it find the package, and answers for that
     folders = []
-    for library in libraries:
-        found = importlib.util.find_spec(library)
+    for found in map(importlib.util.find_spec, libraries):
         if found is not None and found.origin is not None:
             place = Path(found.origin).parents[1 if found.submodule_search_locations else 0]
             if not str(place).startswith(own) and why_distrusted(place) is None:
                 folders.append(str(place))
     return [sys.executable, "-I", "-c", _START, package, ":".join(dict.fromkeys(folders)), module]
+
+
+def start_module(module: str, *arguments: str, **options: Any) -> "subprocess.Popen[bytes]":
+    """Start a module as a process of ours; we read its output, unless ``options`` say otherwise."""
+    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    command = [*module_command(module), *arguments]
+    return subprocess.Popen(command, start_new_session=True, **{**pipes, **options})
 
 
 def named_folders() -> list[str]:
@@ -87,11 +93,10 @@ def is_installed(tool: str) -> bool:
 
 def check_command(command: Sequence[str]) -> None:
     """See that a command can be started. Raises InputError: no such program, or not executable."""
-    if shutil.which(command[0]) is not None:
-        return
-    if Path(command[0]).is_file() and os.sep in command[0]:
-        raise InputError(f"{command[0]} is not executable: give it the permission (`chmod +x`)")
-    raise InputError(f"{command[0]}: no such command; try `source /opt/ros/…/setup.bash` first")
+    if shutil.which(command[0]) is None:
+        if os.sep in command[0] and Path(command[0]).is_file():
+            raise InputError(f"{command[0]} is not executable: give it the permission (`chmod +x`)")
+        raise InputError(f"{command[0]}: no such command; try `source /opt/ros/…/setup.bash` first")
 
 
 def start_command(

@@ -1,12 +1,12 @@
 """Processes that may belong to a ROS 2 or DDS application, whose they are, and their nodes' names.
 
 A process takes part in DDS when it has a thread that receives or one for timed events, by the names
-of a DDS implementation; where those do not name theirs (Fast DDS before 2.13), a mapped library
-together with further threads has to do.
+of a DDS implementation, or, where those name none (Fast DDS before 2.13), a mapped library and
+further threads.
 
 A process is a user's when that user both runs it, by all four of its user ids, and has started its
-program: `sudo` and every other set-user-ID program carry the command line and the environment of
-another user than the one they run as. Root may start programs for all.
+program: set-user-ID programs, such as `sudo`, carry the command line and the environment of another
+user than the one they run as. Root may start programs for all.
 
 Upstream: proc(5), credentials(7), getauxval(3); rcl, `arguments.c` and `remap.c`.
 """
@@ -55,11 +55,11 @@ ROUTERS = frozenset({"/rmw_zenohd", "/zenohd"})
 """Zenoh's router, by the name of its program: messages may pass through it."""
 
 _OF_ICEORYX = "KeepAlive"  # `posh_runtime_impl.cpp`; its `Listener` names no thread
-_FROM_SOURCES = "threads are known by rules from its {}, and chainshaper never ran on it"
+_NEVER_RAN = "its threads are known by rules from its {}, and chainshaper never ran on it"
 MIDDLEWARE_LIMITS = {
-    "zenoh": f"Zenoh: its {_FROM_SOURCES.format('sources')}",
-    "connext": f"RTI Connext: its {_FROM_SOURCES.format('manual')}",
-    "iceoryx": f"Cyclone DDS with iceoryx: its {_FROM_SOURCES.format('sources')}; the thread that"
+    "zenoh": f"Zenoh: {_NEVER_RAN.format('sources')}",
+    "connext": f"RTI Connext: {_NEVER_RAN.format('manual')}",
+    "iceoryx": f"Cyclone DDS with iceoryx: {_NEVER_RAN.format('sources')}; the thread that"
     " delivers has no name, and stays as it is",
     "unnamed": "the middleware's threads have no names (Fast DDS before 2.13, GurumDDS): Fast DDS's"
     " that receive are known by what they wait for; others stay as they are, and may wait for a"
@@ -115,32 +115,26 @@ def user_in(folder: int) -> int | None:
     user, *others = status_field(read_proc("status", folder), "Uid")
     if any(other != user for other in others):
         return None
-    try:
+    auxiliary = b""
+    with suppress(OSError):  # it may not be looked at
         auxiliary = read_proc("auxv", folder)
-    except OSError:
-        # It may not be looked at. What is root's by its ids may be a set-user-ID program.
-        auxiliary = b""
     entries = _AUXILIARY.iter_unpack(auxiliary[: len(auxiliary) & -_AUXILIARY.size])
     # The real user when it began its program: who chose command line and environment.
     started_by = next((value for kind, value in entries if kind == _AT_UID), None)
-    if started_by is None:
+    if started_by is None:  # what is root's by its ids may be a set-user-ID program
         return None if user == 0 and os.geteuid() == 0 else user
-    return user if {started_by, _outside(started_by, folder)} & {user, 0} else None
-
-
-def _outside(user: int, folder: int) -> int | None:
-    """The user whom a process calls so in its user namespace (``/proc/PID/uid_map``)."""
-    for line in read_proc("uid_map", folder).splitlines():
+    starters = {started_by}
+    for line in read_proc("uid_map", folder).splitlines():  # of its user namespace
         inside, outside, count = map(int, line.split())
-        if inside <= user < inside + count:
-            return outside + user - inside
-    return None
+        if inside <= started_by < inside + count:
+            starters.add(outside + started_by - inside)
+    return user if starters & {user, 0} else None
 
 
 @dataclass(frozen=True)
 class Process:
-    """A process at one instant, its id in its own pid namespace, whether it takes part in DDS, and
-    whose it is (None: no single user's).
+    """A process at one instant; ``inner_pid`` is its id in its own pid namespace, ``user`` None if
+    it is no single user's. Whether it ``participates`` in DDS.
     """
 
     pid: int
@@ -206,7 +200,13 @@ def _participation(pid: int, threads: tuple[Thread, ...]) -> tuple[bool, tuple[T
         with suppress(OSError):  # another user's: its threads' names are all there is to see
             mapped = read_proc(f"/proc/{pid}/maps")
             if _FAST_DDS in mapped:
-                threads = _with_receivers(threads, list(regions_in(mapped)))
+                regions = list(regions_in(mapped))
+                threads = tuple(
+                    replace(one, role="dds", kind="receive")
+                    if one.tid != pid and _receives_for_fast_dds(one, regions)
+                    else one
+                    for one in threads
+                )
             return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS), threads
     return False, threads
 
@@ -242,23 +242,12 @@ _OF_LANGUAGE = re.compile(r"/(lib(c|pthread|stdc\+\+|gcc_s)|ld-linux[-\w]*)[-.]|
 _OUTERMOST = 16_384  # so near are a thread's first frames to where it waits, and to its stack's end
 
 
-def _with_receivers(threads: tuple[Thread, ...], regions: Sequence[Region]) -> tuple[Thread, ...]:
-    """The threads of a process that has a Fast DDS before 2.13, of which those that receive have
-    their role.
-
-    They wait for a datagram, or for a word in the memory of a port, and the library's function is
-    the first on their stack. One that runs at this instant stays unknown, and all do where we may
-    not look at the process (ptrace(2), PTRACE_MODE_ATTACH).
-    """
-    return tuple(
-        replace(one, role="dds", kind="receive")
-        if one.tid != one.pid and _receives_for_fast_dds(one, regions)
-        else one
-        for one in threads
-    )
-
-
 def _receives_for_fast_dds(thread: Thread, regions: Sequence[Region]) -> bool:
+    """Whether a thread of a process that has a Fast DDS before 2.13 receives: it waits for a
+    datagram, or for a word in the memory of a port, and the library's function is the first on its
+    stack. Not known of one that runs at this instant, nor where we may not look at the process
+    (ptrace(2), PTRACE_MODE_ATTACH).
+    """
     receive, futex = _SYSCALLS.get(platform.machine(), ((), -1))
     try:
         number, *values = read_proc(f"/proc/{thread.pid}/task/{thread.tid}/syscall").split()
@@ -314,22 +303,19 @@ def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
     """
     names: dict[str | None, str] = {}
     namespaces: dict[str | None, str] = {}
-    for owner, name, namespace in _rules(command):
-        if None in (names if name else namespaces):
-            continue  # rules behind one for all nodes never apply
-        if name:
-            names.setdefault(owner, name)
-        else:
-            namespaces.setdefault(owner, namespace)
+    for rule in filter(None, map(_RULE.fullmatch, _remap_rules(command))):
+        owner, name, namespace = rule.groups()
+        found = names if name else namespaces
+        if None not in found:  # rules behind one for all nodes never apply
+            found.setdefault(owner, name or namespace)
     if None not in names:  # nodes of which only the namespace is remapped
         names |= {owner: owner for owner in namespaces if owner and owner not in names}
     for_all = namespaces.get(None, "/")
-    found = (f"{namespaces.get(o, for_all).rstrip('/')}/{name}" for o, name in names.items())
-    return tuple(dict.fromkeys(found))
+    full = (f"{namespaces.get(o, for_all).rstrip('/')}/{name}" for o, name in names.items())
+    return tuple(dict.fromkeys(full))
 
 
-def _rules(command: Sequence[str]) -> Iterator[tuple[str | None, str, str]]:
-    """Valid rules about names: whose (None: all nodes'), and a name, or else a namespace."""
+def _remap_rules(command: Sequence[str]) -> Iterator[str]:
     arguments = iter(command)
     for argument in arguments:
         if argument != "--ros-args":
@@ -340,9 +326,7 @@ def _rules(command: Sequence[str]) -> Iterator[tuple[str | None, str, str]]:
             if ros_argument in _WITH_VALUE:
                 next(arguments, None)
             elif ros_argument in ("-r", "--remap"):
-                rule = _RULE.fullmatch(next(arguments, ""))
-                if rule is not None:
-                    yield rule[1], rule[2] or "", rule[3] or ""
+                yield next(arguments, "")
 
 
 def guessed_name(command: Sequence[str]) -> str | None:

@@ -17,7 +17,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import FileIO
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from chainshaper.linux.threads import find_thread, has_ended, open_process, read_proc, start_of
 from chainshaper.values.errors import OperationError, PlatformError
@@ -82,15 +82,13 @@ class Journal:
 
     def strange_lines(
         self, readers: Mapping[str, Callable[[Mapping[str, Any]], object]]
-    ) -> tuple[tuple[int, str], ...]:
+    ) -> Iterator[tuple[int, str]]:
         """Lines, with their numbers, that are no entries, or that none of these could read."""
-
-        def is_read(entry: Mapping[str, Any] | None) -> bool:
+        for number, line in enumerate(self._lines(), start=1):
+            entry = _entry(line)
             reader = readers.get(entry["kind"]) if entry else None
-            return bool(entry and reader and _value(entry, reader) is not None)
-
-        lines = enumerate(self._lines(), start=1)
-        return tuple((number, line) for number, line in lines if not is_read(_entry(line)))
+            if entry is None or reader is None or _value(entry, reader) is None:
+                yield number, line
 
     def keep(self) -> bool:
         """See that the file is there, from ``memory`` if need be; whether it was not discarded."""
@@ -160,8 +158,7 @@ def process_of(entry: Mapping[str, Any]) -> tuple[int, int]:
     return int(entry["pid"]), int(entry["started"])
 
 
-@dataclass(frozen=True)
-class OwnProcess:
+class OwnProcess(NamedTuple):
     """A process of a run, in its journal, known by id and start; ``core``: a dispatcher's."""
 
     role: str

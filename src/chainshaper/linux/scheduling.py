@@ -9,6 +9,7 @@ import gc
 import os
 import signal
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
@@ -58,6 +59,14 @@ class SchedulingState:
     scheduling_class: SchedulingClass
     nice: int
     cores: tuple[int, ...]
+
+    @property
+    def text(self) -> str:
+        """For a person: ``SCHED_FIFO 87, nice 0, cores 1, 2``."""
+        own = self.scheduling_class
+        policy = POLICIES.get(own.policy, f"policy {own.policy}")
+        priority = f" {own.priority}" if own.priority else ""
+        return f"{policy}{priority}, nice {self.nice}, cores {', '.join(map(str, self.cores))}"
 
 
 def state_of(tid: int) -> SchedulingState:
@@ -109,14 +118,6 @@ def state_from_json(values: dict[str, Any]) -> SchedulingState:
     )
 
 
-def state_text(state: SchedulingState) -> str:
-    """A state for a person: ``SCHED_FIFO 87, nice 0, cores 1, 2``."""
-    own = state.scheduling_class
-    policy = POLICIES.get(own.policy, f"policy {own.policy}")
-    priority = f" {own.priority}" if own.priority else ""
-    return f"{policy}{priority}, nice {state.nice}, cores {', '.join(map(str, state.cores))}"
-
-
 def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
     """Give a thread, if it runs still, class and cores. Raises OperationError: it is refused."""
     try:
@@ -124,18 +125,18 @@ def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
     except ProcessLookupError:
         return
     except OSError as error:
-        whose = f"thread {thread.tid} ({thread.comm}) of process {thread.pid}"
         asked = f"priority {wanted.priority} on cores {wanted.cores}"
-        raise OperationError(f"{whose}: the kernel refuses {asked}: {error.strerror}") from error
+        raise OperationError(
+            f"{thread.text}: the kernel refuses {asked}: {error.strerror}"
+        ) from error
 
 
 def become_fifo(priority: int) -> bool:
     """Put the calling thread under SCHED_FIFO; False when that is not permitted."""
-    try:
+    with suppress(OSError):
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    except OSError:
-        return False
-    return True
+        return True
+    return False
 
 
 def may_use_fifo() -> bool:

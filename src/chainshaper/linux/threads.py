@@ -1,20 +1,18 @@
 """Threads as the kernel shows them, and what their names say.
 
-A thread is identified by its id *and* its start: ids are used again. Cyclone DDS has always named
-its threads, Fast DDS does from 2.13 on (ROS 2 Jazzy); before, those that receive are known by what
-they wait for (:mod:`.processes`). Zenoh's names are short words (`rx-0`), so they count only in a
-process that has several of them.
+A thread is identified by its id *and* its start: ids are used again. Cyclone DDS names its threads,
+and Fast DDS from 2.13 on (ROS 2 Jazzy); before, those that receive are known by what they wait for
+(:mod:`.processes`). Zenoh's names are short words (`rx-0`): a process has to have several of them.
 
 Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading";
-Zenoh, `commons/zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, User's Manual,
-"Identifying Threads".
+Zenoh, `zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, "Identifying Threads".
 """
 
 import functools
 import os
 import re
 import zlib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +23,7 @@ RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
 """A flag that shares the word with the policy."""
 TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 """The kernel shows the start of a thread in ticks of 10 ms."""
+_DEAD = {b"Z", b"X"}
 
 _OF_PYTHON = ("SCHED_OTHER", "SCHED_FIFO", "SCHED_RR", "SCHED_BATCH", "SCHED_IDLE")
 POLICIES: dict[int, str] = {getattr(os, name): name for name in _OF_PYTHON}
@@ -117,6 +116,10 @@ class Thread:
         """What no other thread has until the machine boots again: id and start."""
         return (self.tid, self.started)
 
+    @property
+    def text(self) -> str:
+        return f"thread {self.tid} ({self.comm}) of process {self.pid}"
+
 
 def list_threads(pid: int) -> tuple[Thread, ...]:
     """The threads of a process, main thread first; empty when the process is gone."""
@@ -126,22 +129,13 @@ def list_threads(pid: int) -> tuple[Thread, ...]:
     except OSError:
         return ()
     tids.sort(key=lambda tid: (tid != pid, tid))
-    found = (_thread(pid, tid, inner_pid) for tid in tids)
-    return with_zenoh(thread for thread in found if thread is not None)
-
-
-def with_zenoh(threads: Iterable[Thread]) -> tuple[Thread, ...]:
-    """The threads of a process, of which Zenoh's have their roles; without enough of them, none."""
-    every = tuple(threads)
-    own = {one.tid: match[1] for one in every if (match := _ZENOH_NAME.fullmatch(one.comm))}
-    if len(set(own.values())) < _SURELY_ZENOH:
-        return every
-    return tuple(
-        replace(one, role="dds", kind=_ZENOH_RUNTIMES[own[one.tid]])
-        if one.tid in own and one.tid != one.pid
-        else one
-        for one in every
-    )
+    found = {tid: one for tid in tids if (one := _thread(pid, tid, inner_pid)) is not None}
+    names = ((tid, _ZENOH_NAME.fullmatch(one.comm)) for tid, one in found.items())
+    zenoh = {tid: name[1] for tid, name in names if name is not None}
+    if len(set(zenoh.values())) >= _SURELY_ZENOH:
+        for tid in zenoh.keys() - {pid}:
+            found[tid] = replace(found[tid], role="dds", kind=_ZENOH_RUNTIMES[zenoh[tid]])
+    return tuple(found.values())
 
 
 def is_of_zenoh(thread: Thread) -> bool:
@@ -151,12 +145,9 @@ def is_of_zenoh(thread: Thread) -> bool:
 
 def find_thread(tid: int) -> Thread | None:
     """The thread with this id, None when there is none."""
-    try:
-        status = read_proc(f"/proc/{tid}/status")
-    except OSError:
-        return None
-    pid = status_field(status, "Tgid")[0]
-    return _thread(pid, tid, innermost_id(status) if pid == tid else None)
+    with suppress(OSError):
+        return _thread(status_field(read_proc(f"/proc/{tid}/status"), "Tgid")[0], tid, None)
+    return None
 
 
 def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
@@ -196,7 +187,7 @@ def living_processes() -> Iterator[tuple[int, int]]:
     """All processes but zombies by id and start, those of containers by their ids there, too."""
     for pid, fields in all_stats():
         with suppress(OSError):  # it ended meanwhile
-            if fields[0] not in (b"Z", b"X"):
+            if fields[0] not in _DEAD:
                 status = read_proc(f"/proc/{pid}/status")
                 yield from ((one, int(fields[19])) for one in {pid, innermost_id(status) or pid})
 
@@ -236,30 +227,26 @@ def innermost_id(status: bytes) -> int | None:
 
 def start_of(pid: int, tid: int) -> int | None:
     """When a thread started, in clock ticks since the machine booted; None if there is none."""
-    try:
+    with suppress(OSError):
         return int(read_stat(f"/proc/{pid}/task/{tid}")[1][19])
-    except OSError:
-        return None
+    return None
 
 
 def has_ended(tid: int, started: int) -> bool:
     """Whether the thread that started then is gone, or a zombie."""
-    try:
+    with suppress(OSError):
         fields = read_stat(f"/proc/{tid}")[1]
-    except OSError:
-        return True
-    return int(fields[19]) != started or fields[0] in {b"Z", b"X"}
+        return int(fields[19]) != started or fields[0] in _DEAD
+    return True
 
 
 def open_process(pid: int, started: int) -> int | None:
     """A pidfd of the process that started then, None when it has ended."""
-    try:
+    with suppress(ProcessLookupError):
         pidfd = os.pidfd_open(pid)
-    except ProcessLookupError:
-        return None
-    if start_of(pid, pid) == started:
-        return pidfd
-    os.close(pidfd)
+        if start_of(pid, pid) == started:
+            return pidfd
+        os.close(pidfd)
     return None
 
 

@@ -29,8 +29,6 @@ def main() -> None:
             result: Any = None
             if method == "create":
                 servers = create(table_of(arguments[0]))
-            elif method == "change":
-                servers.change(table_of(arguments[0]), arguments[1])  # type: ignore[union-attr]
             elif method == "since":
                 result = servers.in_force_from()  # type: ignore[union-attr]
             elif method == "kickers":

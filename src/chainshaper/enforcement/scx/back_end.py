@@ -2,17 +2,16 @@
 
 While the policy (`policy/table.bpf.c`, compiled ahead) is in force, *every* thread of the machine's
 fair class is scheduled by it. Real-time threads stand above it, so a thread that shall be governed
-must not be one. It begins with an empty table, under which everything is best effort.
+must not be one. Nothing has to be put back by hand: the policy hangs on a file descriptor of this
+process, and however it ends, the kernel returns to its fair class. (A fork without exec inherits
+it.)
 
-Nothing has to be put back by hand: the policy hangs on a file descriptor of this process, and
-however it ends, the kernel returns to its fair class. (A fork without exec inherits it.)
-
-PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, a process of its own:
+PREEMPT_RT kernels refuse BPF timers. There each core has a **kicker**, a process of its own, since
+a thread of the loader would wait for the interpreter's lock:
 
     python -m chainshaper.enforcement.scx.back_end CORE DESCRIPTOR
 
-Under SCHED_FIFO, of the lowest priority, it sleeps on the core until the next boundary. (A thread
-of the loader would wait for the interpreter's lock.)
+Under SCHED_FIFO, of the lowest priority, it sleeps on the core until the next boundary.
 """
 
 import ctypes
@@ -24,21 +23,18 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from chainshaper.enforcement.scx.libbpf import (
     BpfObject,
     ProgramRun,
-    delete_element,
     kernel_enum_value,
     load_libbpf,
-    look_up_element,
-    update_element,
 )
 from chainshaper.enforcement.servers import BackEnd, ServerCounters, ServerTable, server_named
-from chainshaper.linux.own_processes import module_command, what_happened
+from chainshaper.linux.own_processes import start_module, what_happened
 from chainshaper.linux.scheduling import (
     check_cores,
     lock_memory,
@@ -46,7 +42,7 @@ from chainshaper.linux.scheduling import (
     set_thread_name,
     stop_garbage_collection,
 )
-from chainshaper.linux.threads import POLICIES, RESET_ON_FORK
+from chainshaper.linux.threads import POLICIES, RESET_ON_FORK, status_field
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 POLICY = Path(__file__).with_name("policy") / "table.bpf.o"
@@ -94,7 +90,9 @@ def missing() -> str | None:
             f"this process lacks {' and '.join(lacking)}: run as root, or give it these "
             "capabilities (AmbientCapabilities= of a systemd unit, or capsh --addamb=)"
         )
-    return _other_scheduler()
+    if (scheduler := scheduler_in_force()) is not None:
+        return f"sched_ext scheduler {scheduler} is in force, and there can be one only: end it"
+    return None
 
 
 def is_realtime_kernel() -> bool:
@@ -112,32 +110,21 @@ def scheduler_in_force() -> str | None:
         return None
 
 
-def _other_scheduler() -> str | None:
-    scheduler = scheduler_in_force()
-    if scheduler is None:
-        return None
-    return f"sched_ext scheduler {scheduler} is in force, and there can be one only: end it"
-
-
 def _lacking_privileges() -> list[str]:
-    mask = int(STATUS.read_text().partition("CapEff:")[2].split()[0], 16)
+    (mask,) = status_field(STATUS.read_bytes(), "CapEff", base=16)
     granted = {name for name, bit in _CAPABILITIES.items() if mask >> bit & 1}
-    lacking = []
-    if "CAP_SYS_ADMIN" not in granted:
-        lacking += [name for name in ("CAP_BPF", "CAP_PERFMON") if name not in granted]
+    wanted = [] if "CAP_SYS_ADMIN" in granted else ["CAP_BPF", "CAP_PERFMON"]
     if is_realtime_kernel():
         if not may_use_fifo():
-            lacking.append("CAP_SYS_NICE")
-        limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-        if "CAP_IPC_LOCK" not in granted and limit != resource.RLIM_INFINITY:
-            lacking.append("CAP_IPC_LOCK")
-    return lacking
+            wanted.append("CAP_SYS_NICE")
+        if resource.getrlimit(resource.RLIMIT_MEMLOCK)[0] != resource.RLIM_INFINITY:
+            wanted.append("CAP_IPC_LOCK")
+    return [name for name in wanted if name not in granted]
 
 
 def check_table(table: ServerTable) -> None:
     """Refuse a table that the policy cannot hold. Raises InputError: a limit is exceeded."""
-    if too_many := _too_many(table):
-        where, count, most = too_many[0]
+    for where, count, most in _too_many(table):
         raise InputError(
             f"{count} servers{where} are more than the {most} that back end scx can have; join"
             " servers that share slots"
@@ -164,51 +151,42 @@ def with_places_apart(table: ServerTable) -> ServerTable:
     runs the most urgent of a server's threads. Where these would be more servers than the policy
     can hold, the last places of each are one.
     """
-    most = max((server.places for server in table.servers), default=1)
-    while most > 1 and _too_many(_apart(table, most)):
-        most -= 1
-    return _apart(table, most)
-
-
-def _apart(table: ServerTable, most: int) -> ServerTable:
-    places = [(one, k) for one in table.servers for k in range(min(one.places, most))]
-    ranks = sorted({(one.priority, k) for one, k in places})
-    apart = (
-        replace(one, name=_of_place(one.name, k), priority=1 + ranks.index((one.priority, k)))
-        for one, k in places
-    )
-    return replace(table, servers=tuple(apart))
+    for most in range(max((server.places for server in table.servers), default=1), 0, -1):
+        places = [(one, k) for one in table.servers for k in range(min(one.places, most))]
+        ranks = sorted({(one.priority, k) for one, k in places})
+        apart = (
+            replace(one, name=_of_place(one.name, k), priority=1 + ranks.index((one.priority, k)))
+            for one, k in places
+        )
+        found = replace(table, servers=tuple(apart))
+        if not _too_many(found):
+            break
+    return found
 
 
 def _of_place(server: str, place: int) -> str:
     return f"{server}\0{place}" if place else server
 
 
-def number_servers(table: ServerTable, known: Mapping[str, int]) -> dict[str, int]:
-    """Ids for all servers; ``known`` ones stay, used or not. Raises InputError: none is left."""
-    ids = dict(known)
-    for server in table.servers:
-        ids.setdefault(server.name, len(ids) + 1)
-    if len(ids) >= MAX_SERVERS:
-        raise InputError(f"{len(ids)} servers by now are too many; release it and start again")
-    return ids
+def numbered(table: ServerTable) -> dict[str, int]:
+    """An id for each server; 0 means best effort."""
+    return {server.name: number for number, server in enumerate(table.servers, start=1)}
 
 
-def pack_servers(table: ServerTable, ids: Mapping[str, int], anchor_ns: int) -> dict[int, bytes]:
-    """Map `servers`: every id, empty where there is no server. The anchor must be in the past."""
-    size = SERVER.size + MAX_SLOTS * SLOT.size
-    packed = dict.fromkeys(range(MAX_SERVERS), bytes(size))
-    for server in table.servers:
+def pack_servers(table: ServerTable, anchor_ns: int) -> dict[int, bytes]:
+    """Map `servers` by id. The anchor must be in the past."""
+    packed = {}
+    for number, server in enumerate(table.servers, start=1):
         where = (server.core, server.priority, len(server.slots), 0)
         head = SERVER.pack(table.cycle_ns, anchor_ns, ROTATION_NS, *where)
         slots = b"".join(SLOT.pack(start, end) for start, end in server.slots)
-        packed[ids[server.name]] = (head + slots).ljust(size, b"\0")
+        packed[number] = (head + slots).ljust(SERVER.size + MAX_SLOTS * SLOT.size, b"\0")
     return packed
 
 
-def pack_cores(table: ServerTable, ids: Mapping[str, int], core_count: int) -> dict[int, bytes]:
-    """Map `cpus` by core below ``core_count``: its servers, best first, equals as in the table."""
-    packed = dict.fromkeys(range(core_count), bytes(CORE.size))
+def pack_cores(table: ServerTable) -> dict[int, bytes]:
+    """Map `cpus`: the ids of a core's servers, best first, equals as in the table."""
+    ids, packed = numbered(table), {}
     for core in {server.core for server in table.servers}:
         here = sorted((s for s in table.servers if s.core == core), key=lambda s: s.priority)
         padding = [0] * (MAX_SERVERS_PER_CORE - len(here))
@@ -225,8 +203,7 @@ def change_word(generation: int, instant_ns: int, *, replaces: bool) -> bytes:
 
 def unpack_counters(value: bytes) -> ServerCounters:
     """An element of map `counters`."""
-    slots, late, longest, overruns, _, _ = COUNTERS.unpack(value)
-    return ServerCounters(slots, late, longest, overruns)
+    return ServerCounters(*COUNTERS.unpack(value)[:4])
 
 
 def in_all_places(counters: Sequence[ServerCounters]) -> ServerCounters:
@@ -247,16 +224,11 @@ def create(table: ServerTable) -> "ScxServers":
     """Servers for this table; nothing is loaded before :meth:`ScxServers.arm`. Raises InputError:
     as :func:`check_table`. PlatformError: there is no such core, or as :func:`missing` says.
     """
-    _check(table)
-    reason = missing()
-    if reason is not None:
-        raise PlatformError(f"back end scx: {reason}")
-    return ScxServers(table)
-
-
-def _check(table: ServerTable) -> None:
     check_table(table)
     check_cores({server.core: f"server {server.name}" for server in table.servers})
+    if (reason := missing()) is not None:
+        raise PlatformError(f"back end scx: {reason}")
+    return ScxServers(table)
 
 
 class ScxServers(BackEnd):
@@ -264,17 +236,20 @@ class ScxServers(BackEnd):
 
     def __init__(self, table: ServerTable) -> None:
         super().__init__(table)
-        self._ids = number_servers(with_places_apart(table), {})
+        self._apart = with_places_apart(table)
+        self._ids = numbered(self._apart)
+        self._cores = sorted({server.core for server in table.servers})
         self._members: dict[int, tuple[int, int]] = {}  # tid -> (thread descriptor, server id)
         self._has_timer = not is_realtime_kernel()
-        self._core_count = min(os.sysconf("SC_NPROCESSORS_CONF"), MAX_CORES)
         self._policy: BpfObject | None = None
         self._link = 0
         self._kickers: dict[int, subprocess.Popen[bytes]] = {}
         self._generation = 0
         self._failure: str | None = None
         self._released = threading.Event()
-        self._last_counters: dict[str, ServerCounters] = {}
+        self._last_counters = dict.fromkeys(
+            (server.name for server in table.servers), ServerCounters(0, 0, 0, 0)
+        )
         self._lock = threading.RLock()
 
     def assign(self, tid: int, server: str, place: int = 0) -> None:
@@ -287,44 +262,23 @@ class ScxServers(BackEnd):
                 return
             if tid in self._members:
                 os.close(self._members.pop(tid)[0])
-            places = [_of_place(server, k) for k in range(place + 1)]
-            apart = with_places_apart(self._table)
-            its = [one.name for one in apart.servers if one.name in places][-1]
-            self._members[tid] = (descriptor, self._ids[its])
+            places = (_of_place(server, k) for k in range(place, -1, -1))
+            number = next(self._ids[name] for name in places if name in self._ids)
+            self._members[tid] = (descriptor, number)
             if self._policy is not None:
                 self._hand_over(self._policy, tid)
-                ProgramRun(self._policy.program_descriptor("table_decide"), WAKE.size)()
+                self._policy.run("table_decide", WAKE.size)()
 
     def arm(self, anchor_ns: int) -> None:
         """See :meth:`BackEnd.arm`; returns when the slots are in force, on all cores at once."""
-        self.change(self._table, anchor_ns)
-
-    def change(self, table: ServerTable, anchor_ns: int) -> None:
-        """Put another table in force, on all cores at one instant.
-
-        Threads stay in the server of the same name; those of a server that is no longer there run
-        as best effort. Raises as :func:`create`, and OperationError: the kernel refuses the policy,
-        or it has ended.
-        """
-        _check(table)
         with self._lock:
             self._check_in_use()
-            apart = with_places_apart(table)
-            self._ids = number_servers(apart, self._ids)
-            cores = sorted({s.core for s in (*self._table.servers, *table.servers)})
             if self._policy is None:
-                self._policy = self._begin(cores)
-            self._start_kickers(self._policy, cores)
-            instant = self._put_in_force(self._policy, apart, cores, anchor_ns)
+                self._policy = self._begin()
+            instant = self._put_in_force(self._policy, anchor_ns)
             while (left := instant - time.monotonic_ns()) > 0:
                 time.sleep(left / 1e9)
-            self._table, self._since_ns = table, instant
-            present = {self._ids[server.name] for server in apart.servers}
-            for tid, (descriptor, number) in tuple(self._members.items()):
-                if number not in present:
-                    delete_element(self._policy.map_descriptor("assignments"), descriptor)
-                    os.close(descriptor)
-                    del self._members[tid]
+            self._since_ns = instant
 
     def counters(self) -> dict[str, ServerCounters]:
         """See :meth:`BackEnd.counters`; after :meth:`release`, the last ones.
@@ -334,20 +288,18 @@ class ScxServers(BackEnd):
         """
         with self._lock:
             if self._policy is not None:
-                counters = self._policy.map_descriptor("counters")
-                of: dict[str, list[ServerCounters]] = {}
+                places: dict[str, list[ServerCounters]] = {}
                 for name, number in self._ids.items():
-                    value = look_up_element(counters, number, COUNTERS.size)
-                    of.setdefault(name.partition("\0")[0], []).append(unpack_counters(value))
-                self._last_counters = {name: in_all_places(own) for name, own in of.items()}
-            none = ServerCounters(0, 0, 0, 0)
-            return {s.name: self._last_counters.get(s.name, none) for s in self._table.servers}
+                    own = unpack_counters(self._policy.element("counters", number, COUNTERS.size))
+                    places.setdefault(name.partition("\0")[0], []).append(own)
+                self._last_counters = {name: in_all_places(all_) for name, all_ in places.items()}
+            return dict(self._last_counters)
 
     def failure(self) -> str | None:
         with self._lock:
             if self._failure is None and self._policy is not None:
-                ended = self._policy.map_descriptor("ended")
-                if reason := unpack_exit(look_up_element(ended, 0, EXIT.size)):
+                reason = unpack_exit(self._policy.element("ended", 0, EXIT.size))
+                if reason is not None:
                     self._failure = f"the kernel has ended the policy ({reason}); {_FREELY}"
             return self._failure
 
@@ -365,7 +317,7 @@ class ScxServers(BackEnd):
         if (failure := self.failure()) is not None:
             raise OperationError(f"{failure}; release these servers and create them anew")
 
-    def _begin(self, cores: list[int]) -> BpfObject:
+    def _begin(self) -> BpfObject:
         """The policy with an empty table in force: for now, everything runs as best effort."""
         try:
             policy = BpfObject(POLICY)
@@ -373,7 +325,8 @@ class ScxServers(BackEnd):
             raise OperationError(f"the policy cannot be read: {error.strerror}") from error
         try:
             config = policy.initial_bytes(".rodata.config", CONFIG.size)
-            CONFIG.pack_into(config, 0, self._has_timer, self._core_count)
+            core_count = min(os.sysconf("SC_NPROCESSORS_CONF"), MAX_CORES)
+            CONFIG.pack_into(config, 0, self._has_timer, core_count)
             # Where the kernel has it: threads that must not migrate are ours to place, too.
             flags = policy.initial_bytes("table_ops", _FLAGS.size)
             wanted = kernel_enum_value("scx_ops_flags", "SCX_OPS_ENQ_MIGRATION_DISABLED") or 0
@@ -381,8 +334,10 @@ class ScxServers(BackEnd):
             policy.load()
             for tid in tuple(self._members):
                 self._hand_over(policy, tid)
-            self._start_kickers(policy, cores)
-            if (reason := _other_scheduler()) is not None:
+            for core in () if self._has_timer else self._cores:
+                boundary = policy.program_descriptor("table_boundary")
+                self._kickers[core] = _start_kicker(core, boundary)
+            if (reason := missing()) is not None:  # another scheduler's, since it was looked for
                 raise OperationError(reason)
             self._link = policy.attach_operations("table_ops")
         except (OperationError, OSError) as error:
@@ -397,9 +352,7 @@ class ScxServers(BackEnd):
             threading.Thread(target=self._watch, name="scx watch", daemon=True).start()
         return policy
 
-    def _put_in_force(
-        self, policy: BpfObject, table: ServerTable, cores: list[int], anchor_ns: int
-    ) -> int:
+    def _put_in_force(self, policy: BpfObject, anchor_ns: int) -> int:
         """Write the idle generation and have all cores change over; the instant at which they will.
 
         It lies a little ahead, for each core to learn of it. Kickers look by themselves. A timer
@@ -408,30 +361,28 @@ class ScxServers(BackEnd):
         """
         generation = self._generation = 1 - self._generation
         # Cycles repeat: the anchor lies within the first one after booting.
-        packed = pack_servers(table, self._ids, anchor_ns % table.cycle_ns)
-        for number, value in packed.items():
-            key = generation * MAX_SERVERS + number
-            update_element(policy.map_descriptor("servers"), key, value)
-        for core, value in pack_cores(table, self._ids, self._core_count).items():
-            update_element(policy.map_descriptor("cpus"), generation * MAX_CORES + core, value)
-        start_timer = ProgramRun(policy.program_descriptor("table_boundary"), WAKE.size)
-        assignments, home = policy.map_descriptor("assignments"), os.sched_getaffinity(0)
+        for number, value in pack_servers(self._apart, anchor_ns % self._table.cycle_ns).items():
+            policy.update("servers", generation * MAX_SERVERS + number, value)
+        for core, value in pack_cores(self._apart).items():
+            policy.update("cpus", generation * MAX_CORES + core, value)
+        start_timer, home = policy.run("table_boundary", WAKE.size), os.sched_getaffinity(0)
+        visited = self._cores if self._has_timer else ()
         descriptor = _thread_descriptor(threading.get_native_id())
-        update_element(assignments, descriptor, _VISITOR.to_bytes(4, "little"))
+        policy.update("assignments", descriptor, _VISITOR.to_bytes(4, "little"))
         try:
-            ahead = _VISIT_NS * (1 + len(cores)) if self._has_timer else _KICKER_ROUND_NS
+            ahead = _VISIT_NS * (1 + len(visited)) if self._has_timer else _KICKER_ROUND_NS
             instant = time.monotonic_ns() + ahead
             word = change_word(generation, instant, replaces=self._since_ns is not None)
-            update_element(policy.map_descriptor("in_force"), 0, word)
-            for core in cores if self._has_timer else ():
+            policy.update("in_force", 0, word)
+            for core in visited:
                 os.sched_setaffinity(0, {core})
                 start_timer()
         except OSError as error:
             raise OperationError(
-                f"the table cannot be put in force on the cores {cores}: {error}"
+                f"the table cannot be put in force on the cores {self._cores}: {error}"
             ) from error
         finally:
-            delete_element(assignments, descriptor)
+            policy.delete("assignments", descriptor)
             os.close(descriptor)
             os.sched_setaffinity(0, home)
         return instant
@@ -440,19 +391,12 @@ class ScxServers(BackEnd):
         """Give the policy the server of a thread; one that has ended is forgotten."""
         descriptor, number = self._members[tid]
         try:
-            assignments = policy.map_descriptor("assignments")
-            update_element(assignments, descriptor, number.to_bytes(4, "little"))
+            policy.update("assignments", descriptor, number.to_bytes(4, "little"))
         except (ProcessLookupError, FileNotFoundError):
             os.close(descriptor)
             del self._members[tid]
         except OSError as error:
             raise OperationError(f"thread {tid} gets no server: {error.strerror}") from error
-
-    def _start_kickers(self, policy: BpfObject, cores: list[int]) -> None:
-        for core in () if self._has_timer else cores:
-            if core not in self._kickers:
-                boundary = policy.program_descriptor("table_boundary")
-                self._kickers[core] = _start_kicker(core, boundary)
 
     def _watch(self) -> None:
         """Fail open when a kicker stops: an idle core would never notice by itself."""
@@ -491,6 +435,7 @@ def _thread_descriptor(tid: int) -> int:
 
 def _examine_thread(tid: int, server: str, core: int) -> int | None:
     """A descriptor of a thread that the policy can govern on this core; None when it has ended."""
+    refused = f"thread {tid} cannot be put into server {server}"
     try:
         descriptor = _thread_descriptor(tid)
         policy = os.sched_getscheduler(tid) & ~RESET_ON_FORK
@@ -498,9 +443,7 @@ def _examine_thread(tid: int, server: str, core: int) -> int | None:
     except ProcessLookupError:
         return None
     except OSError as error:
-        raise OperationError(
-            f"thread {tid} cannot be put into server {server}: {error.strerror}"
-        ) from error
+        raise OperationError(f"{refused}: {error.strerror}") from error
     if policy not in _FAIR_POLICIES:
         problem = f"it is under {POLICIES.get(policy, policy)}: `chrt --other --pid 0 {tid}` first"
     elif core not in cores:
@@ -508,19 +451,13 @@ def _examine_thread(tid: int, server: str, core: int) -> int | None:
     else:
         return descriptor
     os.close(descriptor)
-    raise OperationError(f"thread {tid} cannot be put into server {server}: {problem}")
+    raise OperationError(f"{refused}: {problem}")
 
 
 def _start_kicker(core: int, program: int) -> subprocess.Popen[bytes]:
     """Start a core's kicker, with `table_boundary`'s descriptor. Raises OperationError: it ends."""
-    process = subprocess.Popen(
-        [*module_command(__name__), str(core), str(program)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        pass_fds=(program,),
-        start_new_session=True,  # Ctrl-C is for the loader, which ends the kicker last
-    )
+    # In its own session, Ctrl-C is for the loader, which ends the kicker last.
+    process = start_module(__name__, str(core), str(program), pass_fds=(program,))
     if not process.stdout or not process.stdout.readline():
         _, said = process.communicate()
         reason = said.decode(errors="replace").strip().rpartition("\n")[2]

@@ -2,8 +2,7 @@
 
 libbpf.so.1 comes with every distribution that has BPF at all. An object file is opened, adjusted,
 loaded, and its struct_ops map attached, which gives a link: a file descriptor that the kernel
-closes when the process ends, and takes the policy away. Functions raise OSError with what libbpf
-said.
+closes when the process ends, and takes the policy away. All raise OSError with what libbpf said.
 """
 
 import ctypes
@@ -21,8 +20,7 @@ _OLDEST = (1, 4)
 _KIND_ENUM64 = 19
 _BTF_TYPE = struct.Struct("<III")
 _TEST_RUN_OPTIONS = struct.Struct("<QQQIIQQIIIIIIII")
-_messages: list[str] = []
-"""What libbpf has warned of since the object was opened; it has no better place for reasons."""
+_messages: list[str] = []  # what libbpf has warned of since the object was opened
 
 
 @functools.cache
@@ -121,8 +119,31 @@ class BpfObject:
     def map_descriptor(self, name: str) -> int:
         return int(self._library.bpf_map__fd(self._find("map", name)))
 
+    def run(self, program: str, context_size: int) -> "ProgramRun":
+        """A `SEC("syscall")` program, to be run by calling it."""
+        return ProgramRun(self.program_descriptor(program), context_size)
+
     def program_descriptor(self, name: str) -> int:
         return int(self._library.bpf_program__fd(self._find("program", name)))
+
+    def update(self, map_name: str, key: int, value: bytes) -> None:
+        """Write one element of a map with 32-bit keys. Raises OSError: the kernel refuses."""
+        its, number = self.map_descriptor(map_name), ctypes.c_uint32(key)
+        if self._library.bpf_map_update_elem(its, ctypes.byref(number), value, 0):
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+
+    def element(self, map_name: str, key: int, size: int) -> bytes:
+        """Read one element, of ``size`` bytes. Raises OSError: there is none."""
+        its, number = self.map_descriptor(map_name), ctypes.c_uint32(key)
+        value = ctypes.create_string_buffer(size)
+        if self._library.bpf_map_lookup_elem(its, ctypes.byref(number), value):
+            raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
+        return value.raw
+
+    def delete(self, map_name: str, key: int) -> None:
+        """Remove one element; harmless when there is none."""
+        number = ctypes.c_uint32(key)
+        self._library.bpf_map_delete_elem(self.map_descriptor(map_name), ctypes.byref(number))
 
     def attach_operations(self, map_name: str) -> int:
         """Put a struct_ops map in force; the address of its link, for :meth:`detach`."""
@@ -139,27 +160,6 @@ class BpfObject:
         if self._object:
             self._library.bpf_object__close(self._object)
             self._object = None
-
-
-def update_element(map_descriptor: int, key: int, value: bytes) -> None:
-    """Write one element of a map with 32-bit keys. Raises OSError: the kernel refuses."""
-    number = ctypes.c_uint32(key)
-    if load_libbpf().bpf_map_update_elem(map_descriptor, ctypes.byref(number), value, 0):
-        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-
-
-def look_up_element(map_descriptor: int, key: int, size: int) -> bytes:
-    """Read one element, of ``size`` bytes. Raises OSError: there is none."""
-    number, value = ctypes.c_uint32(key), ctypes.create_string_buffer(size)
-    if load_libbpf().bpf_map_lookup_elem(map_descriptor, ctypes.byref(number), value):
-        raise OSError(ctypes.get_errno(), os.strerror(ctypes.get_errno()))
-    return value.raw
-
-
-def delete_element(map_descriptor: int, key: int) -> None:
-    """Remove one element; harmless when there is none."""
-    number = ctypes.c_uint32(key)
-    load_libbpf().bpf_map_delete_elem(map_descriptor, ctypes.byref(number))
 
 
 class ProgramRun:

@@ -20,12 +20,8 @@ typedef _Bool bool;
 #define READ_ONCE(x) (*(const volatile __typeof__(x) *)&(x))
 
 /* <linux/bpf.h> is not included: a distribution's may be older than these. */
-enum {
-	BPF_MAP_TYPE_HASH = 1,
-	BPF_MAP_TYPE_ARRAY = 2,
-	BPF_MAP_TYPE_TASK_STORAGE = 29,
-};
-
+#define BPF_MAP_TYPE_ARRAY 2
+#define BPF_MAP_TYPE_TASK_STORAGE 29
 #define BPF_F_NO_PREALLOC 1
 #define BPF_F_TIMER_ABS 1
 #define BPF_F_TIMER_CPU_PIN 2

@@ -3,25 +3,22 @@
  * Table-driven reservation servers as a sched_ext policy.
  *
  * A server has slots that repeat every cycle, on one core. Its threads run inside these slots and
- * at no other time; of several servers with an open slot the best priority runs; threads of one
- * server take turns; everything else ("best effort") runs when no server's thread wants to.
- *
- * Each server has a queue, best effort has one more. Whenever a core has to decide (dispatch), the
- * table is looked up with the present time, and the best server that is open and has a thread gets
- * the core. The slots are exact because every core is made to decide at each boundary, where a slot
- * starts or ends or a turn is over:
+ * at no other time; of several open servers the best priority runs; threads of one server take
+ * turns; everything else ("best effort") runs when no server's thread wants to. Each server has a
+ * queue, best effort another. A core that decides (dispatch) looks the present time up in the table.
+ * Slots are exact because every core is made to decide at each boundary, where a slot starts or
+ * ends or a turn is over:
  *
  *  - normally by a timer per core whose callback kicks the core;
- *  - on PREEMPT_RT, which refuses bpf_timer, by a SCHED_FIFO thread per core ("kicker", of the
- *    loader) that sleeps from boundary to boundary: its running pushes the present thread back to
- *    its queue, and when it sleeps again the core decides anew. Should it stop, decisions find its
- *    boundary overdue and end the policy: a table that only the tick follows is none.
+ *  - on PREEMPT_RT by a SCHED_FIFO thread per core ("kicker", of the loader) that sleeps from
+ *    boundary to boundary: its running pushes the present thread back to its queue, and when it
+ *    sleeps again the core decides anew. Should it stop, decisions find its boundary overdue and
+ *    end the policy: a table that only the tick follows is none.
  *
- * There are two generations of the table. One 64-bit word says which is in force from which instant
- * on, the other one being in force before that. So the loader writes the idle generation, then the
- * word, and all cores change over at one instant without ever seeing half a table. Threads that
- * waited for the first table are in a queue that is emptied first when it has come: each gets as
- * far as `running`, which has it sent to the queue where it belongs now.
+ * There are two generations of the table. The loader writes the idle one, then the word that says
+ * which is in force from which instant on, so all cores change over at once. Threads that waited
+ * for the first table are in a queue that is emptied first when it has come: `running` has each
+ * sent to the queue where it belongs now.
  *
  * Everything fails open: the kernel goes back to its fair class when the loader's link is closed,
  * by whatever, and when a runnable thread has not run for half a minute.
@@ -54,10 +51,7 @@ const volatile char source_digest[] = SOURCE_DIGEST;
 #define BEST_EFFORT 1000
 #define UNSORTED 1001			/* assigned threads, until the first table is in force */
 
-/*
- * bpf_ktime_get_ns() may be some nanoseconds behind the clock that timers follow. Without slack, a
- * core that is kicked at the end of a slot could find three nanoseconds of it left, and go on.
- */
+/* bpf_ktime_get_ns() may be some ns behind the timers' clock: the end of a slot would be missed. */
 #define CLOCK_SLACK 200ULL
 
 struct timer_of_cpu {
@@ -208,10 +202,7 @@ static __always_inline bool is_shared(u32 id, u32 cpu)
 	return scx_bpf_dsq_nr_queued(id) + (state && state->server == id) > 1;
 }
 
-/*
- * When this core has to decide anew at the latest. (A thread that comes to share a server in the
- * middle of a slot waits for the tick to end the present turn.)
- */
+/* When this core has to decide anew at the latest, but for a thread that has just come to share. */
 static __noinline u64 next_boundary(u32 cpu, u64 now)
 {
 	u32 generation = generation_at(now);
@@ -256,10 +247,7 @@ static __always_inline void take_turn(u32 id, struct moment *m)
 		k->turn = m->turn_start;
 }
 
-/*
- * At every decision of the server's core: the first one inside a slot is its opening, the first one
- * after it its end. What a higher class costs a server counts as lateness.
- */
+/* The core's first decision inside a slot is its opening, the first one after it its end. */
 static __noinline int count(u32 id, struct moment *m, u64 now, bool wants_to_run)
 {
 	struct table_counters *k = bpf_map_lookup_elem(&counters, &id);
@@ -365,9 +353,8 @@ static __always_inline bool run_server(u32 id, struct moment *m, struct task_str
 }
 
 /*
- * The kicker outranks whatever this decision is about: were it able to run, it would have. After a
- * standstill of the machine its timer interrupt may still be pending, so it has to be overdue in
- * two decisions, with time for interrupts in between.
+ * The kicker outranks all here: were it able to run, it would have. After a standstill of the
+ * machine its interrupt may be pending, so it has to be overdue in two decisions, some time apart.
  */
 static __always_inline void check_kicker(u32 cpu, u64 now)
 {
@@ -489,10 +476,10 @@ static __always_inline void tell(struct table_instant *when, u64 instant)
 }
 
 /*
- * Have the calling core decide at its next boundary. With a timer, the loader runs this once on
- * each core after each change of the table (a timer is pinned to the core that starts it);
- * without, the core's kicker runs it again and again: it sleeps until the boundary, a little longer
- * since planning would delay those who wait for it, and then plans anew.
+ * Have the calling core decide at its next boundary. With a timer, which is pinned to the core that
+ * starts it, the loader runs this once on each core after each change of the table; without, the
+ * core's kicker again and again: it sleeps until the boundary, a little longer since planning
+ * would delay those who wait for it, and then plans anew.
  */
 SEC("syscall")
 int table_boundary(struct table_wake *wake)
