@@ -1,8 +1,7 @@
 """Which back ends this machine offers, the strongest of them, and making one; the back end `fifo`.
 
-Strongest first: **scx** and **litmus** gate in the kernel, to the microsecond; **freezer** gates
-with a dispatcher on any kernel, to some tens of microseconds; **fifo** isolates, and leaves gating
-to the shaping node.
+**scx** and **litmus** gate in the kernel, to the microsecond; **freezer** with a dispatcher on any
+kernel, to some tens of microseconds; **fifo** isolates, and leaves gating to the shaping node.
 """
 
 import os
@@ -74,10 +73,8 @@ def gates(name: str) -> bool:
 def make_back_end(
     name: str, table: ServerTable, journal: Journal, go_on: Callable[[], None] = lambda: None
 ) -> BackEnd:
-    """Make a back end for a table; no application notices anything yet.
-
-    Where processes have to start, ``go_on`` is called again and again meanwhile, and may raise.
-    Raises InputError: the table is more than the back end can do. And as the back end.
+    """Make a back end for a table. ``go_on`` is called while processes start, and may raise. Raises
+    InputError: the table is more than the back end can do. And as the back end.
     """
     match name:
         case "scx":
@@ -91,10 +88,8 @@ def make_back_end(
 
 
 class Fifo(BackEnd):
-    """Servers as SCHED_FIFO priorities, on any kernel, without slots; see :class:`BackEnd`.
-
-    Threads have their core and priority already (:func:`.threads.plan_scheduling`), which isolates
-    a chain from what is less important; a shaping node's gate has to do the rest.
+    """Servers as SCHED_FIFO priorities, without slots; see :class:`BackEnd`. Threads have core and
+    priority already (:func:`.threads.plan_scheduling`); a shaping node's gate has to do the rest.
     """
 
     def __init__(self, table: ServerTable, journal: Journal) -> None:
@@ -122,12 +117,9 @@ def _missing_for_freezer() -> str | None:
 
 
 def _missing_for_fifo() -> str | None:
-    if may_use_fifo():
-        return None
-    return (
-        "SCHED_FIFO is not permitted: run as root or with CAP_SYS_NICE, or give your user an "
-        "rtprio limit of 98 in /etc/security/limits.conf"
-    )
+    remedy = "run as root or with CAP_SYS_NICE, or give your user an rtprio limit of 98 in "
+    refused = f"SCHED_FIFO is not permitted: {remedy}/etc/security/limits.conf"
+    return None if may_use_fifo() else refused
 
 
 _KNOWN: dict[str, tuple[str, Callable[[], str | None]]] = {

@@ -2,16 +2,15 @@
 
     python -m chainshaper.enforcement.guardian FOLDER
 
-Every run has two, which do the same: each is there should the other be killed or stopped at the
-same instant as what they watch over. They learn of a death from a pidfd, at once, and of a
-dispatcher that hangs from its sign of life; then they undo all that the journal says. Each has a
-session and a cgroup of its own, and a priority above the dispatchers' where it shares a core with
-one. On its standard output it says when it watches.
+Every run has two, in case one is killed or stopped at the same instant as what they watch over.
+They learn of a death from a pidfd, at once, and of a dispatcher that hangs from its sign of life;
+then they undo all that the journal says. Each has a session and a cgroup of its own, and a priority
+above the dispatchers' where it shares a core with one. On its standard output it says when it
+watches.
 
 A dispatcher without a sign of life for a tenth of a second may hang, or its core may have been
-taken from the machine for a moment. So its threads are let go first; one that stays away for half a
-second has failed. The sign must stand still over several looks, rather than for some time: that a
-machine stalls as a whole is no fault.
+taken from the machine for a moment: its threads are let go. One that stays away for half a second
+has failed. Looks are counted, not time: that a machine stalls as a whole is no fault.
 """
 
 import contextlib
@@ -37,15 +36,12 @@ GROUP = "chainshaper.guardians"
 _HOW_MANY = 2
 _PRIORITY = 98
 _ELSEWHERE_PRIORITY = 88
-"""On cores without a dispatcher: above all servers, below DDS, which delivers outputs there. Above
-it, looks of a tenth of a millisecond delayed two of a hundred outputs, by up to 0.3 ms."""
+"""On cores without a dispatcher: above all servers, below DDS, whose outputs looks would delay."""
 _LOOK_S = 0.02
 _LOOKS_UNTIL_THAWED = 4
 _LOOKS_UNTIL_HUNG = 24
-_IDLE_S = 1.0
-"""Where no dispatcher is known. Not more often: such looks come from above all others, too."""
-_LOOKS_AT_ONCE = 5
-"""Between two at the journal: nothing that can wait is to keep a core from those in their slots."""
+_IDLE_S = 1.0  # where no dispatcher is known: looks delay others
+_LOOKS_AT_ONCE = 5  # between two at the journal, which can wait
 _START_S = 20.0
 
 
@@ -146,15 +142,14 @@ class _Watch:
         return False
 
     def journal_is_there(self) -> bool:
-        try:
+        with contextlib.suppress(OSError):
             return self.journal.keep()
-        except OSError:  # its folder is gone, and there is no room for another: it is in memory
-            return True
+        return True  # in memory: its folder is gone, and there is no room for another
 
     def look_for_dispatchers(self) -> bool:
         """Learn of new ones; whether one of them has ended already."""
         if self.page is not None and self.beats.keys() >= self.page.cores.keys():
-            return False  # all are known: whatever else is written down is nothing to read up here
+            return False  # all are known
         lost, size = False, self.journal.size()
         run = None if size == self.read_until else run_of(self.journal)
         self.read_until = size
@@ -169,8 +164,7 @@ class _Watch:
             if one.core is None or one.core in self.beats:
                 continue
             self.beats[one.core] = (-1, 0)
-            pidfd = open_process(one.pid, one.started)
-            if pidfd is None:
+            if (pidfd := open_process(one.pid, one.started)) is None:
                 lost = True
             else:
                 self.cores[pidfd] = one.core

@@ -12,6 +12,7 @@ daemon whose parent ended before, are left alone: :func:`look_alikes` names them
 
 import os
 from collections.abc import Callable, Collection, Iterable, Mapping
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -66,10 +67,9 @@ class Change:
 
 
 def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -> None:
-    """Give threads their class and cores; one that has ended meanwhile is no error.
-
-    Raises OperationError: as :func:`note_scheduling` (then nothing is changed), or the kernel
-    refuses. PlatformError: a privilege is missing.
+    """Give threads, if they run still, their class and cores. Raises OperationError: as
+    :func:`note_scheduling` (then nothing is changed), or the kernel refuses. PlatformError: a
+    privilege is missing.
     """
     wishes = [(thread, partial(after_wish, wanted=wanted)) for thread, wanted in changes]
     for thread, target in note_scheduling(journal, wishes):
@@ -99,7 +99,6 @@ def note_scheduling(
     journal: Journal, changes: Iterable[tuple[Thread, Callable[[SchedulingState], SchedulingState]]]
 ) -> list[tuple[Thread, SchedulingState]]:
     """Write down what threads have before each changes; those that are to be, with their targets.
-
     Raises OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
     """
     known = {one.identity: one for one in remembered_threads(journal)}
@@ -161,10 +160,8 @@ def remembered_threads(journal: Journal) -> list[Change]:
 
 
 def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Write down processes that the journal's have started meanwhile, of those that were there at
-    the look ``before``, too: helpers come and go as long as a run lasts. Returns all that are new.
-
-    Raises: as ``note_all``.
+    """Write down processes that the journal's have started meanwhile, if they were there at the
+    look ``before``, too: helpers come and go. Returns all that are new. Raises: as ``note_all``.
     """
     remembered = remembered_threads(journal)
     known = {one.pid for one in remembered}
@@ -177,11 +174,9 @@ def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> s
 
 
 def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
-    """Put back the class and cores of every thread in the journal, and of what inherited them.
-
-    ``groups`` are the run's cgroups. Works from any process, and as often as one likes. Inheritance
-    is undone last: until its parent is restored, a new thread inherits. Raises OperationError: the
-    kernel refuses for some threads; the others are as before.
+    """Put back the class and cores of every thread in the journal, and of what inherited them, from
+    any process and as often as one likes. ``groups`` are the run's cgroups. Raises OperationError:
+    the kernel refuses for some threads; the others are as before.
     """
     if journal.outdated:
         return
@@ -202,8 +197,8 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
     for one in reversed(remembered):
         if (thread := find_thread(one.tid)) is not None and thread.identity == one.identity:
             give_back(thread, [one])
+    # Until its parent is restored, a new thread inherits: what starts some may have just done so.
     for _ in range(_GENERATIONS if remembered else 0):
-        # What starts threads all the time may have started one before it was reached itself.
         changed = [give_back(*born) for born in _born_of(journal, remembered, groups)]
         if not any(changed):
             break
@@ -212,8 +207,8 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
 
 
 def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...]:
-    """Threads with a real-time class and cores as we gave them, not known as ours, in words: to be
-    asked before the undoing. ``groups`` are the run's cgroups.
+    """Threads with a real-time class and cores as we gave them, not known as ours, in words; asked
+    before the undoing.
     """
     remembered = [] if journal.outdated else remembered_threads(journal)
     known = {one.identity for one in remembered}
@@ -222,15 +217,13 @@ def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...
     for thread in (thread for pid in parents() if remembered for thread in list_threads(pid)):
         if thread.priority == 0 or thread.identity in known:
             continue  # cores alone are no likeness
-        try:
+        with suppress(ProcessLookupError):
             now = state_of(thread.tid)
-        except ProcessLookupError:
-            continue
-        if any(now in one.given and thread.started >= one.changed_at for one in remembered):
-            found.append(
-                f"{thread.text} is left as it is: {now.text}; if it is the application's, which"
-                f" nothing shows, `chrt --other --pid 0 {thread.tid}`"
-            )
+            if any(now in one.given and thread.started >= one.changed_at for one in remembered):
+                found.append(
+                    f"{thread.text} is left as it is: {now.text}; if it is the application's, which"
+                    f" nothing shows, `chrt --other --pid 0 {thread.tid}`"
+                )
     return tuple(found)
 
 

@@ -1,10 +1,9 @@
 """Reservation servers as the back ends see them, and what every back end can do.
 
-A **table** has servers with slots that repeat every cycle (paper, section 2.2.1); threads are
-assigned to them by their ids. Between slots a server's threads do not run at all (``fifo``
-excepted, which isolates only); where servers overlap on a core, the better priority runs, a smaller
-number; of one server's threads those of the first place are the most urgent (``litmus``: they take
-turns); threads of no server run when no server's wants to.
+A **table** has servers with slots that repeat every cycle (paper, section 2.2.1). Between slots a
+server's threads do not run at all (``fifo`` excepted, which isolates only); where servers overlap
+on a core, the better priority runs, a smaller number; of one server's threads those of the first
+place are the most urgent (``litmus``: they take turns); others run when no server's wants to.
 """
 
 from abc import ABC, abstractmethod
@@ -15,9 +14,8 @@ from chainshaper.values.errors import InputError
 
 @dataclass(frozen=True)
 class ReservationServer:
-    """A plan's server without its nodes, which processes read that have Python alone: half-open
-    slots in ns after the start of a cycle, ascending, on one core; and how many ``places`` its
-    threads have, the first the most urgent.
+    """A plan's server, for processes that have Python alone: half-open slots in ns after the start
+    of a cycle, ascending, on one core; how many ``places`` its threads have.
     """
 
     name: str
@@ -37,19 +35,16 @@ class ServerTable:
 
 def server_named(table: ServerTable, name: str) -> ReservationServer:
     """The server of a name. Raises InputError: there is none."""
-    for server in table.servers:
-        if server.name == name:
-            return server
-    names = ", ".join(server.name for server in table.servers)
-    raise InputError(f"no server is named {name}: {names} are")
+    servers = {server.name: server for server in table.servers}
+    if name not in servers:
+        raise InputError(f"no server is named {name}: {', '.join(servers)} are")
+    return servers[name]
 
 
 @dataclass(frozen=True)
 class ServerCounters:
-    """What a server has done since it was armed; None: the back end cannot know.
-
-    Late entries are slots that opened more than 100 us after their start; overruns those at whose
-    end a thread of the server still wanted to run.
+    """What a server has done since it was armed; None: the back end cannot know. Slots are entered
+    late more than 100 us after their start, overrun where a thread still wants to run at their end.
     """
 
     slots: int | None = None
@@ -59,10 +54,9 @@ class ServerCounters:
 
 
 class BackEnd(ABC):
-    """A table of servers in force on this machine.
-
-    Making one changes nothing yet that an application could notice. Then ``assign`` and ``arm`` in
-    any order and number; ``release`` ends it. All raise OperationError where the kernel refuses.
+    """A table of servers in force on this machine. Making one changes nothing that an application
+    could notice. Then ``assign`` and ``arm`` in any order and number; ``release`` ends it. All
+    raise OperationError where the kernel refuses.
     """
 
     def __init__(self, table: ServerTable) -> None:
@@ -71,18 +65,17 @@ class BackEnd(ABC):
 
     @abstractmethod
     def assign(self, tid: int, server: str, place: int = 0) -> None:
-        """Put a thread into a server; before ``arm`` it goes on running freely. Its place there is
-        for back ends that choose between a server's threads themselves.
-
-        One that has ended is passed over: threads come and go. Raises InputError: no such server.
+        """Put a thread into a server; before ``arm`` it runs on freely. Its place there is for back
+        ends that choose between a server's threads. One that has ended is passed over. Raises
+        InputError: no such server.
         """
 
     @abstractmethod
     def arm(self, anchor_ns: int) -> None:
         """Enforce the slots from now on; cycles start at ``anchor_ns`` (CLOCK_MONOTONIC) + k * CT.
 
-        Once more with another anchor, it moves the cycles without letting threads slip between.
-        Where the kernel refuses, what was done before stays until the release.
+        Another anchor moves the cycles without letting threads slip between. Where the kernel
+        refuses, what was done before stays until the release.
         """
 
     def in_force_from(self) -> int | None:

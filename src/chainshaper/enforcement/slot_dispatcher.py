@@ -40,8 +40,7 @@ from chainshaper.values.errors import ChainshaperError, OperationError, Platform
 PRIORITY = 97
 _LATE_NS = 100_000
 _TICK_NS = 20_000_000
-# After a boundary: frozen threads, too, need the core to reach the freezer; and a publish slot may
-# open there, in which a gate releases as much later as its chain has begun late (0.1 to 0.7 ms).
+# After a boundary: frozen threads, too, need the core to reach the freezer; and a gate may publish.
 _REST_NS = 1_000_000
 _ROOM_NS = 200_000  # at least, between a tick and the boundaries around it
 _WATCH_NS = 100_000  # before a boundary, instead of sleeping
@@ -81,15 +80,14 @@ def boundaries_of(
 def instants(
     boundaries: tuple[Boundary, ...], cycle_ns: int, begin_ns: int
 ) -> Iterator[tuple[int, Boundary]]:
-    """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on. Where
-    nothing changes (only at 0), it is left out from the second cycle on: no dispatcher wakes up.
+    """Every boundary with its time (ns), without end, from the cycle at ``begin_ns`` on; from the
+    second on without the one at 0 where nothing changes there: no dispatcher wakes up.
     """
-    first, last = boundaries[0], boundaries[-1]
-    idle = len(boundaries) > 1 and first.open == last.open and not first.starts
+    first, *others = boundaries
+    idle = bool(others) and first.open == others[-1].open and not first.starts
     yield begin_ns, first
     while True:
-        for boundary in boundaries[1:]:
-            yield begin_ns + boundary.offset_ns, boundary
+        yield from ((begin_ns + boundary.offset_ns, boundary) for boundary in others)
         begin_ns += cycle_ns
         if not idle:
             yield begin_ns, first
@@ -111,10 +109,8 @@ def moved(
 
 
 class Dispatcher:
-    """The servers of one core at work.
-
-    ``groups`` are, for each of them, its cgroups by folder: open files of `cgroup.freeze` and
-    `cgroup.threads`, since looking up a path takes longer than writing.
+    """The servers of one core at work. ``groups`` are, for each of them, its cgroups by folder:
+    open files of `cgroup.freeze` and `cgroup.threads`, since a path takes longer than writing.
     """
 
     def __init__(self, run: FreezerRun, core: int) -> None:
@@ -195,7 +191,8 @@ class Dispatcher:
     def _tick(self) -> None:
         """A sign of life, and all that has waited."""
         self.last_tick = time.monotonic_ns()
-        for counters, late_ns in ((self.counters[server], late) for server, late in self.begun):
+        for server, late_ns in self.begun:
+            counters = self.counters[server]
             counters.slots += 1
             counters.late += late_ns > _LATE_NS
             counters.longest = max(counters.longest, late_ns)
@@ -210,9 +207,8 @@ class Dispatcher:
         """Show that we live, and close again what a guardian, or the other later, has thawed."""
         self.own.beats += 1
         let_go = self.own.let_go
-        if self.open is not None and (
-            let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
-        ):
+        thawed = let_go != self.let_go or now - self.last_sign > _THAWED_AFTER_NS
+        if self.open is not None and thawed:
             self._write(self.all - self.open, b"1")
         self.last_sign, self.let_go = now, let_go
 
@@ -255,13 +251,11 @@ class Dispatcher:
 
     def _add(self, server: int, folder: str) -> None:
         self._forget(server, folder)  # of a container of that name that ended
-        try:
+        with contextlib.suppress(FileNotFoundError):  # another process was quick to remove it
             self.groups[server][folder] = (
                 os.open(f"{folder}/cgroup.freeze", os.O_WRONLY | os.O_CLOEXEC),
                 os.open(f"{folder}/cgroup.threads", os.O_RDONLY | os.O_CLOEXEC),
             )
-        except FileNotFoundError:  # another process was quick to remove it
-            return
         closed = self.open is not None and server not in self.open
         self._write([server], b"1" if closed else b"0")
 
@@ -275,18 +269,17 @@ def overrun(groups: Iterable[int]) -> bool | None:
     """
     undecided = False
     for group in groups:
-        try:
+        tids = list[str]()
+        with contextlib.suppress(OSError):  # the group is gone
             tids = os.pread(group, 32768, 0).decode().split()
-        except OSError:  # the group is gone
-            continue
         for tid in tids:
-            try:
+            with contextlib.suppress(
+                FileNotFoundError, ProcessLookupError
+            ):  # it ended while frozen
                 where = read_proc(f"/proc/{tid}/syscall")
-            except (FileNotFoundError, ProcessLookupError):
-                continue  # it ended while frozen
-            if where.startswith(b"-1"):
-                return True
-            undecided |= where.startswith(b"running")
+                if where.startswith(b"-1"):
+                    return True
+                undecided |= where.startswith(b"running")
     return None if undecided else False
 
 

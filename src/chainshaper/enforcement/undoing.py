@@ -49,8 +49,8 @@ class ServerState(ReservationServer):
 
 @dataclass(frozen=True)
 class SlotMove:
-    """From an instant on a chain's output has its slots ``moved_ns`` behind the plan's, the last
-    one ``start_ns`` after its origin.
+    """From an instant on a chain's slots are ``moved_ns`` behind the plan's, its output's last one
+    ``start_ns`` after its origin.
     """
 
     from_ns: int
@@ -67,10 +67,9 @@ class SlotMove:
 
 @dataclass(frozen=True)
 class RunState:
-    """A plan in force. Instants are ns of CLOCK_MONOTONIC, None if they are still to come.
-
-    Cycles start at ``anchor_ns`` + k * ``cycle_ns``, the first enforced as a whole ``in_force_ns``;
-    the chain's beginning has moved by ``drift_ns`` since; ``failure``: why it is not enforced.
+    """A plan in force. Instants are ns of CLOCK_MONOTONIC, None if they are still to come. Cycles
+    start at ``anchor_ns`` + k * ``cycle_ns``, the first enforced as a whole ``in_force_ns``; the
+    chain's beginning has moved by ``drift_ns`` since; ``failure``: why it is not enforced.
     """
 
     run: str
@@ -98,9 +97,8 @@ def save_run_state(folder: Path, state: RunState) -> None:
     try:
         partial_file.write_text(json.dumps(asdict(state)))
         partial_file.replace(folder / runs.STATE_FILE)
-    except OSError:
+    finally:
         partial_file.unlink(missing_ok=True)  # a part of it would fill the disk for good
-        raise
 
 
 def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | None]]:
@@ -117,7 +115,7 @@ def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | 
 
 
 def runs_as_json(folder: Path | None = None) -> list[dict[str, Any]]:
-    """The same as plain data; ``unreadable`` are lines of the journal that say nothing."""
+    """The same as plain data; ``unreadable`` are :func:`strange_lines`."""
     return [
         {
             "run": journal.name,
@@ -142,7 +140,7 @@ def claim_run(
     governs one of them, a crashed one cannot be undone, or one that begins does not get on with it.
     PlatformError: nothing may be written to the folder.
     """
-    base = runs.journals_folder() if folder is None else folder
+    base = runs.journals_folder(folder)
     wanted: dict[str, set[Any]] = {"core": set(cores), "node": set(nodes)}
 
     def waiting(waited_s: float) -> None:
@@ -210,10 +208,8 @@ def strange_lines(journal: Journal) -> tuple[str, ...]:
 
 
 def end_run(journal: Journal) -> tuple[str, ...]:
-    """End a run: its owner does it, or we do where it is gone or hangs. What could not be undone.
-
-    An owner that was stopped (Ctrl-Z) is made to go on; one that does not end is killed. Raises
-    OperationError: the owner is not ours to end.
+    """End a run: its owner does it, made to go on if it was stopped (Ctrl-Z), or we do, if it is
+    gone or has to be killed. What could not be undone. Raises OperationError: it is not ours.
     """
     if (pidfd := journal.open_owner()) is not None:
         try:

@@ -1,8 +1,8 @@
 """Control groups of version 2, as far as stopping single threads needs them.
 
 ``cgroup.freeze`` stops every thread in a group on its way back to user space. A **threaded** group
-may have some threads of a process while the others stay, if all groups that share a process lie in
-one *threaded domain*: so it is made directly beneath their present one, and keeps every limit.
+has some threads of a process, if all groups that share it lie in one *threaded domain*: so it is
+made directly beneath their present one, and keeps every limit.
 
 Upstream: Documentation/admin-guide/cgroup-v2.rst of the kernel, "Threads" and "Mounting".
 """
@@ -76,12 +76,11 @@ def remount(options: str) -> None:
 
 def make_moves_quick() -> None:
     """Have the hierarchy mounted with :data:`QUICK_MOVES` besides what it has."""
-    if moves_are_quick():
-        return
-    before = mount_options()
-    with contextlib.suppress(OSError):  # without the privilege there is no remounting either
-        os.setxattr(mount_point(), _BEFORE, before.encode())
-        remount(f"{before},{QUICK_MOVES}")
+    if not moves_are_quick():
+        before = mount_options()
+        with contextlib.suppress(OSError):  # without the privilege there is no remounting either
+            os.setxattr(mount_point(), _BEFORE, before.encode())
+            remount(f"{before},{QUICK_MOVES}")
 
 
 def restore_mount() -> None:
@@ -99,7 +98,7 @@ def cgroup_of(tid: int) -> Path:
         lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
     except OSError:
         raise OperationError(f"there is no thread {tid}: it has ended, or never was") from None
-    path = next((line[len("0::") :] for line in lines if line.startswith("0::")), "")
+    path = next((line[3:] for line in lines if line.startswith("0::")), "")
     root = mount_point()
     folder = root / path.lstrip("/")
     # A thread outside our cgroup namespace shows as "/../…", or as a path that is not here.
@@ -144,9 +143,8 @@ def _obstacle(parent: Path) -> str | None:
         kind = _read(child / "cgroup.type").strip()
         if kind == "domain" and "populated 1" in _read(child / "cgroup.events"):
             found.append(f"its child {child.name} holds processes of its own")
-    if not found:
-        return None
-    return f": {found[0]}; run the application in a group of its own (a scope or unit)"
+    remedy = "run the application in a group of its own (a scope or unit)"
+    return f": {found[0]}; {remedy}" if found else None
 
 
 def move_thread(tid: int, folder: Path) -> bool:
@@ -180,8 +178,7 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
     deadline = time.monotonic() + within_s
     reason = ""
     while folder.is_dir():
-        # Children may be born while their parents are being moved, and a process that is being
-        # killed holds its group for a moment longer: once is not always enough.
+        # Again: children are born meanwhile, and a dying process holds its group a little longer.
         for tid in threads_in(folder):
             try:
                 # Moving to a group that is not frozen thaws, whatever became of cgroup.freeze.
@@ -202,7 +199,7 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
 
 def enter_own_group(name: str) -> bool:
     """Put this process into a group of that name, out of reach of what befalls its present one;
-    False where it has to stay, as in a container, whose end ends it, too.
+    False where it has to stay, as in a container.
     """
     for folder in _own_groups(name):
         for _ in range(_ATTEMPTS):  # the last to leave may just be removing it

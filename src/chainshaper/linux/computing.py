@@ -1,7 +1,7 @@
 """Who computes what there is much of: threads of this process, or a Dask cluster.
 
-Threads suffice on one machine, because decoding, Polars and the compiled engine run without the
-interpreter's lock; and they open no port that other users of the machine could reach.
+Threads suffice on one machine: decoding, Polars and the compiled engine run without the
+interpreter's lock. And they open no port that other users could reach.
 """
 
 import asyncio
@@ -47,11 +47,9 @@ def engine(
     workers: int, scheduler: str | None, purpose: str, stays: str = ""
 ) -> AbstractContextManager[Engine]:
     """So many threads, or the cluster of a Dask ``scheduler``; a thread's function also gets
-    ``progress``, to be called now and then.
-
-    ``purpose`` is for messages, and so is what ``stays`` where the cluster fails. Raises
-    InputError: that is no address. PlatformError: `distributed` is not installed. OperationError:
-    the cluster fails, or has other versions of what results depend on.
+    ``progress``, to be called now and then. For messages: ``purpose``, and what ``stays`` where the
+    cluster fails. Raises InputError: that is no address. PlatformError: `distributed` is not
+    installed. OperationError: the cluster fails, or has other versions of what results depend on.
     """
     return _threads(workers) if scheduler is None else _cluster(scheduler, purpose, stays)
 

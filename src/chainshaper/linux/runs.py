@@ -44,9 +44,8 @@ class Journal:
         self.note_all(kind, (fields,))
 
     def note_all(self, kind: str, changes: Iterable[Mapping[str, Any]]) -> None:
-        """Write down, with one `fsync`, how to undo changes that are about to be made.
-
-        Raises OperationError: they cannot be written; make no change then.
+        """Write down, with one `fsync`, how to undo changes that are about to be made. Raises
+        OperationError: they cannot be written; make no change then.
         """
         lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in changes)
         try:
@@ -54,8 +53,7 @@ class Journal:
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
             with os.fdopen(descriptor, "r+b", buffering=0) as file:
                 size = os.fstat(descriptor).st_size
-                if size and os.pread(descriptor, 1, size - 1) != b"\n":
-                    # A crash, or a full disk, has cut a line off.
+                if size and os.pread(descriptor, 1, size - 1) != b"\n":  # a crash cut a line off
                     size = os.pread(descriptor, size, 0).rfind(b"\n") + 1
                     file.truncate(size)
                 if file.write(lines) != len(lines):
@@ -69,8 +67,8 @@ class Journal:
             ) from error
 
     def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
-        """All that was noted, oldest first; of one ``kind`` if given. What a crash cut off was not
-        done, and is left out. Raises OperationError: unreadable.
+        """All that was noted (of a ``kind``), oldest first; what a crash cut off was not done, and
+        is left out. Raises OperationError: unreadable.
         """
         entries = (_entry(line) for line in self._lines())
         return tuple(one for one in entries if one and kind in (None, one["kind"]))
@@ -202,7 +200,7 @@ def open_journal(folder: str | Path | None = None, run: str | None = None) -> Jo
     """Begin a journal in ``folder``/``run``; both have defaults. Raises OperationError: there is
     one, or it cannot be written. PlatformError: no folder for it.
     """
-    base = journals_folder() if folder is None else Path(folder)
+    base = journals_folder(folder)
     place = base / (run or f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}")
     path = place / FILE
     try:
@@ -230,8 +228,10 @@ def remembered_journal(path: Path) -> Journal:
     return Journal(path, FileIO(path, "r"))
 
 
-def journals_folder() -> Path:
+def journals_folder(named: str | Path | None = None) -> Path:
     """Where runs have their folders. Raises PlatformError: no root, and no session of a user."""
+    if named is not None:
+        return Path(named)
     if os.geteuid() == 0:
         return Path("/run/chainshaper")
     if unit := os.environ.get("RUNTIME_DIRECTORY"):  # RuntimeDirectory= of a systemd unit
@@ -243,8 +243,7 @@ def journals_folder() -> Path:
 
 def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
     """All journals that have not been discarded, oldest name first."""
-    base = journals_folder() if folder is None else Path(folder)
-    return tuple(Journal(path) for path in sorted(base.glob(f"*/{FILE}")))
+    return tuple(Journal(path) for path in sorted(journals_folder(folder).glob(f"*/{FILE}")))
 
 
 def discard_journal(journal: Journal) -> None:
@@ -315,27 +314,27 @@ def governing(
     """The runs that govern threads of these processes; of those seen ``before``, one that is gone
     is over since then.
     """
-    found = {one.run: one for one in before}
-    living = set()
+    known = {one.run: one for one in before}
+    found = {
+        one.run: replace(one, until_ns=one.seen_ns if one.until_ns is None else one.until_ns)
+        for one in before
+    }
     with contextlib.suppress(OperationError, PlatformError, OSError):
         for journal in find_journals(folder):
             name, state = journal.name, _plain(journal.path.with_name(STATE_FILE))
             if state is None or journal.owner is None:
                 continue
             with contextlib.suppress(KeyError, TypeError, ValueError):  # not as a run writes it
-                since, known = state["in_force_ns"], name in found
-                tids = (int(tid) for server in state["servers"] for tid in server["threads"])
-                threads = (thread for tid in tids if (thread := find_thread(tid)) is not None)
-                if since is None or not (known or any(one.pid in pids for one in threads)):
+                threads = [find_thread(int(t)) for one in state["servers"] for t in one["threads"]]
+                if name in known:
+                    plan = known[name].plan
+                elif any(one is not None and one.pid in pids for one in threads):
+                    plan = _plain(journal.path.with_name(PLAN_FILE))
+                else:
                     continue
-                plan_file = journal.path.with_name(PLAN_FILE)
-                plan = found[name].plan if known else _plain(plan_file)
-                found[name] = Governed(name, since, now_ns, state.get("ended_ns"), plan)
-                living.add(name)
-    return tuple(
-        one if one.run in living or one.until_ns is not None else replace(one, until_ns=one.seen_ns)
-        for one in found.values()
-    )
+                if (since_ns := state["in_force_ns"]) is not None:
+                    found[name] = Governed(name, since_ns, now_ns, state.get("ended_ns"), plan)
+    return tuple(found.values())
 
 
 def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
