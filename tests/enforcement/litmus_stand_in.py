@@ -146,10 +146,9 @@ class StandIn:
     @property
     def calls(self) -> list[list[str]]:
         """All commands so far."""
-        calls = self.proc / "calls"
-        return (
-            [json.loads(line) for line in calls.read_text().splitlines()] if calls.exists() else []
-        )
+        with (self.proc / "calls").open("a+") as calls:
+            calls.seek(0)
+            return [json.loads(line) for line in calls]
 
 
 def install(folder: Path, plugin: str = "Linux") -> StandIn:

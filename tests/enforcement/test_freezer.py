@@ -152,15 +152,20 @@ def test_processes_of_one_server_are_opened_and_closed_together(tmp_path: Path) 
             assert inside_its_slots(spinner, begin, end, (5, 12)) > 0.95
 
 
-def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(tmp_path: Path) -> None:
-    """Forward, which closes for a while, and back, which cuts a cycle short."""
+def test_another_anchor_or_other_slots_come_at_the_end_of_a_cycle_and_nothing_slips_between(
+    tmp_path: Path,
+) -> None:
+    """Forward, which closes for a while, and back, which cuts a cycle short; then other slots."""
     with stamping(tmp_path, 30) as spinner, freezer(tmp_path, server("a", (5, 12))) as back_end:
         back_end.assign(spinner.tid, "a")
         since: list[int] = []
-        for anchor in (0, 7 * MS, MS):
-            back_end.arm(anchor)
+        for anchor in (0, 7 * MS, MS, None):
+            if anchor is None:
+                back_end.change(ServerTable(CYCLE, (server("a", (12, 17)),)), MS)
+            else:
+                back_end.arm(anchor)
             since.append(begun(back_end))
-            assert (since[-1] - anchor) % CYCLE == 0
+            assert (since[-1] - (MS if anchor is None else anchor)) % CYCLE == 0
             with ahead_of_others(spinner.tid):
                 time.sleep(0.5)
         end = time.monotonic_ns()
@@ -170,33 +175,8 @@ def test_another_anchor_moves_the_slots_and_lets_nothing_slip_between(tmp_path: 
         between = spinner.windows(closed, since[1])
         assert sum(b - a for a, b in between) < MS, "no slot lies between"
         assert inside_its_slots(spinner, since[1], since[2], (5, 12), anchor=7 * MS) > 0.98
-        assert inside_its_slots(spinner, since[2], end, (5, 12), anchor=MS) > 0.99
-
-
-def test_slots_move_at_the_end_of_a_cycle_and_lets_nothing_slip_between(tmp_path: Path) -> None:
-    first, later = (
-        tuple(server(name, slot) for name, slot in zip("ab", slots, strict=True))
-        for slots in (((2, 7), (7, 9)), ((2, 12), (12, 14)))
-    )
-    with (
-        stamping(tmp_path, 30) as one,
-        stamping(tmp_path, 30) as two,
-        freezer(tmp_path, *first) as back_end,
-    ):
-        back_end.assign(one.tid, "a")
-        back_end.assign(two.tid, "b")
-        back_end.arm(0)
-        begin = begun(back_end)
-        with ahead_of_others(one.tid, two.tid):
-            time.sleep(0.4)
-            back_end.change(ServerTable(CYCLE, later), 0)
-            moved = begun(back_end)
-            time.sleep(0.4)
-            end = time.monotonic_ns()
-        back_end.release()
-        assert (moved - begin) % CYCLE == 0
-        assert inside_its_slots(one, begin, moved, (2, 7)) > 0.99
-        assert inside_its_slots(two, moved, end, (12, 14)) > 0.95
+        assert inside_its_slots(spinner, since[2], since[3], (5, 12), anchor=MS) > 0.99
+        assert inside_its_slots(spinner, since[3], end, (12, 17), anchor=MS) > 0.95
 
 
 def stands_still(tid: int) -> bool:
@@ -233,36 +213,6 @@ def test_a_thread_joins_and_changes_servers_and_is_gated_while_they_are_in_force
         wait_until_it_runs("released")
         with pytest.raises(OperationError, match="no longer in force: they were released"):
             back_end.assign(spinner.tid, "shut")
-
-
-def test_where_servers_overlap_the_better_priority_runs(tmp_path: Path) -> None:
-    if not may_use_fifo():
-        pytest.skip("SCHED_FIFO is not permitted (CAP_SYS_NICE)")
-    servers = (server("chain", (0, 12), priority=2), server("output", (4, 8), priority=1))
-    with (
-        stamping(tmp_path, 30) as chain,
-        stamping(tmp_path, 30) as output,
-        freezer(tmp_path, *servers) as back_end,
-    ):
-        back_end.assign(chain.tid, "chain")
-        back_end.assign(output.tid, "output")
-        back_end.arm(0)
-        begin = begun(back_end)
-        # The classes are the thread allocator's business.
-        os.sched_setscheduler(chain.tid, os.SCHED_FIFO, os.sched_param(10))
-        os.sched_setscheduler(output.tid, os.SCHED_FIFO, os.sched_param(20))
-        begin = time.monotonic_ns()
-        time.sleep(1)
-        end = time.monotonic_ns()
-        for spinner in (chain, output):
-            os.sched_setscheduler(spinner.tid, os.SCHED_OTHER, os.sched_param(0))
-        back_end.release()
-        behind = chain.windows(begin, end)
-        first = output.windows(begin, end)
-        assert len(first) > 20
-        assert len(behind) > 40, "interrupted once a cycle"
-        assert share_inside(first, ((4 * MS, 8 * MS),), CYCLE, 0) > 0.99
-        assert share_inside(behind, ((0, 4 * MS), (8 * MS, 12 * MS)), CYCLE, 0) > 0.97
 
 
 def test_a_slot_that_ends_while_a_thread_computes_is_an_overrun(tmp_path: Path) -> None:
@@ -323,6 +273,11 @@ def plain() -> Iterator[str]:
 
 
 def test_others_that_move_processes_make_nobody_wait_meanwhile(tmp_path: Path, plain: str) -> None:
+    make_moves_quick()  # as a run left it whose journal is gone
+    journal = open_journal(tmp_path)
+    Freezer(ServerTable(CYCLE, (server("a", (0, 1)),)), journal).release()
+    discard_journal(journal)
+    assert mount_options() == plain
     with sleeping() as pid:
         remount(f"{plain},{QUICK_MOVES}")
         with freezer(tmp_path / "theirs", server("a", (0, 1))) as back_end:
@@ -334,16 +289,6 @@ def test_others_that_move_processes_make_nobody_wait_meanwhile(tmp_path: Path, p
             back_end.assign(pid, "a")
             assert mount_options() == f"{plain},{QUICK_MOVES}"
         assert mount_options() == plain
-
-
-def test_what_a_run_without_a_journal_left_mounted_is_not_taken_for_another_program_s(
-    tmp_path: Path, plain: str
-) -> None:
-    make_moves_quick()  # and nothing else says who did
-    journal = open_journal(tmp_path)
-    Freezer(ServerTable(CYCLE, (server("a", (0, 1)),)), journal).release()
-    discard_journal(journal)
-    assert mount_options() == plain
 
 
 def test_the_last_of_two_runs_at_once_leaves_it_mounted_as_the_first_found_it(
@@ -412,42 +357,34 @@ def test_a_container_that_ends_takes_its_group_along_and_the_next_of_its_name_is
         assert inside_its_slots(sibling, begin, end, (0, 7)) > 0.99
 
 
-def test_one_run_at_a_time_has_a_thread(tmp_path: Path) -> None:
-    with sleeping() as pid, freezer(tmp_path, server("a", (5, 12))) as back_end:
-        back_end.assign(pid, "a")
-        journal = open_journal(tmp_path, "another")
-        other = Freezer(ServerTable(CYCLE, (server("b", (0, 1)),)), journal)
-        try:
-            with pytest.raises(OperationError, match=f"thread {pid} is in .* of another run"):
-                other.assign(pid, "b")
-        finally:
-            other.release()
-        assert cgroup_of(pid) in groups_left(os.getpid()), "the first run's is still there"
-
-
-def test_what_cannot_be_assigned_is_refused_and_changes_nothing(tmp_path: Path) -> None:
+def test_what_cannot_be_assigned_is_refused_or_passed_over_and_changes_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     ended = subprocess.Popen(["true"])
     ended.wait()
-    with freezer(tmp_path, server("a", (5, 12)), server("b", (12, 15))) as back_end:
+    servers = (server("a", (5, 12)), server("b", (12, 15)))
+    with sleeping() as pid, sleeping() as ending, freezer(tmp_path, *servers) as back_end:
         with pytest.raises(InputError, match="no server is named c: a, b are"):
             back_end.assign(os.getpid(), "c")
         back_end.assign(ended.pid, "a")
-        assert groups_left(os.getpid()) == []
-
-
-def test_a_thread_that_ends_while_its_cgroup_is_looked_up_is_passed_over(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with freezer(tmp_path, server("a", (5, 12))) as back_end, sleeping() as pid:
 
         def ends(tid: int) -> Path:
             kill(tid)
             wait_for(lambda: not is_alive(tid), "its end")
             raise PlatformError(f"thread {tid} is in a cgroup that is gone")
 
-        monkeypatch.setattr(cgroups, "cgroup_of", ends)
-        back_end.assign(pid, "a")
+        with monkeypatch.context() as while_it_is_looked_up:
+            while_it_is_looked_up.setattr(cgroups, "cgroup_of", ends)
+            back_end.assign(ending, "a")
         assert groups_left(os.getpid()) == []
+        back_end.assign(pid, "a")
+        other = Freezer(ServerTable(CYCLE, servers[1:]), open_journal(tmp_path, "another"))
+        try:
+            with pytest.raises(OperationError, match=f"thread {pid} is in .* of another run"):
+                other.assign(pid, "b")
+        finally:
+            other.release()
+        assert cgroup_of(pid) in groups_left(os.getpid()), "the first run's is still there"
 
 
 def test_a_core_that_the_machine_lacks_is_named_and_nothing_stays_behind(tmp_path: Path) -> None:
@@ -542,34 +479,6 @@ def test_after_a_stall_what_should_be_open_by_then_counts(tmp_path: Path) -> Non
         # Slots that passed meanwhile are not opened belatedly, one after the other.
         assert known(after.slots) - known(before.slots) <= (end - resumed) // CYCLE + 3
         assert inside_its_slots(spinner, resumed + CYCLE, end, (5, 12)) > 0.99
-
-
-def test_an_entry_that_comes_late_is_counted_with_its_lateness(tmp_path: Path) -> None:
-    # Slots of 95 % of a cycle: whenever the dispatcher comes back it enters one late.
-    with freezer(tmp_path, server("a", (0, 95)), cycle=100 * MS) as back_end:
-        back_end.arm(0)
-        wait_for(lambda: (back_end.counters()["a"].slots or 0) >= 2, "slots")
-        before = back_end.counters()["a"]
-        for _ in range(2):
-            kill(back_end.dispatchers[CORE], signal.SIGSTOP)
-            time.sleep(0.15)  # one slot's start lies in it at least
-            kill(back_end.dispatchers[CORE], signal.SIGCONT)
-            time.sleep(0.2)
-        after = back_end.counters()["a"]
-        assert back_end.failure() is None
-        assert known(after.late_entries) > known(before.late_entries)
-        assert known(after.longest_lateness_ns) > MS
-
-
-def test_thirty_two_servers_share_a_core(tmp_path: Path) -> None:
-    servers = [server(f"s{number}", (number, number + 1)) for number in range(32)]
-    with freezer(tmp_path, *servers, cycle=40 * MS) as back_end:
-        back_end.arm(0)
-        time.sleep(1)
-        opened = [counters.slots for counters in back_end.counters().values()]
-        assert back_end.failure() is None
-        assert min(opened) > 10  # type: ignore[type-var, operator]
-        assert max(opened) - min(opened) <= 3  # type: ignore[type-var, operator]
 
 
 def test_boundaries_without_room_between_them_leave_it_a_sign_of_life(tmp_path: Path) -> None:

@@ -63,12 +63,8 @@ class Run:
 
     def pids(self, name: str) -> list[int]:
         """``owner``, ``guardian`` (the first), ``guardians`` (both) or ``dispatcher``."""
-        return {
-            "owner": [self.owner.pid],
-            "guardian": self.guardians[:1],
-            "guardians": self.guardians,
-            "dispatcher": self.dispatchers,
-        }[name]
+        one = {"owner": [self.owner.pid], "guardian": self.guardians[:1]}
+        return {**one, "guardians": self.guardians, "dispatcher": self.dispatchers}[name]
 
     def wait_until_restored(self) -> None:
         """The node runs, where it was, as it was, and no group is left."""
@@ -94,37 +90,31 @@ class Run:
 
 
 @contextmanager
-def owner_of(folder: Path, *arguments: object) -> Iterator[subprocess.Popen[str]]:
-    with subprocess.Popen(
-        [sys.executable, str(OWNER), *map(str, arguments)],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        stderr=(folder / "said").open("w"),
-        text=True,
-    ) as owner:
-        try:
-            yield owner
-        finally:
-            kill(owner.pid)
-
-
-@contextmanager
 def run_on(
     node: Governed, back_end: str = "freezer", cycle_ms: int = MINUTE, slot_ms: int = 2
 ) -> Iterator[Run]:
     runs = node.folder / f"runs-{time.monotonic_ns()}"
     arguments = (back_end, runs, CORE, cycle_ms, slot_ms, node.pid)
-    with owner_of(node.folder, *arguments) as owner:
-        said = known(owner.stdout).readline()
-        assert said.startswith("in force"), (node.folder / "said").read_text()
-        first, second, *dispatchers = map(int, said.split()[3:])
-        run = Run(owner, [first, second], dispatchers, runs, node)
+    with subprocess.Popen(
+        [sys.executable, str(OWNER), *map(str, arguments)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=(node.folder / "said").open("w"),
+        text=True,
+    ) as owner:
         try:
-            if cycle_ms == MINUTE and back_end == "freezer":
-                wait_for(run.is_frozen, "the node to be frozen")
-            yield run
+            said = known(owner.stdout).readline()
+            assert said.startswith("in force"), (node.folder / "said").read_text()
+            first, second, *dispatchers = map(int, said.split()[3:])
+            run = Run(owner, [first, second], dispatchers, runs, node)
+            try:
+                if cycle_ms == MINUTE and back_end == "freezer":
+                    wait_for(run.is_frozen, "the node to be frozen")
+                yield run
+            finally:
+                run.end()
         finally:
-            run.end()
+            kill(owner.pid)
 
 
 @pytest.fixture(autouse=True)
@@ -199,14 +189,13 @@ def test_what_loses_guardians_only_goes_on_being_served(
         assert run.ask("failure") == "None"
 
 
-def test_an_owner_that_raises_leaves_nothing(node: Governed) -> None:
+def test_an_owner_that_raises_leaves_nothing_and_a_dispatcher_that_ends_thaws_first(
+    node: Governed,
+) -> None:
     with run_on(node) as run:
         assert run.ask("raise") == ""
         assert run.owner.wait(timeout=20) == 1
         run.wait_until_restored()
-
-
-def test_a_dispatcher_that_is_asked_to_end_thaws_first(node: Governed) -> None:
     with run_on(node) as run:
         for pid in run.guardians:  # they cannot help
             kill(pid, STOP)
@@ -229,23 +218,18 @@ def test_threads_of_a_silent_dispatcher_are_let_go_first_and_closed_again_if_it_
                 events.read()
             kill(run.dispatchers[0], signal.SIGCONT)
         wait_for(run.is_frozen, "it to be closed again")
-        assert groups_left(run.owner.pid) == groups
-        assert run.ask("failure") == "None"
-
-
-def test_threads_that_a_guardian_lets_go_when_the_dispatcher_is_back_are_closed_again(
-    node: Governed,
-) -> None:
-    with run_on(node) as run:
         (journal,) = find_journals(run.runs)
         freezer = known(run_of(journal))
         let_go(journal, CounterPage(freezer.page, freezer.table), CORE)  # as the slower of two may
         wait_for(run.is_frozen, "it to be closed again")
+        assert groups_left(run.owner.pid) == groups
         assert run.ask("failure") == "None"
 
 
 def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) -> None:
-    """They have a session and a cgroup of their own, and hear no terminal."""
+    """They have a session and a cgroup of their own, and hear no terminal; and elsewhere than the
+    dispatcher they are below DDS, which delivers outputs there, and above all servers.
+    """
     with run_on(node) as run:
         for pid in run.guardians:
             assert os.getsid(pid) == pid
@@ -255,21 +239,10 @@ def test_guardians_are_out_of_reach_of_what_befalls_the_owner(node: Governed) ->
         time.sleep(0.2)
         assert all(map(is_alive, run.guardians))
         assert run.ask("failure") == "None"
-
-
-@pytest.mark.skipif(len(available_cores()) < 2, reason="it needs a core beside the servers'")
-def test_guardians_elsewhere_are_below_dds_and_above_all_servers(node: Governed) -> None:
-    """DDS delivers outputs on a core without servers."""
-    with run_on(node) as run:
-        wait_for(
-            lambda: not any(map(beside_the_dispatcher, run.guardians)), "them to look elsewhere"
-        )
-        wait_for(
-            lambda: all(
-                _BEST_SERVER_PRIORITY < priority_of(one) < DDS_PRIORITY for one in run.guardians
-            ),
-            "their class",
-        )
+        if len(available_cores()) > 1:
+            elsewhere = range(_BEST_SERVER_PRIORITY + 1, DDS_PRIORITY)
+            wait_for(lambda: {*map(priority_of, run.guardians)} <= {*elsewhere}, "their class")
+            assert not any(CORE in os.sched_getaffinity(pid) for pid in run.guardians)
 
 
 def test_guardians_are_above_a_dispatcher_that_they_share_a_core_with(node: Governed) -> None:
@@ -282,10 +255,6 @@ def test_guardians_are_above_a_dispatcher_that_they_share_a_core_with(node: Gove
             assert all(priority_of(one) > priority_of(run.dispatchers[0]) for one in run.guardians)
     finally:
         os.sched_setaffinity(0, available)
-
-
-def beside_the_dispatcher(pid: int) -> bool:
-    return CORE in os.sched_getaffinity(pid)
 
 
 def priority_of(pid: int) -> int:

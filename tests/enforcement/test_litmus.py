@@ -13,7 +13,7 @@ import pytest
 from actors import Actor, acting
 from applied_plans import one_server_plan
 from command_line import called
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from litmus_stand_in import StandIn, install
 from small_chain import small_chain_plan
@@ -91,19 +91,14 @@ def test_printed_commands_open_servers_for_overruns_as_apply_does(
     assert created[-3:] == ("[0,9)", "[9,16)", "[19,50)")
 
 
-@pytest.mark.parametrize(
-    ("duration_ns", "text"),
-    [(0, "0"), (1, "0.000001"), (86_500_000, "86.5"), (100 * MS, "100"), (1_001_000, "1.0010005")],
-)
-def test_times_are_decimal_milliseconds(duration_ns: int, text: str) -> None:
-    assert milliseconds_text(duration_ns) == text
-
-
 @settings(max_examples=2000)
 @given(st.integers(0, 10**13))
-def test_a_time_survives_being_a_double_to_the_nanosecond(duration_ns: int) -> None:
+@example(86_500_000)
+def test_times_are_decimal_milliseconds_that_survive_being_a_double(duration_ns: int) -> None:
     """C's conversion: to a double, times a million, cut off; `resctl` does no rounding."""
     assert int(float(milliseconds_text(duration_ns)) * 1_000_000) == duration_ns
+    known = {0: "0", 1: "0.000001", 86_500_000: "86.5", 1_001_000: "1.0010005"}
+    assert {one: milliseconds_text(one) for one in known} == known
 
 
 @pytest.mark.parametrize(
@@ -150,24 +145,19 @@ def _resctl(tools: StandIn, *arguments: str) -> "subprocess.CompletedProcess[str
     )
 
 
-REFUSED = {
-    "exceeds major cycle length": ["[86,100]"],
-    "overlaps with previous interval": ["[2,86]", "[86,87]"],
-    "end before start": ["[5,5)"],
-    "must not start before zero": ["[-1,5)"],
-    "could not parse": ["[1 ,2)"],
-    "at least one interval": [],
-}
-
-
-@pytest.mark.parametrize(("reason", "intervals"), REFUSED.items(), ids=list(REFUSED))
-def test_the_stand_in_refuses_what_resctl_refuses(
-    tools: StandIn, reason: str, intervals: list[str]
-) -> None:
-    done = _resctl(tools, "-n", "9", "-t", "table-driven", "-m", "100", *intervals)
-    assert done.returncode in (1, 5)
-    assert reason in done.stderr
-    assert not [r for r in tools.state["reservations"] if r["number"] == 9]
+def test_the_stand_in_refuses_what_resctl_refuses(tools: StandIn) -> None:
+    for reason, intervals in {
+        "exceeds major cycle length": ["[86,100]"],
+        "overlaps with previous interval": ["[2,86]", "[86,87]"],
+        "end before start": ["[5,5)"],
+        "must not start before zero": ["[-1,5)"],
+        "could not parse": ["[1 ,2)"],
+        "at least one interval": [],
+    }.items():
+        done = _resctl(tools, "-n", "9", "-t", "table-driven", "-m", "100", *intervals)
+        assert done.returncode in (1, 5)
+        assert reason in done.stderr
+        assert not [r for r in tools.state["reservations"] if r["number"] == 9]
 
 
 @st.composite
@@ -231,10 +221,8 @@ def actor(tmp_path: Path) -> Iterator[Actor]:
 def _home(stand_in: StandIn, tid: int) -> dict[str, object]:
     """The reservation that a thread is in."""
     core, number = stand_in.state["home"][str(tid)]
-    (found,) = [
-        r for r in stand_in.state["reservations"] if (r["core"], r["number"]) == (core, number)
-    ]
-    return found  # type: ignore[no-any-return]
+    made = {(r["core"], r["number"]): r for r in stand_in.state["reservations"]}
+    return made[core, number]  # type: ignore[no-any-return]
 
 
 def test_servers_are_made_threads_attached_and_everything_put_back(
@@ -260,60 +248,49 @@ def test_servers_are_made_threads_attached_and_everything_put_back(
     assert {tid: state_of(tid) for tid in actor.tids.values()} == before
 
 
-def test_another_anchor_turns_the_slots_and_moves_the_threads(
+def test_another_anchor_moves_threads_and_those_that_have_ended_are_passed_over(
     stand_in: StandIn, journal: Journal, actor: Actor
 ) -> None:
     servers = Litmus(TABLE, journal, stand_in.proc)
-    servers.assign(actor.tids["a"], "chain")
+    for tid in actor.tids.values():
+        servers.assign(tid, "chain")
+    actor.end("b")
     servers.arm(anchor_ns=0)
+    assert stand_in.state["attached"] == [actor.tids["a"]]
     servers.arm(anchor_ns=1_030 * MS)
     home = _home(stand_in, actor.tids["a"])
     assert home["slots"] == [[0, 16 * MS - 1], [30 * MS, 100 * MS - 1]]
+    actor.end("a")
     servers.release()
     assert stand_in.plugin == "Linux"
 
 
-def test_the_plugin_that_was_active_comes_back(
+def test_a_plugin_that_others_chose_comes_back_stays_theirs_or_is_not_put_at_risk(
     tmp_path: Path, journal: Journal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "other").mkdir()
-    stand_in = install(tmp_path / "other", plugin="GSN-EDF")
+    stand_in = install(tmp_path, plugin="GSN-EDF")
     monkeypatch.setenv("PATH", str(stand_in.programs), prepend=os.pathsep)
+    setsched = str(stand_in.programs / "setsched")
     servers = Litmus(TABLE, journal, stand_in.proc)
     servers.arm(anchor_ns=0)
     assert stand_in.plugin == "P-RES"
     servers.release()
     assert stand_in.plugin == "GSN-EDF"
-
-
-def test_reservations_of_others_are_not_put_at_risk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, journal: Journal
-) -> None:
-    stand_in = install(tmp_path, plugin="P-RES")
-    monkeypatch.setenv("PATH", str(stand_in.programs), prepend=os.pathsep)
+    servers = Litmus(TABLE, journal, stand_in.proc)
+    servers.arm(anchor_ns=0)
+    subprocess.run([setsched, "Linux"], check=True)
+    assert servers.failure() == "the scheduler plugin was changed from P-RES to Linux"
+    servers.release()
+    assert stand_in.plugin == "Linux", "it is theirs"
+    subprocess.run([setsched, "P-RES"], check=True)
+    calls = stand_in.calls
     with pytest.raises(OperationError, match=r"P-RES is active already.*`setsched Linux`"):
         Litmus(TABLE, journal, stand_in.proc)
-    assert stand_in.calls == []
+    assert stand_in.calls == calls
 
 
-def test_a_kernel_that_is_not_litmus_is_named_with_the_remedy(
-    tmp_path: Path, journal: Journal
-) -> None:
-    with pytest.raises(PlatformError, match=r"not LITMUS.RT.*--backend auto.*--dry-run"):
-        Litmus(TABLE, journal, tmp_path / "nothing")
-
-
-def test_tools_that_are_not_installed_are_named(
-    stand_in: StandIn, monkeypatch: pytest.MonkeyPatch, journal: Journal
-) -> None:
-    (stand_in.programs / "resctl").unlink()
-    monkeypatch.setenv("PATH", str(stand_in.programs))
-    with pytest.raises(PlatformError, match=r"resctl is not on \$PATH.*liblitmus"):
-        Litmus(TABLE, journal, stand_in.proc)
-
-
-def test_what_litmus_refuses_is_said_in_its_words_and_undone(
-    stand_in: StandIn, journal: Journal
+def test_what_is_missing_or_refused_is_named_with_the_remedy(
+    stand_in: StandIn, monkeypatch: pytest.MonkeyPatch, journal: Journal, tmp_path: Path
 ) -> None:
     beyond = ReservationServer("far", 4095, 1, ((0, MS),))
     servers = Litmus(ServerTable(100 * MS, (beyond,)), journal, stand_in.proc)
@@ -321,29 +298,12 @@ def test_what_litmus_refuses_is_said_in_its_words_and_undone(
         servers.arm(anchor_ns=0)
     servers.release()
     assert stand_in.plugin == "Linux"
-
-
-def test_threads_that_have_ended_are_passed_over(
-    stand_in: StandIn, journal: Journal, actor: Actor
-) -> None:
-    servers = Litmus(TABLE, journal, stand_in.proc)
-    servers.assign(actor.tids["a"], "chain")
-    servers.assign(actor.tids["b"], "chain")
-    actor.end("a")
-    servers.arm(anchor_ns=0)
-    assert stand_in.state["attached"] == [actor.tids["b"]]
-    actor.end("b")
-    servers.release()
-    assert stand_in.plugin == "Linux"
-
-
-def test_a_plugin_that_somebody_changed_is_a_failure(stand_in: StandIn, journal: Journal) -> None:
-    servers = Litmus(TABLE, journal, stand_in.proc)
-    servers.arm(anchor_ns=0)
-    subprocess.run([str(stand_in.programs / "setsched"), "GSN-EDF"], check=True)
-    assert servers.failure() == "the scheduler plugin was changed from P-RES to GSN-EDF"
-    servers.release()
-    assert stand_in.plugin == "GSN-EDF", "it is theirs"
+    with pytest.raises(PlatformError, match=r"not LITMUS.RT.*--backend auto.*--dry-run"):
+        Litmus(TABLE, journal, tmp_path / "nothing")
+    (stand_in.programs / "resctl").unlink()
+    monkeypatch.setenv("PATH", str(stand_in.programs))
+    with pytest.raises(PlatformError, match=r"resctl is not on \$PATH.*liblitmus"):
+        Litmus(TABLE, journal, stand_in.proc)
 
 
 _ARMED_AND_KILLED = """

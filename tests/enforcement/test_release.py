@@ -179,7 +179,7 @@ def test_a_process_that_was_never_ours_stays_as_it_is(tmp_path: Path) -> None:
         wait_for(lambda: not leftovers(), "the undoing")
         assert state_of(pid) == before
         governed.check_as_before()
-        assert f"thread {pid} (sleep) is left as it is" in said
+        assert f"thread {pid} (sleep) of process {pid} is left as it is" in said
 
 
 SLOW = """

@@ -67,53 +67,33 @@ def test_class_and_cores_are_changed_and_put_back(tmp_path: Path, journal: Journ
             assert _states(actor) == before
 
 
-def test_several_changes_go_back_to_what_was_there_at_first(
+def test_several_changes_go_back_to_what_was_there_at_first_but_what_is_others_stays(
     tmp_path: Path, journal: Journal
 ) -> None:
-    with acting(tmp_path, "a") as actor:
-        before = _states(actor)
-        for wanted in (WANTED, Scheduling(None, (FIRST,)), Scheduling(12, None)):
-            change_all(journal, [(actor.thread("a"), wanted)])
-        release_threads(journal)
-        assert _states(actor) == before
+    theirs = (os.SCHED_RR, 5)
+    with acting(tmp_path, "a", "b", "c", "ending") as actor:
+        before, ended = _states(actor), actor.thread("ending")
 
+        def wish(name: str, priority: int | None, *cores: int) -> None:
+            change_all(journal, [(actor.thread(name), Scheduling(priority, cores or None))])
 
-def test_what_somebody_else_has_changed_since_is_theirs(tmp_path: Path, journal: Journal) -> None:
-    with acting(tmp_path, "a") as actor:
-        tid = actor.tids["a"]
-        before = state_of(tid)
-        change_all(journal, [(actor.thread("a"), WANTED)])
-        os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
-        release_threads(journal)
-        now = state_of(tid)
-        assert now.scheduling_class.policy == os.SCHED_RR
-        assert now.cores == before.cores, "the cores were ours still"
-
-
-def test_what_somebody_else_set_between_two_changes_is_what_was_there(
-    tmp_path: Path, journal: Journal
-) -> None:
-    with acting(tmp_path, "a") as actor:
-        tid = actor.tids["a"]
-        change_all(journal, [(actor.thread("a"), WANTED)])
-        os.sched_setscheduler(tid, os.SCHED_RR, os.sched_param(5))
-        change_all(journal, [(actor.thread("a"), Scheduling(40, None))])
-        release_threads(journal)
-        now = state_of(tid).scheduling_class
-        assert (now.policy, now.priority) == (os.SCHED_RR, 5)
-
-
-def test_threads_and_processes_that_have_ended_are_no_error(
-    tmp_path: Path, journal: Journal
-) -> None:
-    with acting(tmp_path, "a", "b") as actor:
-        ended, before = actor.thread("a"), state_of(actor.tids["b"])
+        for wanted in ((30, LAST), (None, FIRST), (12,)):
+            wish("a", *wanted)
+        wish("b", 30, LAST)
+        wish("c", 30, LAST)
+        for name in "bc":
+            os.sched_setscheduler(actor.tids[name], theirs[0], os.sched_param(theirs[1]))
+        wish("c", 40)  # what they set between two changes is what was there
         change_all(journal, [(ended, WANTED)])
-        change_all(journal, [(actor.thread("b"), WANTED)])
-        actor.end("a")
+        actor.end("ending")
         change_all(journal, [(ended, WANTED)])
         release_threads(journal)
-        assert state_of(actor.tids["b"]) == before
+        after = _states(actor)
+        assert after["a"] == before["a"]
+        for name in "bc":
+            now = after[name].scheduling_class
+            assert (now.policy, now.priority) == theirs
+            assert after[name].cores == before[name].cores, "the cores were ours still"
     release_threads(journal)
 
 
@@ -141,38 +121,17 @@ def test_what_threads_inherited_goes_back_to_what_their_parents_had(
         time.sleep(0.05)  # starts are counted in ticks of 10 ms
         change_all(journal, [(actor.thread("main"), WANTED)])
         time.sleep(0.05)
-        actor.begin("late")  # by the main thread
+        late, changed, own = (actor.begin(name) for name in ("late", "changed", "own"))  # by main
         child = actor.fork()
-        for tid in (actor.tids["late"], child):
+        for tid in (late, changed, own, child):
             assert state_of(tid).scheduling_class.priority == 30, "the kernel lets it inherit"
+        change_all(journal, [(actor.thread("changed"), Scheduling(29, (FIRST,)))])
+        os.sched_setscheduler(own, os.SCHED_FIFO, os.sched_param(3))  # by itself, say
         release_threads(journal)
-        for tid in (actor.tids["late"], child, actor.pid):
+        for tid in (late, changed, child, actor.pid):
             assert state_of(tid) == before
         assert state_of(actor.tids["early"]) == early
-
-
-def test_a_thread_that_is_changed_after_it_inherited_gets_its_parents_original(
-    tmp_path: Path, journal: Journal
-) -> None:
-    with acting(tmp_path) as actor:
-        before = state_of(actor.pid)
-        time.sleep(0.05)
-        change_all(journal, [(actor.thread("main"), WANTED)])
-        time.sleep(0.05)
-        actor.begin("late")
-        change_all(journal, [(actor.thread("late"), Scheduling(29, (FIRST,)))])
-        release_threads(journal)
-        assert state_of(actor.tids["late"]) == before
-
-
-def test_a_new_thread_of_a_class_of_its_own_is_left_alone(tmp_path: Path, journal: Journal) -> None:
-    with acting(tmp_path) as actor:
-        change_all(journal, [(actor.thread("main"), WANTED)])
-        time.sleep(0.05)
-        tid = actor.begin("late")
-        os.sched_setscheduler(tid, os.SCHED_FIFO, os.sched_param(3))
-        release_threads(journal)
-        assert state_of(tid).scheduling_class.priority == 3
+        assert state_of(own).scheduling_class.priority == 3
 
 
 _APPLIER = """
@@ -333,7 +292,7 @@ def test_a_stranger_with_all_that_we_gave_is_named_and_left(
             set_state(stranger.pid, state_of(actor.pid))
             set_state(other.pid, state_of(actor.pid))  # older
             (named,) = look_alikes(journal)
-            assert f"thread {stranger.pid} (sleep) is left as it is: SCHED_FIFO 30" in named
+            assert f"of process {stranger.pid} is left as it is: SCHED_FIFO 30" in named
             release_threads(journal)
             assert state_of(stranger.pid).scheduling_class.priority == 30
             assert state_of(other.pid).scheduling_class.priority == 30
