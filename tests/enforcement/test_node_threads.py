@@ -333,15 +333,6 @@ def test_on_zenoh_its_router_delivers_too_and_notes_say_what_was_never_run(tmp_p
         assert note.endswith("known by rules from its sources, and chainshaper never ran on it")
 
 
-def test_threads_without_names_are_left_alone_and_a_note_says_so() -> None:
-    found = allocate([_process(1, X, "talker", "talker", "talker")])
-    assert _by_tid(
-        plan_scheduling(_plan(_server("c", PlannedThread(node="/x"))), found, (0, 1))
-    ) == {1: Scheduling(87, (1,))}
-    (note,) = found.notes
-    assert note.startswith("/x: the middleware's threads have no names (Fast DDS before 2.13")
-
-
 def test_the_cycle_begins_with_the_first_node() -> None:
     """Not with one on a core of a lower number, nor with a shaping node, though it is due first."""
     named = {"output": "/out", "publisher": "/b", "nodes": ("/a", "/b")}

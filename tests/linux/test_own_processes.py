@@ -111,12 +111,8 @@ def test_a_command_that_starts_processes_runs_nothing_of_the_current_folder(
 def test_python_dash_m_imports_from_no_current_folder(tmp_path: Path) -> None:
     """What was imported before the package's own first line is Python's affair."""
     (tmp_path / "typer.py").write_text("raise SystemExit('evil')")
-    run = subprocess.run(
-        [sys.executable, "-m", "chainshaper", "--help"],
-        cwd=tmp_path,
-        capture_output=True,
-        check=False,
-    )
+    command = [sys.executable, "-m", "chainshaper", "--help"]
+    run = subprocess.run(command, cwd=tmp_path, capture_output=True, check=False)
     assert (run.returncode, run.stderr) == (0, b"")
 
 
@@ -288,12 +284,9 @@ def test_commands_that_cannot_be_started_are_named_beforehand(tmp_path: Path) ->
         start_command([str(plain)])
 
 
-@pytest.mark.parametrize(
-    ("code", "words"),
-    [(3, "ended with code 3"), (-11, "was killed by SIGSEGV"), (-40, "was killed by signal 40")],
-)
-def test_the_end_of_a_command_in_words(code: int, words: str) -> None:
-    assert end_in_words(code) == words
+def test_the_end_of_a_command_in_words() -> None:
+    codes = {3: "ended with code 3", -11: "was killed by SIGSEGV", -40: "was killed by signal 40"}
+    assert {code: end_in_words(code) for code in codes} == codes
 
 
 def _group(leader: int) -> list[int]:

@@ -209,10 +209,7 @@ def _receiving(pid: int) -> set[int]:
 def test_a_forked_helper_takes_no_part_whatever_its_command_line_says(tmp_path: Path) -> None:
     arguments = ("--ros-args", "-r", "__node:=talker")
     with acting(tmp_path, *CYCLONE, arguments=arguments) as actor:
-        helper = read_process(actor.fork())
-        node = read_process(actor.pid)
-    assert helper is not None
-    assert node is not None
+        helper, node = known(read_process(actor.fork())), known(read_process(actor.pid))
     assert helper.command == node.command
     assert (helper.participates, node.participates) == (False, True)
 
@@ -225,12 +222,8 @@ def test_descendants_are_children_and_theirs(tmp_path: Path) -> None:
     assert descendants({2: 1, 3: 2, 4: 3, 5: 1}, 2) == {2, 3, 4}
 
 
-def test_what_is_gone_is_no_process() -> None:
+def test_what_is_gone_or_the_kernels_own_is_no_process() -> None:
     pid = os.posix_spawn("/bin/true", ["true"], {})
     os.waitpid(pid, 0)
     assert read_process(pid) is None
-
-
-def test_the_kernels_own_threads_are_no_processes() -> None:
-    assert 2 not in {process.pid for process in list_processes() if not process.command}
     assert all(process.command for process in list_processes())

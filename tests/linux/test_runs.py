@@ -107,18 +107,14 @@ def test_a_journal_whose_folder_is_removed_stays_known_to_those_who_have_it_open
     assert journal.path.stat().st_mode & 0o077 == 0
 
 
-def test_a_journal_that_was_discarded_is_not_written_again(journal: Journal) -> None:
-    other = remembered_journal(journal.path)
-    discard_journal(journal)
-    assert not other.keep()
-    assert other.entries() == ()
-    assert not journal.path.exists()
-
-
-@pytest.mark.usefixtures("journal")
-def test_a_second_journal_of_the_same_run_is_refused(tmp_path: Path) -> None:
+def test_a_second_journal_of_the_same_run_is_refused_and_one_from_before_a_boot_has_no_owner(
+    journal: Journal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(OperationError, match="exists: that run is going on, or has crashed"):
         open_journal(tmp_path, "run")
+    monkeypatch.setattr(module, "boot_id", lambda: "another boot")
+    assert journal.outdated
+    assert journal.owner is None
 
 
 def test_a_full_disk_is_named_before_anything_is_changed(full_disk: Path) -> None:
@@ -126,14 +122,6 @@ def test_a_full_disk_is_named_before_anything_is_changed(full_disk: Path) -> Non
         journal = open_journal(full_disk, "run")
         for _ in range(10_000):
             journal.note("cgroup", path="a" * 1000)
-
-
-def test_a_journal_from_before_the_machine_booted_has_nothing_to_undo(
-    journal: Journal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(module, "boot_id", lambda: "another boot")
-    assert journal.outdated
-    assert journal.owner is None
 
 
 def test_a_journal_whose_owner_was_killed_is_nobodys(tmp_path: Path) -> None:
@@ -154,8 +142,11 @@ def test_discarding_removes_the_file_and_its_folder_unless_there_is_more(tmp_pat
         folder = journal.path.parent
         if others:
             (folder / "counters").touch()
+        other = remembered_journal(journal.path)
         discard_journal(journal)
         discard_journal(journal)
+        assert not other.keep(), "nor is it written again"
+        assert other.entries() == ()
         assert folder.exists() is others
         assert find_journals(tmp_path) == ()
 

@@ -107,29 +107,20 @@ def test_a_process_has_its_main_thread_first_and_named_threads_by_name() -> None
     assert sender.identity == (thread.native_id, sender.started)
 
 
-def test_a_process_that_is_gone_has_no_threads() -> None:
-    pid = os.posix_spawn("/bin/true", ["true"], {})
-    os.waitpid(pid, 0)
-    assert list_threads(pid) == ()
-
-
-def test_a_thread_is_found_by_its_id_alone(tmp_path: Path) -> None:
-    with acting(tmp_path, "a") as actor:
-        found = find_thread(actor.tids["a"])
-        assert found == actor.thread("a")
-        assert found is not None
-        assert found.pid == actor.pid
-        assert start_of(actor.pid, actor.tids["a"]) == found.started
-        actor.end("a")
-        wait_for(lambda: find_thread(actor.tids["a"]) is None, "the end of a thread")
-        assert start_of(actor.pid, actor.tids["a"]) is None
-
-
-def test_a_name_with_brackets_and_spaces_does_not_confuse(tmp_path: Path) -> None:
-    with acting(tmp_path, ") R 1 2 (") as actor:
-        thread = actor.thread(") R 1 2 (")
-        assert thread.comm == ") R 1 2 ("
-        assert thread.started >= actor.thread("main").started
+def test_a_thread_is_found_by_its_id_alone_whatever_its_name_as_long_as_it_lives(
+    tmp_path: Path,
+) -> None:
+    name = ") R 1 2 ("  # as in /proc/PID/stat
+    with acting(tmp_path, name) as actor:
+        tid = actor.tids[name]
+        found = known(find_thread(tid))
+        assert found == actor.thread(name)
+        assert (found.pid, found.comm) == (actor.pid, name)
+        assert start_of(actor.pid, tid) == found.started >= actor.thread("main").started
+        actor.end(name)
+        wait_for(lambda: find_thread(tid) is None, "the end of a thread")
+        assert start_of(actor.pid, tid) is None
+    assert list_threads(actor.pid) == ()
 
 
 def test_in_a_container_a_thread_has_an_id_of_its_own() -> None:
