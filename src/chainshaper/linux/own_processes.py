@@ -47,7 +47,6 @@ _START = (
 
 def module_command(module: str, libraries: Sequence[str] = ()) -> list[str]:
     """How a module runs as a process of ours, with ``libraries`` found where this process does.
-
     Raises OperationError: others may change the package, and an isolated Python has no other.
     """
     own = (*site.getsitepackages(), str(Path(os.__file__).parent))  # where it looks anyway
@@ -102,9 +101,8 @@ def check_command(command: Sequence[str]) -> None:
 def start_command(
     command: Sequence[str], environment: Mapping[str, str] | None = None, stdout: int | None = None
 ) -> subprocess.Popen[bytes]:
-    """Start the command with ``environment`` added to ours, printing to the descriptor ``stdout``.
-
-    Should we be killed, it gets a SIGINT. Raises InputError: as :func:`check_command`.
+    """Start the command with ``environment`` added to ours, printing to the descriptor ``stdout``;
+    should we be killed, it gets a SIGINT. Raises InputError: as :func:`check_command`.
     OperationError: the kernel refuses to run it.
     """
     check_command(command)

@@ -40,17 +40,10 @@ _AUXILIARY = struct.Struct("@NN")
 _RULE = re.compile(
     r"(?:([A-Za-z_]\w*):)?__(?:(?:node|name):=([A-Za-z_]\w*)|ns:=(/|(?:/[A-Za-z_]\w*)+))", re.ASCII
 )
-_WITH_VALUE = frozenset(
-    ("-p", "--param", "--params-file", "--log-level", "--log-config-file", "--log-file-name")
-) | frozenset(("-e", "--enclave"))
+_WITH_VALUE = {"-p", "--param", "--params-file", "-e", "--enclave"}
+_WITH_VALUE |= {"--log-level", "--log-config-file", "--log-file-name"}
 _FAST_DDS = b"/libfastrtps.so"
-_LIBRARIES_WITHOUT_NAMED_THREADS = (
-    _FAST_DDS,
-    b"/libfastdds.so",
-    b"/libnddscore.so",
-    b"/libgurumdds.so",
-    b"/librmw_zenoh_cpp.so",
-)
+_WITHOUT_NAMED_THREADS = ("fastrtps", "fastdds", "nddscore", "gurumdds", "rmw_zenoh_cpp")
 ROUTERS = frozenset({"/rmw_zenohd", "/zenohd"})
 """Zenoh's router, by the name of its program: messages may pass through it."""
 
@@ -207,13 +200,13 @@ def _participation(pid: int, threads: tuple[Thread, ...]) -> tuple[bool, tuple[T
                     else one
                     for one in threads
                 )
-            return any(library in mapped for library in _LIBRARIES_WITHOUT_NAMED_THREADS), threads
+            return any(b"/lib%s.so" % n.encode() in mapped for n in _WITHOUT_NAMED_THREADS), threads
     return False, threads
 
 
 class Region(NamedTuple):
-    """An area of a process's memory; ``offset`` is where in its file it begins. The ``path`` is the
-    file's, what the kernel calls it (``[stack]``), or nothing.
+    """An area of a process's memory, ``offset`` bytes into the file ``path``, or with no file, or
+    the kernel's name for it (``[stack]``).
     """
 
     start: int
@@ -243,10 +236,9 @@ _OUTERMOST = 16_384  # so near are a thread's first frames to where it waits, an
 
 
 def _receives_for_fast_dds(thread: Thread, regions: Sequence[Region]) -> bool:
-    """Whether a thread of a process that has a Fast DDS before 2.13 receives: it waits for a
-    datagram, or for a word in the memory of a port, and the library's function is the first on its
-    stack. Not known of one that runs at this instant, nor where we may not look at the process
-    (ptrace(2), PTRACE_MODE_ATTACH).
+    """Whether a thread, of a process with Fast DDS before 2.13, receives: it waits for a datagram,
+    or for a word in the memory of a port, and the library's function is the first on its stack. Not
+    known of one that runs just now, nor without ptrace(2)'s PTRACE_MODE_ATTACH.
     """
     receive, futex = _SYSCALLS.get(platform.machine(), ((), -1))
     try:
@@ -294,7 +286,7 @@ def named_nodes(command: Sequence[str]) -> tuple[str, ...]:
 
     ``__node:=NAME`` and ``__ns:=/NAMESPACE`` apply to every node of the process,
     ``OLD:__node:=NAME`` to the one that would be called OLD; the first that applies counts. Without
-    a rule a node's namespace is taken for `/`, which it is unless the program says otherwise.
+    a rule a namespace is taken for `/`, which it is unless the program says otherwise.
 
         >>> named_nodes(["talker", "--ros-args", "-r", "__node:=front", "-r", "__ns:=/lidar"])
         ('/lidar/front',)

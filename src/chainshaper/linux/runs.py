@@ -33,8 +33,8 @@ _LOOK_S = 0.02
 
 @dataclass(frozen=True)
 class Journal:
-    """A journal on disk, read anew each time, since others may write to it too; and the open file,
-    from which it is written again where its folder is removed.
+    """A journal on disk, read anew each time, since others write to it too; and the open file, from
+    which it is written again where its folder is removed.
     """
 
     path: Path
@@ -263,8 +263,8 @@ def boot_id() -> str:
 
 @contextlib.contextmanager
 def locked(folder: Path, waiting: Callable[[float], None]) -> Iterator[None]:
-    """Inside, no other process has this folder locked. ``waiting`` is called again and again, with
-    the seconds waited so far, and may raise.
+    """Inside, no other process has this folder locked. Until then ``waiting`` is called with the
+    seconds waited so far, and may raise.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -294,8 +294,8 @@ def holder_of(folder: Path) -> int | None:
 
 @dataclass(frozen=True)
 class Governed:
-    """A run that governs processes from its first whole cycle on, as it was seen last, at
-    ``seen_ns`` (CLOCK_MONOTONIC); ``until_ns``: when it ended (None: not seen to).
+    """A run that governs processes from its first whole cycle on, seen last at ``seen_ns``
+    (CLOCK_MONOTONIC); ``until_ns``: when it ended (None: not seen to).
     """
 
     run: str

@@ -78,8 +78,8 @@ def state_of(tid: int) -> SchedulingState:
 
 
 def set_state(tid: int, target: SchedulingState) -> None:
-    """Give a thread the aspects of a state in which it differs, the class first: on a core where a
-    FIFO thread spins, it would not run again as SCHED_OTHER. Raises OSError: it has ended
+    """Give a thread the aspects of a state in which it differs, the class first: as SCHED_OTHER it
+    would not run again where a FIFO thread spins. Raises OSError: it has ended
     (ProcessLookupError), or the kernel refuses.
     """
     for aspect in different_aspects(state_of(tid), target):
@@ -113,9 +113,8 @@ def with_aspect(state: SchedulingState, aspect: Aspect, source: SchedulingState)
 
 def state_from_json(values: dict[str, Any]) -> SchedulingState:
     """What `dataclasses.asdict` made plain."""
-    return SchedulingState(
-        SchedulingClass(**values["scheduling_class"]), values["nice"], tuple(values["cores"])
-    )
+    own = SchedulingClass(**values["scheduling_class"])
+    return SchedulingState(own, values["nice"], tuple(values["cores"]))
 
 
 def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
@@ -125,10 +124,8 @@ def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
     except ProcessLookupError:
         return
     except OSError as error:
-        asked = f"priority {wanted.priority} on cores {wanted.cores}"
-        raise OperationError(
-            f"{thread.text}: the kernel refuses {asked}: {error.strerror}"
-        ) from error
+        asked = f"priority {wanted.priority} on cores {wanted.cores}: {error.strerror}"
+        raise OperationError(f"{thread.text}: the kernel refuses {asked}") from error
 
 
 def become_fifo(priority: int) -> bool:
