@@ -88,7 +88,7 @@ def test_several_changes_go_back_to_what_was_there_at_first_but_what_is_others_s
         actor.end("ending")
         change_all(journal, [(ended, WANTED)])
         release_threads(journal)
-        after = _states(actor)
+        after = {name: state_of(actor.tids[name]) for name in "abc"}
         assert after["a"] == before["a"]
         for name in "bc":
             now = after[name].scheduling_class
