@@ -43,9 +43,8 @@ def offered_back_ends() -> tuple[Offer, ...]:
 
 
 def choose_back_end(name: str = "auto") -> Choice:
-    """The back end of this name; for ``auto`` the strongest that works here.
-
-    Raises InputError: there is no such back end. PlatformError: it, or any, cannot be used here.
+    """The back end of this name; for ``auto`` the strongest that works here. Raises InputError:
+    there is no such back end. PlatformError: it, or any, cannot be used here.
     """
     if name not in ("auto", *_KNOWN):
         raise InputError(f"no back end {name!r}: choose one of auto, {', '.join(_KNOWN)}")

@@ -87,9 +87,7 @@ def groups_of(run: FreezerRun | None, core: int | None = None) -> tuple[Path, ..
 
 
 def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
-    """Groups of ours of none of these journals, whose owner has ended; one in a container has made
-    them by its number there.
-    """
+    """Groups of ours of no journal of these, whose owner (by its id in a container) has ended."""
     if not (groups := _all_groups()):
         return ()
     known = {run.owner for journal in journals if (run := run_of(journal)) is not None}
@@ -169,9 +167,7 @@ class CounterPage:
 
 @dataclass(frozen=True)
 class Anchoring:
-    """Cycles start at ``begin_ns`` and every cycle time thereafter; the old ones end at ``end_ns``,
-    or earlier, where the new ones begin.
-    """
+    """Cycles start at ``begin_ns``, again and again; the old ones end at ``end_ns``, or there."""
 
     begin_ns: int
     end_ns: int
@@ -205,10 +201,9 @@ def next_anchoring(
 
 
 class Freezer(BackEnd):
-    """A table of servers in force by freezing; see :class:`BackEnd` for what each method does.
-
-    Making one starts a dispatcher per core; ``go_on`` is called while something is waited for, and
-    may raise. Raises OperationError: a dispatcher does not start. PlatformError: no such core.
+    """A table of servers in force by freezing; see :class:`BackEnd`. Making one starts a dispatcher
+    per core; ``go_on`` is called while something is waited for, and may raise. Raises
+    OperationError: a dispatcher does not start. PlatformError: no such core.
     """
 
     def __init__(
@@ -248,7 +243,6 @@ class Freezer(BackEnd):
 
     def assign(self, tid: int, server: str, place: int = 0) -> None:  # noqa: ARG002 - by priority
         """See :meth:`BackEnd.assign`. While armed, a thread whose server is closed stops at once.
-
         Raises OperationError: it belongs to another run, or the servers are no longer in force.
         PlatformError: its cgroup or our privileges do not allow it.
         """

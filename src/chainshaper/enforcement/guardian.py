@@ -87,7 +87,6 @@ def run_claimed(
     cores: Collection[int], nodes: Collection[str], folder: Path | None = None
 ) -> Iterator[Journal]:
     """A run that governs these, watched over: all in its journal is as before when it is over.
-
     Raises: as :func:`.claim_run` and :meth:`Guardians.await_ready`; or not all could be put back.
     """
     journal = claim_run(cores, nodes, folder)

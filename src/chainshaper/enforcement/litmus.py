@@ -56,10 +56,9 @@ def missing(proc: Path = _PROC) -> str | None:
 
 
 class Litmus(BackEnd):
-    """A table of servers in force as reservations; see :class:`.servers.BackEnd`.
-
-    Raises PlatformError: the kernel is not LITMUS^RT, or its tools are not installed.
-    OperationError: others use the plugin. InputError: the table has what LITMUS^RT cannot do.
+    """A table of servers in force as reservations; see :class:`.servers.BackEnd`. Raises
+    PlatformError: the kernel is not LITMUS^RT, or its tools are not installed. OperationError:
+    others use the plugin. InputError: the table has what LITMUS^RT cannot do.
     """
 
     def __init__(self, table: ServerTable, journal: Journal, proc: Path = _PROC) -> None:
@@ -214,9 +213,8 @@ def _attach_command(tid: int | str, number: int, core: int) -> Command:
 
 
 def milliseconds_text(duration_ns: int) -> str:
-    """The shortest decimal milliseconds that `resctl` turns into exactly this duration.
-
-    It makes a C double of them, multiplies it by a million and drops what is behind the point.
+    """The shortest decimal milliseconds that `resctl` turns into exactly this duration: it makes a
+    C double of them, multiplies it by a million and drops what is behind the point.
 
     >>> milliseconds_text(86_500_000)
     '86.5'
@@ -231,12 +229,11 @@ def milliseconds_text(duration_ns: int) -> str:
 def turned(
     slots: Iterable[tuple[int, int]], cycle_ns: int, anchor_ns: int
 ) -> tuple[tuple[int, int], ...]:
-    """Slots that count from an anchor, counted from time zero instead; ascending.
+    """Slots that count from an anchor, counted from time zero instead; ascending. One across the
+    end of the cycle becomes two; a piece that the kernel refuses is left out.
 
-    A slot across the end of the cycle becomes two; a piece that the kernel refuses is left out.
-
-        >>> turned([(10, 30)], cycle_ns=100, anchor_ns=1080)
-        ((0, 10), (90, 100))
+    >>> turned([(10, 30)], cycle_ns=100, anchor_ns=1080)
+    ((0, 10), (90, 100))
     """
     pieces = []
     for start, end in slots:

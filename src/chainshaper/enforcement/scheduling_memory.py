@@ -141,9 +141,8 @@ def read_change(entry: Mapping[str, Any]) -> Change:
 
 
 def remembered_threads(journal: Journal) -> list[Change]:
-    """The threads of a journal, each with its changes joined, in order of their first change.
-
-    Where another program changed an aspect between two changes of ours, theirs is the original.
+    """The threads of a journal, each with its changes joined, in order of their first change. Where
+    another program changed an aspect between two changes of ours, theirs is the original.
     """
     threads: dict[tuple[int, int], Change] = {}
     for change in journal.read(KIND, read_change):
@@ -207,9 +206,7 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
 
 
 def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...]:
-    """Threads with a real-time class and cores as we gave them, not known as ours, in words; asked
-    before the undoing.
-    """
+    """Before the undoing: real-time threads as we made some, not known as ours, in words."""
     remembered = [] if journal.outdated else remembered_threads(journal)
     known = {one.identity for one in remembered}
     known |= {thread.identity for thread, _ in _born_of(journal, remembered, groups)}
@@ -263,9 +260,7 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
 
 
 def _given_back(state: SchedulingState, family: Iterable[Change]) -> SchedulingState:
-    """A state with every aspect that is one of ours as it was before; for want of a recorded
-    parent, as the first of the family with that aspect had it.
-    """
+    """A state with aspects of ours as the first of the family that was given these had them."""
     for aspect in ASPECTS:
         for one in family:
             ours = any(getattr(state, aspect) == getattr(given, aspect) for given in one.given)

@@ -73,7 +73,6 @@ class BackEnd(ABC):
     @abstractmethod
     def arm(self, anchor_ns: int) -> None:
         """Enforce the slots from now on; cycles start at ``anchor_ns`` (CLOCK_MONOTONIC) + k * CT.
-
         Another anchor moves the cycles without letting threads slip between. Where the kernel
         refuses, what was done before stays until the release.
         """

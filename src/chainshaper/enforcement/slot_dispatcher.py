@@ -49,9 +49,7 @@ _FAR = 1 << 62
 
 
 class Boundary(NamedTuple):
-    """From ``offset_ns`` into the cycle on, exactly the servers (by their place) in ``open`` are
-    open, of which those in ``starts`` begin a slot here.
-    """
+    """An instant in the cycle: the servers, by place, that are open from it on, or start a slot."""
 
     offset_ns: int
     open: frozenset[int]
@@ -61,9 +59,8 @@ class Boundary(NamedTuple):
 def boundaries_of(
     cycle_ns: int, slots: tuple[tuple[tuple[int, int], ...], ...]
 ) -> tuple[Boundary, ...]:
-    """The boundaries of one cycle, ascending; ``slots`` has one entry per server.
-
-    One stands at 0 always: cycles of another anchor may begin there.
+    """The boundaries of one cycle, ascending; ``slots`` has one entry per server. One stands at 0
+    always: cycles of another anchor may begin there.
 
     >>> [(b.offset_ns, set(b.open)) for b in boundaries_of(10, (((0, 4),), ((4, 10),)))]
     [(0, {0}), (4, {1})]
@@ -263,9 +260,8 @@ class Dispatcher:
 def overrun(groups: Iterable[int]) -> bool | None:
     """Whether a frozen thread was computing when it was stopped, at the end of its slot: in user
     mode, which is -1 in ``/proc/TID/syscall``; one inside a system call passes for one that waits.
-    None: one has not reached the freezer yet, for want of the core.
-
-    ``groups`` are open ``cgroup.threads`` files. Raises PermissionError: not to be seen by us.
+    None: one has not reached the freezer yet, for want of the core. ``groups`` are open
+    ``cgroup.threads`` files. Raises PermissionError: not to be seen by us.
     """
     undecided = False
     for group in groups:

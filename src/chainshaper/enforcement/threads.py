@@ -89,8 +89,8 @@ class RecordedProcess:
 
 @dataclass(frozen=True)
 class NodeThread:
-    """A thread of an application, and its nodes. Its role is ``known_by`` something, if at all; its
-    nodes by ``recording``, ``command line``, or, a guess, ``program's name``.
+    """A thread of an application, what its role is ``known_by``, if at all, and its nodes, known by
+    ``recording``, ``command line``, or, a guess, ``program's name``.
     """
 
     thread: Thread
@@ -130,10 +130,8 @@ def allocate(
     among: Sequence[Process] | None = None,
     users: Collection[int] | None = None,
 ) -> Allocation:
-    """Find out what each thread of ``processes`` does.
-
-    ``among`` are all processes that were looked at, if these are some of them: who started whom
-    tells a node from the commands that run it. Where ``users`` are given, others' have no nodes.
+    """Find out what each thread of ``processes`` does, ``among`` all that were looked at: who
+    started whom tells a node from the commands that run it. Others' than ``users``' have no nodes.
     """
     looked_at = processes if among is None else among
     identified = [
@@ -254,10 +252,9 @@ def _same_program(
 
 
 def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedThread]:
-    """The threads of a process as an earlier run of its program had them; none if it is not sure.
-
-    A program starts its threads in one order, so those of one name are the same by turns, once
-    there are as many. It is asked for executors beside the main thread only.
+    """The threads of a process as an earlier run of its program had them; none if it is not sure. A
+    program starts its threads in one order, so those of one name are the same by turns, once there
+    are as many. It is asked for executors beside the main thread only.
     """
     executing = [one for one in earlier.threads if one.role == "executor"]
     found: dict[int, RecordedThread] = {}
@@ -352,10 +349,8 @@ class WantedScheduling:
 def server_members(
     plan: ApplicationPlan, allocation: Allocation
 ) -> dict[str, tuple[NodeThread, ...]]:
-    """The threads of each server of a plan, by the server's name.
-
-    Raises OperationError: a planned thread is not running, two processes are the same node, or one
-    thread executes nodes of two servers.
+    """The threads of each server of a plan, by its name. Raises OperationError: a planned thread is
+    not running, two processes are the same node, or one thread executes nodes of two servers.
     """
     homes: dict[tuple[int, int], str] = {}
     members: dict[str, tuple[NodeThread, ...]] = {}
@@ -433,9 +428,7 @@ def plan_scheduling(
     plan: ApplicationPlan, allocation: Allocation, available_cores: Sequence[int]
 ) -> tuple[WantedScheduling, ...]:
     """What every thread concerned by a plan shall get: servers' threads first, then the others.
-
-    Executors that receive an output and are in no server stand below all of these. Raises: as
-    :func:`server_members` and :func:`scheduling_around`.
+    Raises: as :func:`server_members` and :func:`scheduling_around`.
     """
     members = server_members(plan, allocation)
     cores = {receiver: node.core for node in plan.shaping_nodes for receiver in node.receivers}
@@ -476,9 +469,7 @@ def in_order_of_slots(chain: Plan) -> Iterator[tuple[Server, PlannedThread]]:
 
 
 def closed_before(chain: Plan) -> int | None:
-    """For how long (ns) before a cycle the server of a chain's first thread is closed: its timer
-    may expire so early. None: that thread is never stopped.
-    """
+    """How long (ns) before a cycle the server of a chain's first thread closes, if it does."""
     slots = next(in_order_of_slots(chain))[0].slots
     is_always_open = slots[0][0] == 0 and slots[-1][1] >= chain.cycle_ns
     return None if is_always_open else chain.cycle_ns - slots[-1][1]
@@ -618,11 +609,9 @@ def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> W
 def left_by_back_end(
     back_end: str, wanted: Iterable[WantedScheduling], free: Collection[PlannedThread] = ()
 ) -> tuple[WantedScheduling, ...]:
-    """What threads get from us where a back end schedules its servers' threads itself.
-
-    These need no priority, and under sched_ext may have none, since the kernel runs real-time
-    threads above it. So ``free`` threads, which no back end keeps in their slots, stand above them;
-    a receiver would, instead of below: it is left as it is.
+    """What threads get from us where a back end schedules its servers' threads itself: no priority,
+    and under sched_ext none may be left, since the kernel runs real-time threads above it. ``free``
+    threads, which no back end keeps in their slots, do stand above; a receiver is left as it is.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)

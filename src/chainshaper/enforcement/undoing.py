@@ -134,10 +134,9 @@ def claim_run(
     folder: Path | None = None,
     go_on: Callable[[], None] = lambda: None,
 ) -> Journal:
-    """Begin a run that governs these cores and nodes: the journal for all that it changes.
-
-    ``go_on`` is called while another run begins, and may raise. Raises OperationError: a living run
-    governs one of them, a crashed one cannot be undone, or one that begins does not get on with it.
+    """Begin a run that governs these cores and nodes: the journal for all that it changes. While
+    another begins, ``go_on`` is called, and may raise. Raises OperationError: a living run governs
+    one of them, a crashed one cannot be undone, or one that begins does not get on with it.
     PlatformError: nothing may be written to the folder.
     """
     base = runs.journals_folder(folder)

@@ -111,9 +111,8 @@ def cgroup_of(tid: int) -> Path:
 
 
 def make_threaded_child(parent: Path, name: str) -> Path:
-    """Make an empty threaded group directly beneath the group of the threads it is for.
-
-    Raises OperationError: the name is taken. PlatformError: machine or privileges do not allow it.
+    """Make an empty threaded group directly beneath the group of the threads it is for. Raises
+    OperationError: the name is taken. PlatformError: machine or privileges do not allow it.
     """
     folder = parent / name
     try:
@@ -197,21 +196,15 @@ def dissolve(folder: Path, within_s: float = 1.0) -> str | None:
     return None
 
 
-def enter_own_group(name: str) -> bool:
-    """Put this process into a group of that name, out of reach of what befalls its present one;
-    False where it has to stay, as in a container.
+def enter_own_group(name: str) -> None:
+    """Put this process into a group of that name, out of reach of what befalls its present one, if
+    it need not stay there, as in a container.
     """
-    for folder in _own_groups(name):
-        for _ in range(_ATTEMPTS):  # the last to leave may just be removing it
-            try:
-                folder.mkdir(exist_ok=True)
-                (folder / "cgroup.procs").write_text(str(os.getpid()))
-                return True
-            except FileNotFoundError:
-                continue
-            except OSError:
-                break
-    return False
+    for folder in (folder for folder in _own_groups(name) for _ in range(_ATTEMPTS)):
+        with contextlib.suppress(OSError):  # the last to leave may just be removing it
+            folder.mkdir(exist_ok=True)
+            (folder / "cgroup.procs").write_text(str(os.getpid()))
+            return
 
 
 def leave_own_group(name: str) -> None:

@@ -311,9 +311,7 @@ def governing(
     before: Collection[Governed] = (),
     folder: Path | None = None,
 ) -> tuple[Governed, ...]:
-    """The runs that govern threads of these processes; of those seen ``before``, one that is gone
-    is over since then.
-    """
+    """The runs that govern threads of these processes; one seen ``before`` and gone has ended."""
     known = {one.run: one for one in before}
     found = {
         one.run: replace(one, until_ns=one.seen_ns if one.until_ns is None else one.until_ns)

@@ -148,8 +148,7 @@ def _too_many(table: ServerTable) -> list[tuple[str, int, int]]:
 
 def with_places_apart(table: ServerTable) -> ServerTable:
     """The table with a server for each place, in the order of priorities and places: so the policy
-    runs the most urgent of a server's threads. Where these would be more servers than the policy
-    can hold, the last places of each are one.
+    runs the most urgent of a server's threads. If it cannot hold so many, the last places are one.
     """
     for most in range(max((server.places for server in table.servers), default=1), 0, -1):
         places = [(one, k) for one in table.servers for k in range(min(one.places, most))]
@@ -195,9 +194,7 @@ def pack_cores(table: ServerTable) -> dict[int, bytes]:
 
 
 def change_word(generation: int, instant_ns: int, *, replaces: bool) -> bytes:
-    """Map `in_force`: this generation from the instant on, before it the other one, if it
-    ``replaces`` one.
-    """
+    """Map `in_force`: this generation from the instant on; before, the other that it replaces."""
     return (instant_ns << 2 | replaces << 1 | generation).to_bytes(8, "little")
 
 
@@ -281,10 +278,8 @@ class ScxServers(BackEnd):
             self._since_ns = instant
 
     def counters(self) -> dict[str, ServerCounters]:
-        """See :meth:`BackEnd.counters`; after :meth:`release`, the last ones.
-
-        A slot counts as opened with the core's first decision inside it, and once as overrun, by
-        however many threads.
+        """See :meth:`BackEnd.counters`; after :meth:`release`, the last ones. A slot opens with the
+        core's first decision inside it, and counts once as overrun, by however many threads.
         """
         with self._lock:
             if self._policy is not None:
@@ -353,11 +348,10 @@ class ScxServers(BackEnd):
         return policy
 
     def _put_in_force(self, policy: BpfObject, anchor_ns: int) -> int:
-        """Write the idle generation and have all cores change over; the instant at which they will.
-
-        It lies a little ahead, for each core to learn of it. Kickers look by themselves. A timer
-        belongs to the core that starts it, so the calling thread goes round; the policy lets it
-        pass before everything else. Raises OperationError: it may not run on one of the cores.
+        """Write the idle generation and have all cores change over; the instant at which they will,
+        a little ahead, for each core to learn of it. Kickers look by themselves. A timer belongs to
+        the core that starts it, so the calling thread goes round; the policy lets it pass before
+        everything else. Raises OperationError: it may not run on one of the cores.
         """
         generation = self._generation = 1 - self._generation
         # Cycles repeat: the anchor lies within the first one after booting.
