@@ -142,10 +142,9 @@ def claim_run(
     base = runs.journals_folder(folder)
     wanted: dict[str, set[Any]] = {"core": set(cores), "node": set(nodes)}
 
-    def waiting(waited_s: float) -> None:
+    def waiting(holder: int | None, waited_s: float) -> None:
         go_on()
         if waited_s > PATIENCE_S:
-            holder = runs.holder_of(base)
             raise OperationError(
                 f"process {holder} begins a run, and has not got on with it for {PATIENCE_S:g} s: "
                 f"let it go on (`kill -CONT {holder}`), or end it (`kill -KILL {holder}`)"
@@ -250,7 +249,7 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
         try:
             if not journal.keep():
                 return ()
-            stack.enter_context(locked(journal.path.parent, partial(_hasten, journal)))
+            stack.enter_context(locked(journal.path.parent, _hasten))
         except FileNotFoundError:
             return ()  # another process was quicker
         except OSError:
@@ -276,14 +275,12 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
     return tuple(left)
 
 
-def _hasten(journal: Journal, waited_s: float) -> None:
+def _hasten(holder: int | None, waited_s: float) -> None:
     """Another process undoes this run: one that was stopped goes on, one that hangs is ended."""
-    holder = runs.holder_of(journal.path.parent)
     if holder not in (None, os.getpid()):
         with contextlib.suppress(OSError):
             os.kill(holder, signal.SIGCONT)
-        if waited_s > PATIENCE_S / 2:
-            with contextlib.suppress(ProcessLookupError):
+            if waited_s > PATIENCE_S / 2:
                 os.kill(holder, signal.SIGKILL)
 
 

@@ -262,9 +262,9 @@ def boot_id() -> str:
 
 
 @contextlib.contextmanager
-def locked(folder: Path, waiting: Callable[[float], None]) -> Iterator[None]:
+def locked(folder: Path, waiting: Callable[[int | None, float], None]) -> Iterator[None]:
     """Inside, no other process has this folder locked. Until then ``waiting`` is called with the
-    seconds waited so far, and may raise.
+    one that has, if it is known, and the seconds waited so far, and may raise.
     """
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     try:
@@ -274,14 +274,14 @@ def locked(folder: Path, waiting: Callable[[float], None]) -> Iterator[None]:
                 fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 break
             except BlockingIOError:
-                waiting(time.monotonic() - begun)
+                waiting(_holder_of(folder), time.monotonic() - begun)
                 time.sleep(_LOOK_S)
         yield
     finally:
         os.close(descriptor)
 
 
-def holder_of(folder: Path) -> int | None:
+def _holder_of(folder: Path) -> int | None:
     """The process that has a folder locked, as far as the kernel shows it (proc_locks(5))."""
     with contextlib.suppress(OSError):
         inode = str(folder.stat().st_ino)

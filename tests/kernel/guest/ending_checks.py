@@ -43,23 +43,6 @@ def killing_the_loader_frees_the_threads() -> str:
     return f"first run outside its slots {(outside[0] - killed) / MS:.1f} ms afterwards"
 
 
-def killing_the_loader_disables_the_scheduler() -> str:
-    """The same without virtual time, in which shares and delays can be relied on."""
-    with scene() as s:
-        a = s.spinner("a")
-        loader = s.loader(table(A), {"A": [a]})
-        loader.arm()
-        wait(200)
-        loader.process.kill()
-        loader.process.wait()
-        wait_for_state("disabled")
-        killed = time.monotonic_ns()
-        wait(1000)
-        ran = cut(a.windows(), killed, killed + 1000 * MS)
-    assert [a for a, _ in ran if a % CYCLE > 21 * MS], "the thread is still governed"
-    return f"ran {length(ran) / MS:.0f} of 1000 ms afterwards"
-
-
 def releasing_twice_leaves_nothing_behind() -> str:
     """And a new back end can begin where the old one ended."""
     with scene() as s:
@@ -167,18 +150,13 @@ def _stop_kicker(stop: signal.Signals, loader_too: bool, busy: bool) -> tuple[st
     return failure, passed
 
 
-def a_killed_kicker_fails_open() -> str:
+def a_kicker_that_is_killed_or_stopped_fails_open() -> str:
     """On a busy core and on an idle one; PREEMPT_RT only."""
-    busy = _stop_kicker(signal.SIGKILL, loader_too=False, busy=True)
-    idle = _stop_kicker(signal.SIGKILL, loader_too=False, busy=False)
-    return f"after {busy[1]:.1f} ms, idle core {idle[1]:.1f} ms: {idle[0]}"
-
-
-def a_stopped_kicker_fails_open() -> str:
-    """SIGSTOP; PREEMPT_RT only."""
-    busy = _stop_kicker(signal.SIGSTOP, loader_too=False, busy=True)
-    idle = _stop_kicker(signal.SIGSTOP, loader_too=False, busy=False)
-    return f"after {busy[1]:.1f} ms, idle core {idle[1]:.1f} ms: {idle[0]}"
+    told = []
+    for number in (signal.SIGKILL, signal.SIGSTOP):
+        (_, busy), (said, idle) = (_stop_kicker(number, False, busy) for busy in (True, False))
+        told.append(f"after {busy:.1f} ms, idle core {idle:.1f} ms: {said}")
+    return "; ".join(told)
 
 
 def the_policy_notices_a_stopped_kicker_by_itself() -> str:
