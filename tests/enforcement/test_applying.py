@@ -100,9 +100,8 @@ def test_a_command_is_started_governed_and_ended(tmp_path: Path) -> None:
     talking = ("sh", "-c", 'echo so says the command; exec "$@"', "sh")
     command = [*talking, *node_command("origin", output)]
     with applied(one_server_plan(), tmp_path, *FIFO, "--json", "--", *command) as run:
-        assert "FIFO" in str(
-            [t.policy for p in _processes_of(str(output)) for t in list_threads(p)]
-        )
+        threads = [t for p in _processes_of(str(output)) for t in list_threads(p)]
+        assert "SCHED_FIFO" in [t.policy for t in threads]
         run.send_signal(signal.SIGTERM)
         stdout, _ = run.communicate(timeout=40)
         assert run.returncode == 0
@@ -120,13 +119,8 @@ def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_pa
         ended = called("apply", path, *FIFO, "--", *words)
         assert ended.code == 1
         assert f"the command {how} before all nodes" in ended.err
-    shaped = plan_shaping(
-        np.array([8, 12]) * 1_000_000,
-        50_000_000,
-        output="/out",
-        publisher="/origin",
-        nodes=("/origin",),
-    )
+    named = {"output": "/out", "publisher": "/origin", "nodes": ("/origin",)}
+    shaped = plan_shaping(np.array([8, 12]) * MS, 50 * MS, **named)  # type: ignore[arg-type]
     save_plan(shaped, tmp_path / "shaped.yaml")
     command = ("timeout", "3", *node_command("origin", tmp_path / "windows"))
     without = chainshaper("apply", tmp_path / "shaped.yaml", *FIFO, "--", *command)

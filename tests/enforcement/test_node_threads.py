@@ -214,32 +214,13 @@ def test_which_of_several_processes_is_the_node(processes: list[Process], nodes:
     assert bool(allocate(processes[:1], among=processes).threads[0].nodes) == (len(nodes) > 1)
 
 
-def test_threads_that_appear_and_end_are_found_by_looking_again(tmp_path: Path) -> None:
-    arguments = ("--ros-args", "-r", "__node:=talker")
-    with acting(tmp_path, *CYCLONE, "worker", arguments=arguments) as actor:
-
-        def look() -> Allocation:
-            process = known(read_process(actor.pid))
-            return allocate([process])
-
-        before = look()
-        assert new_and_ended(before, look()) == ((), ())
-        begun = actor.begin("dds.asyn.0.1")
-        actor.end("worker")
-        new, ended = new_and_ended(before, look())
-    assert [(t.thread.tid, t.thread.role, t.nodes) for t in new] == [
-        (begun, "publisher", ("/talker",))
-    ]
-    assert [t.thread.comm for t in ended] == ["worker"]
-
-
-def test_an_id_that_is_used_again_is_another_thread() -> None:
-    """Ids alone would say that nothing has changed."""
-    before = allocate([_process(100, "talker", "recv")])
-    main, recv = before.threads
+def test_threads_that_appear_and_end_are_found_also_where_an_id_is_used_again() -> None:
+    before = allocate([_process(100, "talker", "recv", "worker")])
+    assert new_and_ended(before, before) == ((), ())
+    main, recv, _ = before.threads
     reborn = replace(recv, thread=replace(recv.thread, started=99))
     new, ended = new_and_ended(before, Allocation((main, reborn), ()))
-    assert ([t.thread.tid for t in new], [t.thread.tid for t in ended]) == ([101], [101])
+    assert ([t.thread.tid for t in new], [t.thread.tid for t in ended]) == ([101], [101, 102])
 
 
 @pytest.mark.parametrize("started_later", [False, True])
@@ -288,6 +269,15 @@ def _by_tid(wanted: tuple[WantedScheduling, ...]) -> dict[int, Scheduling]:
     return {one.thread.thread.tid: one.wanted for one in wanted}
 
 
+def _text(wanted: tuple[WantedScheduling, ...]) -> str:
+    """What threads get: ``TID:PRIORITY@CORES``, with ``-`` and ``*`` for what stays as it is."""
+    found = []
+    for tid, one in sorted(_by_tid(wanted).items()):
+        priority = "-" if one.priority is None else one.priority
+        found.append(f"{tid}:{priority}@{'+'.join(map(str, one.cores or '*'))}")
+    return " ".join(found)
+
+
 EXECUTOR_A, EXECUTOR_B = PlannedThread(node="/a"), PlannedThread(node="/b")
 PUBLISHER_B = PlannedThread(node="/b", role="publisher")
 
@@ -301,13 +291,8 @@ def test_servers_stand_below_dds_in_the_order_of_their_priority() -> None:
         _node("/b", 200, "executor", "dds"),
         _node("/elsewhere", 300, "executor", "dds"),
     )
-    assert _by_tid(plan_scheduling(plan, allocation, (0, 1))) == {
-        200: Scheduling(87, (1,)),
-        100: Scheduling(85, (1,)),
-        101: Scheduling(90, (0,)),
-        201: Scheduling(90, (0,)),
-        # Best effort, unknown threads and other processes are left alone.
-    }
+    wanted = _text(plan_scheduling(plan, allocation, (0, 1)))
+    assert wanted == "100:85@1 101:90@0 200:87@1 201:90@0", "all others are left alone"
 
 
 ZENOH = ("app-0", "net-0", "acc-0", "tx-0", "rx-0", "rx-1")
@@ -352,30 +337,15 @@ def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:
     )
     allocation = _allocation([real_time], _node("/b", 200, "executor", "dds"))
     wanted = plan_scheduling(plan, allocation, (0, 1))
-    dds = Scheduling(90, (0,))
-    assert _by_tid(left_by_back_end("scx", wanted)) == {
-        100: Scheduling(0, (1,)),  # real-time threads run above every server of sched_ext's
-        200: Scheduling(None, (1,)),
-        201: dds,
-    }
-    assert _by_tid(left_by_back_end("litmus", wanted)) == {
-        100: Scheduling(None, (1,)),
-        200: Scheduling(None, (1,)),
-        201: dds,
-    }
+    # Real-time threads run above every server of sched_ext's.
+    assert _text(left_by_back_end("scx", wanted)) == "100:0@1 200:-@1 201:90@0"
+    assert _text(left_by_back_end("litmus", wanted)) == "100:-@1 200:-@1 201:90@0"
     assert left_by_back_end("freezer", wanted) == wanted
     assert Scheduling(0, None).policy == os.SCHED_OTHER
 
 
-GATE = ShapingNode(
-    name="gate",
-    input="/out_tmp",
-    output="/out",
-    core=1,
-    fifo_priority=84,
-    spin_ns=0,
-    pause_ns=0,
-)
+NUMBERS = {"core": 1, "fifo_priority": 84, "spin_ns": 0, "pause_ns": 0}
+GATE = ShapingNode.model_validate({"name": "gate", "input": "/i", "output": "/out", **NUMBERS})
 
 
 def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() -> None:
@@ -387,12 +357,8 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     receiving = replace(sink[1], thread=replace(sink[1].thread, kind="receive"))
     allocation = _allocation(gate, _node("/a", 200, "executor"), [sink[0], receiving, sink[2]])
     wanted = plan_scheduling(plan, allocation, (0, 1))
-    assert _by_tid(wanted) == {
-        100: Scheduling(87, (1,)),
-        200: Scheduling(85, (1,)),  # in the chain, and so not below it
-        300: Scheduling(83, (1,)),
-        301: Scheduling(91, (0,)),  # waited for, so above other DDS threads
-    }
+    # 200 is in the chain, and so not below it; 301 is waited for, so above other DDS threads.
+    assert _text(wanted) == "100:87@1 200:85@1 300:83@1 301:91@0"
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
     assert more_cores[301] == Scheduling(91, (0,)), "the core that is kept clear for them"
     assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
@@ -455,13 +421,9 @@ def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> No
         _node("/b", 200, "executor", "publisher", "dds", "unknown"),
         _node("/c", 300, "executor"),
     )
-    wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
-    assert wanted[100] == Scheduling(85, (1,)), "it comes first in its server"
-    assert wanted[200] == Scheduling(84, (1,))
-    assert wanted[201] == Scheduling(83, (1,)), "not 87, which its server would have"
-    assert wanted[300] == Scheduling(82, (1,)), "the next server stays below it"
-    assert wanted[202] == Scheduling(90, (0,))
-    assert wanted[203] == Scheduling(None, (0,)), "it would be outranked on core 1"
+    # 201 has not 87, as its server would; 203 would be outranked on core 1; and 300 stays below.
+    wanted = "100:85@1 200:84@1 201:83@1 202:90@0 203:-@0 300:82@1"
+    assert _text(plan_scheduling(plan, allocation, (0, 1))) == wanted
 
 
 def test_what_fast_dds_sends_late_is_sent_by_a_thread_that_lets_others_run() -> None:
@@ -469,11 +431,9 @@ def test_what_fast_dds_sends_late_is_sent_by_a_thread_that_lets_others_run() -> 
     plan = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
     resending = _node("/b", 200, "executor", "dds", "dds")
     resending[1] = replace(resending[1], thread=replace(resending[1].thread, kind="resend"))
-    wanted = _by_tid(
-        plan_scheduling(plan, _allocation(_node("/a", 100, "executor"), resending), (0, 1))
-    )
-    assert wanted[201] == Scheduling(0, (0,))
-    assert wanted[202] == Scheduling(90, (0,))
+    allocation = _allocation(_node("/a", 100, "executor"), resending)
+    wanted = _text(plan_scheduling(plan, allocation, (0, 1)))
+    assert wanted == "100:87@1 200:86@1 201:0@0 202:90@0"
 
 
 def test_threads_of_a_server_stand_in_the_plans_order_those_of_a_node_together() -> None:
@@ -483,9 +443,8 @@ def test_threads_of_a_server_stand_in_the_plans_order_those_of_a_node_together()
         _node("/b", 200, "executor"),
         _node("/a", 100, "executor", "executor"),
     )
-    wanted = _by_tid(plan_scheduling(plan, allocation, (0, 1)))
-    order = {100: 87, 101: 87, 200: 86, 300: 85}
-    assert wanted == {tid: Scheduling(priority, (1,)) for tid, priority in order.items()}
+    wanted = _text(plan_scheduling(plan, allocation, (0, 1)))
+    assert wanted == "100:87@1 101:87@1 200:86@1 300:85@1"
 
 
 def test_a_publisher_on_a_core_of_its_own_has_its_servers_priority() -> None:
@@ -535,9 +494,7 @@ def test_what_an_executor_that_we_had_raised_starts_leaves_the_publishers_core()
 def test_nodes_that_share_an_executor_are_one_thread_of_one_server() -> None:
     shared = [replace(one, nodes=("/a", "/b")) for one in _node("/a", 100, "executor")]
     together = _plan(_server("chain", EXECUTOR_A, EXECUTOR_B))
-    assert _by_tid(plan_scheduling(together, _allocation(shared), (0, 1))) == {
-        100: Scheduling(87, (1,))
-    }
+    assert _text(plan_scheduling(together, _allocation(shared), (0, 1))) == "100:87@1"
     apart = _plan(_server("one", EXECUTOR_A), _server("two", EXECUTOR_B, start=1))
     with pytest.raises(OperationError, match=r"thread 100 .* /a, /b,.* servers one and two"):
         server_members(apart, _allocation(shared))
