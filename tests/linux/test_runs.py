@@ -55,7 +55,7 @@ def test_what_is_noted_can_be_read_back_in_order(tmp_path: Path) -> None:
     journal = open_journal(tmp_path / "new" / "folder", "run")
     journal.note("cgroup", path="/sys/fs/cgroup/a", type="domain")
     journal.note("plugin", previous="Linux")
-    journal.note_all("cgroup", ({"path": str(number)} for number in range(2)))
+    journal.note("cgroup", *({"path": str(number)} for number in range(2)))
     again = Journal(journal.path)
     kinds = [entry["kind"] for entry in again.entries()]
     assert kinds == ["opened", "cgroup", "plugin", "cgroup", "cgroup"]

@@ -129,7 +129,7 @@ def note_scheduling(
         entry |= {"before": asdict(before), "given": asdict(target)}
         entries.append({**entry, "at": clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS})
     if entries:
-        journal.note_all(KIND, entries)
+        journal.note(KIND, *entries)
     return noted
 
 
@@ -160,7 +160,7 @@ def remembered_threads(journal: Journal) -> list[Change]:
 
 def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> set[tuple[int, int]]:
     """Write down processes that the journal's have started meanwhile, if they were there at the
-    look ``before``, too: helpers come and go. Returns all that are new. Raises: as ``note_all``.
+    look ``before``, too: helpers come and go. Returns all that are new. Raises: as ``note``.
     """
     remembered = remembered_threads(journal)
     known = {one.pid for one in remembered}
@@ -168,7 +168,7 @@ def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> s
     new = {(pid, when) for pid, when in found if pid not in known and when is not None}
     new -= set(journal.read(DESCENDANTS, process_of))
     if entries := [{"pid": pid, "started": when} for pid, when in sorted(new.intersection(before))]:
-        journal.note_all(DESCENDANTS, entries)
+        journal.note(DESCENDANTS, *entries)
     return new
 
 

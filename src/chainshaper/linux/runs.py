@@ -40,14 +40,12 @@ class Journal:
     path: Path
     memory: FileIO | None = None
 
-    def note(self, kind: str, **fields: Any) -> None:
-        self.note_all(kind, (fields,))
-
-    def note_all(self, kind: str, changes: Iterable[Mapping[str, Any]]) -> None:
-        """Write down, with one `fsync`, how to undo changes that are about to be made. Raises
-        OperationError: they cannot be written; make no change then.
+    def note(self, kind: str, *changes: Mapping[str, Any], **fields: Any) -> None:
+        """Write down, with one `fsync`, how to undo changes that are about to be made, or one, of
+        these ``fields``. Raises OperationError: they cannot be written; make no change then.
         """
-        lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in changes)
+        all_ = changes or (fields,)
+        lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in all_)
         try:
             self.keep()
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
