@@ -123,7 +123,7 @@ def restore(run: FreezerRun | None) -> tuple[str, ...]:
     """Put every thread back, remove the groups, mount as before; what could not be, in words."""
     groups = groups_of(run)
     thaw(groups)
-    left = tuple(why for folder in groups if (why := cgroups.dissolve(folder)) is not None)
+    left = tuple(filter(None, map(cgroups.dissolve, groups)))
     restore_mount()
     return left
 

@@ -296,8 +296,7 @@ def _end_processes(journal: Journal, role: str) -> None:
 def _restore_groups(journal: Journal) -> None:
     left = freezer.restore(freezer.run_of(journal))
     if journal.owner is None and strange_lines(journal):  # one of them may have spoken of groups
-        strays = map(cgroups.dissolve, freezer.stray_groups(()))
-        left += tuple(why for why in strays if why is not None)
+        left += tuple(filter(None, map(cgroups.dissolve, freezer.stray_groups(()))))
     if left:
         raise OperationError("; ".join(left))
 

@@ -60,7 +60,7 @@ SERVER = struct.Struct("<QQQIIII")
 SLOT = struct.Struct("<QQ")
 CORE = struct.Struct(f"<I{MAX_SERVERS_PER_CORE}I")
 COUNTERS = struct.Struct("<QQQQQQ")
-EXIT = struct.Struct("<iiq64s192s")
+EXIT = struct.Struct("<i64s192s")
 CONFIG = struct.Struct("<II")
 WAKE = struct.Struct("<qqqq")
 INSTANT = struct.Struct("<qq")
@@ -212,7 +212,7 @@ def in_all_places(counters: Sequence[ServerCounters]) -> ServerCounters:
 
 def unpack_exit(value: bytes) -> str | None:
     """The element of map `ended`: why the kernel ended the policy, None if it has not."""
-    kind, _, _, *texts = EXIT.unpack(value)
+    kind, *texts = EXIT.unpack(value)
     said = [text.split(b"\0", 1)[0].decode(errors="replace") for text in texts]
     return ": ".join(filter(None, said)) if kind else None
 

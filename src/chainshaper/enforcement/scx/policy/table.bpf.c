@@ -361,7 +361,7 @@ static __always_inline void check_kicker(u32 cpu, u64 now)
 	/* not const: the verifier takes this for memory that may be written to */
 	static char format[] = "the kicker of core %d has stopped, %d us overdue";
 	struct cpu_state *state = bpf_map_lookup_elem(&cpu_states, &cpu);
-	unsigned long long data[2];
+	unsigned long long data[2] = { cpu };
 
 	if (config.has_timer || !state || !state->due || now < state->due + KICKER_GRACE)
 		return;
@@ -371,7 +371,6 @@ static __always_inline void check_kicker(u32 cpu, u64 now)
 	}
 	if (now < state->missed_at + KICKER_GRACE)
 		return;
-	data[0] = cpu;
 	data[1] = (now - state->due) / 1000;
 	scx_bpf_error_bstr(format, data, sizeof(data));
 }
@@ -469,12 +468,6 @@ static int at_boundary(void *map, u32 *key, struct timer_of_cpu *t)
 	return 0;
 }
 
-static __always_inline void tell(struct table_instant *when, u64 instant)
-{
-	when->seconds = instant / SECOND;
-	when->nanoseconds = instant % SECOND;
-}
-
 /*
  * Have the calling core decide at its next boundary. With a timer, which is pinned to the core that
  * starts it, the loader runs this once on each core after each change of the table; without, the
@@ -507,8 +500,8 @@ int table_boundary(struct table_wake *wake)
 	planning = next_boundary(cpu, next);
 	if (planning > next + PLANNING_PAUSE)
 		planning = next + PLANNING_PAUSE;
-	tell(&wake->boundary, next);
-	tell(&wake->planning, planning);
+	wake->boundary = (struct table_instant){ next / SECOND, next % SECOND };
+	wake->planning = (struct table_instant){ planning / SECOND, planning % SECOND };
 	return 0;
 }
 
@@ -548,7 +541,6 @@ void BPF_PROG(table_exit, struct scx_exit_info *info)
 		return;
 	bpf_probe_read_kernel_str(e->reason, sizeof(e->reason), info->reason);
 	bpf_probe_read_kernel_str(e->message, sizeof(e->message), info->msg);
-	e->code = info->exit_code;
 	e->kind = info->kind;
 }
 

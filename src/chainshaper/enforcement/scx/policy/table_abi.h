@@ -26,8 +26,7 @@ struct table_server {
 	unsigned long long rotation;	/* how long a thread of many has its turn */
 	unsigned int cpu;
 	unsigned int priority;		/* smaller is better */
-	unsigned int slot_count;
-	unsigned int pad;
+	unsigned int slot_count, pad;
 	struct table_slot slots[TABLE_MAX_SLOTS];	/* ascending, disjoint */
 };
 
@@ -39,10 +38,7 @@ struct table_cpu {
 
 /* Key: server id. Written by the policy, kept when the table changes. */
 struct table_counters {
-	unsigned long long slots;
-	unsigned long long late_entries;
-	unsigned long long longest_lateness;
-	unsigned long long overruns;
+	unsigned long long slots, late_entries, longest_lateness, overruns;
 	unsigned long long open_since;	/* start of the slot that is open; 0: none is */
 	unsigned long long turn;	/* start of the rotation period that its runner was chosen in */
 };
@@ -50,8 +46,6 @@ struct table_counters {
 /* Why the kernel ended the policy; a kind of 0: it has not. */
 struct table_exit {
 	int kind;
-	int pad;
-	long long code;
 	char reason[64];
 	char message[192];
 };
@@ -68,8 +62,7 @@ struct table_instant {			/* as struct timespec */
 
 /* What a kicker gets from table_boundary: until when to sleep, and until when then once more. */
 struct table_wake {
-	struct table_instant boundary;
-	struct table_instant planning;
+	struct table_instant boundary, planning;
 };
 
 #endif
