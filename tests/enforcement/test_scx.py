@@ -20,10 +20,10 @@ from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.scx import libbpf
 from chainshaper.enforcement.scx.back_end import (
     POLICY,
-    change_word,
     check_table,
     numbered,
     pack_cores,
+    pack_in_force,
     pack_servers,
     unpack_counters,
     unpack_exit,
@@ -203,7 +203,8 @@ def test_layouts_and_limits_are_those_that_a_c_compiler_makes_of_the_header(tmp_
         "sizeof(struct table_server)": scx.SERVER.size + scx.MAX_SLOTS * scx.SLOT.size,
         "offsetof(struct table_server, slots)": scx.SERVER.size,
         "sizeof(struct table_slot)": scx.SLOT.size,
-        "offsetof(struct table_server, cpu)": 24,
+        "offsetof(struct table_server, cpu)": 16,
+        "sizeof(struct table_in_force)": scx.IN_FORCE.size,
         "sizeof(struct table_cpu)": scx.CORE.size,
         "sizeof(struct table_counters)": scx.COUNTERS.size,
         "sizeof(struct table_exit)": scx.EXIT.size,
@@ -231,11 +232,10 @@ def test_layouts_and_limits_are_those_that_a_c_compiler_makes_of_the_header(tmp_
 
 def test_a_server_is_packed_field_by_field() -> None:
     two_slots = server("a", 3, 7, (1 * MS, 2 * MS), (4 * MS, 6 * MS))
-    value = pack_servers(table(server("x"), two_slots), 123)[2]
-    head = struct.unpack_from("<QQQIIII", value)
-    assert head == (50 * MS, 123, scx.ROTATION_NS, 3, 7, 2, 0)
-    assert struct.unpack_from("<QQQQ", value, 40) == (1 * MS, 2 * MS, 4 * MS, 6 * MS)
-    assert not any(value[72:])
+    value = pack_servers(table(server("x"), two_slots))[2]
+    assert struct.unpack_from("<QQIIII", value) == (50 * MS, scx.ROTATION_NS, 3, 7, 2, 0)
+    assert struct.unpack_from("<QQQQ", value, 32) == (1 * MS, 2 * MS, 4 * MS, 6 * MS)
+    assert not any(value[64:])
 
 
 def test_servers_of_a_core_stand_best_first_and_equals_in_the_order_of_the_table() -> None:
@@ -269,14 +269,13 @@ def test_the_more_urgent_of_a_servers_threads_are_in_a_better_server_of_their_ow
 
 
 @given(st.integers(0, 1), st.integers(0, 2**61 - 1), st.booleans(), st.integers(-(2**40), 2**40))
-def test_one_word_says_which_generation_holds_at_each_instant(
-    generation: int, instant: int, replaces: bool, offset: int
+def test_one_word_says_which_anchor_holds_at_each_instant(
+    place: int, instant: int, replaces: bool, offset: int
 ) -> None:
-    word = int.from_bytes(change_word(generation, instant, replaces=replaces), "little")
+    word, *anchors = struct.unpack("<3Q", pack_in_force(place, (7, 9), instant, replaces=replaces))
     now = instant + offset
     # as the policy reads it
-    in_force = word & 1 if now >= word >> 2 else 1 - (word & 1)
-    assert in_force == (generation if offset >= 0 else 1 - generation)
+    assert anchors[(word ^ (now < word >> 2)) & 1] == (7, 9)[place if offset >= 0 else 1 - place]
     assert bool(word & 2) == replaces
 
 

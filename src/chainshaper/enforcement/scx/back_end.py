@@ -56,9 +56,10 @@ MAX_SLOTS = 64
 MAX_SERVERS_PER_CORE = 32
 MAX_CORES = 512
 _VISITOR = 0xFFFFFFFF
-SERVER = struct.Struct("<QQQIIII")
+SERVER = struct.Struct("<QQIIII")
 SLOT = struct.Struct("<QQ")
 CORE = struct.Struct(f"<I{MAX_SERVERS_PER_CORE}I")
+IN_FORCE = struct.Struct("<QQQ")
 COUNTERS = struct.Struct("<QQQQQQ")
 EXIT = struct.Struct("<i64s192s")
 CONFIG = struct.Struct("<II")
@@ -172,12 +173,12 @@ def numbered(table: ServerTable) -> dict[str, int]:
     return {server.name: number for number, server in enumerate(table.servers, start=1)}
 
 
-def pack_servers(table: ServerTable, anchor_ns: int) -> dict[int, bytes]:
-    """Map `servers` by id. The anchor must be in the past."""
+def pack_servers(table: ServerTable) -> dict[int, bytes]:
+    """Map `servers` by id."""
     packed = {}
     for number, server in enumerate(table.servers, start=1):
         where = (server.core, server.priority, len(server.slots), 0)
-        head = SERVER.pack(table.cycle_ns, anchor_ns, ROTATION_NS, *where)
+        head = SERVER.pack(table.cycle_ns, ROTATION_NS, *where)
         slots = b"".join(SLOT.pack(start, end) for start, end in server.slots)
         packed[number] = (head + slots).ljust(SERVER.size + MAX_SLOTS * SLOT.size, b"\0")
     return packed
@@ -193,9 +194,9 @@ def pack_cores(table: ServerTable) -> dict[int, bytes]:
     return packed
 
 
-def change_word(generation: int, instant_ns: int, *, replaces: bool) -> bytes:
-    """Map `in_force`: this generation from the instant on; before, the other that it replaces."""
-    return (instant_ns << 2 | replaces << 1 | generation).to_bytes(8, "little")
+def pack_in_force(place: int, anchors: Sequence[int], instant_ns: int, *, replaces: bool) -> bytes:
+    """Map `in_force`: the anchor in this place from the instant on; before, the other, if any."""
+    return IN_FORCE.pack(instant_ns << 2 | replaces << 1 | place, *anchors)
 
 
 def unpack_counters(value: bytes) -> ServerCounters:
@@ -241,7 +242,7 @@ class ScxServers(BackEnd):
         self._policy: BpfObject | None = None
         self._link = 0
         self._kickers: dict[int, subprocess.Popen[bytes]] = {}
-        self._generation = 0
+        self._anchors, self._place = [0, 0], 0
         self._failure: str | None = None
         self._released = threading.Event()
         self._last_counters = dict.fromkeys(
@@ -313,7 +314,7 @@ class ScxServers(BackEnd):
             raise OperationError(f"{failure}; release these servers and create them anew")
 
     def _begin(self) -> BpfObject:
-        """The policy with an empty table in force: for now, everything runs as best effort."""
+        """The policy, with a table that is not in force yet: everything runs as best effort."""
         try:
             policy = BpfObject(POLICY)
         except OSError as error:
@@ -327,6 +328,10 @@ class ScxServers(BackEnd):
             wanted = kernel_enum_value("scx_ops_flags", "SCX_OPS_ENQ_MIGRATION_DISABLED") or 0
             _FLAGS.pack_into(flags, 0, _FLAGS.unpack_from(flags)[0] | wanted)
             policy.load()
+            for number, value in pack_servers(self._apart).items():
+                policy.update("servers", number, value)
+            for core, value in pack_cores(self._apart).items():
+                policy.update("cpus", core, value)
             for tid in tuple(self._members):
                 self._hand_over(policy, tid)
             for core in () if self._has_timer else self._cores:
@@ -348,17 +353,13 @@ class ScxServers(BackEnd):
         return policy
 
     def _put_in_force(self, policy: BpfObject, anchor_ns: int) -> int:
-        """Write the idle generation and have all cores change over; the instant at which they will,
-        a little ahead, for each core to learn of it. Kickers look by themselves. A timer belongs to
-        the core that starts it, so the calling thread goes round; the policy lets it pass before
-        everything else. Raises OperationError: it may not run on one of the cores.
+        """Write the anchor and have all cores change over; the instant at which they will, a little
+        ahead, for each core to learn of it. Kickers look by themselves. A timer belongs to the core
+        that starts it, so the calling thread goes round; the policy lets it pass before everything
+        else. Raises OperationError: it may not run on one of the cores.
         """
-        generation = self._generation = 1 - self._generation
-        # Cycles repeat: the anchor lies within the first one after booting.
-        for number, value in pack_servers(self._apart, anchor_ns % self._table.cycle_ns).items():
-            policy.update("servers", generation * MAX_SERVERS + number, value)
-        for core, value in pack_cores(self._apart).items():
-            policy.update("cpus", generation * MAX_CORES + core, value)
+        place = 1 - self._place
+        self._anchors[place] = anchor_ns % self._table.cycle_ns  # in the past: cycles repeat
         start_timer, home = policy.run("table_boundary", WAKE.size), os.sched_getaffinity(0)
         visited = self._cores if self._has_timer else ()
         descriptor = _thread_descriptor(threading.get_native_id())
@@ -366,8 +367,10 @@ class ScxServers(BackEnd):
         try:
             ahead = _VISIT_NS * (1 + len(visited)) if self._has_timer else _KICKER_ROUND_NS
             instant = time.monotonic_ns() + ahead
-            word = change_word(generation, instant, replaces=self._since_ns is not None)
-            policy.update("in_force", 0, word)
+            replaces = self._since_ns is not None
+            value = pack_in_force(place, self._anchors, instant, replaces=replaces)
+            policy.update("in_force", 0, value)
+            self._place = place
             for core in visited:
                 os.sched_setaffinity(0, {core})
                 start_timer()

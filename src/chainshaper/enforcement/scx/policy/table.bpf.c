@@ -15,10 +15,9 @@
  *    sleeps again the core decides anew. Should it stop, decisions find its boundary overdue and
  *    end the policy: a table that only the tick follows is none.
  *
- * There are two generations of the table. The loader writes the idle one, then the word that says
- * which is in force from which instant on, so all cores change over at once. Threads that waited
- * for the first table are in a queue that is emptied first when it has come: `running` has each
- * sent to the queue where it belongs now.
+ * The loader writes when cycles start beside what is in force, with the instant from which on it
+ * counts, so all cores change over at once. Threads that waited for the first instant are in a
+ * queue that is emptied first when it has come: `running` has each sent to where it belongs now.
  *
  * Everything fails open: the kernel goes back to its fair class when the loader's link is closed,
  * by whatever, and when a runnable thread has not run for half a minute.
@@ -49,7 +48,7 @@ const volatile char source_digest[] = SOURCE_DIGEST;
 #define SECOND 1000000000ULL
 /* Queues; a server's is named by its id. */
 #define BEST_EFFORT 1000
-#define UNSORTED 1001			/* assigned threads, until the first table is in force */
+#define UNSORTED 1001			/* assigned threads, until the table is in force */
 
 /* bpf_ktime_get_ns() may be some ns behind the timers' clock: the end of a slot would be missed. */
 #define CLOCK_SLACK 200ULL
@@ -83,13 +82,9 @@ struct moment {
 		__type(value, element); \
 	} name SEC(".maps")
 
-ARRAY(servers, TABLE_GENERATIONS * TABLE_MAX_SERVERS, struct table_server);
-ARRAY(cpus, TABLE_GENERATIONS * TABLE_MAX_CPUS, struct table_cpu);
-/*
- * instant << 2 | replaces << 1 | generation: that generation from the instant on, the other one
- * before it, which holds no table yet unless `replaces` is set. 0: there is no table.
- */
-ARRAY(in_force, 1, u64);
+ARRAY(servers, TABLE_MAX_SERVERS, struct table_server);
+ARRAY(cpus, TABLE_MAX_CPUS, struct table_cpu);
+ARRAY(in_force, 1, struct table_in_force);
 /* Server id by thread: ends with the thread, and no thread id is ever taken for another's. */
 struct {
 	__uint(type, BPF_MAP_TYPE_TASK_STORAGE);
@@ -110,9 +105,9 @@ static __always_inline u64 time_to_decide_for(void)
 static __always_inline u64 word_in_force(void)
 {
 	u32 zero = 0;
-	u64 *word = bpf_map_lookup_elem(&in_force, &zero);
+	struct table_in_force *f = bpf_map_lookup_elem(&in_force, &zero);
 
-	return word ? READ_ONCE(*word) : 0;
+	return f ? READ_ONCE(f->word) : 0;
 }
 
 static __always_inline bool is_governed(u64 now)
@@ -122,30 +117,24 @@ static __always_inline bool is_governed(u64 now)
 	return word && ((word & 2) || now >= word >> 2);
 }
 
-static __always_inline u32 generation_at(u64 now)
+static __always_inline u64 anchor_at(u64 now)
 {
+	u32 zero = 0;
+	struct table_in_force *f = bpf_map_lookup_elem(&in_force, &zero);
 	u64 word = word_in_force();
-	u32 generation = word & 1;
 
-	return now >= word >> 2 ? generation : !generation;
+	return f ? f->anchors[(word ^ (now < word >> 2)) & 1] : 0;
 }
 
-static __always_inline struct table_server *find_server(u32 generation, u32 id)
+/* Of a thread or core, while the table is in force. */
+static __always_inline struct table_server *find_server(bool governed, u32 id)
 {
-	u32 key = generation * TABLE_MAX_SERVERS + id;
 	struct table_server *s;
 
-	if (!id || id >= TABLE_MAX_SERVERS)
+	if (!governed || !id || id >= TABLE_MAX_SERVERS)
 		return 0;
-	s = bpf_map_lookup_elem(&servers, &key);
+	s = bpf_map_lookup_elem(&servers, &id);
 	return s && s->cycle ? s : 0;
-}
-
-static __always_inline struct table_cpu *find_cpu(u32 generation, u32 cpu)
-{
-	u32 key = generation * TABLE_MAX_CPUS + cpu;
-
-	return cpu < TABLE_MAX_CPUS ? bpf_map_lookup_elem(&cpus, &key) : 0;
 }
 
 static __always_inline u32 id_of(struct task_struct *p)
@@ -155,7 +144,7 @@ static __always_inline u32 id_of(struct task_struct *p)
 	return id ? *id : 0;
 }
 
-static __noinline int look_up(struct table_server *s, u64 now, struct moment *m)
+static __noinline int look_up(struct table_server *s, u64 now, u64 anchor, struct moment *m)
 {
 	u64 phase, inside;
 	u32 n;
@@ -167,7 +156,7 @@ static __noinline int look_up(struct table_server *s, u64 now, struct moment *m)
 	n = s->slot_count;
 	if (!s->cycle || !s->rotation || !n || n > TABLE_MAX_SLOTS)
 		return 0;
-	phase = (now - s->anchor) % s->cycle;
+	phase = (now - anchor) % s->cycle;
 	bpf_for(i, 0, n) {
 		if (i < 0 || i >= TABLE_MAX_SLOTS)	/* for the verifier */
 			break;
@@ -205,9 +194,8 @@ static __always_inline bool is_shared(u32 id, u32 cpu)
 /* When this core has to decide anew at the latest, but for a thread that has just come to share. */
 static __noinline u64 next_boundary(u32 cpu, u64 now)
 {
-	u32 generation = generation_at(now);
-	u64 change = word_in_force() >> 2, soonest = SECOND;
-	struct table_cpu *c = find_cpu(generation, cpu);
+	u64 anchor = anchor_at(now), change = word_in_force() >> 2, soonest = SECOND;
+	struct table_cpu *c = is_governed(now) ? bpf_map_lookup_elem(&cpus, &cpu) : 0;
 	struct table_server *s;
 	struct moment m;
 	int i;
@@ -216,10 +204,10 @@ static __noinline u64 next_boundary(u32 cpu, u64 now)
 		bpf_for(i, 0, TABLE_MAX_SERVERS_PER_CPU) {
 			if (i < 0 || i >= TABLE_MAX_SERVERS_PER_CPU || i >= c->count)
 				break;
-			s = find_server(generation, c->ids[i]);
+			s = find_server(1, c->ids[i]);
 			if (!s)
 				continue;
-			look_up(s, now, &m);
+			look_up(s, now, anchor, &m);
 			if (m.until_boundary < soonest)
 				soonest = m.until_boundary;
 			if (m.left && m.turn_left < soonest && is_shared(c->ids[i], cpu))
@@ -260,7 +248,7 @@ static __noinline int count(u32 id, struct moment *m, u64 now, bool wants_to_run
 	k->open_since = m->slot_start;
 	if (!m->slot_start)
 		return 0;
-	/* a new table may begin within a slot */
+	/* other cycles may begin within a slot */
 	entry = change <= now && change > m->slot_start ? change : m->slot_start;
 	now -= CLOCK_SLACK;
 	lateness = now > entry ? now - entry : 0;
@@ -276,7 +264,7 @@ s32 SEC("struct_ops/table_select_cpu")
 BPF_PROG(table_select_cpu, struct task_struct *p, s32 previous, u64 wake_flags)
 {
 	u32 id = id_of(p);
-	struct table_server *s = find_server(generation_at(time_to_decide_for()), id);
+	struct table_server *s = find_server(is_governed(time_to_decide_for()), id);
 	bool is_idle = 0;
 
 	if (id == TABLE_VISITOR)
@@ -310,7 +298,7 @@ void BPF_PROG(table_enqueue, struct task_struct *p, u64 flags)
 {
 	u64 now = time_to_decide_for();
 	u32 id = id_of(p), cpu;
-	struct table_server *s = find_server(generation_at(now), id);
+	struct table_server *s = find_server(is_governed(now), id);
 	struct cpu_state *state;
 	struct moment m;
 
@@ -322,7 +310,7 @@ void BPF_PROG(table_enqueue, struct task_struct *p, u64 flags)
 		enqueue_freely(p, id && !is_governed(now) ? UNSORTED : BEST_EFFORT, flags);
 		return;
 	}
-	look_up(s, now, &m);
+	look_up(s, now, anchor_at(now), &m);
 	/* pushed out by a higher class during its turn: it keeps its place */
 	if ((flags & SCX_ENQ_REENQ) && has_its_turn(id, &m))
 		flags |= SCX_ENQ_HEAD;
@@ -378,9 +366,10 @@ static __always_inline void check_kicker(u32 cpu, u64 now)
 SEC("struct_ops/table_dispatch")
 void BPF_PROG(table_dispatch, s32 cpu, struct task_struct *prev)
 {
-	u64 now = time_to_decide_for();
-	u32 generation = generation_at(now), id, prev_id = 0;
-	struct table_cpu *c = find_cpu(generation, cpu);
+	u64 now = time_to_decide_for(), anchor = anchor_at(now);
+	u32 id, prev_id = 0, key = cpu;
+	bool governed = is_governed(now);
+	struct table_cpu *c = governed ? bpf_map_lookup_elem(&cpus, &key) : 0;
 	bool prev_wants = prev && (prev->scx.flags & SCX_TASK_QUEUED), decided = 0;
 	struct table_server *s;
 	struct moment m;
@@ -390,17 +379,17 @@ void BPF_PROG(table_dispatch, s32 cpu, struct task_struct *prev)
 	if (prev_wants)
 		prev_id = id_of(prev);
 	/* without a table yet, they take turns with best effort; nobody may starve */
-	if (is_governed(now) || (now >> TURN_BIT & 1))
+	if (governed || (now >> TURN_BIT & 1))
 		decided = move_to_local(UNSORTED);
 	if (c) {
 		bpf_for(i, 0, TABLE_MAX_SERVERS_PER_CPU) {
 			if (i < 0 || i >= TABLE_MAX_SERVERS_PER_CPU || i >= c->count)
 				break;
 			id = c->ids[i];
-			s = find_server(generation, id);
+			s = find_server(1, id);
 			if (!s)
 				continue;
-			look_up(s, now, &m);
+			look_up(s, now, anchor, &m);
 			count(id, &m, now, prev_id == id || scx_bpf_dsq_nr_queued(id) > 0);
 			if (!decided && m.left)
 				decided = run_server(id, &m, prev, prev_wants && prev_id == id);
@@ -409,7 +398,7 @@ void BPF_PROG(table_dispatch, s32 cpu, struct task_struct *prev)
 	if (decided || move_to_local(BEST_EFFORT) || move_to_local(UNSORTED))
 		return;
 	/* a closed server's thread keeps no slice: by SCX_OPS_ENQ_LAST it waits in the queue */
-	if (prev_wants && !find_server(generation, prev_id))
+	if (prev_wants && !find_server(governed, prev_id))
 		set_slice(prev, BEST_EFFORT_SLICE);
 }
 
@@ -418,7 +407,7 @@ void BPF_PROG(table_running, struct task_struct *p)
 {
 	u64 now = time_to_decide_for();
 	u32 cpu = scx_bpf_task_cpu(p), id = id_of(p);
-	struct table_server *s = find_server(generation_at(now), id);
+	struct table_server *s = find_server(is_governed(now), id);
 	struct cpu_state *state = bpf_map_lookup_elem(&cpu_states, &cpu);
 	struct moment m;
 
@@ -428,7 +417,7 @@ void BPF_PROG(table_running, struct task_struct *p)
 	state->priority = s ? s->priority : ~0u;
 	if (!s)
 		return;
-	look_up(s, now, &m);
+	look_up(s, now, anchor_at(now), &m);
 	take_turn(id, &m);
 	set_slice(p, m.turn_left ?: 1);
 	/* assigned while it waited among best effort, or on another core: decide anew at once */
@@ -470,7 +459,7 @@ static int at_boundary(void *map, u32 *key, struct timer_of_cpu *t)
 
 /*
  * Have the calling core decide at its next boundary. With a timer, which is pinned to the core that
- * starts it, the loader runs this once on each core after each change of the table; without, the
+ * starts it, the loader runs this once on each core after each change; without, the
  * core's kicker again and again: it sleeps until the boundary, a little longer since planning
  * would delay those who wait for it, and then plans anew.
  */
@@ -522,7 +511,6 @@ BPF_PROG(table_init)
 	s32 error = scx_bpf_create_dsq(BEST_EFFORT, -1) ?: scx_bpf_create_dsq(UNSORTED, -1);
 	int id;
 
-	/* all of them, so that a later table may have more servers */
 	bpf_for(id, 1, TABLE_MAX_SERVERS) {
 		if (error)
 			break;

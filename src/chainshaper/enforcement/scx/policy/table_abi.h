@@ -10,7 +10,6 @@
 #define TABLE_MAX_SLOTS 64		/* of one server */
 #define TABLE_MAX_SERVERS_PER_CPU 32
 #define TABLE_MAX_CPUS 512
-#define TABLE_GENERATIONS 2
 
 /* Instead of a server id: a thread of the loader that goes from core to core. */
 #define TABLE_VISITOR 0xffffffffU
@@ -19,10 +18,9 @@ struct table_slot {
 	unsigned long long start, end;	/* half open, after the start of a cycle */
 };
 
-/* Key: generation * TABLE_MAX_SERVERS + id. A cycle of 0: there is no such server. */
+/* Key: id. A cycle of 0: there is no such server. */
 struct table_server {
 	unsigned long long cycle;
-	unsigned long long anchor;	/* a start of a cycle, in the past */
 	unsigned long long rotation;	/* how long a thread of many has its turn */
 	unsigned int cpu;
 	unsigned int priority;		/* smaller is better */
@@ -30,13 +28,22 @@ struct table_server {
 	struct table_slot slots[TABLE_MAX_SLOTS];	/* ascending, disjoint */
 };
 
-/* Key: generation * TABLE_MAX_CPUS + cpu. */
+/*
+ * A word, instant << 2 | replaces << 1 | place: from the instant on, cycles have started at the
+ * anchor in this place, in the past; before, at the other one, or not at all unless it `replaces`
+ * that. 0: the table is not in force yet.
+ */
+struct table_in_force {
+	unsigned long long word, anchors[2];
+};
+
+/* Key: cpu. */
 struct table_cpu {
 	unsigned int count;
 	unsigned int ids[TABLE_MAX_SERVERS_PER_CPU];	/* best priority first */
 };
 
-/* Key: server id. Written by the policy, kept when the table changes. */
+/* Key: server id. Written by the policy. */
 struct table_counters {
 	unsigned long long slots, late_entries, longest_lateness, overruns;
 	unsigned long long open_since;	/* start of the slot that is open; 0: none is */
