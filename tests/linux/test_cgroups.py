@@ -2,13 +2,12 @@
 
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 from gated import cpu_ns, needs_cgroups, own_cgroup, sleeping, stamping
 from known import known
-from processes import children_of, wait_for
+from processes import wait_for
 
 from chainshaper.linux import cgroups
 from chainshaper.linux.threads import has_ended, start_of
@@ -48,31 +47,6 @@ def test_one_thread_stops_while_the_others_of_its_process_run_on(tmp_path: Path)
         assert cgroups.cgroup_of(spinner.tid) == home
         assert kind(home) == "domain"
         assert not child.exists()
-
-
-def test_children_born_in_the_group_are_put_back_as_well() -> None:
-    with own_cgroup("children") as home:
-        parent = subprocess.Popen(
-            [sys.executable, "-c", "import os, time; input(); os.fork(); time.sleep(60)"],
-            stdin=subprocess.PIPE,
-        )
-        try:
-            (home / "cgroup.procs").write_text(str(parent.pid))
-            child = cgroups.make_threaded_child(home, "gated")
-            cgroups.move_thread(parent.pid, child)
-            assert parent.stdin is not None
-            parent.stdin.write(b"\n")
-            parent.stdin.flush()
-            wait_for(lambda: len(children_of(parent.pid)) == 1, "the fork")
-            (born,) = children_of(parent.pid)
-            assert set(cgroups.threads_in(child)) == {parent.pid, born}
-            assert cgroups.dissolve(child) is None
-            assert set(cgroups.threads_in(home)) == {parent.pid, born}
-        finally:
-            for pid in [*children_of(parent.pid), parent.pid]:
-                os.kill(pid, 9)
-            parent.wait()
-            wait_for(lambda: not cgroups.threads_in(home), "the children to end")
 
 
 def test_a_process_that_is_killed_while_frozen_ends_and_does_not_hold_its_group() -> None:
