@@ -408,3 +408,32 @@ def test_steps_of_the_wall_clock_are_not_seen() -> None:
     )
     readers = {path.name for path in sources if wall_clock.search(path.read_text())}
     assert readers == {"decision.py"}
+
+
+def _step(by_ns: int) -> None:
+    now = time.clock_gettime_ns(time.CLOCK_REALTIME)
+    time.clock_settime_ns(time.CLOCK_REALTIME, now + by_ns)
+
+
+@pytest.mark.skipif(
+    "CHAINSHAPER_STEP_CLOCK" not in os.environ,
+    reason="it steps this machine's clock: set CHAINSHAPER_STEP_CLOCK=1 where that may be done",
+)
+def test_slots_stay_where_they_are_when_the_wall_clock_steps(tmp_path: Path) -> None:
+    output = tmp_path / "windows"
+    with (
+        running_node("origin", tmp_path / "origin"),
+        running_node("other", output, period=10 * MS, busy=2 * MS),
+        applied(BOTH, tmp_path, "--backend", "freezer", "--json") as run,
+    ):
+        begun = time.monotonic_ns()
+        for by_ns in (2_000 * MS, -2_000 * MS) * 6:
+            _step(by_ns)
+            time.sleep(0.4)
+        over = time.monotonic_ns()
+        run.send_signal(signal.SIGINT)
+        stdout, _ = run.communicate(timeout=30)
+    state = json.loads(stdout)
+    assert share_in_the_second_slot(output, begun, over, state["anchor_ns"]) > 0.95
+    assert (run.returncode, state["failure"]) == (0, None)
+    assert not leftovers()

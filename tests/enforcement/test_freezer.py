@@ -515,3 +515,61 @@ def test_where_a_frozen_thread_was_tells_whether_it_wanted_to_run(tmp_path: Path
         assert overrun(threads.values()) is False, "the groups are gone"
         for file in threads.values():
             os.close(file)
+
+
+def test_where_servers_overlap_the_better_priority_runs(tmp_path: Path) -> None:
+    if not may_use_fifo():
+        pytest.skip("SCHED_FIFO is not permitted (CAP_SYS_NICE)")
+    servers = (server("chain", (0, 12), priority=2), server("output", (4, 8), priority=1))
+    with (
+        stamping(tmp_path, 30) as chain,
+        stamping(tmp_path, 30) as output,
+        freezer(tmp_path, *servers) as back_end,
+    ):
+        back_end.assign(chain.tid, "chain")
+        back_end.assign(output.tid, "output")
+        back_end.arm(0)
+        begin = begun(back_end)
+        # The classes are the thread allocator's business.
+        os.sched_setscheduler(chain.tid, os.SCHED_FIFO, os.sched_param(10))
+        os.sched_setscheduler(output.tid, os.SCHED_FIFO, os.sched_param(20))
+        begin = time.monotonic_ns()
+        time.sleep(1)
+        end = time.monotonic_ns()
+        for spinner in (chain, output):
+            os.sched_setscheduler(spinner.tid, os.SCHED_OTHER, os.sched_param(0))
+        back_end.release()
+        behind = chain.windows(begin, end)
+        first = output.windows(begin, end)
+        assert len(first) > 20
+        assert len(behind) > 40, "interrupted once a cycle"
+        assert share_inside(first, ((4 * MS, 8 * MS),), CYCLE, 0) > 0.99
+        assert share_inside(behind, ((0, 4 * MS), (8 * MS, 12 * MS)), CYCLE, 0) > 0.97
+
+
+def test_an_entry_that_comes_late_is_counted_with_its_lateness(tmp_path: Path) -> None:
+    # Slots of 95 % of a cycle: whenever the dispatcher comes back it enters one late.
+    with freezer(tmp_path, server("a", (0, 95)), cycle=100 * MS) as back_end:
+        back_end.arm(0)
+        wait_for(lambda: (back_end.counters()["a"].slots or 0) >= 2, "slots")
+        before = back_end.counters()["a"]
+        for _ in range(2):
+            kill(back_end.dispatchers[CORE], signal.SIGSTOP)
+            time.sleep(0.15)  # one slot's start lies in it at least
+            kill(back_end.dispatchers[CORE], signal.SIGCONT)
+            time.sleep(0.2)
+        after = back_end.counters()["a"]
+        assert back_end.failure() is None
+        assert known(after.late_entries) > known(before.late_entries)
+        assert known(after.longest_lateness_ns) > MS
+
+
+def test_thirty_two_servers_share_a_core(tmp_path: Path) -> None:
+    servers = [server(f"s{number}", (number, number + 1)) for number in range(32)]
+    with freezer(tmp_path, *servers, cycle=40 * MS) as back_end:
+        back_end.arm(0)
+        time.sleep(1)
+        opened = [counters.slots for counters in back_end.counters().values()]
+        assert back_end.failure() is None
+        assert min(opened) > 10  # type: ignore[type-var, operator]
+        assert max(opened) - min(opened) <= 3  # type: ignore[type-var, operator]

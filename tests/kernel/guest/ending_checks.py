@@ -43,6 +43,23 @@ def killing_the_loader_frees_the_threads() -> str:
     return f"first run outside its slots {(outside[0] - killed) / MS:.1f} ms afterwards"
 
 
+def killing_the_loader_disables_the_scheduler() -> str:
+    """The same without virtual time, in which shares and delays can be relied on."""
+    with scene() as s:
+        a = s.spinner("a")
+        loader = s.loader(table(A), {"A": [a]})
+        loader.arm()
+        wait(200)
+        loader.process.kill()
+        loader.process.wait()
+        wait_for_state("disabled")
+        killed = time.monotonic_ns()
+        wait(1000)
+        ran = cut(a.windows(), killed, killed + 1000 * MS)
+    assert [a for a, _ in ran if a % CYCLE > 21 * MS], "the thread is still governed"
+    return f"ran {length(ran) / MS:.0f} of 1000 ms afterwards"
+
+
 def releasing_twice_leaves_nothing_behind() -> str:
     """And a new back end can begin where the old one ended."""
     with scene() as s:

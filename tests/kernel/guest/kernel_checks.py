@@ -15,6 +15,7 @@ from ending_checks import (
     a_kicker_that_is_killed_or_stopped_fails_open,
     a_second_instance_is_refused,
     a_thread_without_a_slot_for_half_a_minute_ends_the_policy,
+    killing_the_loader_disables_the_scheduler,
     killing_the_loader_frees_the_threads,
     releasing_twice_leaves_nothing_behind,
     the_policy_notices_a_stopped_kicker_by_itself,
@@ -358,4 +359,4 @@ REAL_TIME_KERNEL = (
     a_kicker_that_is_killed_or_stopped_fails_open,
     the_policy_notices_a_stopped_kicker_by_itself,
 )
-TWO_CORES = (two_cores_are_governed_independently,)
+TWO_CORES = (two_cores_are_governed_independently, killing_the_loader_disables_the_scheduler)
