@@ -2,14 +2,11 @@
 
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
-Only where and when threads run is changed, and every change stands in a journal first
-(:mod:`chainshaper.linux.runs`): whatever ends the run, a signal or a crash, puts it back. Servers
-are armed only when all nodes run, and released before a command of ours is to end, since a stopped
-thread cannot. A thread that appears later gets what the plan says at the next look. A shaping node
-is its own server, unless the plan says otherwise (`shaping_thread`): it has no slots.
+Every change stands in a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run puts
+it back. Servers are armed only when all nodes run, and released before a command of ours is to end,
+since a stopped thread cannot. A thread that appears later gets what the plan says at the next look.
 """
 
-import contextlib
 import json
 import os
 import subprocess
@@ -17,6 +14,7 @@ import threading
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import repeat
@@ -30,7 +28,7 @@ from chainshaper.enforcement.freezer import Freezer, groups_of, run_of
 from chainshaper.enforcement.guardian import Guardians, put_back
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters
-from chainshaper.enforcement.threads import Allocation, NodeThread, RecordedProcess
+from chainshaper.enforcement.threads import Allocation, NodeThread
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
@@ -40,12 +38,8 @@ from chainshaper.linux.own_processes import end_command, end_in_words, start_com
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    open_until_done,
-    whole,
-    with_slots_moved,
-)
+from chainshaper.planning import application_plan as planned
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, shaping_nodes
@@ -63,7 +57,6 @@ _LOOK_S = 1.0
 _SETTLING_LOOKS = 3  # nodes that have just started go on to start threads for a while
 GATE_START_NS = 10_000_000_000  # a shaping node appears so long after all others, or never
 _FLEETING = 3  # so many threads that a look finds, and the next does not, are worth a note
-_NOTHING = ServerCounters()
 
 
 @dataclass(frozen=True)
@@ -97,11 +90,10 @@ def apply_plan(
     ``command`` is started first (its output goes to ``command_stdout``); without one, the
     application runs already. Its nodes have ``wait_ns`` to appear (default: 30 s with a command,
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
-    (None: those of all chains are measured). With ``adapt`` slots follow the latencies of what
-    runs, to no later end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of
-    the very processes, or of an earlier run of their programs. Only processes of ``users`` (names
-    or numbers; default: who launched us, and root) are nodes of the plan. ``watch`` gets the state
-    every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
+    (None: those of all chains are measured). With ``adapt`` slots follow the latencies, to no later
+    end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of the very
+    processes, or of an earlier run. ``users`` are as for :func:`.find_threads`. ``watch`` gets the
+    state every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
 
     Raises:
         InputError: there is no such user, or the plan cannot be carried out: it names no threads,
@@ -111,7 +103,7 @@ def apply_plan(
             the chain has no regular beginning, the kernel refuses something, the servers failed,
             the application ended by itself, or ``stop`` was set before the plan was in force.
     """
-    given, taken = whole(plan), run_users(users)
+    given, taken = planned.whole(plan), run_users(users)
     threads.server_table(given)
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
@@ -123,8 +115,7 @@ def apply_plan(
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     # Looked up once: that takes longer than looking at processes.
     recorded = () if recording is None else threads.recorded_processes(recording)[0]
-    stop = stop or threading.Event()
-    cores = {server.core for server in given.servers}
+    cores, stop = {server.core for server in given.servers}, stop or threading.Event()
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
     run = _Run(given, given, choice, journal, recorded, taken, stop)
     try:
@@ -140,11 +131,11 @@ def apply_plan(
         run.note(*said, *(one for one in run.found.notes if one.endswith(allocation.IN_ORDER)))
         run.find_anchor(phase_ns, progress)
         table = threads.server_table(run.plan)
-        run.servers = make_back_end(choice.name, table, journal, run.go_on)
-        run.arm(run.servers, progress)
+        servers = run.servers = make_back_end(choice.name, table, journal, run.go_on)
+        run.arm(servers, progress)
         run.note(*why_not)
         run.start_followers(reaches_ns)
-        run.watch_over(run.servers, watch)
+        run.watch_over(servers, watch)
         strangers = look_alikes(journal, groups_of(run_of(journal)))
     finally:
         run.put_back()
@@ -168,7 +159,7 @@ class _Run:
     plan: ApplicationPlan  # as it is carried out: with room for overruns, once timers are known
     choice: Choice
     journal: Journal
-    recorded: tuple[RecordedProcess, ...]
+    recorded: tuple[allocation.RecordedProcess, ...]
     users: frozenset[int]
     stop: threading.Event
     guardians: Guardians | None = None
@@ -191,11 +182,15 @@ class _Run:
         return self.journal.path.parent
 
     @property
+    def gated(self) -> bool:
+        """Whether a back end stops threads outside their slots, or sets priorities only."""
+        return gates(self.choice.name)
+
+    @property
     def command_ended(self) -> bool:
         return self.command is not None and self.command.poll() is not None
 
     def go_on(self) -> None:
-        """See whether the run is to come into force still. Raises OperationError: it is to end."""
         _go_on(self.stop)
 
     def show(self, **changes: Any) -> None:
@@ -203,11 +198,11 @@ class _Run:
 
     def show_servers(self, **changes: Mapping[str, Any]) -> None:
         """Set fields of the servers' states, each from what it is by the server's name."""
-        servers = (
-            replace(one, **{field: of[one.name] for field, of in changes.items()})
-            for one in self.state.servers
-        )
-        self.show(servers=tuple(servers))
+
+        def changed(one: ServerState) -> ServerState:
+            return replace(one, **{field: of[one.name] for field, of in changes.items()})
+
+        self.show(servers=tuple(map(changed, self.state.servers)))
 
     def note(self, *notes: str, instead: Collection[str] = ()) -> None:
         """Add notes, each once; ``instead`` of others."""
@@ -220,6 +215,8 @@ class _Run:
     def await_nodes(self, wait_ns: int, progress: Callable[[float, str], None]) -> None:
         """Look until all nodes of the plan run; where there is time, a little for late threads."""
         begun, looks, before, others_ns = time.monotonic_ns(), 0, None, 0
+        shaping = {node.thread.node for node in self.given.shaping_nodes}
+        wanted = {one.node for server in self.given.servers for one in server.threads}
         while True:
             self.go_on()
             self.found = self.find()
@@ -228,13 +225,11 @@ class _Run:
                 allocation.server_members(self.plan, self.found)
                 looks += 1
             except OperationError:
-                looks, gates = 0, {node.thread.node for node in self.given.shaping_nodes}
-                planned = {one.node for server in self.given.servers for one in server.threads}
-                missing = planned - {node for one in self.found.threads for node in one.nodes}
-                named = ", ".join(sorted(missing))
-                others_ns = waited if missing - gates else others_ns
+                missing = wanted - {node for one in self.found.threads for node in one.nodes}
+                looks, named = 0, ", ".join(sorted(missing))
+                others_ns = waited if missing - shaping else others_ns
                 over = self.command_ended or waited >= min(wait_ns, others_ns + GATE_START_NS)
-                if over and missing and missing <= gates:
+                if over and missing and missing <= shaping:
                     raise OperationError(
                         f"the plan's shaping node {named} is not running, all other nodes are:"
                         " start the application with it (`chainshaper splice plan.yaml LAUNCH... -o"
@@ -283,31 +278,29 @@ class _Run:
             self.go_on()
             progress(share, "measuring where in a cycle the chain begins")
 
-        gated = gates(self.choice.name)
         self.given, self.anchor_ns, self.waits_ns, phases = threads.carried_out(
-            self.given, self.found, phase_ns, gated=gated, progress=measured
+            self.given, self.found, phase_ns, gated=self.gated, progress=measured
         )
-        self.note(
-            *(
-                f"the beginning of {chain_name(chain)} varies by {duration_text(phase.spread_ns)}"
-                " from cycle to cycle: it is started by something less regular than a timer"
-                for chain, phase in zip(self.given.chains, phases, strict=False)
-                if phase.spread_ns > LEAD_NS
-            )
-        )
+        for chain, phase in zip(self.given.chains, phases, strict=False):
+            if phase.spread_ns > LEAD_NS:
+                self.note(
+                    f"the beginning of {chain_name(chain)} varies by"
+                    f" {duration_text(phase.spread_ns)} from cycle to cycle: it is started by"
+                    " something less regular than a timer"
+                )
         if phases:
             self.show(phase_spread_ns=max(phase.spread_ns for phase in phases))
-        elif gated:
+        elif self.gated:
             self.note("slots stay where --phase puts them, also when the chain's timer drifts")
         self.plan = open_until_done(self.given, self.waits_ns)
-        keeper = self.choice.name if gated else "none: priority only"
-        kept_by = {one.name: keeper for one in threads.server_table(self.plan).servers}
+        keeper = self.choice.name if self.gated else "none: priority only"
+        kept = {one.name for one in threads.server_table(self.plan).servers}
         servers = (
             ServerState(
                 *(one.name, one.core, one.priority, one.slots, ()),
                 places=threads.places_in(one, self.plan.most_urgent_first),
-                kept_by=kept_by.get(one.name, "gate"),
-                counters=_NOTHING,
+                kept_by=keeper if one.name in kept else "gate",
+                counters=ServerCounters(),
             )
             for one in self.plan.servers
         )
@@ -326,7 +319,7 @@ class _Run:
         self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
 
     def save_plan(self) -> None:
-        with contextlib.suppress(OSError):  # a full /run ends no plan; recordings lack it then
+        with suppress(OSError):  # a full /run ends no plan; recordings lack it then
             (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
 
     def begins(self, place: int) -> int:
@@ -336,12 +329,10 @@ class _Run:
 
     def early(self, place: int) -> int:
         """How long before its slot a chain begins: with its timer, unless a server stops it."""
-        chain = self.plan.chains[place]
-        if not gates(self.choice.name):
-            return self.waits_ns[place] if self.waits_ns else LEAD_NS
-        if not self.waits_ns:
+        closed = allocation.closed_before(self.plan.chains[place]) is not None
+        if self.gated and (closed or not self.waits_ns):
             return 0
-        return self.waits_ns[place] if allocation.closed_before(chain) is None else 0
+        return self.waits_ns[place] if self.waits_ns else LEAD_NS
 
     def tell(self, moved_ns: Mapping[int, int]) -> None:
         """Begin to give shaping nodes of these chains where cycles, moved by so much, begin."""
@@ -370,7 +361,7 @@ class _Run:
         """Move a chain's slots in the servers, where they change; from when on the gate has to."""
         with self.arming:
             moves = {**self.moved_ns, place: moved_ns}
-            plan = open_until_done(with_slots_moved(self.given, moves), self.waits_ns)
+            plan = open_until_done(planned.with_slots_moved(self.given, moves), self.waits_ns)
             before, table = threads.server_table(self.plan), threads.server_table(plan)
             cycle_ns = self.plan.chains[place].cycle_ns
             since = time.monotonic_ns() + 2 * cycle_ns
@@ -389,7 +380,7 @@ class _Run:
             if follower.failure is not None:
                 del self.followers[place]
                 follower.end()
-                with contextlib.suppress(OperationError):  # as it ends, or is lost
+                with suppress(OperationError):  # as it ends, or is lost
                     self.move_slots(place, 0)  # the gate's are there already
                 self.note(f"slots are as planned, and do not follow any more: {follower.failure}")
 
@@ -433,9 +424,8 @@ class _Run:
             try:
                 undoing.save_run_state(self.folder, shown)
             except OSError as error:  # the plan is in force all the same
-                unsaved = (
-                    f"{self.folder}: `status` cannot show how this run is doing ({error.strerror})"
-                )
+                reason = f"`status` cannot show how this run is doing ({error.strerror})"
+                unsaved = f"{self.folder}: {reason}"
             watch(shown)
             if is_over:
                 self.state = shown
@@ -465,7 +455,7 @@ class _Run:
         chains, whose timers have one clock, that with the shortest wait for its slot is followed.
         """
         anchor_ns, waits = self.anchor_ns, self.waits_ns
-        if not gates(self.choice.name) or not waits:
+        if not self.gated or not waits:
             yield from repeat(0)
         first = waits.index(min(waits))
         drift, cycle_ns = drifts[first], self.plan.chains[first].cycle_ns
@@ -498,25 +488,22 @@ class _Run:
 
     def drift_watches(self) -> list[DriftWatch]:
         """Watches over where chains begin, one for each first executor."""
-        gated, cores = gates(self.choice.name), {server.core for server in self.plan.servers}
+        cores = set(available_cores()) - {server.core for server in self.plan.servers}
         watches: dict[tuple[int, ...], DriftWatch] = {}
         origins = threads.first_threads(self.plan, self.found)
         self.origins = [{one.identity for one in origin} for origin in origins]
         tids = [tuple(one.tid for one in origin) for origin in origins]
-        for place, (chain, own_tids) in enumerate(zip(self.plan.chains, tids, strict=True)):
-            own = (
-                one.slots
-                for one in chain.servers
-                for state in self.state.servers
-                if gated and state.name == one.name and own_tids[0] in state.threads
-                if not self.early(place)  # else nothing stops it, and short runs count too
-            )
-            if own_tids not in watches:
-                watches[own_tids] = DriftWatch(
-                    *(origins[place][0].pid, own_tids, chain.cycle_ns),
+        for place, (chain, own) in enumerate(zip(self.plan.chains, tids, strict=True)):
+            holding = {state.name for state in self.state.servers if own[0] in state.threads}
+            slots = (one.slots for one in chain.servers if one.name in holding)
+            # Where nothing stops it, short runs count too.
+            stopped = self.gated and not self.early(place)
+            if own not in watches:
+                watches[own] = DriftWatch(
+                    *(origins[place][0].pid, own, chain.cycle_ns),
                     self.begins(place),
-                    next(own, ()),
-                    cores=set(available_cores()) - cores,
+                    next(slots, ()) if stopped else (),
+                    cores=cores,
                 )
         return [watches[one] for one in tids]
 
@@ -529,7 +516,7 @@ class _Run:
         ours = self.command is not None or self.stop.is_set()
         if failure is None and not ours and not any(one.threads for one in self.state.servers):
             failure = "the application has ended: no thread of the plan's nodes is left"
-        self.show_servers(counters=defaultdict(lambda: _NOTHING, counters))
+        self.show_servers(counters=defaultdict(ServerCounters, counters))
         self.show(drift_ns=drift_ns, failure=failure)
 
     def look_again(
@@ -541,10 +528,16 @@ class _Run:
         """
         before, now = self.found, self.find()
         new, ended = allocation.new_and_ended(before, now)
-        self.name_fleeting(latest, ended)
+        over = {one.thread.identity for one in ended}
+        fleeting = Counter(one.thread.pid for one in latest if one.thread.identity in over)
+        for pid, times in fleeting.items():
+            if times >= _FLEETING:
+                self.note(
+                    f"threads of process {pid} come and go: each has the class, cores and cgroup of"
+                    " the thread that started it, and is left so"
+                )
         self.name_strangers(now)
-        gone = {one.thread.tid for one in ended}
-        servers_now = self.state.servers
+        gone, servers_now = {one.thread.tid for one in ended}, self.state.servers
         left = {one.name: tuple(t for t in one.threads if t not in gone) for one in servers_now}
         self.show_servers(threads=left)
         self.found = now
@@ -579,38 +572,35 @@ class _Run:
                 for place, (chain, wait_ns) in enumerate(timers)
                 if place not in again
             }
-            gated = gates(self.choice.name)
-            carried = threads.carried_out(
+            given, anchor_ns, waits_ns, _ = threads.carried_out(
                 *(self.given, self.found, None),
-                gated=gated,
+                gated=self.gated,
                 progress=lambda _: self.go_on(),
                 known=known,
             )
-            anchor_ns, waits_ns = carried.anchor_ns, carried.waits_ns
             with self.arming:
-                plan = open_until_done(with_slots_moved(carried.plan, self.moved_ns), waits_ns)
+                moved = planned.with_slots_moved(given, self.moved_ns)
+                plan = open_until_done(moved, waits_ns)
                 table = threads.server_table(plan)
                 if isinstance(servers, Freezer):
                     servers.change(table, anchor_ns)
-                elif gated and table != threads.server_table(self.plan):
+                elif self.gated and table != threads.server_table(self.plan):
                     raise OperationError(
                         f"the back end {self.choice.name} cannot move slots of some chains only:"
                         " end the run, and apply the plan again"
                     )
                 else:
                     servers.arm(anchor_ns)
-                self.given, self.plan = carried.plan, plan
+                self.given, self.plan = given, plan
                 self.anchor_ns, self.waits_ns = anchor_ns, waits_ns
             self.save_plan()
             self.show(anchor_ns=anchor_ns)
             self.tell(dict.fromkeys(range(len(origins)), 0))
-            self.note(
-                *(
-                    f"the node that begins {chain_name(self.plan.chains[place])} was started again:"
-                    " slots count from its new timer since"
-                    for place in sorted(again)
+            for chain in (self.plan.chains[place] for place in sorted(again)):
+                self.note(
+                    f"the node that begins {chain_name(chain)} was started again: slots count from"
+                    " its new timer since"
                 )
-            )
         self.end_drifts()
 
     def end_drifts(self) -> None:
@@ -623,17 +613,6 @@ class _Run:
         if found.strangers is not None:
             said = [one for one in self.state.notes if one.startswith(allocation.LEFT_ALONE)]
             self.note(found.strangers, instead=said)
-
-    def name_fleeting(self, latest: Sequence[NodeThread], ended: Sequence[NodeThread]) -> None:
-        """Name the processes whose threads come and go: what ended since it was new."""
-        gone = {one.thread.identity for one in ended}
-        counted = Counter(one.thread.pid for one in latest if one.thread.identity in gone)
-        for pid, times in counted.items():
-            if times >= _FLEETING:
-                self.note(
-                    f"threads of process {pid} come and go: each has the class, cores and cgroup of"
-                    " the thread that started it, and is left so"
-                )
 
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""
