@@ -1,5 +1,6 @@
 """Verbs about what runs on this machine: its threads, plans in force, and what it can do."""
 
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -15,7 +16,7 @@ from chainshaper.values.errors import InputError, OperationError
 if TYPE_CHECKING:
     from chainshaper.enforcement.undoing import RunState
 
-LINE_EVERY = 10
+LINE_EVERY = 10  # states of a run, without a terminal
 
 
 def threads(
@@ -84,11 +85,8 @@ def apply(
 
     planned = cs.load_application_plan(plan)
     opt.refuse_bound_alone(max_latency, adapt)
-    how: dict[str, Any] = {
-        "recording": opt.recording_of(recording),
-        "phase_ns": phase,
-        "users": user or (),
-    }
+    how: dict[str, Any] = {"recording": opt.recording_of(recording), "phase_ns": phase}
+    how["users"] = user or ()
     if dry_run:
         _show_changes(planned, backend, json, how)
         return
@@ -117,8 +115,6 @@ def apply(
 def _show_changes(
     plan: "cs.ApplicationPlan", backend: str, json: bool, how: dict[str, Any]
 ) -> None:
-    import shlex
-
     from chainshaper.reporting.overviews import changes_table
 
     changes = cs.planned_changes(plan, backend, **how)
@@ -137,31 +133,25 @@ def _watching() -> "Iterator[tuple[Callable[[RunState], None], out.Progress]]":
     """What shows the state of a run, and progress before: a live table, or a line now and then."""
     from chainshaper.reporting.overviews import run_line, servers_table
 
-    live: Any = None
-    seen = 0
+    seen: int = 0
+    show: Any = None
 
-    def watch_live(state: "RunState") -> None:
-        nonlocal live
-        if live is None:
-            from rich.console import Console
-            from rich.live import Live
-
+    def watch(state: "RunState") -> None:
+        nonlocal seen, show
+        first, seen = seen == 0, seen + 1
+        if first and sys.stderr.isatty():
             stack.pop_all().close()  # the bar makes room for the table
-            live = Live(console=Console(stderr=True), transient=True, auto_refresh=False)
-            stack.enter_context(live)
-        live.update(servers_table(state), refresh=True)
-
-    def watch_in_lines(state: "RunState") -> None:
-        nonlocal seen
-        if seen == 0:
+            show = stack.enter_context(out.live(on_stderr=True))
+        if show is not None:
+            show([servers_table(state)])
+        elif first:
             out.say(f"in force with {state.back_end}: {state.reason}; Ctrl-C ends it")
-        elif seen % LINE_EVERY == 0:
+        elif seen % LINE_EVERY == 1:
             out.say(run_line(state))
-        seen += 1
 
     with ExitStack() as stack:
         report = stack.enter_context(out.progress("applying"))
-        yield watch_live if sys.stderr.isatty() else watch_in_lines, report
+        yield watch, report
 
 
 def status(
@@ -220,13 +210,12 @@ def release(
     from chainshaper.linux.runs import find_journals
 
     runs = find_journals()
-    chosen = [journal for journal in runs if run in (None, journal.path.parent.name)]
+    chosen = [journal for journal in runs if run in (None, journal.name)]
     if run is not None and not chosen:
-        known = ", ".join(journal.path.parent.name for journal in runs) or "there are none"
+        known = ", ".join(journal.name for journal in runs) or "there are none"
         raise InputError(f"no run {run!r}: {known}")
     chosen = [journal for journal in chosen if not crashed or journal.owner is None]
-    problems: list[str] = []
-    strangers: list[str] = []
+    problems, strangers = list[str](), list[str]()
     for journal in chosen:
         try:
             strangers += look_alikes(journal, groups_of(run_of(journal)))
@@ -235,7 +224,7 @@ def release(
             left = (str(error),)
         problems += left
         if not left:
-            out.show_line(f"{journal.path.parent.name}: everything is as it was before")
+            out.show_line(f"{journal.name}: everything is as it was before")
     strays, left = release_strays(runs) if run is None else ((), ())
     for folder in strays:
         out.show_line(f"{folder}, of a run whose journal is gone: its threads run again")

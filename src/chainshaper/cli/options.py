@@ -1,8 +1,4 @@
-"""Options that several verbs share, and those that are wishes for a plan.
-
-A wish is declared once, in :class:`chainshaper.values.plan_choices.Wishes`; :func:`takes_wishes`
-makes options of them.
-"""
+"""Options that several verbs share, and those that are wishes for a plan."""
 
 from collections.abc import Callable
 from dataclasses import fields
@@ -24,8 +20,7 @@ if TYPE_CHECKING:
 
 Source: TypeAlias = Literal["lttng", "preload", "ebpf"]
 
-DESCRIPTIONS = (".yaml", ".yml")
-"""What files that people write end with: applications and plans."""
+DESCRIPTIONS = (".yaml", ".yml")  # what applications' and plans' files end with
 
 
 def _duration(text: str) -> int:
@@ -62,10 +57,11 @@ def _cores(text: str) -> tuple[int, ...]:
 def _share(text: str) -> float:
     try:
         value = float(text.removesuffix("%")) / (100 if text.endswith("%") else 1)
-    except ValueError as error:
-        raise typer.BadParameter(f"{text!r} is no share: write 0.4 or 40%") from error
+    except ValueError:
+        value = 0.0
     if not 0 < value <= 1:
-        raise typer.BadParameter(f"{text} is no share: write more than 0, at most 1 or 100%")
+        said = f"{text} is no share: write more than 0, at most 1 or 100%, such as 0.4 or 40%"
+        raise typer.BadParameter(said)
     return value
 
 
@@ -80,10 +76,8 @@ PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
 
 
 def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
-    """An option as a parameter's default: ``--epsilon DURATION``, ``--output -o FILE``.
-
-    Of a duration (with its unit; in ns), of bands and of a share the value is parsed, and its
-    default written; ``...`` where it must be given.
+    """An option as a parameter's default: ``--epsilon DURATION``, ``--output -o FILE``. What has a
+    metavar of :data:`PARSERS` is parsed; ``...`` where it must be given.
     """
     words = names.split()
     metavar = None if words[-1].startswith("-") else words.pop()
@@ -94,11 +88,8 @@ def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
 
 
 def argument(metavar: str, help_text: str, default: Any = None) -> Any:
-    """An argument as a parameter's default; ``...`` where it must be given.
-
-    Click adds what says that it may be left out, or repeated.
-    """
-    metavar = metavar.strip("[]").rstrip(".…")
+    """An argument as a parameter's default; ``...`` where it must be given."""
+    metavar = metavar.strip("[]").rstrip(".…")  # Click says that it may be left out, or repeated
     return typer.Argument(default, metavar=metavar, help=help_text, show_default=False)
 
 
@@ -111,6 +102,9 @@ JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
     "--chain FIRST..LAST",
     "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
+)
+CHAINS: list[str] | None = option(
+    "--chain FIRST..LAST", "A chain (may be repeated). Default: the one the recording names."
 )
 STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.", False)
 PLAN_IN_FORCE: Path | None = option(
@@ -169,13 +163,12 @@ def plan_in_force(path: Path | None) -> "cs.ApplicationPlan | None":
 
 
 _WISHES = {field.name: field for field in fields(Wishes)}
-PLAN_WISHES = (*_WISHES, "modes", "late")
-"""All that :func:`takes_wishes` knows."""
+PLAN_WISHES = (*_WISHES, "modes", "late")  # all that :func:`takes_wishes` knows
 
 
 def wish(name: str, **more: Any) -> Any:
     """The option of a wish; ``more`` may give it another ``default``."""
-    described = next(one for one in get_args(_WISHES[name].type) if hasattr(one, "panel"))
+    _, described = get_args(_WISHES[name].type)
     names = described.flag or "--" + name.removesuffix("_ns").replace("_", "-")
     metavar = "DURATION" if name.endswith("_ns") else described.metavar or ""
     if described.least is not None:
@@ -208,15 +201,13 @@ _OTHERS: dict[str, tuple[Any, Any]] = {
     "late": (Late | None, _LATE),
     "bands": (str, wish("bands")),  # Typer knows no unions
     "cores": (str | None, wish("cores")),  # nor tuples of any length
-    "best_effort": (list[str], wish("best_effort", default=[])),  # and no tuples of any length
+    "best_effort": (list[str], wish("best_effort", default=[])),
 }
 
 
 def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
-    """Give a verb, in place of its parameter ``request``, an option for each of these wishes.
-
-    ``request`` is the :class:`~chainshaper.planning.PlanRequest` that the options make. Wishes here
-    are also ``modes`` and ``late``, which give it the modes of the system.
+    """Give a verb, in place of its parameter ``request``, a PlanRequest, options for these
+    wishes: fields of :class:`.Wishes`, and ``modes`` and ``late``, the modes of the system.
     """
 
     def decorate(verb: Callable[..., None]) -> Any:
@@ -231,15 +222,15 @@ def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
                 wished["best_effort"] = tuple(wished["best_effort"])
             verb(**values, request=cs.PlanRequest(**wished, modes=modes))
 
-        options = []
-        for name in names:
-            kind, default = _OTHERS.get(name) or (get_args(_WISHES[name].type)[0], wish(name))
-            more = {"default": default, "annotation": kind}
-            options.append(Parameter(name, Parameter.KEYWORD_ONLY, **more))
         parameters: list[Parameter] = []
         for one in signature(verb).parameters.values():
-            own = [one.replace(kind=Parameter.KEYWORD_ONLY)]
-            parameters += options if one.name == "request" else own
+            if one.name != "request":
+                parameters.append(one.replace(kind=Parameter.KEYWORD_ONLY))
+                continue
+            for name in names:
+                kind, default = _OTHERS.get(name) or (get_args(_WISHES[name].type)[0], wish(name))
+                own = one.replace(name=name, default=default, annotation=kind)
+                parameters.append(own.replace(kind=Parameter.KEYWORD_ONLY))
         called.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
         called.__annotations__ = {one.name: one.annotation for one in parameters}
         return called
@@ -257,9 +248,7 @@ def mode_profiles(given: list[str] | None, request: "cs.PlanRequest") -> dict[st
 
 def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     """The modes that `--modes` names, such as ``/mode:city=2,highway=1``; the first is the default.
-
-    Without numbers bands have those of the modes' order. An output behind its mode's slot leaves at
-    once unless ``late`` says otherwise.
+    Without numbers bands have those of the modes' order.
 
     Raises InputError: it is not of this form, or names what no mode or topic may be called.
     """

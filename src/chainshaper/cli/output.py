@@ -18,18 +18,14 @@ if TYPE_CHECKING:
 
     from chainshaper.values.plan_choices import NodeKind
 
-Progress: TypeAlias = Callable[[float, str], None]
-"""Gets the share that is done, and what is done now."""
-
-PATIENCE_S = 2.0
-"""What takes longer than this shows its progress."""
+Progress: TypeAlias = Callable[[float, str], None]  # the share that is done, what is done now
+PATIENCE_S = 2.0  # what takes longer than this shows its progress
 
 
 def show(*tables: "RenderableType") -> None:
-    """Tables on stdout; colour only on a terminal."""
+    """Tables on stdout; in a file or a pipe without colour, and not folded to no width."""
     from rich.console import Console
 
-    # A table in a file or a pipe must not be folded to the width of nothing.
     console = Console() if sys.stdout.isatty() else Console(width=120)
     with _written():
         for table in tables:
@@ -43,12 +39,10 @@ def show_line(text: str | Path) -> None:
 
 
 def print_json(value: Any, *, indent: int | None = 2) -> None:
-    """One JSON document on stdout, out at once; without an indent it is a line.
-
-    The one control character that JSON leaves alone is escaped.
-    """
+    """One JSON document on stdout, out at once; without an indent it is a line."""
+    text = json.dumps(value, indent=indent).replace("\x7f", "\\u007f")  # JSON leaves it alone
     with _written():
-        sys.stdout.write(json.dumps(value, indent=indent).replace("\x7f", "\\u007f") + "\n")
+        sys.stdout.write(text + "\n")
 
 
 def present(as_json: bool, value: Any, *tables: "RenderableType") -> bool:
@@ -124,24 +118,19 @@ def progress(title: str) -> Iterator[Progress]:
 @contextmanager
 def late_progress(title: str) -> Iterator[Progress]:
     """As :func:`progress`, but nothing is shown of what is over in two seconds."""
-    lock = threading.Lock()
     latest = (0.0, "working")
     bar: Progress | None = None
-    over = False
 
     def begin() -> None:
         nonlocal bar
-        with lock:
-            if not over:
-                bar = stack.enter_context(progress(title))
-                bar(*latest)
+        bar = stack.enter_context(progress(title))
+        bar(*latest)
 
     def report(share: float, what: str) -> None:
         nonlocal latest
-        with lock:
-            latest = (share, what)
-            if bar is not None:
-                bar(share, what)
+        latest = (share, what)
+        if bar is not None:
+            bar(share, what)
 
     timer = threading.Timer(PATIENCE_S, begin)
     timer.daemon = True
@@ -151,15 +140,14 @@ def late_progress(title: str) -> Iterator[Progress]:
             yield report
         finally:
             timer.cancel()
-            with lock:
-                over = True
+            timer.join()
 
 
 def stage_lines(title: str) -> Progress:
     """Progress as one line per stage, for where a bar would disturb what others print."""
     last = ""
 
-    def report(share: float, what: str) -> None:  # noqa: ARG001 - the signature of progress
+    def report(_: float, what: str) -> None:
         nonlocal last
         if what != last:
             say(f"{title}: {what}")
@@ -214,13 +202,13 @@ def set_by(*numbers: signal.Signals) -> Iterator[threading.Event]:
 
 
 @contextmanager
-def live() -> "Iterator[Callable[[Sequence[RenderableType]], None]]":
+def live(*, on_stderr: bool = False) -> "Iterator[Callable[[Sequence[RenderableType]], None]]":
     """Tables that take the place of those before, on a terminal; else they follow each other."""
-    if not sys.stdout.isatty():
+    if not (on_stderr or sys.stdout.isatty()):
         yield lambda tables: show(*tables)
         return
-    from rich.console import Group
+    from rich.console import Console, Group
     from rich.live import Live
 
-    with Live(auto_refresh=False) as place:
+    with Live(console=Console(stderr=on_stderr), transient=on_stderr, auto_refresh=False) as place:
         yield lambda tables: place.update(Group(*tables), refresh=True)

@@ -9,6 +9,7 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError
+from chainshaper.values.files import new_file
 from chainshaper.values.plan_choices import Fallback, NodeKind
 
 
@@ -48,34 +49,26 @@ def plan(
 
     From a recording, or from bare latencies with their period.
     """
+    from chainshaper import planning
     from chainshaper.linux.scheduling import available_cores
-    from chainshaper.planning import (
-        band_choice,
-        plan_application,
-        plan_json,
-        plan_warnings,
-        publish_slots,
-    )
     from chainshaper.planning.profile import deciding_cycles, doubts_about
     from chainshaper.planning.request import on_cores
-    from chainshaper.reporting.figures import ENDINGS, draw_curve
-    from chainshaper.reporting.overviews import bands_table, choice_json, choice_table, plan_table
-    from chainshaper.values.files import new_file
+    from chainshaper.reporting import figures, overviews
 
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
     if curve is not None and request.bands != "auto":
         raise InputError("--curve draws what --bands auto looked at: add --bands auto")
     if curve is not None:
-        curve = new_file(curve, ENDINGS)  # before a plan is written
+        new_file(curve, figures.ENDINGS)  # before a plan is written
     wanted: list[str | None] = [*chain] if chain else [None]
     how: dict[str, Any] = {"modes": request.modes, "since_ns": since, "until_ns": until}
     how["mode_recordings"] = opt.mode_profiles(mode_profile, request)
     profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], how)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
-    outliers = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
-    strange = [doubt for one in profiles for doubt in doubts_about(one)]
-    strange += [
+    doubts = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
+    doubts += [doubt for one in profiles for doubt in doubts_about(one)]
+    doubts += [
         f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
         for core in sorted({*(request.cores or ())} - {*available_cores()})
     ]
@@ -84,26 +77,26 @@ def plan(
             raise InputError("--sink goes with one chain: name the other output with --chain, too")
         if curve is not None:
             raise InputError("--curve goes with one chain: plan it alone")
-        joint, remarks = plan_application(planned, request)
-        remarks += [*outliers, *strange]
-        _print_several(joint.chains, remarks, output, json)
+        joint, remarks = planning.plan_application(planned, request)
+        _print_several(joint.chains, remarks + doubts, output, json)
         return
     made = cs.plan_chain(planned[0], request, sinks)
-    choice = band_choice(made, planned[0], request, sinks) if request.bands == "auto" else None
+    of_auto = request.bands == "auto"
+    choice = planning.band_choice(made, planned[0], request, sinks) if of_auto else None
     if output is not None:
         cs.save_plan(made, output)
-    warnings = [*on_cores(profiles, request)[1], *outliers, *strange, *plan_warnings(made)]
-    values: dict[str, Any] = {**plan_json(made), "warnings": warnings}
-    tables = [plan_table(made)]
-    if len(publish_slots(made)) > 1 or made.modes is not None:
-        tables.append(bands_table(made))
+    warnings = [*on_cores(profiles, request)[1], *doubts, *planning.plan_warnings(made)]
+    values: dict[str, Any] = {**planning.plan_json(made), "warnings": warnings}
+    tables = [overviews.plan_table(made)]
+    if len(planning.publish_slots(made)) > 1 or made.modes is not None:
+        tables.append(overviews.bands_table(made))
     if choice is not None:
-        values["choice"] = choice_json(choice)
-        tables.append(choice_table(choice))
+        values["choice"] = overviews.choice_json(choice)
+        tables.append(overviews.choice_table(choice))
         if curve is not None:
-            draw_curve(choice, curve)
+            figures.draw_curve(choice, curve)
     if out.present(json, values, *tables):
-        out.notes(values["warnings"])
+        out.notes(warnings)
         for path in filter(None, (curve, output)):
             out.show_line(path)
 
@@ -156,23 +149,22 @@ def _print_several(
     placed: "Sequence[cs.Plan]", remarks: Sequence[str], output: Path | None, json: bool
 ) -> None:
     """Plans of several chains, written as one plan of all, or into a folder with a plan each."""
-    from chainshaper.planning import plan_json, plan_warnings, save_plans
+    from chainshaper import planning
     from chainshaper.planning.application_plan import combined
     from chainshaper.planning.several_chains import with_own_names
     from chainshaper.reporting.overviews import plan_table
 
     written = [output] if output is not None else []
     if output is not None and output.suffix not in opt.DESCRIPTIONS:
-        written = save_plans(placed, output)
+        written = planning.save_plans(placed, output)
     else:
         joint = combined(with_own_names(placed))
         placed = joint.chains
         if output is not None:
             cs.save_application_plan(joint, output)
-    warnings = [*remarks, *plan_warnings(*placed)]
-    files = [str(path) for path in written]
-    values = {"plans": [plan_json(one) for one in placed], "files": files, "warnings": warnings}
-    if out.present(json, values, *map(plan_table, placed)):
+    warnings = [*remarks, *planning.plan_warnings(*placed)]
+    values = {"plans": [*map(planning.plan_json, placed)], "files": [*map(str, written)]}
+    if out.present(json, values | {"warnings": warnings}, *map(plan_table, placed)):
         out.notes(warnings)
         for path in written:
             out.show_line(path)
@@ -212,24 +204,21 @@ def sweep(
     from chainshaper.flow.sweep import parse_axis, rows_beside
     from chainshaper.reporting.figures import ENDINGS, draw_sweep
     from chainshaper.reporting.overviews import sweep_table
-    from chainshaper.values.files import new_file
 
     if workers is not None and scheduler is not None:
         raise InputError("a cluster has workers of its own: leave out --workers, or --scheduler")
     if draw is not None:
-        draw = new_file(draw, ENDINGS)
-    described = cs.load_application(application)
-    in_force = None if plan is None else cs.load_plan(plan)
+        new_file(draw, ENDINGS)
     axes = [parse_axis(text) for text in vary]
     if len(dict(axes)) < len(axes):
         raise InputError("an axis is given twice: give all of its values in one --vary")
     try:
         with out.progress("sweep") as report:
             frame = cs.sweep(
-                described,
+                cs.load_application(application),
                 dict(axes),
                 output,
-                in_force,
+                None if plan is None else cs.load_plan(plan),
                 cycles=cycles,
                 seed=seed,
                 workers=workers,
@@ -312,13 +301,11 @@ def splice(
         if fallback is not None:
             raise InputError("a throttler has no fallback: --fallback goes with a plan")
         if message_type is not None or node in ("typed", "component"):
-            raise InputError(
-                "a throttler is for all types: choose --node python or cpp, and no --type"
-            )
+            said = "a throttler is for all types: choose --node python or cpp, and no --type"
+            raise InputError(said)
         if not files:
-            raise InputError(
-                "give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
-            )
+            said = "give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
+            raise InputError(said)
         known = opt.recording_of(recording)
         splicing = cs.splice_throttlers(throttled_inputs(throttle), recording=known, **common)
     elif plan is None or not files:
@@ -366,11 +353,8 @@ def _show_splicing(
         loads = [f"{key}={value}" for key, value in splicing.environment.items()]
         out.show_line("what is launched gets the gate; what starts otherwise, as a service, by:")
         out.show_line(shlex.join(["env", *loads, "COMMAND"]))
-    for found in splicing.redirected:
-        for started in found["redirected"]:
-            out.show_line(
-                f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}"
-            )
+    for started in (one for found in splicing.redirected for one in found["redirected"]):
+        out.show_line(f"would add to {started['as']}: {' '.join(started['rules']) or 'nothing'}")
     out.notes(splicing.notes)
     if dry_run:
         return

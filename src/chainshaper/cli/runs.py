@@ -6,6 +6,7 @@ import sys
 import time
 from contextlib import ExitStack, suppress
 from datetime import datetime
+from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +17,9 @@ from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables, judge
+from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.plan_choices import NodeKind
 
 if TYPE_CHECKING:
@@ -27,16 +30,9 @@ if TYPE_CHECKING:
     from chainshaper.verify.budgets import Budget, Judged
     from chainshaper.verify.watch import Seen, Watch
 
-MIB = 1 << 20
 STDERR = 2
-PATIENCE_NS = 10_000_000_000
-"""So long after nodes are there `watch` names what has not run of a budget."""
-
-MOST_RECORDED = 100
-"""Recordings that `watch --budget` writes by itself: a limit that breaks again and again for weeks
-would fill the robot's disk."""
-
-SHAPING_DURATION_NS = 60_000_000_000
+PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
+MOST_RECORDED = 100  # by `watch --budget` itself: a limit that breaks for weeks fills no disk
 
 COMMAND: list[str] | None = opt.argument(
     "[-- COMMAND…]", "Starts the application, such as `ros2 launch …`; ended with the recording."
@@ -76,7 +72,7 @@ def demo(
 
     folder = output or Path(f"chainshaper-demo-{datetime.now():%Y%m%d-%H%M%S}")
     with out.progress("demo") as report:
-        result = run_demo(
+        compared = run_demo(
             folder,
             application=application,
             cycles=cycles,
@@ -86,12 +82,14 @@ def demo(
             planned=out.warn,
             progress=report,
         )
-    tables = [callback_table(result.callbacks), plan_table(result.plan)]
-    tables.append(comparison_tables(result.comparison)[0])
-    if out.present(json, comparison_json(result.comparison) | {"folder": str(folder)}, *tables):
-        out.notes(result.notes)
+    before, after = (one.recording for one in compared.measurements)
+    flow = cs.data_flow(before.events, before.info.clock_offset_ns)
+    tables = [callback_table(cs.callback_statistics(flow))]
+    tables += [plan_table(cs.load_plan(folder / "plan.yaml")), comparison_tables(compared)[0]]
+    if out.present(json, comparison_json(compared) | {"folder": str(folder)}, *tables):
+        out.notes(dict.fromkeys((*before.info.notes, *after.info.notes)))
         out.show_line(folder.absolute())
-        judge([result.comparison], strict=False, json=json)
+        judge([compared], strict=False, json=json)
 
 
 def init(
@@ -104,7 +102,6 @@ def init(
     Edit its nodes, callbacks and execution times; `chainshaper run` and `simulate` take it.
     """
     from chainshaper.flow.described import synthetic_chain
-    from chainshaper.values.files import new_file, write_whole
 
     write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])
     out.show_line(output)
@@ -216,13 +213,9 @@ def record(
             "no command given: `chainshaper record -o REC -- ros2 launch …`; to attach to what "
             "runs already, add `--source ebpf`, or `--source preload` if it has the library"
         )
+    how: dict[str, Any] = {"pids": pid or [], "users": user or [], "watch_stalls": watch_stalls}
     _record_and_show(
-        *(output, command or [], json, buffer),
-        source=source,
-        duration_ns=duration,
-        pids=pid or [],
-        users=user or [],
-        watch_stalls=watch_stalls,
+        output, command or [], json, buffer, source=source, duration_ns=duration, **how
     )
 
 
@@ -230,35 +223,31 @@ def _record_and_show(
     output: Path, command: list[str], json: bool, buffer: int | None, **how: Any
 ) -> None:
     """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
-    from chainshaper.linux.own_processes import end_in_words
-
     with out.stop_on_signals() as stop:
         recorded = cs.record_command(
             output,
             command,
             command_stdout=STDERR if json else None,  # standard output is ours
-            buffer=buffer and buffer * MIB,
+            buffer=buffer and buffer << 20,
             stop=stop,
             progress=out.stage_lines("record"),
             **how,
         )
     recording = recorded.recording
-    count = int(cs.event_counts(recording)["count"].sum())
+    events = int(cs.event_counts(recording)["count"].sum())
     values = {
         "recording": str(recording.path),
-        "events": count,
+        "events": events,
         "lost": recording.info.lost,
         "exit_code": recorded.exit_code,
         "notes": list(recording.info.notes),
     }
     if out.present(json, values):
         out.show_line(recording.path)
-    out.notes((*recording.info.notes, f"{count} events; {out.lost_events(recording)}"))
+    out.notes((*recording.info.notes, f"{events} events; {out.lost_events(recording)}"))
     if recorded.exit_code:
-        raise OperationError(
-            f"the command {end_in_words(recorded.exit_code)}; what was recorded until then is in "
-            f"{recording.path}"
-        )
+        ended = f"the command {end_in_words(recorded.exit_code)}"
+        raise OperationError(f"{ended}; what was recorded until then is in {recording.path}")
 
 
 def watch(
@@ -309,14 +298,7 @@ def watch(
     The application needs the library in front of ROS 2: `eval "$(chainshaper watch --environment)"`
     before it is started, or start it here, as COMMAND. Watching needs no root and changes nothing.
     """
-    from chainshaper.linux.own_processes import (
-        check_command,
-        end_command,
-        end_in_words,
-        start_command,
-    )
     from chainshaper.linux.processes import run_users
-    from chainshaper.planning import load_application_plan
     from chainshaper.reporting.overviews import watch_tables
     from chainshaper.sources.preload import installed_library, preloading
     from chainshaper.values.recording import refuse_existing
@@ -326,11 +308,10 @@ def watch(
     if environment:
         out.show_line(f"export LD_PRELOAD={shlex.quote(preloading(installed_library()))}")
         return
-    known = None if plan is None else load_application_plan(plan)
+    known = opt.plan_in_force(plan)
     specs = () if known is None else (one.chain.spec for one in known.chains)
     limits = Budget() if budget is None else load_budget(budget)
-    chains = [*(chain or filter(None, specs)), *(one.chain for one in limits.chains)]
-    chains = list(dict.fromkeys(chains))
+    chains = dict.fromkeys((*(chain or filter(None, specs)), *(one.chain for one in limits.chains)))
     if not chains:
         raise InputError(
             "no chain is named: give --chain FIRST..LAST, such as /t1../t5, or --plan or --budget"
@@ -349,7 +330,7 @@ def watch(
         export = until.enter_context(exporting(metrics, otlp))
         asked = until.enter_context(out.set_by(signal.SIGQUIT))
         watched = Watch(
-            chains,
+            list(chains),
             users=run_users(user or []),
             plan=known,
             longest_ns=longest,
@@ -407,8 +388,13 @@ def _judging(
 
 def _save(watched: "Watch", recorder: Path, reasons: "Sequence[str]" = ()) -> None:
     """Have the flight recorder write; that it cannot is no reason to stop watching."""
+    name = f"watch-{datetime.now():%Y%m%d-%H%M%S}"
     try:
-        folder = _own_folder(recorder / f"watch-{datetime.now():%Y%m%d-%H%M%S}")
+        for number in count(1):  # another watch may have taken the name
+            folder = recorder / (name if number == 1 else f"{name}-{number}")
+            with suppress(FileExistsError):
+                folder.mkdir()
+                break
         try:
             out.say(f"the last ten seconds are in {watched.save(folder, reasons=reasons).path}")
         finally:
@@ -416,17 +402,6 @@ def _save(watched: "Watch", recorder: Path, reasons: "Sequence[str]" = ()) -> No
                 folder.rmdir()  # it is empty: nothing was written
     except (ChainshaperError, OSError) as error:
         out.say(f"the flight recorder has not written: {error}")
-
-
-def _own_folder(wanted: Path) -> Path:
-    """A new folder of this name, or with a number behind it if another watch has taken it."""
-    folder, number = wanted, 1
-    while True:
-        with suppress(FileExistsError):
-            folder.mkdir()
-            return folder
-        number += 1
-        folder = wanted.with_name(f"{wanted.name}-{number}")
 
 
 def _publisher(watched: "Watch", until: ExitStack) -> "Callable[[Seen], None]":
@@ -489,7 +464,6 @@ def profile(
     part of --duration.
     """
     from chainshaper.flow.profiling import check_profiling, profiled_cores, undelayed
-    from chainshaper.linux.own_processes import check_command
     from chainshaper.planning.request import best_effort_cores
     from chainshaper.values.recording import refuse_existing
 
@@ -507,15 +481,14 @@ def profile(
         raise InputError("--core is for one core, --cores for several: give one of them")
     if core is not None:
         request = cs.PlanRequest(cores=(core,))
-    cores = check_profiling(request.cores)
-    names = [f"/{name.strip('/')}" for name in node or ()]
-    earlier = opt.recording_of(like)
+    cores, earlier = check_profiling(request.cores), opt.recording_of(like)
     if len(cores) > 1 and not (earlier and chains):
         raise InputError(
             "--cores are distributed by what chains do at the same time: name these with --chain,"
             " and a recording that has them with --like"
         )
-    core_of, seen = dict.fromkeys(names, cores[0]), tuple["cs.Profile", ...]()
+    core_of = {f"/{name.strip('/')}": cores[0] for name in node or ()}
+    seen = tuple["cs.Profile", ...]()
     if earlier is not None and chains:
         seen, found = profiled_cores(earlier, chains, request)
         core_of |= found
@@ -570,8 +543,8 @@ def shape(
     period: int | None = opt.option(
         "--period DURATION>0", "Period of a chain that no timer starts."
     ),
-    duration: int | None = opt.option(
-        "--duration DURATION", "How long to measure, before and after. Default: 60s."
+    duration: int = opt.option(
+        "--duration DURATION>0", "How long to measure, before and after.", 60_000_000_000
     ),
     since: int = opt.SINCE,
     until: int | None = opt.UNTIL,
@@ -600,8 +573,7 @@ def shape(
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, **following}
-        shaped = _shape_described(Path(words[0]), Path(words[1]), output, how)
-        judge(shaped, strict=strict, json=False)
+        _shape_described(*map(Path, words), output, strict, how)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
@@ -617,7 +589,7 @@ def shape(
         mode_recordings=opt.mode_profiles(mode_profile, request),
         since_ns=since,
         until_ns=until,
-        duration_ns=duration or SHAPING_DURATION_NS,
+        duration_ns=duration,
         source=source,
         node=node,
         back_end=backend,
@@ -628,21 +600,15 @@ def shape(
 
 
 def _shape_described(
-    application: Path, plan: Path, output: Path, how: dict[str, Any]
-) -> "Sequence[cs.Comparison]":
+    application: Path, plan: Path, output: Path, strict: bool, how: dict[str, Any]
+) -> None:
     from chainshaper.verify.overruns import dropped_text, overruns_text
 
     described, planned = cs.load_application(application), cs.load_application_plan(plan)
     out.warn(planned)
     with out.progress(f"shaping {described.name}") as report:
-        recording = cs.shape_application(
-            described,
-            planned,
-            output,
-            command=sys.argv,
-            progress=report,
-            **how,
-        )
+        how |= {"command": sys.argv, "progress": report}
+        recording = cs.shape_application(described, planned, output, **how)
     comparisons = cs.compare_chains([recording], least=1)
     for one in comparisons:
         about = f"{one.chain}: " if len(comparisons) > 1 else ""
@@ -653,7 +619,7 @@ def _shape_described(
             out.notes([about + dropped_text(measured.dropped)])
     out.notes(recording.info.notes)
     out.show_line(recording.path)
-    return comparisons
+    judge(comparisons, strict=strict, json=False)
 
 
 def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, **how: Any) -> None:

@@ -1,6 +1,7 @@
 """Verbs that look at recordings and traces, one or several, and write what they find elsewhere."""
 
 from dataclasses import asdict
+from glob import glob, has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.files import new_file, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -19,11 +21,11 @@ if TYPE_CHECKING:
 
 def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
-    from chainshaper.reporting.overviews import contents_json, contents_table
+    from chainshaper.reporting import overviews
 
     with out.opened("info", trace, overview=True) as (recording, _):
-        contents = contents_json(recording)
-    if out.present(json, contents, *contents_table(recording)):
+        contents = overviews.contents_json(recording)
+    if out.present(json, contents, *overviews.contents_table(recording)):
         out.show_line(out.lost_events(recording))
         out.notes(contents["notes"])
 
@@ -38,7 +40,6 @@ def describe(
     `chainshaper simulate` and `run` take it; edit it as you like.
     """
     from chainshaper.flow.exploration import application_file
-    from chainshaper.values.files import new_file, write_whole
 
     new_file(output, opt.DESCRIPTIONS)
     with out.opened("describe", trace) as (recording, _):
@@ -61,7 +62,6 @@ def graph(
 ) -> None:
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
     from chainshaper.reporting import graph_drawing
-    from chainshaper.values.files import new_file
 
     if output is not None:
         new_file(output, graph_drawing.ENDINGS)
@@ -84,12 +84,12 @@ def graph(
 
 def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
-    from chainshaper.reporting.overviews import callback_rows, callback_table
+    from chainshaper.reporting import overviews
 
     with out.opened("callbacks", trace) as (recording, _):
         flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
-        statistics = cs.callback_statistics(flow)
-    if out.present(json, callback_rows(statistics), callback_table(statistics)):
+        found = cs.callback_statistics(flow)
+    if out.present(json, overviews.callback_rows(found), overviews.callback_table(found)):
         out.show_line(out.lost_events(recording))
         out.notes((*recording.info.notes, *flow.notes))
     elif any(recording.info.lost.values()):  # the array has no place for it
@@ -112,17 +112,17 @@ def chains(
     The heaviest chain has the largest sum of its callbacks' mean response times.
     """
     from chainshaper.analysis import graph_of
-    from chainshaper.reporting.overviews import chain_table, chains_json, count_text
+    from chainshaper.reporting import overviews
 
     with out.opened("chains", trace) as (recording, report):
         flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
         report(0.9, "searching chains")
-        application = graph_of(flow)
-        found = cs.list_chains(flow, start, end, limit)
+        application, found = graph_of(flow), cs.list_chains(flow, start, end, limit)
     remarks = [*recording.info.notes, *flow.notes]
-    values = chains_json(application, found) | {"lost": recording.info.lost, "notes": remarks}
-    if out.present(json, values, chain_table(application, found)):
-        out.show_line(f"{count_text(found)}; {out.lost_events(recording)}")
+    values = overviews.chains_json(application, found)
+    values |= {"lost": recording.info.lost, "notes": remarks}
+    if out.present(json, values, overviews.chain_table(application, found)):
+        out.show_line(f"{overviews.count_text(found)}; {out.lost_events(recording)}")
         out.notes(remarks)
 
 
@@ -145,8 +145,7 @@ def latency(
 
     if instances and not json:
         raise InputError("--instances goes with --json: add it")
-    if chains is not None:
-        chain = named_chain(chains, chain)
+    chain = chain if chains is None else named_chain(chains, chain)
     with out.opened("latency", trace) as (recording, _):
         measurement = cs.measure_latency(recording, chain)
     analysis = measurement.analysis
@@ -169,23 +168,19 @@ def convert(trace: list[Path] = opt.TRACE, output: Path = opt.RECORDING_OUTPUT) 
     out.notes((*written.info.notes, out.lost_events(written)))
 
 
-FEW = 3
-"""More recordings than these get an overview."""
+FEW = 3  # more recordings than these get an overview
 
 
 def budget(
     trace: list[Path] = opt.TRACE,
     output: Path = opt.option("--output -o FILE", "The budget file.", ...),
-    chain: list[str] | None = opt.option(
-        "--chain FIRST..LAST", "A chain (may be repeated). Default: the one the recording names."
-    ),
+    chain: list[str] | None = opt.CHAINS,
     room: float = opt.option("--room SHARE", "How far limits lie beyond what was measured.", 0.1),
 ) -> None:
     """Propose a budget: limits for chains, their hops and callbacks, as a recording has them.
 
     It is a YAML file that you edit; `chainshaper check` says which recordings keep to it.
     """
-    from chainshaper.values.files import new_file
     from chainshaper.verify.budgets import propose_budget, save_budget
 
     new_file(output)
@@ -198,15 +193,12 @@ def _matching(recordings: list[Path]) -> list[Path]:
     """Folders, and those that a pattern in quotes means, which the shell left to us."""
     found: list[Path] = []
     for one in recordings:
-        own = [one]
-        if not one.exists() and any(letter in str(one) for letter in "*?["):
-            try:
-                own = sorted(Path(one.anchor or ".").glob(str(one.relative_to(one.anchor))))
-            except ValueError as error:  # such as runs/**x
-                raise InputError(f"{one} is no pattern: {error}") from error
-        if not own:
+        if one.exists() or not has_magic(str(one)):
+            found.append(one)
+        elif own := glob(str(one), recursive=True):  # noqa: PTH207 - as a shell: hidden ones aside
+            found += map(Path, sorted(own))
+        else:
             raise InputError(f"{one}: no folder has such a name; see that the pattern is right")
-        found += own
     return found
 
 
@@ -216,10 +208,7 @@ def check(
     baseline: list[Path] | None = opt.option(
         "--baseline REC", "Recordings of before (may be repeated): is a callback slower now?"
     ),
-    chain: list[str] | None = opt.option(
-        "--chain FIRST..LAST",
-        "A chain beside the baseline (may be repeated). Default: the one that recordings name.",
-    ),
+    chain: list[str] | None = opt.CHAINS,
     junit: Path | None = opt.option("--junit FILE", "Also write JUnit XML, for a CI system."),
     markdown: Path | None = opt.option("--markdown FILE", "Also write Markdown, for a review."),
     scheduler: str | None = opt.SCHEDULER,
@@ -231,7 +220,6 @@ def check(
     --baseline all recordings together are compared with those of before, callback by callback.
     """
     from chainshaper.reporting.latency import JSON_FORMAT
-    from chainshaper.values.files import new_file, write_whole
     from chainshaper.verify import budgets
 
     if budget is None and not baseline:
@@ -241,20 +229,19 @@ def check(
         new_file(wanted)
     found: list[list[Judged]] = []
     compared: list[Compared] = []
-    notes: list[str] = []
     paths, before = _matching(recordings), _matching(baseline or [])
     with out.late_progress("check") as report:
         if budget is not None:
             found = budgets.check_budgets(paths, limits, report, scheduler)
-            every_one = (one for own in found for one in own)  # none where a budget limits nothing
-            unread = {one.recording for one in every_one if one.what == budgets.EVENTS}
-            paths = [path for path in paths if str(path) not in unread]
+        judged = [one for own in found for one in own]
+        unread = {one.recording for one in judged if one.what == budgets.EVENTS}
+        paths = [path for path in paths if str(path) not in unread]
         if before and paths:
             from chainshaper.verify.slowdowns import slowdowns_in
 
             chains = chain or [one.chain for one in limits.chains]
             compared, notes = slowdowns_in(paths, before, chains, report, scheduler)
-    judged = [one for own in found for one in own]
+            out.notes(notes)
     every: list[Judged | Compared] = [*judged, *compared]
     if junit is not None:
         write_whole(junit, [budgets.junit_report(every).encode()])
@@ -263,57 +250,51 @@ def check(
         parts = [budgets.markdown_report(judged)] if judged else []
         parts += [budgets.markdown_report(compared, words)] if compared else []
         write_whole(markdown, ["\n".join(parts).encode()])
-    out.notes(notes)
     if json:
         said = ("where", "what", "met", "text")
         rows = [asdict(one) | {name: getattr(one, name) for name in said} for one in every]
         out.print_json({"format": JSON_FORMAT, "limits": rows})
+    else:
+        _show_checked(found, compared, budget)
+    broken = f"limits of {budget} are broken"
     verdicts = [
-        _limits_shown(found, str(budget), json) if budget is not None else None,
-        _callbacks_shown(compared, json) if compared else None,
+        f"{wrong} of {len(checked)} {said}"
+        for checked, said in ((judged, broken), (compared, "callbacks are slower than before"))
+        if (wrong := sum(not one.met for one in checked))
     ]
-    if any(verdicts):
-        raise OperationError("; ".join(filter(None, verdicts)))
+    if verdicts:
+        raise OperationError("; ".join(verdicts))
 
 
-def _limits_shown(found: "list[list[Judged]]", budget: str, json: bool) -> str | None:
-    """What breaks of a budget; the number in words, if any."""
+def _show_checked(
+    found: "list[list[Judged]]", compared: "list[Compared]", budget: Path | None
+) -> None:
+    """The limits that are broken and the callbacks that are slower, or that none is."""
     from chainshaper.reporting.overviews import broken_table, fleet_table
 
     judged = [one for own in found for one in own]
-    broken = [one for one in judged if not one.met]
-    if broken and not json:
+    if broken := [one for one in judged if not one.met]:
         out.show(*([fleet_table(found)] if len(found) > FEW else []), broken_table(broken))
-    elif not json:
+    elif budget is not None:
         out.show_line(f"all {len(judged)} limits of {budget} are met")
-    return f"{len(broken)} of {len(judged)} limits of {budget} are broken" if broken else None
-
-
-def _callbacks_shown(compared: "list[Compared]", json: bool) -> str | None:
-    """Callbacks that are slower; the number in words, if any."""
-    slower = [one for one in compared if not one.met]
-    for one in [] if json else slower:
-        out.show_line(one.text)
-    if not (slower or json):
-        out.show_line(f"none of {len(compared)} callbacks is slower than before")
-    return f"{len(slower)} of {len(compared)} callbacks are slower than before" if slower else None
+    slower = [one.text for one in compared if not one.met]
+    if compared:
+        said = f"none of {len(compared)} callbacks is slower than before"
+        out.show_line("\n".join(slower) or said)
 
 
 def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
-    """For each chain recordings beside each other; then each prediction beside its measurement.
-
-    Several chains have an overview in front, a row for each.
+    """An overview of several chains; of each, recordings beside each other, then each prediction
+    beside its measurement.
     """
-    from chainshaper.reporting.latency import comparison_table, overview_table, prediction_table
+    from chainshaper.reporting import latency
 
-    tables = [overview_table(comparisons)] if len(comparisons) > 1 else []
+    tables = [latency.overview_table(comparisons)] if len(comparisons) > 1 else []
     for comparison in comparisons:
-        predictions = [
-            prediction_table(one.prediction, one.recording.path.name)
-            for one in comparison.measurements
-            if one.prediction is not None
-        ]
-        tables += [comparison_table(comparison), *predictions]
+        tables.append(latency.comparison_table(comparison))
+        for one in comparison.measurements:
+            if one.prediction is not None:
+                tables.append(latency.prediction_table(one.prediction, one.recording.path.name))
     return tables
 
 
@@ -324,19 +305,18 @@ def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -
     """
     from chainshaper.reporting.latency import verdict
 
-    several = len(comparisons) > 1
-    found = [
-        (met, f"{one.chain}: {text}" if several else text)
-        for one in comparisons
-        for measured in one.measurements
-        if measured.plan is not None
-        for met, text in [verdict(measured)]
-    ]
-    for _, text in found if not json else ():
-        out.show_line(text)
-    if strict and not found:
+    all_met = list[bool | None]()
+    for comparison in comparisons:
+        about = f"{comparison.chain}: " if len(comparisons) > 1 else ""
+        for measured in comparison.measurements:
+            if measured.plan is not None:
+                met, text = verdict(measured)
+                all_met.append(met)
+                if not json:
+                    out.show_line(about + text)
+    if strict and not all_met:
         raise InputError("--strict judges a plan's promise: name the plan in force with --plan")
-    if strict and not all(met for met, _ in found):
+    if strict and not all(all_met):
         raise OperationError("the plan's promise is not met (--strict)")
 
 
@@ -390,18 +370,15 @@ def report(
     """
     from chainshaper.reporting.latency import comparisons_json
     from chainshaper.reporting.page import ENDINGS
-    from chainshaper.values.files import new_file
 
     new_file(output, ENDINGS)
     in_force = opt.plan_in_force(plan)
     with out.late_progress("report") as progress:
         comparisons = cs.compare_chains(recordings, chain, in_force, least=1, progress=progress)
         progress(0.9, "drawing")
-        written = cs.write_report(comparisons, output, cycles or ())
-    if json:
-        out.print_json({"report": str(written.absolute()), **comparisons_json(comparisons)})
-        return
-    out.show_line(written.absolute())
+        written = cs.write_report(comparisons, output, cycles or ()).absolute()
+    if out.present(json, {"report": str(written), **comparisons_json(comparisons)}):
+        out.show_line(written)
 
 
 def export(
@@ -421,7 +398,6 @@ def export(
     if perfetto == mcap:
         raise InputError("the format is missing: add --perfetto or --mcap")
     from chainshaper.reporting.perfetto import ENDINGS
-    from chainshaper.values.files import new_file
 
     new_file(output, (".mcap",) if mcap else ENDINGS)
     in_force = opt.plan_in_force(plan)
