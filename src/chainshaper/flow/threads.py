@@ -1,9 +1,7 @@
 """The threads of a running application, and what carrying out a plan would change of them.
 
-The functions behind `chainshaper threads` and `chainshaper apply --dry-run`. What /proc shows is
-joined with what a recording of the same processes saw, which LTTng numbers as these do themselves,
-in their own pid namespace. Which nodes a process has, its creation events say; which threads
-execute, the callbacks they ran.
+What /proc shows is joined with what a recording of the same processes saw: their creation events
+say which nodes a process has, the callbacks that ran which threads execute.
 """
 
 import math
@@ -18,49 +16,24 @@ from functools import partial
 from itertools import combinations, pairwise
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, NamedTuple, cast
+from typing import TYPE_CHECKING, TypeAlias, cast
 from xml.etree import ElementTree
 
 from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end, gates
 from chainshaper.enforcement.litmus import litmus_commands
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads import (
-    Allocation,
-    RecordedProcess,
-    RecordedThread,
-    WantedScheduling,
-    allocate,
-)
+from chainshaper.enforcement.threads import Allocation, RecordedProcess, RecordedThread, allocate
 from chainshaper.flow.phase import Phase, measure_phase
-from chainshaper.linux.processes import (
-    ROUTERS,
-    descendants,
-    find_applications,
-    list_processes,
-    run_users,
-)
+from chainshaper.linux import processes as running
+from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread, ThreadRole, read_proc
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    combined,
-    open_until_done,
-    reach,
-    whole,
-    with_slots_moved,
-)
+from chainshaper.planning import application_plan as joint
+from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name, linked, with_windows
 from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
-from chainshaper.planning.plan import (
-    Adaptation,
-    Plan,
-    Server,
-    ShapingNode,
-    publisher_servers,
-    revised,
-    shaping_nodes,
-)
+from chainshaper.planning.plan import Adaptation, Plan, Server, publisher_servers, revised
 from chainshaper.planning.request import simulated_stamps
 from chainshaper.values.errors import InputError, OperationError
 
@@ -88,41 +61,38 @@ def find_threads(
 
     Raises InputError: there is no such process, or no such user.
     """
-    processes, taken = list_processes(), run_users(users)
-    notes: tuple[str, ...] = ()
-    strangers: str | None = None
-    gates: Sequence[ShapingNode] = ()
+    processes, taken = list_processes(), running.run_users(users)
+    plan = None if where is None or isinstance(where, int) else whole(where)
+    shaping, servers = ((), ()) if plan is None else (plan.shaping_nodes, plan.servers)
+    notes, strangers = tuple[str, ...](), None
     if recording is not None:
         recorded, notes = recorded_processes(recording)
     if isinstance(where, int):
-        family = descendants({process.pid: process.parent for process in processes}, where)
-        chosen = [process for process in processes if process.pid in family]
-        if not any(process.pid == where for process in chosen):
+        parent_of = {process.pid: process.parent for process in processes}
+        if where not in parent_of:
             raise InputError(f"no process {where}: it has ended, or is the kernel's own")
+        family = running.descendants(parent_of, where)
+        chosen = [process for process in processes if process.pid in family]
         taken |= {process.user for process in chosen if process.user is not None}
     else:
-        plan = None if where is None else whole(where)
-        gates, servers = (plan.shaping_nodes, plan.servers) if plan is not None else ((), ())
-        found = allocate(find_applications(processes), recorded, processes, taken)
+        found = allocate(running.find_applications(processes), recorded, processes, taken)
         nodes = defaultdict[int, set[str]](set)
-        for one in allocation.with_gates(found, gates).threads:
+        for one in allocation.with_gates(found, shaping).threads:
             nodes[one.thread.pid].update(one.nodes)
         planned = {thread.node: server.name for server in servers for thread in server.threads}
         hosted, chosen = None, [p for p in processes if nodes[p.pid] or p.participates]
         if plan is not None:  # receivers need not run
-            hosted = ROUTERS.union(planned, *(gate.receivers for gate in gates))
+            hosted = running.ROUTERS.union(planned, *(node.receivers for node in shaping))
             chosen = [process for process in processes if nodes[process.pid] & hosted]
         chosen = [process for process in chosen if process.user in taken]
         strangers = allocation.strangers_text(processes, taken, hosted)
-        running = sorted(set().union(*nodes.values()))
-        known = (
-            f"is not running, or cannot be recognised; running: {', '.join(running) or 'no node'}"
-        )
-        missing = [(node, server) for node, server in planned.items() if node not in running]
-        notes += tuple(f"node {node} of server {server} {known}" for node, server in missing)
+        there = sorted(set().union(*nodes.values()))
+        seen = f"is not running, or cannot be recognised; running: {', '.join(there) or 'no node'}"
+        missing = [(node, server) for node, server in planned.items() if node not in there]
+        notes += tuple(f"node {node} of server {server} {seen}" for node, server in missing)
         if plan is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
-    found = allocation.with_gates(allocate(chosen, recorded, processes, taken), gates)
+    found = allocation.with_gates(allocate(chosen, recorded, processes, taken), shaping)
     if recorded and not any(one.nodes_known_by == "recording" for one in found.threads):
         notes += ("none of these processes is in the recording: they were started after it",)
     notes += found.notes + (() if strangers is None else (strangers,))
@@ -139,41 +109,37 @@ def recorded_processes(
     from chainshaper.sources.system import own_pid_namespace
     from chainshaper.values import events
 
-    info, tables = recording.info, recording.events
-    if platform.node() not in info.host.split(", "):
-        return (), (
-            f"{recording.path} was taken on {info.host or 'an unknown machine'}, so its "
-            f"thread ids say nothing about {platform.node()}",
-        )
+    info, tables, taken_on = recording.info, recording.events, recording.info.host
+    if platform.node() not in taken_on.split(", "):
+        where = f"was taken on {taken_on or 'an unknown machine'}, so its thread ids say nothing"
+        return (), (f"{recording.path} {where} about {platform.node()}",)
     names = ("rcl_node_init", "callback_start")
     seen = pl.concat(events.table(tables, name).select("pid", "time") for name in names)
     last = seen.drop_nulls().group_by("pid").agg(pl.col("time").max())
     last_seen: dict[int, int] = dict(last.iter_rows())
     if any(instant > time.monotonic_ns() for instant in last_seen.values()):
-        return (), (
-            f"{recording.path} is from before this machine booted, so its thread ids say nothing",
-        )
+        when = "is from before this machine booted, so its thread ids say nothing"
+        return (), (f"{recording.path} {when}",)
     nodes: dict[int, list[str]] = {}
     created = events.table(tables, "rcl_node_init").select("pid", node=events.NODE_NAME)
     for pid, node in created.unique(maintain_order=True).iter_rows():
         nodes.setdefault(pid, []).append(node)
     threads = defaultdict[int, dict[int, RecordedThread]](dict)
     for one in info.threads:
-        own = (one.node,) if one.node else ()
-        role = cast(ThreadRole, one.role)
-        threads[one.pid][one.tid] = RecordedThread(one.tid, role, own, one.comm)
-        nodes.setdefault(one.pid, list(own))
+        node_of, role = (one.node,) if one.node else (), cast(ThreadRole, one.role)
+        threads[one.pid][one.tid] = RecordedThread(one.tid, role, node_of, one.comm)
+        nodes.setdefault(one.pid, list(node_of))
     ran = executors(data_flow(tables, info.clock_offset_ns))
     several = Counter(one.pid for one in ran)
     for pid, ran_of, _, names_of in ran:
-        apart = names_of if several[pid] > 1 else ()
+        own, apart = threads[pid], names_of if several[pid] > 1 else ()
         for tid, nodes_of in ran_of.items():
-            comm = threads[pid][tid].comm if tid in threads[pid] else ""
-            threads[pid][tid] = RecordedThread(tid, "executor", nodes_of, comm, apart)
+            comm = own[tid].comm if tid in own else ""
+            own[tid] = RecordedThread(tid, "executor", nodes_of, comm, apart)
     here = info.pid_namespace == own_pid_namespace()
     found = (
-        RecordedProcess(pid, tuple(own), tuple(threads[pid].values()), last_seen[pid], here)
-        for pid, own in nodes.items()
+        RecordedProcess(pid, tuple(names), tuple(threads[pid].values()), last_seen[pid], here)
+        for pid, names in nodes.items()
         if pid in last_seen
     )
     return tuple(found), ()
@@ -181,7 +147,7 @@ def recorded_processes(
 
 def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
     """Raises InputError: slots count from stamps of nodes that, by commands, follow `/clock`."""
-    stamped = [one for one in plan.chains if one.anchor == "stamp" and shaping_nodes(one)]
+    stamped = [one for one in plan.chains if one.anchor == "stamp" and one.shaping_node]
     servers = [server for one in stamped for server in one.servers]
     nodes = {thread.node for server in servers for thread in server.threads}
     for one in found.threads:
@@ -203,10 +169,8 @@ def _follows_clock(pid: int) -> bool:
 def check_publishers(
     plan: ApplicationPlan, found: Allocation, recording: "Recording | None" = None
 ) -> list[str]:
-    """Look whether processes publish as a plan that gates publishers' threads asks (design 1).
-
-    A recording knows the writers, the environment of a process how Fast DDS is to publish. Returns
-    what a person must know, one sentence each. Raises InputError: as :func:`.check_publication`.
+    """What a person must know where a plan gates publishers' threads (design 1): whether processes
+    publish so. The recording knows their writers. Raises InputError: as :func:`.check_publication`.
     """
     gating = [chain for chain in plan.chains if any(publisher_servers(chain))]
     if not gating or recording is None:
@@ -257,7 +221,7 @@ class Changes:
 
     back_end: str
     reason: str
-    threads: tuple[WantedScheduling, ...]
+    threads: tuple[allocation.WantedScheduling, ...]
     commands: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...]
 
@@ -284,14 +248,12 @@ def planned_changes(
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         notes = (*found.notes, *allocation.waiting_receivers(plan, threads))
         return Changes(choice.name, choice.reason, threads, (), notes)
-    notes, anchor_ns = found.notes, 0
+    notes, anchor_ns, members = found.notes, 0, dict[str, list[int | str]]()
     try:
         given, anchor_ns, waits_ns, _ = carried_out(given, found, phase_ns)
         table = server_table(open_until_done(given, waits_ns))
-        members: dict[str, list[int | str]] = {
-            name: [member.thread.tid for member in group]
-            for name, group in allocation.server_members(plan, found).items()
-        }
+        for name, group in allocation.server_members(plan, found).items():
+            members[name] = [member.thread.tid for member in group]
     except OperationError:
         members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
         notes += ("slots are counted from a beginning that is measured when the chain runs",)
@@ -332,8 +294,8 @@ def followed_chains(
                 other = chain_name(followed[server.name])
                 raise InputError(f"its server {server.name} is also that of {other}, which follows")
             chains[place] = revised(chain, adaptation=rules)
-            found = reach(plan, place, rules.max_latency_ns)
-            furthest = (with_slots_moved(plan, {place: by}) for by in found)
+            found = joint.reach(plan, place, rules.max_latency_ns)
+            furthest = (joint.with_slots_moved(plan, {place: by}) for by in found)
             tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
             if len(tables) > 1 and back_end not in ("freezer", "fifo"):
                 raise InputError(
@@ -346,7 +308,7 @@ def followed_chains(
             reaches[place] = found
     if not reaches:
         raise InputError("; ".join(why_not))
-    return combined(chains), reaches, why_not
+    return joint.combined(chains), reaches, why_not
 
 
 def server_table(plan: ApplicationPlan) -> ServerTable:
@@ -362,13 +324,12 @@ def server_table(plan: ApplicationPlan) -> ServerTable:
 
 def table_of(cycle_ns: int, servers: Iterable[Server], order: Sequence[str] = ()) -> ServerTable:
     """Servers of a plan without their nodes, whose threads are in this order."""
-    bare = (
-        ReservationServer(
-            *(one.name, one.core, one.priority, one.slots), places=places_in(one, order)
-        )
-        for one in servers
-    )
-    return ServerTable(cycle_ns, tuple(bare))
+
+    def bare(one: Server) -> ReservationServer:
+        own = (one.name, one.core, one.priority, one.slots)
+        return ReservationServer(*own, places=places_in(one, order))
+
+    return ServerTable(cycle_ns, tuple(map(bare, servers)))
 
 
 def order_in(server: Server, order: Sequence[str]) -> list[str]:
@@ -411,24 +372,19 @@ def chain_phases(
         (origin[0].pid, tuple(one.tid for one in origin), chain.cycle_ns)
         for chain, origin in zip(plan.chains, first_threads(plan, found), strict=True)
     ]
-    phases: dict[tuple[int, tuple[int, ...], int], Phase] = {}
     # Chains of one graph begin alike.
     parts = dict.fromkeys(one for place, one in enumerate(wanted) if place not in known)
+    phases = {}
     for number, one in enumerate(parts):
         report = partial(lambda number, share: progress((number + share) / len(parts)), number)
         phases[one] = measure_phase(*one, progress=report)
     return [known[k] if k in known else phases[one] for k, one in enumerate(wanted)]
 
 
-class CarriedOut(NamedTuple):
-    """A plan as it is carried out, and from when on its cycles count (CLOCK_MONOTONIC, modulo the
-    hyper-period). Where timers were measured: how long before slots they expire, and where.
-    """
-
-    plan: ApplicationPlan
-    anchor_ns: int
-    waits_ns: list[int]
-    phases: list[Phase]
+CarriedOut: TypeAlias = tuple[ApplicationPlan, int, list[int], list[Phase]]
+"""A plan as it is carried out, and from when on its cycles count (CLOCK_MONOTONIC, modulo the
+hyper-period). Where timers were measured: how long before slots they expire, and where.
+"""
 
 
 def carried_out(
@@ -446,15 +402,14 @@ def carried_out(
     Raises OperationError: a chain has no regular beginning, or as :func:`placed`.
     """
     if phase_ns is not None:
-        anchor_ns = phase_ns + LEAD_NS - plan.chains[0].offset_ns
-        return CarriedOut(plan, anchor_ns % plan.cycle_ns, [], [])
+        return plan, (phase_ns + LEAD_NS - plan.chains[0].offset_ns) % plan.cycle_ns, [], []
     phases = chain_phases(plan, found, progress, known)
     plan, anchor_ns = placed(plan, phases, gated=gated)
     waits_ns = [
         (anchor_ns + chain.offset_ns - phase.at_ns) % chain.cycle_ns
         for chain, phase in zip(plan.chains, phases, strict=True)
     ]
-    return CarriedOut(plan, anchor_ns, waits_ns, phases)
+    return plan, anchor_ns, waits_ns, phases
 
 
 def placed(
@@ -480,7 +435,7 @@ def placed(
         for k, chain in zip(group, own, strict=True):
             offset_ns = (chain.offset_ns + anchor_ns - first_ns) % chain.cycle_ns
             chains[k] = revised(chain, offset_ns=offset_ns)
-    return combined(chains), first_ns or 0
+    return joint.combined(chains), first_ns or 0
 
 
 def _around(
