@@ -1,9 +1,8 @@
 """From recordings to profiles, and to a plan.
 
 A chain in a graph waits at synchronising callbacks for branches that are not part of it (paper,
-section 2.3). Whoever plans slots for its callbacks has to plan for those branches too, so they are
-followed backwards here, from every input of a synchronising callback to what starts it, or to the
-node with which the chain begins: what feeds a subscription there is not planned for.
+section 2.3). Slots have to be planned for those too, so they are followed backwards, to what starts
+them or to the node with which the chain begins: what feeds a subscription there is not planned for.
 """
 
 from collections import Counter, defaultdict
@@ -57,22 +56,19 @@ def profile_chains(
 
     ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
     names. All times but ``every_latency_ns`` are over cycles that the machine did not disturb (of
-    fewer than two: over all): a stall is not part of the chain's latency, but its output is late
-    nevertheless. Of ``modes``, each has a profile of its own: of its recording or file of latencies
-    in ``mode_recordings``, or of the cycles that began in it, by the description of what ran. What
-    happened before ``since_ns`` of the recording, or from ``until_ns`` on, is left out.
+    fewer than two: over all). Of ``modes``, each has a profile of its own: of its recording or file
+    of latencies in ``mode_recordings``, or of the cycles that began in it, by the description of
+    what ran. What happened before ``since_ns`` or from ``until_ns`` on is left out.
 
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
     """
     recording = opened(recording)
     all_events = recording.events
-    starts = events.table(all_events, "callback_start")["time"]
-    begun = int(starts.min() or 0)  # type: ignore[arg-type]
+    begun = int(events.table(all_events, "callback_start")["time"].min() or 0)  # type: ignore[arg-type]
     if since_ns or until_ns is not None:
         until = None if until_ns is None else begun + until_ns
-        within = events.happened(all_events, begun + since_ns, until)
-        recording = replace(recording, events=within)
+        recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
     stages = [graph_stages(one.graph, one.chain) for one in analyses]
@@ -209,24 +205,24 @@ def _modes_in_force(
 
 
 def _period(analysis: LatencyAnalysis, given: int | None) -> int:
-    first = analysis.graph.callbacks[analysis.chain.callbacks[0]]
+    first, spec = analysis.graph.callbacks[analysis.chain.callbacks[0]], analysis.chain.spec
     if first.period_ns is not None and given not in (None, first.period_ns):
         raise InputError(
             "--period goes with --latencies, or with a chain that no timer starts:"
             f" {first.label} has its own period, leave it out"
         )
     period = given if first.period_ns is None else first.period_ns
-    if period is not None and period <= 0:
-        reason = f"chain {analysis.chain.spec} cannot have the period {duration_text(period)}"
+    if period is None:
+        apart = _between_starts(analysis)
+        seen = "" if apart is None else f" (starts are {duration_text(int(apart))} apart, mostly)"
+        raise InputError(
+            f"chain {spec} starts at {first.label}, which is no timer, so its period is not"
+            f" known{seen}: add --period, or begin the chain at the timer callback that starts it"
+        )
+    if period <= 0:
+        reason = f"chain {spec} cannot have the period {duration_text(period)}"
         raise InputError(f"{reason}: give one longer than 0 ms, or begin the chain at a timer")
-    if period is not None:
-        return period
-    apart = _between_starts(analysis)
-    seen = "" if apart is None else f" (starts are {duration_text(int(apart))} apart, mostly)"
-    raise InputError(
-        f"chain {analysis.chain.spec} starts at {first.label}, which is no timer, so its period is"
-        f" not known{seen}: add --period, or begin the chain at the timer callback that starts it"
-    )
+    return period
 
 
 def _between_starts(analysis: LatencyAnalysis) -> float | None:
@@ -240,14 +236,15 @@ def _simulated(flow: DataFlow, analysis: LatencyAnalysis) -> tuple[str, ...]:
     follow = set(flow.takes.filter(topic="/clock")["node"])
     found = tuple(dict.fromkeys(one.node for one in callbacks if one.node in follow))
     first, apart = callbacks[0], _between_starts(analysis)
-    speed = first.period_ns / apart if first.node in found and first.period_ns and apart else 1.0
-    if abs(speed - 1) >= _SAME_SPEED:
-        raise InputError(
-            f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
-            f" timer of {duration_text(first.period_ns or 0)} expires every"
-            f" {duration_text(round(int(apart or 0), -5))}. Replay at that speed (`ros2 bag play"
-            " --rate 1.0`), or start the nodes with use_sim_time:=false"
-        )
+    if first.node in found and first.period_ns and apart:
+        speed = first.period_ns / apart
+        if abs(speed - 1) >= _SAME_SPEED:
+            raise InputError(
+                f"{first.node} follows /clock, which runs at {speed:.2f} of the speed of time: its"
+                f" timer of {duration_text(first.period_ns)} expires every"
+                f" {duration_text(round(int(apart), -5))}. Replay at that speed (`ros2 bag play"
+                " --rate 1.0`), or start the nodes with use_sim_time:=false"
+            )
     return found
 
 
@@ -267,15 +264,14 @@ _Key = tuple[tuple[int, ...], str]  # of a stage: its callbacks, and the topic i
 def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     """The chain and the branches it waits for, along the graph; the chain's last stands last."""
     outside = _feeding(graph, chain)
-    along: list[_Key] = []
-    before: dict[int, list[_Key]] = {}  # of the chain's callbacks
-    of_chain: dict[int, _Key] = {}
+    along = list[_Key]()
+    before, of_chain = dict[int, list[_Key]](), dict[int, _Key]()  # by the chain's callbacks
     for number, topic in zip(chain.callbacks, chain.topics, strict=True):
         members = inputs_of(graph, graph.callbacks[number], topic) if along else (number,)
         before[number] = along[-1:]
         along.append((members, topic))
         of_chain.update(dict.fromkeys(members, along[-1]))
-    needs: dict[_Key, set[_Key]] = {}
+    needs, level = dict[_Key, set[_Key]](), dict[_Key, int]()
 
     def writers_of(topic: str | None) -> list[_Key]:
         return [
@@ -287,39 +283,25 @@ def graph_stages(graph: ApplicationGraph, chain: Chain) -> list[_Stage]:
     def follow(key: _Key, above: set[_Key]) -> None:
         needs[key] = set()
         for number in key[0]:
-            on_chain = key in along and number in before
-            read = graph.callbacks[number].trigger
+            on_chain, read = key in along and number in before, graph.callbacks[number].trigger
             for one in before[number] if on_chain else writers_of(read):
                 if one not in above:  # what feeds back comes from a cycle before
                     needs[key].add(one)
                     if one not in needs:
                         follow(one, above | {one})
+        level[key] = max((1 + level[one] for one in needs[key]), default=0)
 
     follow(along[-1], {along[-1]})
-    level: dict[_Key, int] = {}
-
-    def level_of(key: _Key) -> int:
-        if key not in level:
-            level[key] = 0  # ends a loop
-            level[key] = max((1 + level_of(one) for one in needs[key]), default=0)
-        return level[key]
-
-    order = sorted(needs, key=lambda key: (level_of(key), key not in along, key))
+    order = sorted(needs, key=lambda key: (level[key], key not in along, key))
+    places = {key: tuple(sorted(map(order.index, needs[key]))) for key in order}
     return [
-        _Stage(
-            node=graph.callbacks[members[0]].node,
-            topic=topic,
-            members=members,
-            after=tuple(sorted(order.index(one) for one in needs[members, topic])),
-        )
+        _Stage(graph.callbacks[members[0]].node, topic, members, places[members, topic])
         for members, topic in order
     ]
 
 
 def taking_part(graph: ApplicationGraph, chain: Chain, stages: Sequence[_Stage]) -> tuple[str, ...]:
-    """The nodes of a chain in its order, then those of the branches that it waits for in theirs:
-    so urgent they are (:mod:`chainshaper.enforcement.threads`).
-    """
+    """The nodes of a chain, then those of the branches that it waits for: so urgent they are."""
     along = (graph.callbacks[number].node for number in chain.callbacks)
     return tuple(dict.fromkeys((*along, *(stage.node for stage in stages))))
 
@@ -330,13 +312,12 @@ def _upstream(graph: ApplicationGraph, chain: Chain, stages: list[_Stage]) -> fr
     ahead = {graph.callbacks[chain.callbacks[0]].trigger}
     while ahead:
         found |= ahead
-        inputs = {
-            number
+        ahead = {
+            graph.callbacks[number].trigger
             for writer in graph.callbacks
             for topic in {*writer.publishes} & ahead
             for number in inputs_of(graph, writer, topic)
-        }
-        ahead = {graph.callbacks[number].trigger for number in inputs} - found
+        } - found
     return frozenset(topic for topic in found - {chain.topics[-1]} if topic is not None)
 
 
@@ -344,12 +325,11 @@ def _feeding(graph: ApplicationGraph, chain: Chain) -> set[str]:
     """All nodes that feed the node with which a chain begins, if it begins with a subscription."""
     first = graph.callbacks[chain.callbacks[0]]
     own = {graph.callbacks[number].node for number in chain.callbacks}
-    found: set[str] = set()
-    fed = set() if first.trigger is None else {first.node}
+    found, fed = set[str](), set() if first.trigger is None else {first.node}
     while fed:
         topics = {callback.trigger for callback in graph.callbacks if callback.node in fed}
-        fed = {writer.node for writer in graph.callbacks if topics.intersection(writer.publishes)}
-        fed -= found | own
+        feeding = {one.node for one in graph.callbacks if topics.intersection(one.publishes)}
+        fed = feeding - found - own
         found |= fed
     return found
 
@@ -468,12 +448,8 @@ def _executors(
     by_pid = {one.pid: one for one in threads if one.role == "executor"}  # of several, ours
     found = {node.name: by_pid[node.pid] for node in graph.nodes if node.pid in by_pid}
     cores = {name: one.cores[0] for name, one in found.items() if len(one.cores) == 1}
-    return (
-        running,
-        named,
-        cores,
-        {name: one.priority for name, one in found.items() if one.priority},
-    )
+    priorities = {name: one.priority for name, one in found.items() if one.priority}
+    return running, named, cores, priorities
 
 
 def _interfering(
@@ -502,9 +478,8 @@ def _writer(recording: Recording, flow: DataFlow, node: str, topic: str) -> dict
     """What is seen of who writes the chain's output, under the names of a profile.
 
     No event says when a publication was over: not after the end of its callback, the next that the
-    callback made, and when all subscribers had the message. A shaping node's will take as long.
-    Whether a thread of the process publishes shows where DDS threads have names; Cyclone DDS has
-    none: there the thread that publishes also sends.
+    callback made, and when all subscribers had the message. Whether a thread of the process
+    publishes shows where DDS threads have names; under Cyclone DDS the thread that publishes sends.
     """
     own, time = (pl.col("topic") == topic) & (pl.col("node") == node), pl.col("time")
     readers = flow.takes.drop_nulls("publication").group_by("publication").agg(taken=time.max())
@@ -572,8 +547,8 @@ def plan_recording(
 ) -> Plan:
     """Plan a recorded chain: single-band shaping (eq. 1, 4) unless ``request`` says otherwise.
 
-    ``sinks`` are chains to further outputs of the same graph. Raises: as :func:`profile_chains` and
-    :func:`chainshaper.planning.plan_chain`.
+    ``sinks`` are chains to further outputs of the same graph. Raises: as :func:`profile_chains`
+    and :func:`~chainshaper.planning.plan_chain`.
     """
     if not isinstance(chain, str | None):
         raise InputError("one chain goes here: profile several, and plan with `plan_application`")
