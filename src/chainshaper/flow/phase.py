@@ -1,22 +1,20 @@
 """Where in a cycle a chain begins: measured from outside, watched, and given to shaping nodes.
 
-Servers' cycles must be anchored to the chain (DESIGN section 6): the slot of its server has to open
-just after its timer. The timer wakes the executor of the chain's first node, which the kernel
-counts: the third number of `/proc/PID/task/TID/schedstat` is how often a thread was put on a core,
-the second for how long it was ready before that. The wake-ups that come once in every cycle at the
-same place are the timer's; of several such places the one after the longest rest is the beginning.
-Of an executor with several threads any may begin a cycle: they are watched together.
+The slot of a chain's server has to open just after its timer (DESIGN section 6). That wakes the
+executor of the chain's first node, which the kernel counts in `/proc/PID/task/TID/schedstat`. The
+wake-ups that come once in every cycle at the same place are the timer's; of several such places the
+one after the longest rest is the beginning. Of an executor with several threads any may begin.
 
 Outputs without a stamp are released by the cycle, whose beginning no message carries: shaping nodes
-in ROS 2 get it as a parameter. That takes a second or two, in a process of its own, as the user of
-the nodes' processes and in one's environment; as whom we may not run, in ours.
+in ROS 2 get it as a parameter, by a process of its own, as the user and in the environment of one
+of them; as whom we may not run, in ours.
 """
 
-import contextlib
 import os
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from io import FileIO
 from typing import TYPE_CHECKING
@@ -42,6 +40,7 @@ WATCHER_PRIORITY = 95
 TO_STOP_NS = 20_000  # stopping and continuing a thread takes 5 to 7 us of its time, a timer tens
 SEEN_IN = 0.8  # a place counts when wake-ups come there in this share of the cycles
 MOST_TRIES = 5
+_HAS_ROS = "AMENT_PREFIX_PATH"  # in a process's environment
 _PATIENCE_S = 20  # ROS 2 has found the nodes by then, however busy the machine is, or never will
 
 
@@ -67,11 +66,11 @@ def measure_phase(
         found = watch_wake_ups(pid, tids, cycles * cycle_ns, progress)
         if (phase := find_phase(found, cycle_ns, cycles)) is not None:
             return phase
-    named = ", ".join(map(str, tids))
+    watched = f"thread {', '.join(map(str, tids))} of process {pid} was watched for"
     raise OperationError(
-        f"thread {named} of process {pid} was watched for {duration_text(cycles * cycle_ns)} and"
-        f" does not wake up once in every {duration_text(cycle_ns)} ({len(found)} wake-ups): is the"
-        " chain running, with the period of the plan? Its phase can also be given (--phase)"
+        f"{watched} {duration_text(cycles * cycle_ns)} and does not wake up once in every"
+        f" {duration_text(cycle_ns)} ({len(found)} wake-ups): is the chain running, with the period"
+        " of the plan? Its phase can also be given (--phase)"
     )
 
 
@@ -97,7 +96,7 @@ def watch_wake_ups(
     started = now = time.monotonic_ns()
     born = [start_of(pid, tid) for tid in tids]
     try:
-        with _undisturbed(), contextlib.ExitStack() as until:
+        with _undisturbed(), ExitStack() as until:
             paths = (f"/proc/{pid}/task/{tid}/schedstat" for tid in tids)
             files = [until.enter_context(FileIO(path)) for path in paths]
             seen = [_counters(file) for file in files]
@@ -114,8 +113,8 @@ def watch_wake_ups(
                     elif times_by_now > times:
                         own.append(((looked + now) // 2 - (waited_by_now - waited), ran))
                 progress(min(1.0, (now - started) / for_ns))
-        for tid, its_start in zip(tids, born, strict=True):
-            if its_start is None or has_ended(tid, its_start):
+        for tid, began in zip(tids, born, strict=True):
+            if began is None or has_ended(tid, began):
                 raise ProcessLookupError(tid)  # a zombie
     except (OSError, ValueError) as error:
         raise OperationError(
@@ -175,10 +174,8 @@ def find_drift(
     expected_ns: int,
     slots: Sequence[tuple[int, int]] = (),
 ) -> int | None:
-    """How far behind ``expected_ns`` a thread begins its cycles (ns, negative: before), if it does.
-
-    ``slots`` count from there, and are all in which a server lets the thread run: being stopped as
-    one ends wakes a thread too, and is not how it begins.
+    """How far behind ``expected_ns`` a thread begins its cycles (ns), if it does: in ``slots``,
+    which count from there, if there are any, since being stopped as one ends wakes a thread too.
 
         >>> find_drift(np.array([1003, 1070, 1103, 1170, 1203, 1270]), 100, 3, 1000, [(0, 70)])
         3
@@ -197,8 +194,7 @@ class DriftWatch:
     ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
     thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
     takes a fifth of a core: it is done on ``cores`` or, where there are none, less often, and only
-    near where the cycle began last. What is not seen there any more is looked for in the whole
-    cycle. It ends with one of the threads, or when it is to.
+    near where the cycle began last, unless it is not seen there. It ends with one of the threads.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -240,7 +236,7 @@ class DriftWatch:
         if self._cores:
             os.sched_setaffinity(0, self._cores)  # the calling thread's alone
         near_ns: int | None = self._expected_ns
-        with contextlib.suppress(OperationError):  # the thread has ended
+        with suppress(OperationError):  # the thread has ended
             while not self._stop.is_set():
                 until = time.monotonic() + self.EVERY_S
                 while time.monotonic() < until and not self.look_soon:
@@ -275,7 +271,7 @@ class DriftWatch:
         return find_drift(seen, cycle_ns, cycles, expected_ns, self._slots)
 
 
-@contextlib.contextmanager
+@contextmanager
 def _undisturbed() -> Iterator[None]:
     """The calling thread, which sleeps nearly always, at a high priority if that is permitted."""
     before = state_of(0)
@@ -309,11 +305,11 @@ class Telling:
             late = not self.script.is_over()
             _, problem = self.script.end()
             problem = f"ROS 2 did not answer within {_PATIENCE_S} s" if late else problem
-        said = (
-            f"{', '.join(self.nodes)} did not get where cycles begin ({problem}): outputs without a"
-            " stamp of their chain's beginning will not be in time"
-        )
-        return () if problem is None else (said,)
+        if problem is None:
+            return ()
+        named = f"{', '.join(self.nodes)} did not get where cycles begin ({problem})"
+        why = "outputs without a stamp of their chain's beginning will not be in time"
+        return (f"{named}: {why}",)
 
 
 NO_NODE = Telling((), None, 0.0)  # none is to get a phase
@@ -327,29 +323,26 @@ def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int)
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:
         return NO_NODE
-    asked = tuple(pids)
     # Who reads what ROS 2 shows reads recordings as well, which is slow to import.
     from chainshaper.sources import ros
 
-    def has_ros(environment: ros.Environment) -> bool:
-        return "AMENT_PREFIX_PATH" in environment.variables
-
-    def environment_for(pid: int) -> ros.Environment:
-        try:
-            return ros.environment_of(pid)
-        except OperationError:  # nothing of the node's may be run
-            if has_ros(own := ros.own_environment()):
-                return own
-            raise
-
+    asked, environments = tuple(pids), dict[str, ros.Environment]()
     try:
         for node in nodes:
             if node.in_process and node.thread.node in pids:
                 ask_phase(node.output, {pids.pop(node.thread.node)}, phase_ns)
-        environments = {node: environment_for(pid) for node, pid in pids.items()}
-        ours = tuple(node for node, one in environments.items() if has_ros(one))
-        if not ours:  # they are the live workload's
+        for name, pid in pids.items():
+            try:
+                environment = ros.environment_of(pid)
+            except OperationError:  # nothing of the node's may be run
+                environment = ros.own_environment()
+                if _HAS_ROS not in environment.variables:
+                    raise
+            if _HAS_ROS in environment.variables:  # else it is the live workload's
+                environments[name] = environment
+        if not environments:
             return NO_NODE
+        ours = tuple(environments)
         arguments = ("parameter", "phase_ns", str(phase_ns), *ours)
         script = ros.start_with_rclpy(environments[ours[0]], ros.script.__file__, *arguments)
     except OperationError as error:
