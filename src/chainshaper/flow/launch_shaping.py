@@ -7,8 +7,7 @@
 Each step is what the verb of its name does, and leaves its result in the folder. The first, short
 recording shows which chains there are, which nodes a chain has and which of these run at the same
 time; the second measures it under the paper's profiling condition (section 2.4), as far as that is
-permitted. Of several chains each is measured as if it were alone, as it is planned: chains that
-would delay each other have recordings of their own. Throttlers stand in front of everything.
+permitted. Chains that would delay each other have recordings of their own.
 """
 
 import sys
@@ -20,39 +19,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
+from chainshaper import planning
 from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
 from chainshaper.enforcement.undoing import RunState
+from chainshaper.flow import launch_splicing
 from chainshaper.flow.apply import START_NS, apply_plan
 from chainshaper.flow.exploration import list_chains
-from chainshaper.flow.launch_splicing import (
-    Splicing,
-    ThrottledInput,
-    splice_launch_files,
-    splice_throttlers,
-)
+from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
 from chainshaper.flow.record import record_command
 from chainshaper.linux.processes import Process, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
-from chainshaper.planning import (
-    ApplicationPlan,
-    Plan,
-    PlanRequest,
-    Profile,
-    plan_application,
-    plan_chain,
-    save_application_plan,
-)
+from chainshaper.planning import ApplicationPlan, Plan, PlanRequest, Profile
+from chainshaper.planning import request as requests
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.profile import doubts_about
-from chainshaper.planning.request import (
-    best_effort_cores,
-    refuse_contradictions,
-    refuse_entangled,
-    refuse_simulated,
-    stages_before,
-)
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.shaping_process import build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
@@ -112,11 +94,10 @@ def shape_launch(
 
     ``chain`` is the one to shape, or several; without it, ``choose`` is asked. ``sinks`` are chains
     to further outputs of the graph of one chain, ``throttled`` inputs with the nodes that get them
-    by way of a throttler. ``request.cores`` are where executors run (default: the last core, and
-    others that are worth it). The application is launched three times, briefly, and for
-    ``duration_ns`` before and after; more often, where chains are measured one by one. ``planned``
-    gets the plan before it is used, to say what is doubtful about it. ``stop`` ends everything. The
-    rest is for :func:`.profile_chains` and :func:`.apply_plan`.
+    by way of a throttler, from the first recording on. ``request.cores`` are where executors run
+    (default: the last core, and others that are worth it). The application is launched briefly, and
+    for ``duration_ns`` before and after. ``planned`` gets the plan before it is used. ``stop`` ends
+    everything. The rest is for :func:`.profile_chains` and :func:`.apply_plan`.
 
     Raises:
         InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
@@ -160,7 +141,9 @@ def shape_launch(
     if throttled:
         request = replace(request, anchor="cycle")  # messages have the stamps of their sensors
         kind: Literal["python", "cpp"] = "python" if node == "python" else "cpp"
-        inputs = splice_throttlers(throttled, [launch.file], folder / "throttled", node=kind)
+        inputs = launch_splicing.splice_throttlers(
+            throttled, [launch.file], folder / "throttled", node=kind
+        )
         launch, setup = replace(launch, file=next(iter(inputs.launch.values()))), _sourced(inputs)
         shaped = [*setup, *launch.with_file(launch.file)]
     first = record("first", shaped, FIRST_LOOK_NS)
@@ -176,8 +159,8 @@ def shape_launch(
         condition = profiling_condition(
             *(cores, cores),
             like=first,
-            before=stages_before(seen, request),
-            best_effort=best_effort_cores(seen, request, core_of),
+            before=requests.stages_before(seen, request),
+            best_effort=requests.best_effort_cores(seen, request, core_of),
             policy=request.policy,
         )
         before = record(
@@ -190,12 +173,12 @@ def shape_launch(
         measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
     progress(0.0, "planning")
     plan, remarks = _planned([measured[k][1] for k in range(len(wanted))], len(chains), request)
-    save_application_plan(plan, folder / "plan.yaml")
+    planning.save_application_plan(plan, folder / "plan.yaml")
     planned(plan if len(plan.chains) > 1 else plan.chains[0])
     found += remarks
     splicing = None
     if plan.shaping_nodes:
-        splicing = splice_launch_files(
+        splicing = launch_splicing.splice_launch_files(
             *(plan, [launch.file], folder / "launch"),
             node=node,
             recording=_with_types([first, *(before for before, _ in measured.values())], plan),
@@ -237,7 +220,7 @@ def _refuse_early(
     modes: bool,
 ) -> None:
     """What need not be tried: it would be refused minutes later."""
-    refuse_contradictions(request, sinks=bool(sinks), modes=modes)
+    requests.refuse_contradictions(request, sinks=bool(sinks), modes=modes)
     check_cores(dict.fromkeys(request.cores or (), "--cores"))
     if sinks and len(chains) > 1:
         raise InputError("--sink goes with one chain: name each output with a --chain of its own")
@@ -250,8 +233,8 @@ def _refuse_early(
 
 def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanRequest) -> None:
     """What is not to be had of these chains, however long they take."""
-    refuse_entangled(seen, request.policy, sinks=len(seen) > chains)
-    refuse_simulated(seen, request)
+    requests.refuse_entangled(seen, request.policy, sinks=len(seen) > chains)
+    requests.refuse_simulated(seen, request)
     if seen and request.policy != "shaped":
         with suppress(OperationError):
             _planned(seen, chains, request)
@@ -265,9 +248,9 @@ def _planned(
         request = replace(request, cores=None)
     doubts = [doubt for one in profiles[:chains] for doubt in doubts_about(one)]
     if chains > 1:
-        plan, remarks = plan_application(profiles, request)
+        plan, remarks = planning.plan_application(profiles, request)
         return plan, remarks + doubts
-    return whole(plan_chain(profiles[0], request, profiles[1:])), doubts
+    return whole(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
 
 
 def _with_types(recordings: Sequence[Recording], plan: ApplicationPlan) -> Recording:
@@ -285,9 +268,8 @@ def _chosen(first: Recording, choose: Choose | None) -> str:
     flow = data_flow(first.events, first.info.clock_offset_ns)
     found = list_chains(flow)
     if not found.chains:
-        raise InputError(
-            f"{first.path}: no chain was seen: do its callbacks publish, and do others take that?"
-        )
+        what = "no chain was seen: do its callbacks publish, and do others take that?"
+        raise InputError(f"{first.path}: {what}")
     if choose is None:
         known = ", ".join(one.spec for one in found.chains[:5])
         raise InputError(f"which chain is meant? Name it with --chain: {known}")

@@ -2,8 +2,8 @@
 
 Nothing of the user's is edited, copied or parsed: a launch file is written that includes theirs,
 starts our nodes, and redirects a topic where `ros2 launch` starts the node that has it
-(:mod:`chainshaper.splicing.redirection`). Before a shaping node it is the publisher that is
-redirected, behind a throttler the subscribers: a player or a driver often is started elsewhere.
+(:mod:`.redirection`). Before a shaping node it is the publisher that is redirected, behind a
+throttler the subscribers: a player or a driver often is started elsewhere.
 """
 
 import difflib
@@ -20,30 +20,10 @@ from chainshaper.planning.application_plan import ApplicationPlan, combined, who
 from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
+from chainshaper.splicing import shaping_process as ours
+from chainshaper.splicing import spliced_launch as launching
 from chainshaper.splicing.application import nothing_to_splice
 from chainshaper.splicing.redirection import Redirect
-from chainshaper.splicing.shaping_process import (
-    GATES,
-    OF_ONE_TYPE,
-    ShapingProcess,
-    delivery_settings,
-    gate_library,
-    gate_settings,
-    has_bytes,
-    write_shaping_process,
-    write_throttler,
-)
-from chainshaper.splicing.spliced_launch import (
-    LOGS,
-    NODES,
-    executable_of,
-    is_run,
-    launch_file_name,
-    launch_text,
-    new_folder,
-    original_words,
-    usable,
-)
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.plan_choices import STANDBY, Fallback, NodeKind
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
@@ -56,7 +36,7 @@ THROTTLER_PRIORITY = 85  # of SCHED_FIFO, until `apply` puts it into its server
 DRY_RUN_S = 120.0  # how long a dry run may take
 
 _Names: TypeAlias = Mapping[str, Sequence[str]]
-_Written: TypeAlias = tuple[list[ShapingProcess], dict[str, str]]  # and the environment to add
+_Written: TypeAlias = tuple[list[ours.ShapingProcess], dict[str, str]]  # and the environment
 
 
 @dataclass(frozen=True)
@@ -66,7 +46,7 @@ class Splicing:
     folder: Path
     launch: Mapping[Path, Path]  # each launch file, or executable: the one to launch instead
     originals: Mapping[Path, Path]  # that one: the first that it includes
-    processes: tuple[ShapingProcess, ...]  # that were added
+    processes: tuple[ours.ShapingProcess, ...]  # that were added
     logs: tuple[Path, ...]  # of shaping nodes and their standbys
     diff: str  # the new launch file as a unified diff
     notes: tuple[str, ...]  # what to know before relying on it
@@ -118,48 +98,49 @@ def splice_launch_files(
         joint = combined([revised(chain, fallback=fallback) for chain in joint.chains])
     if without := [chain for chain in joint.chains if chain.shaping_node is None]:
         raise nothing_to_splice(without[0])
-    folder = usable(Path(output))
+    folder = launching.usable(Path(output))
     known = _endpoints(recording, "publisher")
     every = [
         (chain, one, _publisher(chain, one, known))
         for chain in joint.chains
         for one in shaping_nodes(chain)
     ]
-    redirects = [
-        Redirect(
-            *("publisher", one.output, one.input, (publisher,)),
-            added=(f"/{one.name}", f"/{one.name}{STANDBY}"),
-        )
-        for _, one, publisher in every
-        if not one.in_process
-    ]
+    redirects = []
+    for _, one, publisher in every:
+        if not one.in_process:
+            added = (f"/{one.name}", f"/{one.name}{STANDBY}")
+            redirects.append(Redirect("publisher", one.output, one.input, (publisher,), added))
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
-    if recording is not None and node not in OF_ONE_TYPE:
-        by_nodes = (one.output for _, one, _ in every if not one.in_process)
-        _refuse_undelivered(recording, {end: types.get(end, "") for end in by_nodes}, node)
-    logs = {one.name: folder / LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
+    if recording is not None and node not in ours.OF_ONE_TYPE:
+        _refuse_undelivered(
+            recording, {one.topic: types.get(one.topic, "") for one in redirects}, node
+        )
+    logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
 
     def written(into: Path) -> _Written:
-        made, blocks = list[ShapingProcess](), list[str]()
+        made, blocks = list[ours.ShapingProcess](), list[str]()
         for chain, one, publisher in every:
             if one.in_process:
-                blocks.append(gate_settings(chain, one, publisher, logs[one.name]))
+                blocks.append(ours.gate_settings(chain, one, publisher, logs[one.name]))
                 continue
-            process = write_shaping_process(
-                *(chain, one, node, folder / NODES),
+            process = ours.write_shaping_process(
+                *(chain, one, node, folder / launching.NODES),
                 message_type=message_type or types.get(one.output),
                 log=logs[one.name],
                 into=into,
             )
             redirects[len(made)].component = process.component
             made.append(process)
-        blocks += [delivery_settings(one) for _, one, _ in every]
+        blocks += [ours.delivery_settings(one) for _, one, _ in every]
         if not any(blocks):
             return made, {}
         into.mkdir(parents=True, exist_ok=True)
         (into / "gates").write_text("".join(blocks), encoding="utf-8")
-        return made, {"LD_PRELOAD": str(gate_library()), GATES: str(folder / NODES / "gates")}
+        return made, {
+            "LD_PRELOAD": str(ours.gate_library()),
+            ours.GATES: str(folder / launching.NODES / "gates"),
+        }
 
     dry = dict(arguments or {}) if dry_run else None
     spliced = _spliced(launch_files, folder, redirects, written, throttled=False, dry=dry)
@@ -179,7 +160,7 @@ def _refuse_undelivered(recording: "Recording", types: Mapping[str, str], node: 
     if info.rmw != "rmw_fastrtps_cpp" or info.distribution not in ("lyrical", "rolling"):
         return
     for output, message_type in types.items():
-        if has_bytes(message_type):
+        if ours.has_bytes(message_type):
             raise InputError(
                 f"{output} is of {message_type}: on {info.distribution}, {info.rmw} delivers no"
                 " message with a field uint8[] to nodes that take it serialized, as with --node"
@@ -205,7 +186,7 @@ def splice_throttlers(
     """
     if not inputs:
         raise InputError("no input to throttle: name one, such as /points_raw=100ms")
-    folder = usable(Path(output))
+    folder = launching.usable(Path(output))
     subscribers = _endpoints(recording, "subscription")
     alike: dict[tuple[int, Rule], dict[str, tuple[str, ...]]] = {}
     for one in inputs:
@@ -226,19 +207,18 @@ def splice_throttlers(
         for topic, nodes in topics.items()
     ]
 
+    def throttler(name: str, how: tuple[int, Rule], into: Path) -> ours.ShapingProcess:
+        return ours.write_throttler(
+            {topic: f"{topic}_throttled" for topic in alike[how]},
+            *(how[0], node, folder / launching.NODES),
+            rule=how[1],
+            name=name,
+            fifo_priority=THROTTLER_PRIORITY,
+            into=into,
+        )
+
     def written(into: Path) -> _Written:
-        made = [
-            write_throttler(
-                {topic: f"{topic}_throttled" for topic in topics},
-                *(period_ns, node, folder / NODES),
-                rule=rule,
-                name=name,
-                fifo_priority=THROTTLER_PRIORITY,
-                into=into,
-            )
-            for name, ((period_ns, rule), topics) in zip(names, alike.items(), strict=True)
-        ]
-        return made, {}
+        return [throttler(*one, into) for one in zip(names, alike, strict=True)], {}
 
     dry = dict(arguments or {}) if dry_run else None
     return _spliced(launch_files, folder, redirects, written, throttled=True, dry=dry)
@@ -255,35 +235,31 @@ def _spliced(
 ) -> Splicing:
     """The folder, or with launch arguments for a ``dry`` run none; ``written`` writes our nodes."""
     given = [str(word) for word in launch_files]
-    words = original_words(given, throttled=not throttled)
-    executable = executable_of(given)
+    words = launching.original_words(given, throttled=not throttled)
+    executable = launching.executable_of(given)
     files = [Path(executable)] if executable else [Path(word).absolute() for word in given]
-    name = launch_file_name(words)
-    copy, found = folder / name, []
-    place: AbstractContextManager[str | Path] = (
-        new_folder(folder, {name: words}, throttled=throttled)
-        if dry is None
-        else tempfile.TemporaryDirectory()
-    )
+    name = launching.launch_file_name(words)
+    copy = folder / name
+    place: AbstractContextManager[str | Path]
+    if dry is None:
+        place = launching.new_folder(folder, {name: words}, throttled=throttled)
+    else:
+        place = tempfile.TemporaryDirectory()
     with place as partial:
-        made, environment = written(Path(partial, NODES))
-        text = launch_text(words, made, redirects, environment)
+        made, environment = written(Path(partial, launching.NODES))
+        text = launching.launch_text(words, made, redirects, environment)
         Path(partial, name).write_text(text, encoding="utf-8")
-    if dry is not None:
-        found = _tried(words, redirects, dry)
+    found = [] if dry is None else _tried(words, redirects, dry)
     diff = difflib.unified_diff([], text.splitlines(keepends=True), "/dev/null", str(copy))
+    strange = [file for file in files if not executable and str(file) not in words]
     return Splicing(
         folder=folder,
         launch=dict.fromkeys(files, copy),
-        originals={} if is_run(words) else {copy: Path(words[0])},
+        originals={} if launching.is_run(words) else {copy: Path(words[0])},
         processes=tuple(made),
         logs=(),
         diff="".join(diff),
-        notes=tuple(
-            f"{file}: spliced from its original, {', '.join(words)}"
-            for file in files
-            if not executable and str(file) not in words
-        ),
+        notes=tuple(f"{one}: spliced from its original, {', '.join(words)}" for one in strange),
         redirects=tuple(redirects),
         redirected=tuple(found),
         environment=environment,
@@ -294,9 +270,10 @@ def _tried(
     words: Sequence[str], redirects: Sequence[Redirect], arguments: Mapping[str, str]
 ) -> list[dict[str, Any]]:
     """What `ros2 launch` would redirect, found without starting a process."""
+    ran = launching.is_run(words)
     asked = {
-        "files": [] if is_run(words) else words,
-        "processes": [{"cmd": words}] if is_run(words) else [],
+        "files": [] if ran else words,
+        "processes": [{"cmd": words}] if ran else [],
         "redirects": [one.values() for one in redirects],
         "arguments": arguments,
         "folder": str(Path.cwd()),
