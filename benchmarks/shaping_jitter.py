@@ -69,10 +69,9 @@ def main() -> None:
         for run in range(1, options.runs + 1):
             with compile_beside(Path(name)) as load:
                 print(f"run {run}: {options.cycles} cycles each, beside: {load}", flush=True)
-                result = run_demo(folder / f"run{run}", cycles=options.cycles)
-            for note in result.notes:
+                before, after = run_demo(folder / f"run{run}", cycles=options.cycles).measurements
+            for note in dict.fromkeys(before.recording.info.notes + after.recording.info.notes):
                 print(f"  note: {note}")
-            before, after = result.comparison.measurements
             results.append((f"run {run}", before, after))
     Console(width=120).print(table_of(results))
 

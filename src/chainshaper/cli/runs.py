@@ -573,7 +573,7 @@ def shape(
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
         how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, **following}
-        _shape_described(*map(Path, words), output, strict, how)
+        _shape_described(Path(words[0]), Path(words[1]), output, strict, how)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(

@@ -1,27 +1,14 @@
-"""A described application, live: shaped by a plan, and the demonstration, which is the whole flow.
+"""A described application, live: shaped by a plan; and the demonstration, the whole flow."""
 
-The demonstration leaves everything in one folder:
-
-DIR/application.yaml        what ran
-DIR/before, DIR/after       the recordings of the unshaped and of the shaped run
-DIR/plan.yaml               what was planned from the former
-DIR/latency.png, …          latency of every cycle, and their distributions with the publish slot
-DIR/comparison.json         every figure of the printed table
-"""
-
-import contextlib
 import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-import polars as pl
-
-from chainshaper.analysis import callback_statistics, data_flow
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
@@ -66,8 +53,8 @@ def shape_application(
     threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
     """
     joint = whole(plan)
-    if enforcement is None:
-        enforcement = partial(threads_gated, joint) if gated_threads(joint) else None
+    if enforcement is None and gated_threads(joint):
+        enforcement = partial(threads_gated, joint)
     if adapt:
         joint, reaches_ns, _ = followed_chains(joint, "fifo", max_latency_ns)
         enforcement = partial(slots_followed, joint, reaches_ns, enforcement)
@@ -98,7 +85,7 @@ def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
     ]
 
 
-@contextlib.contextmanager
+@contextmanager
 def threads_gated(plan: ApplicationPlan, nodes: StartedNodes) -> Iterator[None]:
     """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only (paper,
     section 3.2.1, design 1).
@@ -125,7 +112,7 @@ def threads_gated(plan: ApplicationPlan, nodes: StartedNodes) -> Iterator[None]:
         raise OperationError(f"the servers failed while the application ran: {failure}")
 
 
-@contextlib.contextmanager
+@contextmanager
 def slots_followed(
     plan: ApplicationPlan,
     reaches_ns: Mapping[int, tuple[int, int]],
@@ -141,7 +128,7 @@ def slots_followed(
         since = time.monotonic_ns() + 2 * chain.cycle_ns
         return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
 
-    with contextlib.ExitStack() as until:
+    with ExitStack() as until:
         if enforcement is not None:
             until.enter_context(enforcement(nodes))
         followers = []
@@ -168,17 +155,6 @@ def _threads_of(wanted: Thread, nodes: StartedNodes) -> list[int]:
     return found
 
 
-@dataclass(frozen=True)
-class DemoResult:
-    """What the demonstration found; all of it can be recomputed from ``folder``."""
-
-    folder: Path
-    callbacks: pl.DataFrame
-    plan: Plan
-    comparison: Comparison
-    notes: tuple[str, ...]
-
-
 def synthetic_chain() -> Path:
     """The description of the paper's synthetic chain (section 2.5)."""
     return Path(str(resources.files("chainshaper") / "examples" / "synthetic_chain.yaml"))
@@ -194,8 +170,9 @@ def run_demo(
     command: Sequence[str] = (),
     planned: Callable[[Plan], None] = lambda _: None,
     progress: Progress = lambda *_: None,
-) -> DemoResult:
-    """Run an application, plan, shape, run again and compare.
+) -> Comparison:
+    """Run an application, plan, shape, run again and compare the recordings `before` and `after` in
+    ``folder``, beside `application.yaml`, `plan.yaml`, and the comparison's figures.
 
     Raises InputError: ``folder`` exists and is not empty, or the application is not right.
     PlatformError, OperationError: a step failed; complete recordings stay, without one nothing.
@@ -230,10 +207,4 @@ def run_demo(
     progress(0.98, "comparing")
     comparison = compare_recordings([before, after])
     write_comparison(comparison, folder)
-    return DemoResult(
-        folder=folder,
-        callbacks=callback_statistics(data_flow(before.events, before.info.clock_offset_ns)),
-        plan=plan,
-        comparison=comparison,
-        notes=tuple(dict.fromkeys([*before.info.notes, *after.info.notes])),
-    )
+    return comparison
