@@ -44,15 +44,14 @@ def profiling_condition(
     best_effort: Mapping[str, int] = MappingProxyType({}),
     policy: Policy = "shaped",
 ) -> Iterator[Callable[[Sequence[Process]], bool]]:
-    """Have the threads of ``nodes`` (default: of all) run as the paper profiles a chain.
+    """Have the threads of ``nodes`` (default: of all, at one priority) run as the paper profiles a
+    chain: what :func:`.record_command` wants for its ``scheduling``.
 
-    It gives what :func:`chainshaper.flow.record.record_command` wants for its ``scheduling``.
-    The first of ``nodes`` are the most urgent, as in a plan of this ``policy``; all, where none is
-    named, have one priority. ``core`` is where the executors run (default: the last that we may
-    use), or the core of each of ``nodes``, ``before`` how many stages of a pipeline are more urgent
-    there, as a plan has it, and ``best_effort`` the core of nodes that run when these do not.
-    ``folder`` is where journals are (default: `/run/chainshaper`). An earlier recording that this
-    one is ``like`` says which components a container has, and which executors several threads.
+    The first of ``nodes`` are the most urgent, as in a plan of this ``policy``. ``core`` is where
+    the executors run (default: the last that we may use), or the core of each of ``nodes``,
+    ``before`` how many stages of a pipeline are more urgent there, and ``best_effort`` the core of
+    nodes that run when these do not. ``folder`` is for journals (default: `/run/chainshaper`).
+    An earlier recording that this one is ``like`` knows components and executors' threads.
 
     Raises PlatformError: no such core, or SCHED_FIFO is not permitted. OperationError: `apply`
     governs one of the nodes, or the core; a node does not appear; not all could be changed or put
@@ -135,11 +134,11 @@ def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
 def profiled_cores(
     recording: Recording, chains: Sequence[str], request: PlanRequest, period_ns: int | None = None
 ) -> tuple[tuple[Profile, ...], dict[str, int]]:
-    """What an earlier recording shows of chains, and on which cores to profile their executors.
+    """What an earlier recording shows of chains, and on which cores to profile their executors:
+    without ``request.cores`` the last, and others as far as they are worth it, but the first of
+    three and more, for DDS threads. One chain of which too little is to be seen runs on the last.
 
-    Without ``request.cores`` these are the last, and others as far as they are worth it; of three
-    cores and more, the first is left to DDS threads. One chain of which too little is to be seen
-    runs on the last core. Raises: as :func:`.profile_chains`; PlatformError: no such core.
+    Raises: as :func:`.profile_chains`; PlatformError: no such core.
     """
     available = available_cores()
     found = (available[1:] if len(available) > 2 else available)[::-1]
@@ -162,13 +161,11 @@ def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[
     found: list[tuple[list[int], set[int]]] = []
     for group in beginning_together(seen):
         cores = {core_of[node] for place in group for node in seen[place].core_of}
-        for places, taken in found:
-            if taken.isdisjoint(cores):
-                places.extend(group)
-                taken.update(cores)
-                break
-        else:
-            found.append((list(group), cores))
+        apart = next((one for one in found if one[1].isdisjoint(cores)), None)
+        if apart is None:
+            found.append(apart := ([], set()))
+        apart[0].extend(group)
+        apart[1].update(cores)
     return [places for places, _ in found] or [[0]]
 
 

@@ -4,8 +4,7 @@
                                         ─► types and QoS asked for ─► application ends ─► recording
 
 Tracing begins first, because an object emits its name once, when it is created; types and QoS are
-asked for when it is over: discovery costs every node some time. Whatever ends the run, its
-recording is whole; nothing is left running, nor changed.
+asked for when it is over: discovery costs every node some time.
 """
 
 import platform
@@ -24,36 +23,25 @@ from chainshaper.analysis.objects import resolve_objects
 from chainshaper.enforcement.threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.threads import recorded_processes
+from chainshaper.linux import processes as running
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
-from chainshaper.linux.processes import (
-    Process,
-    descendants,
-    find_applications,
-    list_processes,
-    run_users,
-)
+from chainshaper.linux.processes import Process, find_applications
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
 from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.sources import Tracer
+from chainshaper.sources import Tracer, preload
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
 from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.sources.system import own_pid_namespace
 from chainshaper.values import events
+from chainshaper.values import recording as recordings
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
 from chainshaper.values.files import open_to_all
-from chainshaper.values.recording import (
-    EndpointInfo,
-    InForceInfo,
-    Recording,
-    ThreadInfo,
-    refuse_existing,
-    write_recording,
-)
+from chainshaper.values.recording import EndpointInfo, Recording, ThreadInfo
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
 Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[Process]], bool]]
@@ -85,7 +73,6 @@ class _Run:
     folder: Path
     words: Sequence[str]  # of the command
     duration_ns: int | None
-    scheduling: Scheduling | None
     stop: threading.Event
     progress: Callable[[float, str], None]
     users: frozenset[int]
@@ -99,9 +86,8 @@ class _Run:
     processes: tuple[Process, ...] = ()
     strangers: str | None = None
     environment: Environment | None = None  # a node's
-    no_environment_because: str = "no process was seen that looks like a node"
     endpoints: tuple[EndpointInfo, ...] = ()
-    no_qos_because: str | None = None
+    no_qos_because: str | None = "no process was seen that looks like a node"
     in_force_ns: int | None = None  # when the scheduling that was asked for was
     governed: tuple[Governed, ...] = ()  # plans that others put in force meanwhile
     stalls: StallWatch = field(default_factory=StallWatch)
@@ -130,11 +116,10 @@ def record_command(
 
     ``command`` is started, and ended with the recording; it prints to ``command_stdout``. Without
     one, `ebpf` and `preload` attach to ``pids`` and their descendants, or to all that ``users`` run
-    (names or numbers; default: who launched us, and root). Without ``source`` it is `preload`, or
-    `lttng` where the library cannot be had. ``buffer`` is the size of LTTng's buffer of a core in
-    bytes. ``chain`` is noted as the chain of interest, ``plan`` as the plan in force; ``gate_logs``
-    are where its shaping nodes note what they do. ``watch_stalls`` has a sleeper on every core
-    notice when the machine stands still (2 % of it).
+    (as :func:`.find_threads`). Without ``source`` it is `preload`, or `lttng` where the library
+    cannot be had. ``buffer`` is the size of LTTng's buffer of a core in bytes. ``chain`` is noted
+    as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
+    nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
 
     Raises:
         InputError: ``output`` exists, there is no such command or process, or no such source.
@@ -142,7 +127,7 @@ def record_command(
         OperationError: tracing does not start, nothing was traced, or it cannot be read or
             written; what the tracer wrote then stays beside ``output``, and named.
     """
-    output, taken = refuse_existing(output), run_users(users)
+    output, taken = recordings.refuse_existing(output), running.run_users(users)
     if command:
         check_command(command)
     parent = output.absolute().parent
@@ -152,12 +137,12 @@ def record_command(
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
         tracer, notes = _tracer(source, folder, command, pids, buffer, users=taken)
-        how = (command, duration_ns, scheduling, stop or threading.Event(), progress, taken, pids)
+        how = (command, duration_ns, stop or threading.Event(), progress, taken, pids)
         run = _Run(tracer, folder, *how, gate_logs, notes)
         for note in notes:
             progress(0.0, note)
         try:
-            _trace(run, command_stdout, watch_stalls=watch_stalls)
+            _trace(run, scheduling, command_stdout, watch_stalls=watch_stalls)
             progress(1.0, "reading the events")
             recording = _written(output, run, chain, plan)
         except BaseException as error:  # the trace may be of hours: nothing costs it
@@ -193,11 +178,9 @@ def _tracer(
     if source is None and (buffer is not None or not command):
         source = "lttng"  # both are LTTng's to answer
     elif source is None:
-        from chainshaper.sources.preload import installed_library
-
         source = "preload"
         try:
-            installed_library()
+            preload.installed_library()
         except PlatformError as error:
             if shutil.which("lttng") is None:
                 raise
@@ -209,19 +192,18 @@ def _tracer(
     if source not in ("ebpf", "preload"):
         raise InputError(f"{source!r} is no source of events: name lttng, preload or ebpf")
     if buffer is not None:
-        raise InputError(
-            f"--buffer is about LTTng's buffers: leave it out with `--source {source}`"
-        )
+        why = f"leave it out with `--source {source}`"
+        raise InputError(f"--buffer is about LTTng's buffers: {why}")
     if source == "preload":
-        from chainshaper.sources.preload import PreloadTracer
-
-        return PreloadTracer(folder, command, pids, users), ()
+        return preload.PreloadTracer(folder, command, pids, users), ()
     from chainshaper.sources.ebpf import EbpfTracer
 
     return EbpfTracer(folder, command, pids, users), ()
 
 
-def _trace(run: _Run, stdout: int | None, *, watch_stalls: bool) -> None:
+def _trace(
+    run: _Run, scheduling: Scheduling | None, stdout: int | None, *, watch_stalls: bool
+) -> None:
     with ExitStack() as undo:
         if watch_stalls:
             run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
@@ -232,10 +214,10 @@ def _trace(run: _Run, stdout: int | None, *, watch_stalls: bool) -> None:
             run.command = start_command(run.words, environment, stdout)
             undo.callback(end_command, run.command)
             run.pids = (run.command.pid,)
-        if run.scheduling is not None:
-            run.schedule = undo.enter_context(run.scheduling)
+        if scheduling is not None:
+            run.schedule = undo.enter_context(scheduling)
         run.begun_ns = time.monotonic_ns()
-        if run.scheduling is None:
+        if scheduling is None:
             run.stalls.begin()
         _watch(run)
         run.ended_ns = time.monotonic_ns()
@@ -246,9 +228,7 @@ def _trace(run: _Run, stdout: int | None, *, watch_stalls: bool) -> None:
             run.notes += (f"the command {end_in_words(run.exit_code)} after {lasted}.",)
         if run.exit_code is not None:  # types and QoS of all topics are asked of what still runs
             run.no_qos_because = "the application had ended by itself"
-        elif run.environment is None:
-            run.no_qos_because = run.no_environment_because
-        else:
+        elif run.environment is not None:
             run.endpoints, run.no_qos_because = ask_graph(run.environment)
 
 
@@ -288,9 +268,10 @@ def _look(run: _Run) -> None:
     """Which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
-        run.processes = list_processes(descendants(parent_of, *run.pids) & parent_of.keys())
+        family = running.descendants(parent_of, *run.pids) & parent_of.keys()
+        run.processes = running.list_processes(family)
     else:
-        found = find_applications(list_processes())
+        found = find_applications(running.list_processes())
         run.processes = tuple(one for one in found if one.user in run.users)
         run.strangers = strangers_text(found, run.users) or run.strangers
     pids = {one.pid for one in run.processes}
@@ -301,7 +282,7 @@ def _look(run: _Run) -> None:
         try:
             run.environment = environment_of(nodes[-1].pid)
         except OperationError as error:
-            run.no_environment_because = str(error)
+            run.no_qos_because = str(error)
     if run.schedule is not None and run.schedule(run.processes) and run.in_force_ns is None:
         # What was before is left out, so stalls are watched from here on.
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
@@ -347,13 +328,14 @@ def _written(
         "stall_meter": run.stalls.info,
         "chain": chain,
         "plan": None if plan is None else plan_values(whole(plan)),
-        "in_force": None if plan is None else InForceInfo(since_ns=since_ns),
+        "in_force": None if plan is None else recordings.InForceInfo(since_ns=since_ns),
         "notes": tuple(notes),
     }
     if plan is None and (governed := in_force_throughout(run.governed)) is not None:
-        facts["plan"] = governed.plan
-        facts["in_force"] = InForceInfo(since_ns=governed.since_ns, until_ns=governed.until_ns)
-    return write_recording(output, tables, with_trace_events(recording).model_copy(update=facts))
+        spell = recordings.InForceInfo(since_ns=governed.since_ns, until_ns=governed.until_ns)
+        facts |= {"plan": governed.plan, "in_force": spell}
+    info = with_trace_events(recording).model_copy(update=facts)
+    return recordings.write_recording(output, tables, info)
 
 
 def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tuple[ThreadInfo, ...]:
@@ -387,10 +369,8 @@ def _known_endpoints(
     """The graph's endpoints with their depths from the trace, in order, then those only it saw."""
     objects = resolve_objects(tables)
     traced: list[EndpointInfo] = []
-    for kind, owners in (
-        ("publisher", objects.publishers),
-        ("subscription", objects.subscriptions),
-    ):
+    by_kind = {"publisher": objects.publishers, "subscription": objects.subscriptions}
+    for kind, owners in by_kind.items():
         created = events.table(tables, f"rcl_{kind}_init", ["queue_depth"]).select(
             "pid", handle=f"{kind}_handle", valid_from="time", depth="queue_depth"
         )
@@ -400,9 +380,8 @@ def _known_endpoints(
     found = []
     for one in asked:
         same = [t for t in traced if (t.node, t.topic, t.kind) == (one.node, one.topic, one.kind)]
-        depth = one.depth or None  # 0: not known
-        if same:
-            traced.remove(same[0])
-            depth = depth or same[0].depth
+        depth = one.depth or (same[0].depth if same else None)  # 0: not known
+        for other in same[:1]:
+            traced.remove(other)
         found.append(one.model_copy(update={"depth": depth}))
     return (*found, *traced)

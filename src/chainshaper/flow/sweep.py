@@ -1,18 +1,15 @@
 """`sweep` as a function: one application in many variants, each profiled, planned and judged.
 
-An axis is a name with the values that it takes. What the name says is found out in this order:
+An axis is a name with the values that it takes, those of YAML. What the name says, in this order:
 
     bands, epsilon, publish-slot, policy, …     a wish for the plan: a field of PlanRequest
     interference                                the load of section 2.5 beside the chain
     plan.servers.0.slots.0.1, plan.overrun, …   a value of the plan's file
     nodes.node3.core, seed, …                   a value of the application's description
 
-Paths lead through mappings by key and through lists by number, from 0. Values are those of YAML,
-so a whole part of a description may be one: ``{uniform: [5ms, 10ms]}``.
-
-A point is what a careful person would do by hand: simulate the application with its chain in front
-of all others (the profile), plan, splice, simulate again. The run that is judged draws execution
-times with a seed of its own: a margin is tried against latencies that the plan has not seen.
+For a point the application is simulated with its chain in front of all others (the profile),
+planned, shaped, and simulated again with another seed: a margin is tried against latencies that the
+plan has not seen.
 """
 
 import dataclasses
@@ -25,7 +22,7 @@ import os
 import re
 import tempfile
 import time
-from collections import deque
+from collections import defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
@@ -63,7 +60,7 @@ INTERFERENCE = "interference"
 PLAN = "plan."
 UNPLANNED = "none"  # the policy of a point whose application runs as it is described
 MOST_POINTS = 1_000_000
-BY_CALLBACK = ("server-per-callback", "pipelined")
+BY_CALLBACK = ("server-per-callback", "pipelined")  # need response times, which take events
 STRUCTURE_CYCLES = 100  # enough of a recording to see who publishes what where
 MOST_RECORDED = 100_000
 URGENT = 90  # a chain's profile has this priority where it is not the most urgent anyway
@@ -80,14 +77,12 @@ _BAND = {
     **{"start_ns": pl.Int64, "end_ns": pl.Int64},
     **{"predicted_share": pl.Float64, "share": pl.Float64, "jitter_ns": pl.Int64},
 }
-_OF_PLAN = (
-    *("profile_min_ns", "profile_mean_ns", "profile_max_ns"),
-    *("predicted_mean_ns", "predicted_max_ns", "predicted_jitter_ns"),
-)
 _OF_RUN = ("min_ns", "mean_ns", "max_ns", "jitter_ns", "spread_ns")
 
 FIGURES: dict[str, Any] = {
-    **dict.fromkeys((*_OF_PLAN, "count", "incomplete", "late", *_OF_RUN), pl.Int64),
+    **dict.fromkeys(("profile_min_ns", "profile_mean_ns", "profile_max_ns"), pl.Int64),
+    **dict.fromkeys(("predicted_mean_ns", "predicted_max_ns", "predicted_jitter_ns"), pl.Int64),
+    **dict.fromkeys(("count", "incomplete", "late", *_OF_RUN), pl.Int64),
     **{f"p{percentile:g}_ns": pl.Int64 for percentile in PERCENTILES},
     "band_jitter_ns": pl.Int64,
     "per_band": pl.List(pl.Struct(_BAND)),
@@ -133,9 +128,8 @@ def sweep(
     per core that we may use), or the Dask cluster whose ``scheduler`` is at that address.
 
     The frame, also written to ``output`` (Parquet), has a row for each point, in the order of the
-    axes: a column for each axis (durations in ns, with ``_ns`` behind the name), ``cycles``,
-    ``seed``, and :data:`FIGURES`. A point that cannot be has an ``error``. Until it is whole,
-    finished rows stand beside it, and the same call goes on with what is missing.
+    axes: their columns (durations in ns, with ``_ns`` behind the name), ``cycles``, ``seed``, and
+    :data:`FIGURES`. Until it is whole, finished rows stand beside it, and the same call goes on.
 
     Raises InputError: unknown axes or impossible values; ``output`` exists, or rows beside it are
     of another sweep. OperationError: the cluster failed, or the disk is full. PlatformError:
@@ -191,9 +185,6 @@ def _axis(name: str, column: Sequence[Any]) -> pl.Series:
 
     texts = [None if value is None else text(value) for value in column]
     return pl.Series(name, texts, dtype=pl.String)
-
-
-# Axes and points -------------------------------------------------------------------------------
 
 
 def parse_axis(text: str) -> tuple[str, tuple[Any, ...]]:
@@ -378,17 +369,12 @@ def _nanoseconds(name: str, value: Any) -> Any:
     return parse_duration(value)
 
 
-# One point -------------------------------------------------------------------------------------
-
-
 def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> Profile | str:
-    """The measurements that a point is planned from, or why there are none. Response times of
-    callbacks, which are needed where these are planned one by one, take events.
-    """
+    """The measurements that a point is planned from, or why there are none."""
     try:
         application = _urgent(application_at(grid, values))
-        per_callback = values.get("policy") in BY_CALLBACK
-        recorded = min(grid.cycles, MOST_RECORDED if per_callback else STRUCTURE_CYCLES)
+        most = MOST_RECORDED if values.get("policy") in BY_CALLBACK else STRUCTURE_CYCLES
+        recorded = min(grid.cycles, most)
         with tempfile.TemporaryDirectory(prefix="chainshaper-sweep-") as folder:
             place = Path(folder) / "profile"
             recording = simulate(application, place, cycles=recorded, progress=progress)
@@ -462,14 +448,14 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
         shares = [None] * len(slots)
     # An output belongs to the last slot that had started when it left, if it is not late.
     until = [start for start, _ in slots[1:]] + [end for _, end in slots[-1:]]
-    bands = []
+    bands, jitters = [], []
     for (start, end), before, share in zip(slots, until, shares, strict=True):
         inside = latencies[(latencies >= start) & (latencies < before)]
-        jitter = int(np.ptp(inside)) if inside.size else None
+        jitters += [int(np.ptp(inside))] if inside.size else []
+        jitter = jitters[-1] if inside.size else None
         seen = inside.size / latencies.size if latencies.size else None
         bands.append(dict(zip(_BAND, (start, end, share, seen, jitter), strict=True)))
     latest = slots[-1][1] - 1 if slots else plan.predicted.max_ns
-    jitters = [band["jitter_ns"] for band in bands if band["jitter_ns"] is not None]
     evidence, predicted = plan.evidence, plan.predicted
     return {
         "profile_min_ns": evidence.min_latency_ns,
@@ -484,21 +470,17 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
     }
 
 
-# Who computes ----------------------------------------------------------------------------------
-
-
 Points: TypeAlias = list[tuple[int, Values]]  # by their numbers
 
 
 def groups_of(grid: Grid, points: Iterable[tuple[int, Values]]) -> Iterator[tuple[bool, Points]]:
     """Points that share a profile, and whether they need one."""
-    groups: dict[tuple[bool, bool, str], Points] = {}
+    groups = defaultdict[tuple[bool, bool, str], Points](list)
     for number, values in points:
         profiled = request_at(grid, values) is not None
         application = {name: value for name, value in values.items() if _changes_application(name)}
         per_callback = profiled and values.get("policy") in BY_CALLBACK
-        key = (profiled, per_callback, json.dumps(application))
-        groups.setdefault(key, []).append((number, values))
+        groups[profiled, per_callback, json.dumps(application)].append((number, values))
     return ((profiled, own) for (profiled, *_), own in groups.items())
 
 
@@ -506,21 +488,18 @@ def rows_of(
     grid: Grid, points: Iterable[tuple[int, Values]], workers: int, scheduler: str | None = None
 ) -> Generator[tuple[int, Row], None, None]:
     """Rows by their points' numbers, as they are finished; few profiles are in memory at once."""
-    coming = groups_of(grid, points)
-    ready: deque[tuple[int, Values, Any]] = deque()
-    pending: dict[Any, Points | int] = {}
+    groups, pending = list(groups_of(grid, points)), dict[Any, Points | int]()
+    bare = (point for profiled, group in groups if not profiled for point in group)
+    ready = deque[tuple[int, Values, Any]]((number, values, None) for number, values in bare)
+    coming = iter([group for profiled, group in groups if profiled])
     with engine(workers, scheduler, "a sweep", "; finished rows stay") as computing:
         while True:
             while len(pending) < computing.under_way:
                 if ready:
                     number, values, profile = ready.popleft()
                     pending[computing.submit(row_at, grid, values, profile)] = number
-                    continue
-                profiled, group = next(coming, (False, []))
-                if profiled:
+                elif group := next(coming, None):
                     pending[computing.submit(profile_at, grid, group[0][1])] = group
-                elif group:
-                    ready.extend((number, values, None) for number, values in group)
                 else:
                     break
             if not pending:
@@ -531,9 +510,6 @@ def rows_of(
                 yield of, result
             else:
                 ready.extend((number, values, future) for number, values in of)
-
-
-# Where finished rows stand ---------------------------------------------------------------------
 
 
 def rows_beside(output: Path) -> Path:
@@ -547,8 +523,8 @@ def finished_rows(
 ) -> Iterator[tuple[dict[int, Row], Callable[[int, Row], None]]]:
     """The rows that are finished, by the number of their point, and how to add one.
 
-    One line of JSON a row, behind a first line that says what is swept (``about``, plain data).
-    Each is on disk before the next; a crash leaves half a line at most, which is removed.
+    A line of JSON each, behind a first that says what is swept (``about``, plain data). Each is on
+    disk before the next; a crash leaves half a line at most, which is removed.
 
     Raises InputError: the file is of another sweep. OperationError: another process works on it, or
     it cannot be read or written.
@@ -559,10 +535,8 @@ def finished_rows(
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
-                raise OperationError(
-                    f"{path}: another process works on this sweep: wait for it, or name another"
-                    " output"
-                ) from error
+                why = "another process works on this sweep: wait for it, or name another output"
+                raise OperationError(f"{path}: {why}") from error
             rows = _read(file, path, about)
 
             def append(value: Mapping[str, Any]) -> None:
@@ -599,9 +573,8 @@ def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]
         finished = {row["number"]: row["row"] for row in rows}
         changed = [name for name in about if first[name] != about[name]]
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"{path}: these are no rows of a sweep: move the file away, or name another output"
-        ) from error
+        remedy = "move the file away, or name another output"
+        raise InputError(f"{path}: these are no rows of a sweep: {remedy}") from error
     if changed:
         raise InputError(
             f"{path} has {len(finished)} finished rows of another sweep: {' and '.join(changed)}"
