@@ -1,7 +1,4 @@
-"""What this machine can do for latency shaping, and how badly it stalls.
-
-Each check names what was found and, where something is missing, the remedy. Nothing is changed.
-"""
+"""What this machine can do for latency shaping, and how badly it stalls. Nothing is changed."""
 
 import importlib.metadata
 import os
@@ -34,13 +31,13 @@ def examine_machine(watch_ns: int = 5_000_000_000) -> MachineReport:
 def _scheduling_checks(realtime: bool) -> Iterator[Check]:
     cores, throttled = available_cores(), throttle_fraction()
     lockable, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    others = foreign_realtime_processes()
+    others, limits = foreign_realtime_processes(), "in /etc/security/limits.conf"
     text = f"{len(cores)} ({', '.join(map(str, cores))}), kernel {platform.release()}"
     good, remedy = text if len(cores) >= 2 else None, "use a machine with two cores or more"
     yield _check("cores", "DDS threads beside executors", good, "limited", text, remedy)
     purpose = "measuring and shaping with real-time scheduling"
-    remedy = "run as root, or give your user an rtprio limit of 98 in /etc/security/limits.conf"
     good = "permitted" if realtime else None
+    remedy = f"run as root, or give your user an rtprio limit of 98 {limits}"
     yield _check("SCHED_FIFO", purpose, good, "absent", "not permitted", remedy)
     purpose, good = "cores that real-time threads fill", "off" if throttled >= 1.0 else None
     found = f"real-time threads are stopped at {throttled:.0%} of a core"
@@ -48,13 +45,11 @@ def _scheduling_checks(realtime: bool) -> Iterator[Check]:
     yield _check("real-time throttling", purpose, good, "limited", found, remedy)
     unlimited = os.geteuid() == 0 or lockable == resource.RLIM_INFINITY
     purpose, good = "no page faults while a gate waits", "permitted" if unlimited else None
-    remedy = "give your user an unlimited memlock limit in /etc/security/limits.conf"
-    found = f"up to {lockable // 1024} KiB"
+    found, remedy = f"up to {lockable // 1024} KiB", f"give your user an unlimited one {limits}"
     yield _check("memory locking", purpose, good, "limited", found, remedy)
-    purpose, good = "undisturbed measurements", None if others else "none"
+    name, purpose = "other real-time processes", "undisturbed measurements"
     remedy = "end them while you measure, unless they belong to the application"
-    name, found = "other real-time processes", ", ".join(others)
-    yield _check(name, purpose, good, "limited", found, remedy)
+    yield _check(name, purpose, None if others else "none", "limited", ", ".join(others), remedy)
 
 
 def _tool_checks() -> Iterator[Check]:

@@ -1,22 +1,15 @@
 """Slots that follow what runs: a chain's timer, and the latencies of its output.
 
-A chain that a sensor starts has the sensor's clock: 50 ppm off, it has moved by a whole cycle of
-100 ms after half an hour. Its servers' slots have to move with it, so that they open shortly after
-the timer has expired. A thread that waits for its slot begins as that opens: only a timer that
-expires in the open slot shows where it is. So the slots open a little before the timer is expected,
-once in a while, just to see; in between they move at the rate that was found. Outputs do not move:
-they count from the stamp of their own cycle.
+A chain that a sensor starts has the sensor's clock, 50 ppm off: its servers' slots have to move
+with it. A thread that waits for its slot begins as that opens: only a timer that expires in the
+open slot shows where it is. So the slots open a little before the timer is expected, once in a
+while, just to see; in between they move at the rate that was found.
 
-A thread that its slot lets go takes a while to begin: how long usually is seen in all looks in
-which nothing else was. On a busy machine it begins later still, without its timer. So slots soon
-open still earlier once more: the timer stays where it is, while a thread that only begins late
-moves with the opening. What is late in spite of that is so in one direction only: the timer is the
-line beneath all sightings, the edge of their convex hull in the middle (Moon, Skelly and Towsley,
+A thread that its slot lets go takes a while to begin, on a busy machine longer. So slots soon open
+still earlier once more: the timer stays where it is, while a thread that only begins late moves
+with the opening. What is late in spite of that is so in one direction only: the timer is the line
+beneath all sightings, the edge of their convex hull in the middle (Moon, Skelly and Towsley,
 INFOCOM 1999).
-
-The latencies of an output are in its gate's page of memory, and tell where its slots have to be
-(:class:`~chainshaper.planning.margins.Tail`). Slots move in the gate and in the servers with the
-same cycle.
 """
 
 import math
@@ -142,7 +135,8 @@ MOVES = 20  # so many of the latest moves are shown
 
 
 class SlotFollower:
-    """Has the slots of a chain's output follow its latencies, in a thread of its own.
+    """Has the slots of a chain's output follow its latencies, which its gate's page of memory has
+    (:class:`~chainshaper.planning.margins.Tail`), in a thread of its own.
 
     ``pids`` are processes of which one may be the gate, ``reach_ns`` is how far slots may be moved.
     ``put_in_force`` has servers move theirs by so much, and says from when on the gate has to.
