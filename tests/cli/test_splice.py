@@ -70,7 +70,8 @@ def test_a_dry_run_of_a_gate_in_the_publishers_process_names_nothing_that_is_not
     inside = known(plan.shaping_node).model_copy(update={"in_process": True})
     save_plan(revised(plan, shaping_node=inside, anchor="cycle"), file)
     flow = "chainshaper.flow.launch_splicing"
-    monkeypatch.setattr(f"{flow}.gate_library", lambda: Path("/gate.so"))
+    library = "chainshaper.splicing.shaping_process.gate_library"
+    monkeypatch.setattr(library, lambda: Path("/gate.so"))
     monkeypatch.setattr(f"{flow}._tried", lambda *_: [])
     finished = called("splice", file, robot, "-o", folder, "--dry-run")
     assert (finished.code, finished.out) == (0, "what is launched would get the gate\n")

@@ -111,48 +111,33 @@ PLAN_IN_FORCE: Path | None = option(
     "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
 )
 SCHEDULER: str | None = option(
-    "--scheduler ADDRESS",
-    "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
+    "--scheduler ADDRESS", "Compute on this Dask scheduler's cluster: tcp://host:8786."
 )
 TRACE: list[Path] = argument(
-    "TRACE...",
-    "An LTTng trace's folder (several of one trace: kernel and user space), or a recording's.",
-    ...,
+    "TRACE...", "A recording's folder, or those of one LTTng trace (kernel and user space).", ...
 )
 APPLICATION: Path = argument("APP.yaml", "The application's description.", ...)
 RECORDING_OUTPUT: Path = option("--output -o REC", "Folder to write; must not exist.", ...)
-SINCE: int = option(
-    "--skip --from DURATION",
-    "Leave out what the recording begins with, such as 2s of start-up.",
-    0,
-)
+SINCE: int = option("--skip --from DURATION", "Leave out the beginning, such as 2s of start-up.", 0)
 UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
 SEED: int | None = option("--seed", "Instead of the description's.", min=0)
-REALTIME: bool | None = option(
-    "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
-)
+REALTIME: bool | None = option("--realtime/--no-realtime", "SCHED_FIFO. Default: where permitted.")
 USERS: list[str] | None = option(
-    "--user NAME",
-    "Whose processes are taken for nodes (may be repeated). Default: yours, also behind sudo, and"
-    " root's.",
+    "--user NAME", "Whose processes may be nodes (may be repeated). Default: yours, and root's."
 )
 ADAPT: bool = option(
     "--adapt",
-    "Slots follow the latencies: later when the plan's promise does not hold any more, earlier when"
-    " latency can be given back.",
+    "Slots follow the latencies: later to keep the plan's promise, earlier to give some back.",
     False,
 )
 MAX_LATENCY: int | None = option(
     "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
 )
-SOURCE: Source | None = option(
-    "--source", "Tracer. Default: preload, or lttng where that cannot be had."
-)
+SOURCE: Source | None = option("--source", "Tracer. Default: preload, or else lttng.")
 NODE: NodeKind = option(
     "--node",
-    "A script; a package for all types; one generated for the type; or that as a component, in the "
-    "publisher's container.",
+    "A script; a package for all types; one for the type; or that as a component.",
     "python",
 )
 

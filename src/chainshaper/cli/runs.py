@@ -41,9 +41,7 @@ DURATION: int | None = opt.option(
     "--duration DURATION", "How long to record. Default: until the application ends, or Ctrl-C."
 )
 BUFFER: int | None = opt.option(
-    "--buffer MIB",
-    "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
-    min=1,
+    "--buffer MIB", "LTTng's buffer of a core, if events were lost. Default: 4.", min=1
 )
 
 
@@ -93,9 +91,7 @@ def demo(
 
 
 def init(
-    output: Path = opt.option(
-        "--output -o app.yaml", "File to write; must not exist.", Path("app.yaml")
-    ),
+    output: Path = opt.option("--output -o app.yaml", "Must not exist.", Path("app.yaml")),
 ) -> None:
     """Write the description of an application to start from: the paper's synthetic chain.
 
@@ -166,9 +162,7 @@ def simulate(
 
 def generate(
     application: Path = opt.APPLICATION,
-    output: Path = opt.option(
-        "--output -o DIR", "Folder of the package, named like it; must not exist.", ...
-    ),
+    output: Path = opt.option("--output -o DIR", "The package's folder and name.", ...),
     json: bool = opt.option("--json", "Print what was written as JSON.", False),
 ) -> None:
     """Write a colcon package with the application as ROS 2 nodes in C++.
@@ -195,9 +189,7 @@ def record(
     user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
     watch_stalls: bool = opt.option(
-        "--watch-stalls",
-        "Have a sleeper on every core notice when the machine itself stands still.",
-        False,
+        "--watch-stalls", "Notice on every core when the machine stands still.", False
     ),
     json: bool = opt.JSON,
 ) -> None:
@@ -253,28 +245,22 @@ def _record_and_show(
 def watch(
     command: list[str] | None = opt.argument(
         "[-- COMMAND…]",
-        "Starts the application with the library in front, and ends it with Ctrl-C. Default: "
-        "what runs already with the library is watched, and left running.",
+        "Starts the application with the library in front. Default: what runs so is watched.",
     ),
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST", "A chain, by topics or nodes: /t1../t5 (may be repeated)."
     ),
-    plan: Path | None = opt.option(
-        "--plan plan.yaml", "The plan in force: its chains, slots, and which outputs are late."
-    ),
+    plan: Path | None = opt.option("--plan plan.yaml", "The plan in force, with chains and slots."),
     longest: int = opt.option(
         "--longest DURATION>0", "What takes longer counts as incomplete.", 2_000_000_000
     ),
     every: int = opt.option("--every DURATION>0", "How often to look.", 1_000_000_000),
     budget: Path | None = opt.option(
         "--budget FILE",
-        "What chains, hops and callbacks may take in the last minute: a limit that breaks is said,"
-        " and the last ten seconds are written.",
+        "Limits for the last minute: what breaks one is said, and the last ten seconds written.",
     ),
     recorder: Path = opt.option(
-        "--recorder DIR",
-        "Where these are written, also by Ctrl-\\: recordings in folders named by their time.",
-        Path(),
+        "--recorder DIR", "Where these are written, also by Ctrl-\\.", Path()
     ),
     metrics: int | None = opt.option(
         "--metrics PORT", "Serve OpenMetrics (Prometheus) on this port of this machine.", min=1
@@ -287,9 +273,7 @@ def watch(
     ),
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
-        "--environment",
-        "Print the variable that puts the library in front of ROS 2; no more.",
-        False,
+        "--environment", "Print how the library gets in front of ROS 2; no more.", False
     ),
     json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),
 ) -> None:
@@ -432,13 +416,11 @@ def profile(
     *,
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
-        "The chain whose nodes, and those that it waits for, get the priority (may be repeated);"
-        " --like tells which those are.",
+        "A chain whose nodes, and those it waits for, get the priority (may be repeated).",
     ),
     like: Path | None = opt.option(
         "--like REC",
-        "An earlier recording of the application: it knows the chain's nodes, components "
-        "of containers, and executors with several threads.",
+        "An earlier recording: it knows the chain's nodes, components, executors' threads.",
     ),
     node: list[str] | None = opt.option(
         "--node NAME",
@@ -523,29 +505,20 @@ def shape(
         ...,
     ),
     output: Path = opt.option(
-        "--output -o REC",
-        "Folder for the recording; of a launched application, for everything.",
-        ...,
+        "--output -o REC", "Folder for the recording, or for the whole flow.", ...
     ),
     cycles: int = opt.CYCLES,
     realtime: bool | None = opt.REALTIME,
     chain: list[str] | None = opt.option(
-        "--chain FIRST..LAST",
-        "The chain, by topics or nodes: /t1../t5. Several are shaped together. Default: you are"
-        " asked.",
+        "--chain FIRST..LAST", "A chain, or several to shape together. Default: you are asked."
     ),
     sink: list[str] | None = opt.SINK,
     throttle: list[str] | None = opt.option(
         "--throttle NODE:TOPIC=PERIOD",
-        "A throttler before an input of NODE that is not quite periodic, from the first recording"
-        " on (may be repeated).",
+        "A throttler before a not quite periodic input (may be repeated).",
     ),
-    period: int | None = opt.option(
-        "--period DURATION>0", "Period of a chain that no timer starts."
-    ),
-    duration: int = opt.option(
-        "--duration DURATION>0", "How long to measure, before and after.", 60_000_000_000
-    ),
+    period: int | None = opt.option("--period DURATION>0", "Of a chain that no timer starts."),
+    duration: int = opt.option("--duration DURATION>0", "Of each measurement.", 60_000_000_000),
     since: int = opt.SINCE,
     until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,

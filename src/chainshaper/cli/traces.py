@@ -49,13 +49,10 @@ def describe(
 
 def graph(
     trace: list[Path] = opt.TRACE,
-    output: Path | None = opt.option(
-        "--output -o FILE", "File to write: .svg, .dot or .json; must not exist."
-    ),
+    output: Path | None = opt.option("--output -o FILE", "File to write: .svg, .dot or .json."),
     everything: bool = opt.option(
         "--all",
-        "Also what every node has for itself: parameter services, /rosout, "
-        "/parameter_events. In JSON they are always there, marked as internal.",
+        "Also parameter services, /rosout, /parameter_events, which JSON always has.",
         False,
     ),
     json: bool = opt.JSON,
@@ -356,8 +353,7 @@ def report(
     plan: Path | None = opt.PLAN_IN_FORCE,
     cycles: list[int] | None = opt.option(
         "--cycle N",
-        "A cycle that the timeline has to show, where there are too many to show all. "
-        "May be given several times.",
+        "A cycle that the timeline has to show, of too many for all (may be repeated).",
         min=0,
     ),
     json: bool = opt.JSON,
@@ -383,9 +379,7 @@ def report(
 
 def export(
     trace: list[Path] = opt.TRACE,
-    output: Path = opt.option(
-        "--output -o FILE", "File to write, such as trace.pftrace; must not exist.", ...
-    ),
+    output: Path = opt.option("--output -o FILE", "Such as trace.pftrace; must not exist.", ...),
     perfetto: bool = opt.option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
     mcap: bool = opt.option("--mcap", "Times of callbacks and cycles, for Foxglove.", False),
     chain: str | None = opt.CHAIN,
