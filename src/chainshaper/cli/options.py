@@ -251,8 +251,7 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
         bands = {mode: number for number, (mode, _, _) in enumerate(pairs, start=1)}
     if len(bands) != len(pairs):
         raise InputError(
-            f"--modes {text}: write the topic, and each mode once, all with a band or none, such as"
-            " /driving_mode:city=2,highway=1"
+            f"--modes {text}: write TOPIC:MODE,MODE, each mode once, all with a band or none"
         )
     with wrong_values_refused(Modes):
         return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")

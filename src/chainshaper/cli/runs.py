@@ -202,8 +202,7 @@ def record(
         raise InputError("a COMMAND is started, --pid attaches to what runs: give one of them")
     if not command and source not in ("ebpf", "preload"):
         raise InputError(
-            "no command given: `chainshaper record -o REC -- ros2 launch …`; to attach to what "
-            "runs already, add `--source ebpf`, or `--source preload` if it has the library"
+            "no command given: `record -o REC -- ros2 launch …`; to attach, add --source ebpf"
         )
     how: dict[str, Any] = {"pids": pid or [], "users": user or [], "watch_stalls": watch_stalls}
     _record_and_show(
@@ -454,8 +453,7 @@ def profile(
     chains = chain or []
     if chains and like is None and not node:
         raise InputError(
-            f"which nodes {chains[0]} has, an earlier recording knows: name it with --like REC "
-            "(`chainshaper record`), or name the nodes with --node"
+            f"which nodes has {chains[0]}? Name an earlier recording (--like), or these (--node)"
         )
     refuse_existing(output)
     check_command(command)
@@ -466,8 +464,7 @@ def profile(
     cores, earlier = check_profiling(request.cores), opt.recording_of(like)
     if len(cores) > 1 and not (earlier and chains):
         raise InputError(
-            "--cores are distributed by what chains do at the same time: name these with --chain,"
-            " and a recording that has them with --like"
+            "--cores are distributed by what chains do at the same time: add --chain, --like"
         )
     core_of = {f"/{name.strip('/')}": cores[0] for name in node or ()}
     seen = tuple["cs.Profile", ...]()
@@ -478,8 +475,7 @@ def profile(
             out.notes(["chains that share a core delay each other here: profile them one by one"])
     if request.best_effort and not core_of:
         raise InputError(
-            "--best-effort is a node beside the chain: name the chain (--chain, --like) or its"
-            " nodes (--node)"
+            "--best-effort is a node beside the chain: add --chain and --like, or --node"
         )
     _record_and_show(
         *(output, command, json, buffer),
@@ -550,8 +546,7 @@ def shape(
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError(
-            "a described application is shaped with its plan, and nothing else: `chainshaper shape "
-            "APP.yaml plan.yaml -o REC`"
+            "a described application has its plan alone: `shape APP.yaml plan.yaml -o REC`"
         )
     _shape_launched(
         *(words, output, json, strict),

@@ -586,8 +586,7 @@ class _Run:
                     servers.change(table, anchor_ns)
                 elif self.gated and table != threads.server_table(self.plan):
                     raise OperationError(
-                        f"the back end {self.choice.name} cannot move slots of some chains only:"
-                        " end the run, and apply the plan again"
+                        f"{self.choice.name} cannot move slots of some chains only: apply again"
                     )
                 else:
                     servers.arm(anchor_ns)

@@ -132,8 +132,7 @@ def shape_launch(
         if stop.is_set() or done.exit_code is not None:
             ended = "was stopped" if done.exit_code is None else "ended by itself"
             raise OperationError(
-                f"the application {ended} during the recording {done.recording.path}, which stays;"
-                " nothing was shaped"
+                f"the application {ended}: nothing was shaped; {done.recording.path} stays"
             )
         return done.recording
 
@@ -226,8 +225,7 @@ def _refuse_early(
         raise InputError("--sink goes with one chain: name each output with a --chain of its own")
     if unknown := [one.topic for one in throttled if one.subscriber is None]:
         raise InputError(
-            f"which node gets {unknown[0]} is not known before the first recording: name it, as in"
-            f" --throttle NODE:{unknown[0]}=PERIOD"
+            f"which node gets {unknown[0]}? Name it: --throttle NODE:{unknown[0]}=PERIOD"
         )
 
 

@@ -193,8 +193,7 @@ def splice_throttlers(
         how = (one.period_ns, one.rule)
         if any(one.topic in topics for other, topics in alike.items() if other != how):
             raise InputError(
-                f"{one.topic} is throttled twice, with another period or rule: two throttlers would"
-                f" publish {one.topic}_throttled; name it with one"
+                f"{one.topic} is throttled twice, with another period or rule: name it with one"
             )
         topics = alike.setdefault(how, {})
         nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
@@ -311,8 +310,7 @@ def _subscribers(one: ThrottledInput, known: _Names | None) -> Sequence[str]:
         return [one.subscriber]
     if known is None:
         raise InputError(
-            f"who subscribes to {one.topic} is not known: name a recording of the application with"
-            f" --recording REC, or the node with --throttle NODE:{one.topic}=PERIOD"
+            f"who subscribes to {one.topic} is not known: name a recording, or the node"
         )
     if not known.get(one.topic):
         raise InputError(
@@ -324,16 +322,14 @@ def _subscribers(one: ThrottledInput, known: _Names | None) -> Sequence[str]:
 
 def _publisher(plan: Plan, node: ShapingNode, known: _Names | None) -> str:
     standby = f"/{node.name}{STANDBY}"
-    names = [name for name in (known or {}).get(node.output, ()) if name != standby]
+    names = sorted(name for name in (known or {}).get(node.output, ()) if name != standby)
     if len(names) > 1:
         raise InputError(
-            f"{node.output} has {len(names)} publishers, {', '.join(sorted(names))}: a shaping node"
-            " stands behind one, so plan for a topic that has one"
+            f"{node.output} has {len(names)} publishers, {', '.join(names)}: only one can be shaped"
         )
     planned = plan.chain.publisher if node is plan.shaping_node else node.publisher
     if planned is None and not names:
         raise InputError(
-            f"the plan does not say who publishes {node.output}: name a recording of the"
-            " application with --recording REC"
+            f"the plan does not say who publishes {node.output}: name a recording (--recording REC)"
         )
     return planned or names[0]

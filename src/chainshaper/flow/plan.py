@@ -208,8 +208,8 @@ def _period(analysis: LatencyAnalysis, given: int | None) -> int:
     first, spec = analysis.graph.callbacks[analysis.chain.callbacks[0]], analysis.chain.spec
     if first.period_ns is not None and given not in (None, first.period_ns):
         raise InputError(
-            "--period goes with --latencies, or with a chain that no timer starts:"
-            f" {first.label} has its own period, leave it out"
+            "--period goes with --latencies, or with a chain that no timer starts, which"
+            f" {first.label} does: leave it out"
         )
     period = given if first.period_ns is None else first.period_ns
     if period is None:
@@ -355,8 +355,7 @@ def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) ->
     response = (publishing if (publishing := own.filter(publishes)).height else own)["response"]
     if response.is_empty():
         raise OperationError(
-            f"no execution of {stage.node} that publishes {stage.topic} was recorded undisturbed:"
-            " record again"
+            f"{stage.node} did not publish {stage.topic} in any undisturbed execution: record again"
         )
     others = own.filter(~publishes) if len(stage.members) > 1 else own.clear()
     waiting = others.group_by("callback_id").agg(pl.col("response").max())["response"].sum()

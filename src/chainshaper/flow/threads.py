@@ -269,9 +269,7 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
         )
     if plan.takes_turns and back_end == "scx":
         raise InputError(
-            "equal_priorities: round-robin, but under the back end scx turns are those of one"
-            " node's threads, and servers of one priority run in the plan's order: choose"
-            " another (--backend freezer)"
+            "equal_priorities: round-robin, but scx has turns within one node only: choose freezer"
         )
 
 
@@ -299,8 +297,7 @@ def followed_chains(
             tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
             if len(tables) > 1 and back_end not in ("freezer", "fifo"):
                 raise InputError(
-                    f"the back end {back_end} does not move slots of its servers with a cycle:"
-                    " choose freezer, or `shaping_thread: free`"
+                    f"{back_end} moves no slots: choose freezer, or `shaping_thread: free`"
                 )
         except InputError as error:
             why_not.append(f"slots of {chain_name(chain)} cannot follow its latencies: {error}")
@@ -316,8 +313,7 @@ def server_table(plan: ApplicationPlan) -> ServerTable:
     servers = [s for s in plan.servers if set(s.threads) - plan.free_threads]
     if not servers:
         raise OperationError(
-            "the plan's servers name no threads of the application, so there is nothing to apply: "
-            "plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
+            "the plan's servers name no threads, nothing can be applied: plan from a recording"
         )
     return table_of(plan.cycle_ns, servers, plan.most_urgent_first)
 
@@ -352,8 +348,7 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[tuple[Thread
         planned = allocation.first_planned(chain)
         if planned is None:
             raise OperationError(
-                f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
-                " cycle the chain begins: give its phase (--phase)"
+                f"no server of {chain_name(chain)} holds an executor to begin it: give --phase"
             )
         begin.append(tuple(one.thread for one in allocation.threads_for(planned, found)))
     return begin
@@ -467,6 +462,5 @@ def _around(
         names = ", ".join(map(chain_name, chains))
         raise OperationError(
             f"the timers of {names} expire so that, whatever their offsets, one does while the slot"
-            " of its instance before is open: start the nodes again, one after the other, so that"
-            f" their timers expire at other instants ({error})"
+            f" of its instance before is open: start the nodes again, one by one ({error})"
         ) from error
