@@ -23,12 +23,17 @@ from chainshaper.values.recording import Recording
 MISSING_CORE = small_chain_text(executor_core=1023)
 Words: TypeAlias = Callable[[str], list[str]]
 EXISTS = "exists already and is not overwritten: name another, or remove it"
+NO_FOLDER = "missing: no such folder to write"
+NO_RECORDING = "a recording is made with `chainshaper run"
+OTHERS = "is a plan; wanted is a file "
 
 
 @pytest.fixture
 def folder(application_file: Path, plan: Plan) -> Path:
-    """A folder with an application, a plan for it, and latencies longer than their period."""
+    """An application, plans for it with and without shaping, latencies longer than the period."""
     save_plan(plan, application_file.with_name("plan.yaml"))
+    servers = server_per_chain(small_chain_plan(8_000_000, 12_000_000))
+    save_plan(servers, application_file.with_name("servers.yaml"))
     application_file.with_name("latencies.txt").write_text("30ms\n120ms\n")
     return application_file.parent
 
@@ -39,6 +44,7 @@ def words(folder: Path, simulated: Recording) -> Words:
     places = {
         "APP": folder / "application.yaml",
         "PLAN": folder / "plan.yaml",
+        "SERVERS": folder / "servers.yaml",
         "LATENCIES": folder / "latencies.txt",
         "REC": simulated.path,
         "OUT": folder / "recording",
@@ -49,78 +55,32 @@ def words(folder: Path, simulated: Recording) -> Words:
     return lambda text: [str(places.get(word, word)) for word in text.split()]
 
 
-@pytest.mark.parametrize("verb", ["latency", "plan"])
 @pytest.mark.parametrize(
-    ("chain", "message"),
+    ("file", "change", "message"),
     [
-        ("/t1../t9", "/t9"),
-        ("/nobody../t3", "/nobody"),
-        ("/t3../t1", "/t3../t1"),  # against the flow
-        ("/t1../t2../t1", "stands twice"),  # cyclic
-        ("/t1..", "way points"),
+        ("application", "on: /t2 → on: /t9", "subscription: no node publishes /t9"),
+        ("application", "/t1../t3 → /t1../brake", ":2: chain: no topic or node is called '/bra"),
+        ("application", "timer: 50ms → timer: 50", "50 is not a duration: write a number and"),
+        ("application", ": \\[/t3] → : [/t3, /t1]", "the topics form a cycle"),
+        ("application", "nodes: → nodes: [", "not YAML"),
+        ("application", " core: \\d+ → core: 1023", "is not available: this process may use"),
+        ("plan", "50ms → 15ms", "15 ms"),  # shorter than the longest latency
+        ("plan", "50ms → 60ms", "plan again from a recording of this application"),
+        ("plan", "node: /second → node: /secnod", "the plan names /secnod, which 'small chain'"),
+        ("plan", " core: \\d+ →  core: 1023", "core 1023, which node chainshaper_t3 asks for"),
     ],
 )
-def test_a_chain_that_does_not_exist(
-    verb: str, chain: str, message: str, simulated: Recording
+def test_a_mistake_in_a_file(
+    file: str, change: str, message: str, folder: Path, words: Words
 ) -> None:
-    assert message in refused(2, verb, simulated.path, "--chain", chain)
-
-
-@pytest.mark.parametrize("command", ["run APP -o OUT", "shape APP PLAN -o OUT"])
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ("subscription: /t2 → subscription: /t9", "subscription: no node publishes /t9"),
-        ("/t1../t3 → /t1../brake", ":2: chain: no topic or node is called '/brake'"),
-        ("timer: 50ms → timer: 50", "50 is not a duration: write a number and a unit"),
-        ("publishes: [/t3] → publishes: [/t3, /t1]", "the topics form a cycle"),
-        ("nodes: → nodes: [", "not YAML"),
-    ],
-)
-def test_a_mistake_in_the_application(
-    command: str, change: str, message: str, folder: Path, words: Words
-) -> None:
-    old, _, new = change.partition(" → ")
-    (folder / "application.yaml").write_text(small_chain_text().replace(old, new))
-    assert message in refused(2, *words(command))
-    assert not (folder / "recording").exists()
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (("50ms", "15ms"), "15 ms"),  # shorter than the longest latency
-        (("50ms", "60ms"), "plan again from a recording of this application"),
-        (
-            ("node: /second", "node: /secnod"),
-            "the plan names /secnod, which 'small chain' does not",
-        ),
-        ((r" core: \d+", " core: 1023"), "core 1023, which node chainshaper_t3 asks for"),
-    ],
-)
-def test_a_mistake_in_the_plan(
-    change: tuple[str, str], message: str, folder: Path, words: Words
-) -> None:
-    text = (folder / "plan.yaml").read_text()
-    (folder / "plan.yaml").write_text(re.sub(*change, text))
-    code = 3 if "core" in message else 2
+    path, code = folder / f"{file}.yaml", 3 if "1023" in change else 2
+    changed = re.sub(*change.split(" → "), path.read_text())
+    path.write_text(MISSING_CORE if (file, code) == ("application", 3) else changed)
     assert message in refused(code, *words("shape APP PLAN -o OUT"))
-
-
-def test_servers_without_shaping_go_to_apply(words: Words, folder: Path) -> None:
-    file = folder / "servers.yaml"
-    save_plan(server_per_chain(small_chain_plan(8_000_000, 12_000_000)), file)
-    message = refused(2, *words(f"shape APP {file} -o OUT"))
-    assert "put server-per-chain in force with `chainshaper apply plan.yaml`" in message
-
-
-def test_a_missing_core_is_the_platforms_fault(folder: Path, words: Words) -> None:
-    (folder / "application.yaml").write_text(MISSING_CORE)
-    for command in ("run APP -o OUT", "demo --application APP -o OUT"):
-        message = refused(3, *words(command))
-        assert "core 1023, which node" in message
-        assert "is not available: this process may use" in message
-        assert not (folder / "recording").exists()
+    if file == "application":
+        assert message in refused(code, *words("run APP -o OUT"))
+        assert message in refused(code, *words("demo --application APP -o OUT"))
+    assert not (folder / "recording").exists()
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="setpriv is not installed")
@@ -136,8 +96,7 @@ def test_without_the_privilege_it_runs_with_what_it_may(
         return
     if finished.code == 0:
         pytest.skip("SCHED_FIFO is permitted here without CAP_SYS_NICE")
-    assert finished.code == 3
-    assert "may not use SCHED_FIFO: run as root, give your user an rtprio limit" in finished.err
+    assert "may not use SCHED_FIFO: run as root, give your user an" in message_of(finished, 3)
     assert not output.exists()
 
 
@@ -149,22 +108,26 @@ def test_without_the_privilege_it_runs_with_what_it_may(
         ("shape APP PLAN -o DIR", EXISTS),
         ("demo -o DIR", EXISTS),
         ("plan REC -o PLAN", EXISTS),
-        ("run APP -o MISSING", "missing: no such folder to write"),
-        ("demo -o MISSING", "missing: no such folder to write"),
-        ("plan REC -o MISSING", "missing: no such folder to write"),
-        ("latency DIR", "a recording is made with `chainshaper run"),
-        ("callbacks APP", "a recording is made with `chainshaper run"),
-        ("plan OUT", "a recording is made with `chainshaper run"),
+        ("run APP -o MISSING", NO_FOLDER),
+        ("demo -o MISSING", NO_FOLDER),
+        ("plan REC -o MISSING", NO_FOLDER),
+        ("latency DIR", NO_RECORDING),
+        ("callbacks APP", NO_RECORDING),
+        ("plan OUT", NO_RECORDING),
         ("compare REC DIR", ": a folder without"),
         # An application as the plan, a plan as the application, a recording as either.
-        (
-            "shape APP APP -o OUT",
-            "is the description of an application; wanted is a file written by",
-        ),
-        ("run PLAN -o OUT", "is a plan; wanted is a file "),
-        ("shape PLAN APP -o OUT", "is a plan; wanted is a file "),
+        ("shape APP APP -o OUT", "is the description of an application; wanted is a file written"),
+        ("run PLAN -o OUT", OTHERS),
+        ("shape PLAN APP -o OUT", OTHERS),
         ("run REC -o OUT", "is the folder of a recording; wanted is a file "),
         ("plan --latencies TABLE --period 1s", "one duration a line"),
+        ("shape APP SERVERS -o OUT", "put server-per-chain in force with `chainshaper apply plan"),
+        # Chains that do not exist.
+        ("latency REC --chain /t1../t9", "/t9"),
+        ("plan REC --chain /nobody../t3", "/nobody"),
+        ("latency REC --chain /t3../t1", "/t3../t1"),  # against the flow
+        ("latency REC --chain /t1../t2../t1", "stands twice"),
+        ("latency REC --chain /t1..", "way points"),
         # Options that do not go together.
         ("plan", "give either a recording or --latencies"),
         ("plan REC --latencies LATENCIES", "give either a recording or --latencies"),
@@ -176,8 +139,8 @@ def test_without_the_privilege_it_runs_with_what_it_may(
         ("record -o OUT", "no command given"),
         ("record -o OUT --pid 1 -- true", "a COMMAND is started, --pid attaches"),
         ("profile -o OUT", "no command given"),
-        ("profile -o OUT --chain /a../b -- true", "knows: name it with --like"),
-        ("shape APP -o OUT", "a described application is shaped with its plan"),
+        ("profile -o OUT --chain /a../b -- true", "Name an earlier recording (--like)"),
+        ("shape APP -o OUT", "a described application has its plan alone"),
         ("export REC -o OUT", "add --perfetto"),
         ("release nothing", "no run 'nothing': "),
     ],
@@ -188,12 +151,6 @@ def test_what_does_not_go_is_refused_and_nothing_written(
     before = {path: path.read_bytes() for path in folder.iterdir()}
     assert message in refused(2, *words(command))
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
-
-
-def test_a_pattern_that_is_none_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "budget.yaml").write_text("format: 1\nchains: [{chain: /a../b, maximum: 1ms}]\n")
-    said = refused(2, "check", tmp_path / "**x", "--budget", tmp_path / "budget.yaml")
-    assert "no pattern" in said
 
 
 def test_with_json_an_error_is_json_too(words: Words) -> None:
@@ -227,7 +184,6 @@ def test_without_a_chain_those_of_the_trace_are_proposed() -> None:
         "plan rec --anchor clock",
         "shape app.yaml",
         "watch --every 0ms --chain /a../b",
-        "watch --longest 0ms --chain /a../b",
         "latency",
         "dance",
         "--louder",
@@ -260,22 +216,23 @@ def _lack_of_memory_below() -> None:
         raise ValueError("no matrix") from error
 
 
-def _enomem() -> None:
-    raise OSError(errno.ENOMEM, "Cannot allocate memory")
+def _raises(error: BaseException) -> Callable[[], None]:
+    def fails() -> None:
+        raise error
 
-
-def _polars_panics() -> None:
-    raise pl.exceptions.PanicException("assertion failed:\n offset")
+    return fails
 
 
 @pytest.mark.parametrize(
     ("fails", "message"),
     [
         (lambda: np.zeros(1 << 60, np.uint8), "memory ran out (Unable to allocate 1.00 EiB"),
-        (lambda: bytearray(1 << 62), "memory ran out (Python could not allocate it)"),
         (_lack_of_memory_below, "memory ran out (Python could not allocate it)"),
-        (_enomem, "memory ran out ([Errno 12] Cannot allocate memory)"),
-        (_polars_panics, "Polars cannot process this data (assertion failed: offset): check"),
+        (_raises(OSError(errno.ENOMEM, "Cannot allocate")), "memory ran out ([Errno 12] Cannot"),
+        (
+            _raises(pl.exceptions.PanicException("assertion failed:\n offset")),
+            "Polars cannot process this data (assertion failed: offset): check",
+        ),
     ],
 )
 def test_memory_that_runs_out_is_one_message(fails: Callable[[], object], message: str) -> None:
@@ -283,11 +240,8 @@ def test_memory_that_runs_out_is_one_message(fails: Callable[[], object], messag
         found = refused(1, "info")
     assert message in found
     assert found.count("\n") == 1
-
-
-def test_other_mistakes_of_ours_stay_tracebacks() -> None:
     with mock.patch("chainshaper.cli.app.app", side_effect=KeyError("x")), pytest.raises(KeyError):
-        called("info")
+        called("info")  # other mistakes of ours stay tracebacks
 
 
 @pytest.mark.parametrize("megabytes", [100, 400, 650])
