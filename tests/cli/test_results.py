@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from command_line import called, chainshaper, json_of
+from command_line import called, chainshaper, json_of, refused
 from rich.console import Console
 from small_chain import DDS_CORE, EXECUTOR_CORE, small_chain_text
 
@@ -29,18 +29,14 @@ STATISTICS = {
 }
 
 
-@pytest.mark.parametrize("verb", VERBS)
-def test_every_verb_explains_itself(verb: str) -> None:
-    for option in ("--help", "-h"):
-        finished = called(verb, option)
+def test_every_verb_explains_itself() -> None:
+    overview = chainshaper("--help")
+    assert overview.code == 0
+    for verb in VERBS:
+        assert f" {verb} " in overview.out
+        finished = called(verb, "-h")
         assert (finished.code, finished.err) == (0, "")
         assert f"Usage: chainshaper {verb}" in finished.out
-
-
-def test_the_overview_names_every_verb() -> None:
-    finished = chainshaper("--help")
-    assert finished.code == 0
-    assert all(f" {verb} " in finished.out for verb in VERBS)
 
 
 def test_latency_as_json_is_what_the_library_finds(unshaped: Recording) -> None:
@@ -54,17 +50,12 @@ def test_latency_as_json_is_what_the_library_finds(unshaped: Recording) -> None:
     for name in ("count", "incomplete", "min_ns", "max_ns"):
         assert values[name] == getattr(found, name)
     assert values["jitter_ns"] == values["max_ns"] - values["min_ns"]
-    assert all(isinstance(values[key], int) for key in ("min_ns", "mean_ns", "max_ns", "spread_ns"))
-
-
-def test_instances_are_in_wall_clock_time(unshaped: Recording) -> None:
     values = json_of("latency", unshaped.path, "--instances", "--chain", "/t1../t2")
-    assert len(values["instances"]) == values["count"]
     latencies = [instance["latency_ns"] for instance in values["instances"]]
+    assert len(latencies) == values["count"]
     assert (min(latencies), max(latencies)) == (values["min_ns"], values["max_ns"])
     modified = (unshaped.path / "recording.json").stat().st_mtime_ns
     for instance in values["instances"]:
-        assert set(instance) == {"start_ns", "end_ns", "latency_ns", "disturbed"}
         assert instance["end_ns"] - instance["start_ns"] == instance["latency_ns"]
         assert modified - 600 * 10**9 < instance["start_ns"] < modified, "an epoch, not an uptime"
 
@@ -87,9 +78,8 @@ def test_compare_as_json_and_with_figures(
     assert before["count"] == after["count"] or not unshaped.info.realtime
     for name in ("latency.png", "distribution.png"):
         assert (figures / name).read_bytes().startswith(b"\x89PNG")
-    again = called("compare", unshaped.path, shaped.path, "--figures", figures)
-    assert again.code == 2
-    assert "exists already and is not overwritten" in again.err
+    again = refused(2, "compare", unshaped.path, shaped.path, "--figures", figures)
+    assert "exists already and is not overwritten" in again
 
 
 def test_doctor_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,63 +107,49 @@ def test_doctor_as_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None
 @pytest.mark.parametrize(
     ("variables", "found"),
     [
-        ({}, None),
-        ({"ROS_DISTRO": "jazzy"}, "rmw_fastrtps_cpp"),
-        ({"ROS_DISTRO": "humble"}, "have no names"),
-        ({"RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp"}, "rmw_cyclonedds_cpp"),
-        (
-            {
-                "RMW_IMPLEMENTATION": "rmw_cyclonedds_cpp",
-                "CYCLONEDDS_URI": "<PubSubMessageExchange name='iox'/>",
-            },
-            "iceoryx",
-        ),
-        ({"RMW_IMPLEMENTATION": "rmw_zenoh_cpp", "ROS_DISTRO": "kilted"}, "Zenoh"),
-        ({"RMW_IMPLEMENTATION": "rmw_connextdds"}, "RTI Connext"),
-        ({"RMW_IMPLEMENTATION": "rmw_own_cpp"}, "rmw_own_cpp is not known"),
+        ("", None),
+        ("ROS_DISTRO=jazzy", "rmw_fastrtps_cpp"),
+        ("ROS_DISTRO=humble", "have no names"),
+        ("RMW_IMPLEMENTATION=rmw_cyclonedds_cpp", "rmw_cyclonedds_cpp"),
+        ("RMW_IMPLEMENTATION=rmw_cyclonedds_cpp CYCLONEDDS_URI=<x:name='iox'/>", "iceoryx"),
+        ("RMW_IMPLEMENTATION=rmw_zenoh_cpp ROS_DISTRO=kilted", "Zenoh"),
+        ("RMW_IMPLEMENTATION=rmw_connextdds", "RTI Connext"),
+        ("RMW_IMPLEMENTATION=rmw_own_cpp", "rmw_own_cpp is not known"),
     ],
 )
 def test_doctor_says_what_is_limited_on_a_middleware(
-    variables: dict[str, str], found: str | None, monkeypatch: pytest.MonkeyPatch
+    variables: str, found: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("ROS_DISTRO", "RMW_IMPLEMENTATION", "CYCLONEDDS_URI"):
         monkeypatch.delenv(name, raising=False)
-    for name, value in variables.items():
-        monkeypatch.setenv(name, value)
+    for variable in variables.split():
+        monkeypatch.setenv(*variable.split("=", 1))
     checks = list(doctor._middleware())
     assert [(found or "") in check.found for check in checks] == [True] * bool(found)
     works = found in ("rmw_cyclonedds_cpp", "rmw_fastrtps_cpp")
     assert {check.state for check in checks} <= {"good" if works else "limited"}
 
 
-def test_tables_are_for_people(unshaped: Recording, shaped: Recording, plan: Plan) -> None:
-    for command, texts in (
-        (
-            ["latency", unshaped.path],
-            ["End-to-end latency of /t1../t3 [ms]", "disturbed by the machine"],
-        ),
-        (["callbacks", unshaped.path], ["Callbacks [ms]", "/actuator"]),
-        (
-            ["compare", unshaped.path, shaped.path],
-            ["before", "after", "Prediction and measurement", "[21.000, 22.000)"],
-        ),
-        (["plan", unshaped.path], ["Plan for /t1../t3 [ms]"]),
-        (["status"], ["plan"]),
-        (["status", "--outputs"], [""]),
+def test_tables_are_for_people(
+    unshaped: Recording, shaped: Recording, plan: Plan, tmp_path: Path
+) -> None:
+    save_plan(plan, tmp_path / "plan.yaml")
+    dry_run = ["apply", tmp_path / "plan.yaml", "--dry-run", "--backend", "litmus"]
+    compared = ["before", "after", "Prediction and measurement", "[21.000, 22.000)"]
+    for command, *texts in (
+        (["latency", unshaped.path], "latency of /t1../t3 [ms]", "disturbed by the machine"),
+        (["callbacks", unshaped.path], "Callbacks [ms]", "/actuator"),
+        (["compare", unshaped.path, shaped.path], *compared),
+        (["plan", unshaped.path], "Plan for /t1../t3 [ms]"),
+        (["status"], "plan"),
+        (["status", "--outputs"], ""),
+        (dry_run, "resctl -n"),
     ):
         finished = called(*command)
         assert finished.code == 0, finished
         assert [text for text in texts if text not in finished.out] == [], command
     assert "note: the sample is small" in called("plan", unshaped.path).err
-
-
-def test_a_dry_run_shows_what_threads_would_get(plan: Plan, tmp_path: Path) -> None:
-    save_plan(plan, tmp_path / "plan.yaml")
-    apply = ("apply", tmp_path / "plan.yaml", "--dry-run", "--backend")
-    commands = called(*apply, "litmus")
-    assert commands.code == 0, commands
-    assert "resctl -n" in commands.out
-    assert json_of(*apply, "litmus")["back_end"] == "litmus"
+    assert json_of(*dry_run)["back_end"] == "litmus"
 
 
 def test_a_plan_is_written_and_printed(tmp_path: Path, unshaped: Recording) -> None:
@@ -195,27 +171,23 @@ def test_a_plan_is_written_and_printed(tmp_path: Path, unshaped: Recording) -> N
     assert printed[-1] == str(file), "on one line, however long"
 
 
-def test_nothing_is_said_about_what_is_quick(capsys: pytest.CaptureFixture[str]) -> None:
-    with output.late_progress("info") as report:
-        report(0.5, "decoding events")
-    assert capsys.readouterr().err == ""
-
-
+@pytest.mark.parametrize("patience_s", [0.01, 60])
 def test_what_takes_longer_says_what_it_does(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    patience_s: float, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(output, "PATIENCE_S", 0.01)
+    monkeypatch.setattr(output, "PATIENCE_S", patience_s)
+    said = ""
     with output.late_progress("latency") as report:
         report(0.1, "opening the trace")
-        said = ""
-        for _ in range(200):
+        for _ in range(200 if patience_s < 1 else 1):
             time.sleep(0.01)
             said += capsys.readouterr().err
             if said:
                 break
         report(0.5, "decoding events")
     said += capsys.readouterr().err
-    assert said == "latency: opening the trace\nlatency: decoding events\n"
+    stages = ["latency: opening the trace", "latency: decoding events"] if patience_s < 1 else []
+    assert said.splitlines() == stages
 
 
 def test_a_promise_is_judged_in_one_line_and_an_exit_code(tmp_path: Path) -> None:
