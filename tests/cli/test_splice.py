@@ -159,7 +159,7 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(files: Files, p
         ("PLAN ROBOT -o DIR --build", "--node python needs no building"),
         ("PLAN ROBOT -o DIR --node typed", "not known: name it"),
         ("PLAN ROBOT -o DIR --node typed --type Header", "'Header' is not a message type"),
-        ("ROBOT -o DIR --throttle /t1=100ms", "--recording REC, or the node"),
+        ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording, or the node"),
         ("ROBOT -o DIR --throttle /third:/t1", "write a topic and a period"),
         ("ROBOT -o DIR --throttle /third:/t1=1s,last", "'last' should be 'newest' or 'first'"),
         ("ROBOT -o DIR --throttle third:/t1=1s", "'third' is not a full ROS"),

@@ -269,7 +269,7 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
         )
     if plan.takes_turns and back_end == "scx":
         raise InputError(
-            "equal_priorities: round-robin, but scx has turns within one node only: choose freezer"
+            "equal_priorities: under the back end scx servers take no turns (--backend freezer)"
         )
 
 
@@ -297,7 +297,7 @@ def followed_chains(
             tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
             if len(tables) > 1 and back_end not in ("freezer", "fifo"):
                 raise InputError(
-                    f"{back_end} moves no slots: choose freezer, or `shaping_thread: free`"
+                    f"{back_end} does not move slots: choose freezer, or `shaping_thread: free`"
                 )
         except InputError as error:
             why_not.append(f"slots of {chain_name(chain)} cannot follow its latencies: {error}")
