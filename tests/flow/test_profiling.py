@@ -7,18 +7,18 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from command_line import called, json_of, refused
 from lttng_node import LTTNG, chain_command, required_node
 from processes import wait_for
 
-from chainshaper import InputError, OperationError, PlanRequest, PlatformError, open_recording
+from chainshaper import InputError, OperationError, PlanRequest, open_recording
 from chainshaper.enforcement.threads import RecordedProcess, RecordedThread, allocate
 from chainshaper.flow import profiling
 from chainshaper.flow.profiling import (
     chain_nodes,
-    check_profiling,
     executors_of,
     profiled_cores,
     profiling_condition,
@@ -87,36 +87,29 @@ def test_the_chains_threads_are_high_and_apart_and_afterwards_as_before(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_executors_run_on_the_cores_that_are_named(nodes: dict[str, int], tmp_path: Path) -> None:
-    cores = dict(zip(nodes, available_cores(), strict=False))
-    with profiling_condition(cores, cores, folder=tmp_path) as see_to_it:
-        see_to_it(list_processes(nodes.values()))
-        for node, core in cores.items():
-            executor = list_threads(nodes[node])[0]
-            assert (executor.priority, executor.cores) == (87, (core,))
-
-
-def test_earlier_stages_on_a_core_are_more_urgent(nodes: dict[str, int], tmp_path: Path) -> None:
-    core, (front, rear) = available_cores()[-1], nodes
-    cores, ranks = {front: core, rear: core}, {front: 0, rear: 1}
-    with profiling_condition(cores, cores, folder=tmp_path, before=ranks) as see_to_it:
-        see_to_it(list_processes(nodes.values()))
-        front_one, rear_one = (list_threads(nodes[node])[0] for node in (front, rear))
-        assert front_one.priority > rear_one.priority
-        assert front_one.cores == rear_one.cores == (core,)
-
-
-def test_a_best_effort_node_runs_behind_the_chain_on_its_core(
+def test_cores_ranks_and_best_effort_are_those_that_are_named(
     nodes: dict[str, int], tmp_path: Path
 ) -> None:
-    core, (front, rear) = available_cores()[-1], nodes
+    last, (front, rear) = available_cores()[-1], nodes
     before = _states(nodes)
-    with profiling_condition([front], core, tmp_path, best_effort={rear: core}) as see_to_it:
-        see_to_it(list_processes(nodes.values()))
-        front_one, rear_one = (list_threads(nodes[node])[0] for node in (front, rear))
-        assert (front_one.policy, front_one.cores) == ("SCHED_FIFO", (core,))
-        assert (rear_one.policy, rear_one.cores) == ("SCHED_OTHER", (core,))
-    assert _states(nodes) == before
+
+    def executors(*arguments: Any, **how: Any) -> list[Thread]:
+        with profiling_condition(*arguments, folder=tmp_path, **how) as see_to_it:
+            see_to_it(list_processes(nodes.values()))
+            found = [list_threads(pid)[0] for pid in nodes.values()]
+        assert _states(nodes) == before
+        return found
+
+    own = dict(zip(nodes, available_cores(), strict=False))
+    apart = executors(own, own)[: len(own)]
+    assert [(one.priority, one.cores) for one in apart] == [(87, (core,)) for core in own.values()]
+    same = {front: last, rear: last}  # earlier stages of a pipeline on a core are more urgent
+    first, second = executors(same, same, before={front: 0, rear: 1})
+    assert first.priority > second.priority
+    assert first.cores == second.cores == (last,)
+    first, second = executors([front], last, best_effort={rear: last})
+    assert (first.policy, first.cores) == ("SCHED_FIFO", (last,))
+    assert (second.policy, second.cores) == ("SCHED_OTHER", (last,))
 
 
 def test_all_is_as_before_when_the_run_fails(nodes: dict[str, int], tmp_path: Path) -> None:
@@ -182,11 +175,6 @@ def test_an_executor_that_had_several_threads_has_them_again() -> None:
                 assert len(executors_of(found, nodes, running)) == count
         assert executors_of(found, frozenset(["/other"]), running) == []
         process.communicate(b"\n\n")
-
-
-def test_a_core_that_is_not_there_is_refused() -> None:
-    with pytest.raises(PlatformError, match="core 4000, which the chain asks for"):
-        check_profiling([4000])
 
 
 def test_profile_records_the_chain_under_its_condition(node: Path, tmp_path: Path) -> None:
