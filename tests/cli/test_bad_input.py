@@ -74,7 +74,8 @@ def test_a_mistake_in_a_file(
     file: str, change: str, message: str, folder: Path, words: Words
 ) -> None:
     path, code = folder / f"{file}.yaml", 3 if "1023" in change else 2
-    changed = re.sub(*change.split(" → "), path.read_text())
+    old, new = change.split(" → ")
+    changed = re.sub(old, new, path.read_text())
     path.write_text(MISSING_CORE if (file, code) == ("application", 3) else changed)
     assert message in refused(code, *words("shape APP PLAN -o OUT"))
     if file == "application":

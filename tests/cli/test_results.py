@@ -134,17 +134,24 @@ def test_tables_are_for_people(
     unshaped: Recording, shaped: Recording, plan: Plan, tmp_path: Path
 ) -> None:
     save_plan(plan, tmp_path / "plan.yaml")
-    dry_run = ["apply", tmp_path / "plan.yaml", "--dry-run", "--backend", "litmus"]
+    dry_run: list[str | Path] = [
+        "apply",
+        tmp_path / "plan.yaml",
+        "--dry-run",
+        "--backend",
+        "litmus",
+    ]
     compared = ["before", "after", "Prediction and measurement", "[21.000, 22.000)"]
-    for command, *texts in (
-        (["latency", unshaped.path], "latency of /t1../t3 [ms]", "disturbed by the machine"),
-        (["callbacks", unshaped.path], "Callbacks [ms]", "/actuator"),
-        (["compare", unshaped.path, shaped.path], *compared),
-        (["plan", unshaped.path], "Plan for /t1../t3 [ms]"),
-        (["status"], "plan"),
-        (["status", "--outputs"], ""),
-        (dry_run, "resctl -n"),
-    ):
+    shown: list[tuple[list[str | Path], list[str]]] = [
+        (["latency", unshaped.path], ["latency of /t1../t3 [ms]", "disturbed by the machine"]),
+        (["callbacks", unshaped.path], ["Callbacks [ms]", "/actuator"]),
+        (["compare", unshaped.path, shaped.path], compared),
+        (["plan", unshaped.path], ["Plan for /t1../t3 [ms]"]),
+        (["status"], ["plan"]),
+        (["status", "--outputs"], []),
+        (dry_run, ["resctl -n"]),
+    ]
+    for command, texts in shown:
         finished = called(*command)
         assert finished.code == 0, finished
         assert [text for text in texts if text not in finished.out] == [], command

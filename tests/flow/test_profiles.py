@@ -200,7 +200,7 @@ def test_shaping_opens_servers_and_reaches_receivers() -> None:
     assert [thread.node for thread in plan.servers[1].threads] == ["/front_filter"]
     apart = plan_recording(_recorded(), CHAIN, PlanRequest(**wishes, first_slot_ns=2 * MS))
     assert _slots_ms(apart)["first"] == [(0, 2)]
-    sink = {"sinks": ["/rear_raw../small"]}
+    sink: dict[str, Any] = {"sinks": ["/rear_raw../small"]}
     with pytest.raises(InputError, match=r"pose waits for /small, which"):
         plan_recording(_recorded(), CHAIN, **sink)
     with pytest.raises(InputError, match="further sinks are shaped"):

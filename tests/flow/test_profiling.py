@@ -93,8 +93,8 @@ def test_cores_ranks_and_best_effort_are_those_that_are_named(
     last, (front, rear) = available_cores()[-1], nodes
     before = _states(nodes)
 
-    def executors(*arguments: Any, **how: Any) -> list[Thread]:
-        with profiling_condition(*arguments, folder=tmp_path, **how) as see_to_it:
+    def executors(names: Any, cores: Any, **how: Any) -> list[Thread]:
+        with profiling_condition(names, cores, tmp_path, **how) as see_to_it:
             see_to_it(list_processes(nodes.values()))
             found = [list_threads(pid)[0] for pid in nodes.values()]
         assert _states(nodes) == before
