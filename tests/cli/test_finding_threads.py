@@ -80,9 +80,6 @@ def test_a_plan_shows_the_nodes_of_its_servers(
     assert plan.shaping_node is not None
     (missing,) = found["notes"]
     assert f"node /{plan.shaping_node.name} of server output is not running" in missing
-
-
-def test_people_get_a_table_and_notes(application: Running, tmp_path: Path) -> None:
     finished = called("threads", str(application.process.pid))
     assert finished.code == 0
     (line,) = [line for line in finished.out.splitlines() if "dds.asyn" in line]
@@ -139,14 +136,13 @@ def test_a_recording_of_another_machine_or_boot_says_nothing(
     assert all("/a" not in thread.nodes for thread in found.threads)
 
 
-def test_nothing_found_is_said_and_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_nothing_found_is_said_and_what_is_no_process_and_no_plan_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "no process 4194305: it has ended" in refused(2, "threads", "4194305")
+    assert "plan.yaml: cannot be read" in refused(2, "threads", tmp_path / "plan.yaml")
+    assert "REC" not in refused(2, "threads", "1", "--recording", tmp_path / "nothing")
     monkeypatch.setattr(threads, "list_processes", tuple)
     finished = called("threads")
     assert finished.code == 0
     assert "note: no process looks like an application of ROS 2 or DDS" in finished.err
-
-
-def test_what_is_no_process_and_no_plan_is_refused(tmp_path: Path) -> None:
-    assert "no process 4194305: it has ended" in refused(2, "threads", "4194305")
-    assert "plan.yaml: cannot be read" in refused(2, "threads", tmp_path / "plan.yaml")
-    assert "REC" not in refused(2, "threads", "1", "--recording", tmp_path / "nothing")

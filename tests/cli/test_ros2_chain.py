@@ -43,38 +43,26 @@ def _said(capsys: pytest.CaptureFixture[str], arguments: Sequence[str]) -> tuple
     return code, capsys.readouterr().out
 
 
-def test_it_is_found_by_ros2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_it_is_found_by_ros2_and_the_same(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     (found,) = entry_points(group="ros2cli.command")
     assert found.name == "chain"
     assert found.load() is ChainCommand
     assert ChainCommand.__doc__, "the line that `ros2` shows"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["chain", "--help"], ["latency", "ros2 chain"]),
-        (["chain"], ["latency", "ros2 chain"]),
-        (["chain", "latency", "-h"], ["--instances"]),
-    ],
-)
-def test_help_is_of_the_verbs_and_of_each_verb(
-    arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]
-) -> None:
-    code, said = _said(capsys, arguments)
-    assert code == 0
-    assert [word for word in words if word not in said] == []
-
-
-def test_arguments_and_exit_codes_are_the_same(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+    for help_, *words in (
+        (["chain", "--help"], "latency", "ros2 chain"),
+        (["chain"], "latency", "ros2 chain"),
+        (["chain", "latency", "-h"], "--instances"),
+    ):
+        code, said = _said(capsys, help_)
+        assert code == 0
+        assert [word for word in words if word not in said] == []
     file = tmp_path / "latencies.txt"
     file.write_text("20ms\n30ms\n")
     arguments = ["plan", "--latencies", str(file), "--period", "100ms", "--json"]
     code, said = _said(capsys, ["chain", *arguments])
-    assert code == 0
-    assert said == called(*arguments).out
+    assert (code, said) == (0, called(*arguments).out)
     assert _ros2("chain", "info", str(tmp_path / "nothing")) == 2
     assert _ros2("chain", "no-such-verb") == 2
 

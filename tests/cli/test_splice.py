@@ -1,6 +1,5 @@
 """`chainshaper splice` as a person or a script runs it."""
 
-import json
 from pathlib import Path
 from typing import TypeAlias
 
@@ -27,38 +26,26 @@ def files(tmp_path: Path, plan: Plan) -> Files:
 
 def test_it_shows_what_is_redirected_and_what_to_launch(files: Files) -> None:
     plan, robot, folder = files
+    copy = f"{folder}/robot.launch.py"
     finished = called("splice", plan, robot, "n:=1 2", "-o", folder)
     assert finished.code == 0
     (said,) = finished.err.splitlines()
     assert said.startswith("note: the sample is small: 2 cycles"), "before the plan is used"
     assert finished.out.splitlines() == [
         "/third publishes /t3_tmp in place of /t3, for /chainshaper_t3",
-        f"ros2 launch {folder}/robot.launch.py 'n:=1 2'",
+        f"ros2 launch {copy} 'n:=1 2'",
     ]
     assert robot.read_text() == ROBOT
-
-
-def test_its_json_says_the_same(files: Files) -> None:
-    plan, robot, folder = files
     said = json_of("splice", plan, robot, "-o", folder)
-    copy = str(folder / "robot.launch.py")
-    assert said["folder"] == str(folder)
-    assert said["launch"] == {str(robot): copy}
-    assert said["originals"] == {copy: str(robot)}
-    assert said["nodes"] == ["chainshaper_t3"]
-    assert said["standbys"] == ["chainshaper_t3_standby"]
-    assert said["logs"] == [
-        str(folder / f"logs/{name}.csv") for name in ("chainshaper_t3", "chainshaper_t3_standby")
-    ]
-    assert said["diff"].startswith("--- /dev/null\n")
-    assert (said["notes"], said["setup"], said["redirected"]) == ([], None, [])
-
-
-def test_notes_go_to_standard_error(files: Files) -> None:
-    plan, robot, folder = files
-    assert called("splice", plan, robot, "-o", folder).code == 0
-    finished = called("splice", plan, folder / "robot.launch.py", "-o", folder)
-    assert f"note: {folder}/robot.launch.py: spliced from its original, {robot}" in finished.err
+    nodes, standbys = ["chainshaper_t3"], ["chainshaper_t3_standby"]
+    logs = [f"{folder}/logs/{name}.csv" for name in (*nodes, *standbys)]
+    wanted = {"folder": str(folder), "launch": {str(robot): copy}, "originals": {copy: str(robot)}}
+    wanted |= {"nodes": nodes, "standbys": standbys, "logs": logs}
+    wanted |= {"notes": [], "setup": None, "redirected": [], "environment": {}}
+    assert said.pop("diff").startswith("--- /dev/null\n")
+    assert said == wanted
+    again = called("splice", plan, copy, "-o", folder)
+    assert f"note: {copy}: spliced from its original, {robot}" in again.err
 
 
 def test_a_dry_run_of_a_gate_in_the_publishers_process_names_nothing_that_is_not_there(
@@ -102,25 +89,17 @@ def test_the_fallback_is_the_plan_s_or_the_option_s(files: Files) -> None:
     assert "/t is throttled twice" in refused(2, "splice", *twice, robot, "-o", folder)
 
 
-def test_a_throttler_needs_no_plan(files: Files) -> None:
-    _, robot, folder = files
+def test_a_throttler_needs_no_plan_and_undo_the_folder_only(files: Files) -> None:
+    plan, robot, folder = files
     said = json_of("splice", "--throttle", "/third:/t1=100ms,first", robot, "n:=1", "-o", folder)
     parameters = folder / "shaping_nodes" / "chainshaper_throttler.yaml"
     assert "rule: first" in parameters.read_text()
     assert said["nodes"] == ["chainshaper_throttler"]
     assert "'target': '/t1_throttled'" in said["diff"]
     assert called("splice", "--undo", "-o", folder).out == f"{folder} is removed\n"
-
-
-def test_undo_needs_the_folder_only(files: Files) -> None:
-    plan, robot, folder = files
-    removed = f"{folder} is removed\n"
-    words: list[str | Path] = [plan, robot, "--json"]
-    for undo, printed in (([], removed), (words, None)):
-        assert called("splice", plan, robot, "-o", folder).code == 0
-        finished = called("splice", "--undo", "-o", folder, *(undo or ()))
-        assert finished.out == printed or json.loads(finished.out) == {"removed": str(folder)}
-        assert not folder.exists()
+    assert called("splice", plan, robot, "-o", folder).code == 0
+    assert json_of("splice", plan, robot, "--undo", "-o", folder) == {"removed": str(folder)}
+    assert not folder.exists()
     assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
 
 
