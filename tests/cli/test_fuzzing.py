@@ -11,8 +11,7 @@ import random
 import re
 import shutil
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -100,28 +99,27 @@ def columns_of_tables(chance: random.Random, folder: Path, recording: Recording)
     file = chance.choice(sorted(source.glob("*.parquet")))
     frame = pl.read_parquet(file, glob=False)
     column = chance.choice(frame.columns)
-    kind = chance.randrange(8)
+    extreme = chance.choice([0, -1, 2**31 - 1, 2**63 - 1, -(2**63)])
+    other, dtype = chance.choice(["x", "times", column.upper()]), chance.choice(DTYPES)
+    share, order = chance.choice([0, 1, 2]), chance.sample(frame.columns, len(frame.columns))
+    damage: list[Callable[[], pl.DataFrame | None]] = [
+        lambda: None,
+        lambda: frame.drop(column),
+        lambda: frame.rename({column: other}),
+        lambda: frame.with_columns(pl.col(column).cast(dtype, strict=False)),
+        lambda: frame.with_columns(pl.when(pl.col("time") % 3 > 0).then(column).alias(column)),
+        lambda: frame.with_columns(pl.lit(extreme).alias(column)),
+        lambda: frame.sample(fraction=share, with_replacement=True, seed=1),
+        lambda: frame.select(order),
+    ]
     try:
-        if kind == 0:
-            frame = frame.drop(column)
-        elif kind == 1:
-            frame = frame.rename({column: chance.choice(["x", "times", column.upper()])})
-        elif kind == 2:
-            frame = frame.with_columns(pl.col(column).cast(chance.choice(DTYPES), strict=False))
-        elif kind == 3:
-            frame = frame.with_columns(pl.when(pl.col("time") % 3 > 0).then(column).alias(column))
-        elif kind == 4:
-            extreme = chance.choice([0, -1, 2**31 - 1, 2**63 - 1, -(2**63)])
-            frame = frame.with_columns(pl.lit(extreme).alias(column))
-        elif kind == 5:
-            frame = frame.sample(fraction=chance.choice([0, 1, 2]), with_replacement=True, seed=1)
-        elif kind == 6:
-            frame = frame.select(chance.sample(frame.columns, len(frame.columns)))
+        damaged = chance.choice(damage)()
     except pl.exceptions.PolarsError:
-        frame = frame.drop(column)  # a cast that does not exist
-    frame.write_parquet(file)
-    if kind == 7:
+        damaged = frame.drop(column)  # a cast that does not exist
+    if damaged is None:
         file.unlink()
+    else:
+        damaged.write_parquet(file)
     return _looked_at(chance, source)
 
 
@@ -170,21 +168,16 @@ def traces(chance: random.Random, folder: Path, recording: Recording) -> Argumen
 
 def _damaged_text(chance: random.Random, text: str) -> str:
     for _ in range(chance.choice([1, 1, 1, 2, 4])):
-        lines = text.split("\n")
+        lines, kind, at = text.split("\n"), chance.random(), chance.randrange(len(text) or 1)
         place = chance.randrange(len(lines))
-        kind = chance.random()
         if kind < 0.6 and (found := list(re.finditer(r"(?<=[:\[,\-] )[^\s,\]}]+", text))):
             start, end = chance.choice(found).span()
             text = text[:start] + chance.choice(SCALARS) + text[end:]
-        elif kind < 0.7:
-            text = "\n".join([*lines[:place], *lines[place + 1 :]])
-        elif kind < 0.8:
-            text = "\n".join([*lines[:place], lines[place], *lines[place:]])
-        elif kind < 0.9:
+        elif kind < 0.9:  # a line that is lost, or twice there, or indented
             indented = " " * chance.randrange(1, 9) + lines[place].lstrip(" ")
-            text = "\n".join([*lines[:place], indented, *lines[place + 1 :]])
+            lines[place : place + 1] = chance.choice([[], [lines[place]] * 2, [indented]])
+            text = "\n".join(lines)
         else:
-            at = chance.randrange(len(text))
             text = text[:at] + chance.choice(":[]{}&*!|>'\"%@`,#?-<\x00\x85\udcff") + text[at + 1 :]
     return text
 
@@ -246,32 +239,28 @@ def _peak() -> int:
     return int(re.findall(r"VmHWM:\s+(\d+)", status)[0]) << 10
 
 
-@contextmanager
-def _case(kind: str, number: int, folder: Path) -> Iterator[Path]:
-    folder.mkdir()
-    try:
-        yield folder
-    except BaseException as error:
-        raise AssertionError(f"case {number} of {kind}, in {folder}: {error!r}") from error
-    shutil.rmtree(folder)
-
-
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: str(kind.__name__))
 def test_whatever_is_damaged_there_is_a_result_or_one_message(
     kind: Callable[..., Arguments], tmp_path: Path, simulated: Recording, plan: Plan
 ) -> None:
     before, codes = _peak(), set()
     for number in range(FIRST, FIRST + CASES):
-        with _case(kind.__name__, number, tmp_path / str(number)) as folder:
-            chance = random.Random(f"{kind.__name__} {number}")
-            arguments = kind(chance, folder, simulated, *([plan] if kind is plans else []))
-            started = time.monotonic()
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        chance = random.Random(f"{kind.__name__} {number}")
+        arguments = kind(chance, folder, simulated, *([plan] if kind is plans else []))
+        said, started = f"case {number} of {kind.__name__}: {arguments}", time.monotonic()
+        try:
             finished = called(*arguments)
-            assert time.monotonic() - started < SECONDS, arguments
-            assert finished.code in (0, 1, 2, 3), (arguments, finished)
-            assert "Traceback" not in finished.err, (arguments, finished)
-            if finished.code:
-                assert re.search(r"error\"?: ", finished.err) or "Usage: " in finished.err, finished
-            codes.add(finished.code)
+        except BaseException as error:
+            raise AssertionError(said) from error
+        assert time.monotonic() - started < SECONDS, said
+        assert finished.code in (0, 1, 2, 3), (said, finished)
+        assert "Traceback" not in finished.err, (said, finished)
+        if finished.code:
+            one_message = re.search(r"error\"?: ", finished.err) or "Usage: " in finished.err
+            assert one_message, (said, finished)
+        codes.add(finished.code)
+        shutil.rmtree(folder)
     assert _peak() - before < MEMORY
     assert codes - {0}, "some of the damage is seen"
