@@ -1,7 +1,5 @@
-"""The command line: each verb a thin coat over a library call.
-
-Results go to stdout, errors and progress to stderr. Exit codes: 0 done, 1 the operation failed, 2
-wrong use or bad input, 3 the platform cannot do it.
+"""The command line: each verb a thin coat over a library call; results go to stdout, all else to
+stderr. Exit codes: 0 done, 1 the operation failed, 2 wrong use or input, 3 the platform cannot.
 """
 
 import ctypes
@@ -41,14 +39,12 @@ _handlers: list[Any] = []  # ctypes forgets a callback that nothing refers to
 def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
     """Run these arguments (default: the process's own); help calls the command ``name``."""
     from chainshaper.cli.output import say
-    from chainshaper.values.errors import ChainshaperError
+    from chainshaper.values.errors import ChainshaperError, shown
 
     for number in (signal.SIGTERM, signal.SIGHUP):
         if signal.getsignal(number) == signal.SIG_DFL:  # under nohup it stays ignored
             signal.signal(number, _end_in_order)
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
-    _catch_aborts()
+    _prepare_output_and_memory()
     words = list(sys.argv[1:] if arguments is None else arguments)
     own = words[: words.index("--")] if "--" in words else words  # behind it is a COMMAND
 
@@ -61,24 +57,29 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
     try:
         if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # as chainshaper.__main__ has it
             signal.signal(signal.SIGINT, signal.default_int_handler)
-        sys.exit(_run(arguments, name))
+        from chainshaper.cli.app import USAGE_ERROR, Abort, app
+
+        try:
+            sys.exit(app(arguments, prog_name=name, standalone_mode=False))
+        except USAGE_ERROR as error:
+            error.message = shown(error.message, but="\n")  # it may quote a file's name
+            error.show()
+            sys.exit(error.exit_code)
+        except Abort:  # a question without an answer
+            say("Aborted.")
+            sys.exit(1)
     except ChainshaperError as error:
         fail(str(error), error.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)
     except PermissionError as error:
-        fail(
-            f"{error.filename}: permission denied: name a place that you may read and write, or"
-            " change its permissions",
-            2,
-        )
+        remedy = "name a place that you may read and write, or change its permissions"
+        fail(f"{error.filename}: permission denied: {remedy}", 2)
     except ModuleNotFoundError as error:
-        lacking = (error.name or "").partition(".")[0]
-        if lacking not in OF_ANALYSIS:
+        lacks = (error.name or "").partition(".")[0]
+        if lacks not in OF_ANALYSIS:
             raise
-        fail(
-            f"this needs {lacking}, which is not installed: pip install 'chainshaper[analysis]'", 3
-        )
+        fail(f"this needs {lacks}, which is not installed: pip install 'chainshaper[analysis]'", 3)
     except BaseException as error:  # a panic of Polars is no Exception
         message = _exhausted(error)
         if message is None:
@@ -86,34 +87,16 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
         fail(message, 1)
 
 
-def _run(arguments: list[str] | None, name: str) -> Any:
-    """The verb's exit code, None for 0."""
-    from chainshaper.cli.app import USAGE_ERROR, Abort, app
-    from chainshaper.cli.output import say
-    from chainshaper.values.errors import shown
-
-    try:
-        return app(arguments, prog_name=name, standalone_mode=False)
-    except USAGE_ERROR as error:
-        error.message = shown(error.message, but="\n")  # it may quote a file's name
-        error.show()
-        return error.exit_code
-    except Abort:  # a question without an answer
-        say("Aborted.")
-        return 1
-
-
 def _end_in_order(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - a signal handler
     """SIGTERM, or a lost terminal, ends us as Ctrl-C does: through every `finally`."""
     raise KeyboardInterrupt
 
 
-def _exhausted(error: BaseException) -> str | None:
+def _exhausted(error: BaseException | None) -> str | None:
     """The message for lack of memory, or for a panic of Polars; None for every other error."""
     if isinstance(error, KeyboardInterrupt | SystemExit):
         return None
-    seen: set[int] = set()
-    link: BaseException | None = error
+    seen, link = set[int](), error
     while link is not None and id(link) not in seen:
         seen.add(id(link))
         reason = textwrap.shorten(str(link), 160, placeholder=" ...")  # NumPy's has fifty lines
@@ -129,12 +112,14 @@ def _exhausted(error: BaseException) -> str | None:
     return None
 
 
-def _catch_aborts() -> None:
+def _prepare_output_and_memory() -> None:
     """Where memory is limited (`ulimit -v`), let a library's abort end us with a message.
 
     Libraries start as few threads as they can there: each one costs address space, Polars waits for
     ever for one that it cannot start, and its allocator tries to start one for ever.
     """
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         return
     for name, value in _FRUGAL.items():

@@ -74,14 +74,20 @@ def apply(
     Whatever ends it, everything is as it was before.
     """
     from chainshaper.linux.own_processes import end_in_words
-    from chainshaper.reporting.overviews import servers_table
+    from chainshaper.reporting.overviews import changes_table, servers_table
 
     planned = cs.load_application_plan(plan)
     opt.refuse_bound_alone(max_latency, adapt)
     how: dict[str, Any] = {"recording": opt.recording_of(recording), "phase_ns": phase}
     how["users"] = user or ()
     if dry_run:
-        _show_changes(planned, backend, json, how)
+        changes = cs.planned_changes(planned, backend, **how)
+        if out.present(json, asdict(changes)):
+            for words in changes.commands:
+                out.show_line(shlex.join(words))
+            if not changes.commands:
+                out.show(changes_table(changes.threads))
+            out.notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
         return
     out.warn(planned)
     with out.stop_on_signals() as stop, _watching() as (watch, report):
@@ -103,22 +109,6 @@ def apply(
     out.notes(done.state.notes)
     if done.exit_code and not stop.is_set():
         raise OperationError(f"the command {end_in_words(done.exit_code)}")
-
-
-def _show_changes(
-    plan: "cs.ApplicationPlan", backend: str, json: bool, how: dict[str, Any]
-) -> None:
-    from chainshaper.reporting.overviews import changes_table
-
-    changes = cs.planned_changes(plan, backend, **how)
-    if json:
-        out.print_json(asdict(changes))
-        return
-    for command in changes.commands:
-        out.show_line(shlex.join(command))
-    if not changes.commands:
-        out.show(changes_table(changes.threads))
-    out.notes((f"back end {changes.back_end}: {changes.reason}", *changes.notes))
 
 
 @contextmanager

@@ -92,16 +92,13 @@ def apply_plan(
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
     (None: those of all chains are measured). With ``adapt`` slots follow the latencies, to no later
     end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of the very
-    processes, or of an earlier run. ``users`` are as for :func:`.find_threads`. ``watch`` gets the
+    processes, or of an earlier run; ``users`` are as for :func:`.find_threads`. ``watch`` gets the
     state every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
 
-    Raises:
-        InputError: there is no such user, or the plan cannot be carried out: it names no threads,
-            or asks for what the back end, a publisher or the chains' stamps cannot do.
-        PlatformError: the machine lacks a core or the back end, or we a privilege.
-        OperationError: another run governs a core or node, a node does not appear or is ambiguous,
-            the chain has no regular beginning, the kernel refuses something, the servers failed,
-            the application ended by itself, or ``stop`` was set before the plan was in force.
+    Raises InputError: no such user, or the plan cannot be carried out. PlatformError: the machine
+    lacks a core or the back end, or we a privilege. OperationError: another run governs a core or
+    node, a node does not appear, a chain has no regular beginning, the kernel refuses something,
+    the servers failed, the application ended, or ``stop`` was set before the plan was in force.
     """
     given, taken = planned.whole(plan), run_users(users)
     threads.server_table(given)

@@ -99,11 +99,9 @@ def shape_launch(
     for ``duration_ns`` before and after. ``planned`` gets the plan before it is used. ``stop`` ends
     everything. The rest is for :func:`.profile_chains` and :func:`.apply_plan`.
 
-    Raises:
-        InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it launches
-            does not fit: no such chain, a launch file with a mistake …
-        PlatformError, OperationError: there is no such core, or a step failed; what the steps
-            before it left stays.
+    Raises InputError: ``folder`` is not empty, the command is not `ros2 launch`, or what it
+    launches does not fit. PlatformError, OperationError: there is no such core, or a step failed;
+    what the steps before it left stays.
     """
     launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]

@@ -86,12 +86,9 @@ def splice_launch_files(
     A folder that was spliced before and not changed since is replaced. With ``dry_run`` nothing is
     written: our own ROS 2 carries out the launch files with ``arguments``, but starts no process.
 
-    Raises:
-        InputError: the plan shapes nothing, or does not say who publishes; no launch file; the
-            folder is not ours.
-        OperationError: the folder cannot be written; a dry run finds that nothing would be
-            redirected, or more than is meant.
-        PlatformError: there is no ROS 2 environment for a dry run.
+    Raises InputError: the plan shapes nothing, or does not say who publishes; no launch file; the
+    folder is not ours. OperationError: the folder cannot be written, or a dry run finds too few or
+    too many redirections. PlatformError: there is no ROS 2 environment for a dry run.
     """
     joint = whole(plan)
     if fallback is not None:

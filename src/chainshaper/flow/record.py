@@ -121,11 +121,9 @@ def record_command(
     as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
     nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
 
-    Raises:
-        InputError: ``output`` exists, there is no such command or process, or no such source.
-        PlatformError: the tracer is not installed, or a privilege is missing.
-        OperationError: tracing does not start, nothing was traced, or it cannot be read or
-            written; what the tracer wrote then stays beside ``output``, and named.
+    Raises InputError: ``output`` exists, or no such command, process or source does. PlatformError:
+    the tracer or a privilege is missing. OperationError: tracing does not start, or nothing was
+    traced, or it cannot be read or written: then it stays beside ``output``, and is named.
     """
     output, taken = recordings.refuse_existing(output), running.run_users(users)
     if command:
