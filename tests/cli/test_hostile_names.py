@@ -24,8 +24,10 @@ from small_chain import small_chain
 from chainshaper import load_plan, open_source, plan_recording, save_plan, simulate
 from chainshaper.cli.app import VERBS
 from chainshaper.planning.plan import revised
+from chainshaper.reporting.figures import draw_latency
 from chainshaper.values.errors import shown
 from chainshaper.values.recording import Recording, write_recording
+from chainshaper.verify.measure import measure_latency
 
 HOSTILE = (
     "\x1b]0;owned\x07\x1b[31m\x1b[2J\x9b5n\r\b\x7f\t\x00\u202e\u2067\u200b\u2028\ufffe"
@@ -73,17 +75,10 @@ def recording(folder: Path) -> Recording:
         one.model_copy(update={"comm": HOSTILE, "node": one.node + HOSTILE}) for one in info.threads
     )
     about = {
-        "chain": CHAIN,
-        "host": HOSTILE,
-        "kernel": HOSTILE,
-        "distribution": HOSTILE,
-        "rmw": HOSTILE,
-        "command": (HOSTILE,),
+        **dict.fromkeys(("host", "kernel", "distribution", "rmw"), HOSTILE),
+        **{"chain": CHAIN, "command": (HOSTILE,), "notes": (f"a note {HOSTILE}",)},
         "processes": {pid: name + HOSTILE for pid, name in info.processes.items()},
-        "threads": threads,
-        "notes": (f"a note {HOSTILE}",),
-        "lost": {HOSTILE: 3},
-        "application": None,
+        **{"threads": threads, "lost": {HOSTILE: 3}, "application": None},
     }
     return write_recording(folder / "rec", tables, info.model_copy(update=about))
 
@@ -130,10 +125,6 @@ def _texts(value: Any) -> Iterator[str]:
         yield from (text for one in value for text in _texts(one))
 
 
-def test_a_recording_whose_names_no_plan_takes_is_refused_harmlessly(recording: Recording) -> None:
-    assert "is not a full ROS 2 name" in harmless(called("plan", recording.path), code=2).err
-
-
 def test_on_a_terminal_nothing_but_our_own_colours_gets_out(recording: Recording) -> None:
     """All verbs in one process, which believes what a terminal believes."""
     program = (
@@ -169,20 +160,19 @@ def _read(master: int) -> Iterator[bytes]:
 def test_pictures_and_pages_are_well_formed(recording: Recording, folder: Path) -> None:
     svg, dot, page = (folder / name for name in ("graph.svg", "graph.dot", "report.html"))
     trace, figures, curve = folder / "trace.pftrace", folder / "figures", folder / "curve.svg"
-    harmless(called("graph", recording.path, "-o", svg))
-    harmless(called("graph", recording.path, "-o", dot))
-    harmless(called("report", recording.path, "-o", page))
-    harmless(called("export", recording.path, "--perfetto", "-o", trace))
-    harmless(called("compare", recording.path, recording.path, "--figures", figures))
-    from chainshaper.reporting.figures import draw_latency
-    from chainshaper.verify.measure import measure_latency
-
+    for words in (
+        ("graph", recording.path, "-o", svg),
+        ("graph", recording.path, "-o", dot),
+        ("report", recording.path, "-o", page),
+        ("export", recording.path, "--perfetto", "-o", trace),
+        ("compare", recording.path, recording.path, "--figures", figures),
+    ):
+        harmless(called(*words))
     draw_latency([measure_latency(recording, CHAIN)], curve)
     for picture in (svg, curve):
-        assert unsafe_in(picture.read_text()) == []
         ElementTree.fromstring(picture.read_bytes())  # noqa: S314 - ours
     assert "<b>" not in svg.read_text()
-    for file in (dot, page):
+    for file in (svg, curve, dot, page):
         assert unsafe_in(file.read_text()) == []
     # Every text of the page that a script shows, as that script reads it.
     data = re.search(r'<script[^>]*id="data"[^>]*>(.*?)</script>', page.read_text(), re.DOTALL)
@@ -213,6 +203,7 @@ def test_a_plan_and_a_launch_file_are_named_harmlessly(plan: Path, folder: Path)
         ("latency", "REC", "--chain", HOSTILE),
         ("latency", "REC", "--chain", f"/t1../{HOSTILE}"),
         ("latency", f"/{IN_A_PATH}\udcff"),
+        ("plan", "REC"),  # whose names no plan takes
         ("plan", "REC", "--epsilon", HOSTILE),
         ("plan", "REC", f"--{HOSTILE}"),
         ("run", f"{IN_A_PATH}.yaml", "-o", "x"),

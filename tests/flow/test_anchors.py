@@ -37,16 +37,14 @@ def _placed(chains: Sequence[Plan], phases: Sequence[int], *, gated: bool = True
     return _waits(*placed(combined(chains), found, gated=gated), phases)
 
 
-def test_chains_on_cores_of_their_own_do_not_wait_for_each_other() -> None:
-    """With one anchor for both, the second timer (at 40 ms) would expire in its slot of 83 ms."""
+def test_chains_of_one_core_are_moved_together_and_wait_for_no_other() -> None:
+    """Two that share core 1 stay 30 ms apart, wherever the third is; with one anchor for all, a
+    timer at 40 ms would expire in its slot of 83 ms.
+    """
     one, two = _chain("a", 100, 0, 83), _chain("b", 100, 0, 83, core=0)
     plan, anchor_ns = placed(combined([one, two]), [Phase(10 * MS, 0), Phase(40 * MS, 0)])
     assert (anchor_ns, plan.chains[1].offset_ns) == ((10 + LEAD) * MS, 30 * MS)
     assert _waits(plan, anchor_ns, [10, 40]) == [LEAD, LEAD]
-
-
-def test_chains_of_one_core_are_moved_together() -> None:
-    """The two that share core 1 stay 30 ms apart, wherever the third is."""
     shared = _chain("a", 100, 0, 20), _chain("c", 100, 30, 20)
     chains = [shared[0], _chain("b", 100, 70, 20, core=0), shared[1]]
     plan, _ = placed(combined(chains), [Phase(at * MS, 0) for at in (0, 50, 40)])
@@ -55,27 +53,17 @@ def test_chains_of_one_core_are_moved_together() -> None:
     assert (second - first) % 100 == 40  # its wait is LEAD, a's 10 ms longer, for c's is LEAD
 
 
-def test_no_timer_expires_in_its_own_slot_where_that_can_be() -> None:
-    """By hand: b's slot begins 30 ms after a's, and takes 30 of 50 ms.
-
-    Timers at the same instant: where a waits for 2 ms, b waits for 32 and expires 18 ms after its
-    slot has opened. Where b waits for 2, a does for 22 of the 80 ms for which it is closed.
+def test_by_hand_no_timer_expires_in_its_own_slot_where_that_can_be() -> None:
+    """b's slot begins 30 ms after a's, and takes 30 of 50 ms. Timers at the same instant: where a
+    waits for 2 ms, b waits for 32 and expires 18 ms after its slot has opened. Where b waits for
+    2, a does for 22 of the 80 ms for which it is closed.
     """
     chains = [_chain("a", 100, 0, 20), _chain("b", 50, 30, 20 + 10, rank=3)]
     assert _placed(chains, [0, 0]) == [20 + LEAD, LEAD]
     # Nothing stops threads under priorities alone: there the longest wait is the shortest.
     assert _placed(chains, [0, 10], gated=False) == [LEAD, 20 + LEAD]
-
-
-def test_a_chain_that_is_never_stopped_may_begin_at_any_time() -> None:
-    chains = [_chain("a", 100, 0, 100), _chain("b", 100, 0, 60, rank=3)]
-    assert _placed(chains, [0, 40]) == [40 + LEAD, LEAD]
-
-
-def test_where_planned_offsets_do_not_help_others_do() -> None:
-    """Each of three on one core, at priorities of their own, is closed for 25 of 100 ms."""
-    chains = [_chain(name, 100, 0, 75, rank=k + 2) for k, name in enumerate("abc")]
-    assert all(LEAD <= wait <= 25 for wait in _placed(chains, [0, 33, 66]))
+    never_stopped = [_chain("a", 100, 0, 100), _chain("b", 100, 0, 60, rank=3)]
+    assert _placed(never_stopped, [0, 40]) == [40 + LEAD, LEAD]
 
 
 def test_timers_that_allow_no_beginning_are_named() -> None:
