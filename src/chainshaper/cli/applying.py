@@ -53,8 +53,7 @@ def apply(
     ),
     phase: int | None = opt.option(
         "--phase DURATION",
-        "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC: slots then stay there."
-        " Default: measured, and followed where it drifts.",
+        "When in a cycle the chain's timer expires (CLOCK_MONOTONIC). Default: measured.",
     ),
     recording: Path | None = opt.option(
         "--recording REC",

@@ -107,9 +107,7 @@ CHAINS: list[str] | None = option(
     "--chain FIRST..LAST", "A chain (may be repeated). Default: the one the recording names."
 )
 STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.", False)
-PLAN_IN_FORCE: Path | None = option(
-    "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
-)
+PLAN_IN_FORCE: Path | None = option("--plan plan.yaml", "In force in the last recording.")
 SCHEDULER: str | None = option(
     "--scheduler ADDRESS", "Compute on this Dask scheduler's cluster: tcp://host:8786."
 )
@@ -128,12 +126,10 @@ USERS: list[str] | None = option(
 )
 ADAPT: bool = option(
     "--adapt",
-    "Slots follow the latencies: later to keep the plan's promise, earlier to give some back.",
+    "Slots follow the latencies: later to keep the promise, earlier to give some back.",
     False,
 )
-MAX_LATENCY: int | None = option(
-    "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
-)
+MAX_LATENCY: int | None = option("--max-latency DURATION", "With --adapt: no slot ends later.")
 SOURCE: Source | None = option("--source", "Tracer. Default: preload, or else lttng.")
 NODE: NodeKind = option(
     "--node",

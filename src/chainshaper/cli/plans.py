@@ -18,15 +18,12 @@ def plan(
     recording: Path | None = opt.argument("[REC]", "A recording's or a trace's folder."),
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
-        "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
-        " Give several to plan them together: what they share, and when each one's cycles start.",
+        "A chain, or several to plan together. Default: the one the recording names.",
     ),
     output: Path | None = opt.option(
         "--output -o plan.yaml", "File to write; of several chains also a folder. Must not exist."
     ),
-    latencies: Path | None = opt.option(
-        "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
-    ),
+    latencies: Path | None = opt.option("--latencies FILE", "Instead of REC: text, or .npy in ns."),
     period: int | None = opt.option("--period DURATION>0", "With --latencies, or without a timer."),
     *,
     since: int = opt.SINCE,
@@ -174,9 +171,7 @@ def sweep(
         ...,
     ),
     output: Path = opt.option("--output -o FILE.parquet", "File to write, a row a point.", ...),
-    plan: Path | None = opt.argument(
-        "plan.yaml", "A plan that is in force at all points. Default: each is planned."
-    ),
+    plan: Path | None = opt.argument("plan.yaml", "In force everywhere. Default: each is planned."),
     cycles: int = opt.option("--cycles", "Cycles to plan from, and to judge by.", 100_000, min=1),
     seed: int | None = opt.SEED,
     workers: int | None = opt.option("--workers", "Threads. Default: one per core.", min=1),

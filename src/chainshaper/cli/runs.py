@@ -34,12 +34,8 @@ STDERR = 2
 PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
 MOST_RECORDED = 100  # by `watch --budget` itself: a limit that breaks for weeks fills no disk
 
-COMMAND: list[str] | None = opt.argument(
-    "[-- COMMAND…]", "Starts the application, such as `ros2 launch …`; ended with the recording."
-)
-DURATION: int | None = opt.option(
-    "--duration DURATION", "How long to record. Default: until the application ends, or Ctrl-C."
-)
+COMMAND: list[str] | None = opt.argument("[-- COMMAND…]", "Starts it, such as `ros2 launch …`.")
+DURATION: int | None = opt.option("--duration DURATION", "Default: until it ends, or Ctrl-C.")
 BUFFER: int | None = opt.option(
     "--buffer MIB", "LTTng's buffer of a core, if events were lost. Default: 4.", min=1
 )
@@ -47,12 +43,8 @@ BUFFER: int | None = opt.option(
 
 @opt.takes_wishes("ideal_machine")
 def demo(
-    output: Path | None = opt.option(
-        "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
-    ),
-    application: Path | None = opt.option(
-        "--application APP.yaml", "Another application than the paper's synthetic chain."
-    ),
+    output: Path | None = opt.option("--output -o DIR", "Default: chainshaper-demo-DATE-TIME."),
+    application: Path | None = opt.option("--application APP.yaml", "Another application."),
     cycles: int = opt.CYCLES,
     realtime: bool | None = opt.REALTIME,
     *,
@@ -132,9 +124,7 @@ def simulate(
     cycles: int = opt.CYCLES,
     seed: int | None = opt.SEED,
     switches: bool = opt.option("--switches", "Record what ran on which core, too.", False),
-    execution_times: Path | None = opt.option(
-        "--execution-times REC", "Draw execution times from those recorded there."
-    ),
+    execution_times: Path | None = opt.option("--execution-times REC", "Those recorded there."),
     block: int = opt.option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
@@ -183,8 +173,7 @@ def record(
     duration: int | None = DURATION,
     pid: list[int] | None = opt.option(
         "--pid",
-        "Attach to this process and what it has started (ebpf, preload; may be repeated). "
-        "Default, without a COMMAND: everything of the users that looks like ROS 2.",
+        "A process and its descendants (ebpf, preload; may be repeated). Default: all nodes.",
     ),
     user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
@@ -246,34 +235,20 @@ def watch(
         "[-- COMMAND…]",
         "Starts the application with the library in front. Default: what runs so is watched.",
     ),
-    chain: list[str] | None = opt.option(
-        "--chain FIRST..LAST", "A chain, by topics or nodes: /t1../t5 (may be repeated)."
-    ),
+    chain: list[str] | None = opt.option("--chain FIRST..LAST", "A chain (may be repeated)."),
     plan: Path | None = opt.option("--plan plan.yaml", "The plan in force, with chains and slots."),
-    longest: int = opt.option(
-        "--longest DURATION>0", "What takes longer counts as incomplete.", 2_000_000_000
-    ),
+    longest: int = opt.option("--longest DURATION>0", "Longer is incomplete.", 2_000_000_000),
     every: int = opt.option("--every DURATION>0", "How often to look.", 1_000_000_000),
     budget: Path | None = opt.option(
         "--budget FILE",
         "Limits for the last minute: what breaks one is said, and the last ten seconds written.",
     ),
-    recorder: Path = opt.option(
-        "--recorder DIR", "Where these are written, also by Ctrl-\\.", Path()
-    ),
-    metrics: int | None = opt.option(
-        "--metrics PORT", "Serve OpenMetrics (Prometheus) on this port of this machine.", min=1
-    ),
-    otlp: str | None = opt.option(
-        "--otlp URL", "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry)."
-    ),
-    diagnostics: bool = opt.option(
-        "--diagnostics", "Publish the chains on /diagnostics, with the ROS 2 of the nodes.", False
-    ),
+    recorder: Path = opt.option("--recorder DIR", "Where these go, also by Ctrl-\\.", Path()),
+    metrics: int | None = opt.option("--metrics PORT", "OpenMetrics for Prometheus.", min=1),
+    otlp: str | None = opt.option("--otlp URL", "Send metrics there by OTLP over HTTP."),
+    diagnostics: bool = opt.option("--diagnostics", "Publish on /diagnostics in ROS 2.", False),
     user: list[str] | None = opt.USERS,
-    environment: bool = opt.option(
-        "--environment", "Print how the library gets in front of ROS 2; no more.", False
-    ),
+    environment: bool = opt.option("--environment", "Only print the variable to set.", False),
     json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),
 ) -> None:
     """Watch the chains of a running application: latency now, over a minute, over an hour.
@@ -423,13 +398,11 @@ def profile(
     ),
     node: list[str] | None = opt.option(
         "--node NAME",
-        "A node that gets the priority (may be repeated, the most urgent first). Default: the "
-        "chain's, or all, at one priority.",
+        "A node with the priority, most urgent first (may be repeated). Default: the chain's.",
     ),
     core: int | None = opt.option(
         "--core",
-        "Where executors run. Default: the last core; with --chain and --like, others as well where"
-        " branches run at the same time. DDS threads run on the others.",
+        "Where executors run. Default: the last; with --chain and --like, further ones.",
         min=0,
     ),
     request: "cs.PlanRequest",
@@ -496,8 +469,7 @@ def profile(
 def shape(
     words: list[str] = opt.argument(
         "APP.yaml plan.yaml | -- ros2 launch ...",
-        "A described application and the plan in force; or what launches a real one, "
-        "which is then measured and planned first.",
+        "A described application and its plan; or what launches a real one, to be planned.",
         ...,
     ),
     output: Path = opt.option(

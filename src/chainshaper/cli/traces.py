@@ -95,12 +95,8 @@ def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
 
 def chains(
     trace: list[Path] = opt.TRACE,
-    start: str | None = opt.option(
-        "--from X", "Topic or node where they begin. Default: callbacks that nothing triggers."
-    ),
-    end: str | None = opt.option(
-        "--to Y", "Topic or node where they end. Default: topics from which nothing goes on."
-    ),
+    start: str | None = opt.option("--from X", "Topic or node. Default: what nothing triggers."),
+    end: str | None = opt.option("--to Y", "Topic or node. Default: what nothing takes."),
     limit: int = opt.option("--limit", "How many to list.", 100, min=1),
     json: bool = opt.JSON,
 ) -> None:
@@ -126,9 +122,7 @@ def chains(
 def latency(
     trace: list[Path] = opt.TRACE,
     chain: str | None = opt.CHAIN,
-    chains: Path | None = opt.option(
-        "--chains FILE", "A CARET architecture file: --chain then names one of its named_paths."
-    ),
+    chains: Path | None = opt.option("--chains FILE", "A CARET architecture's named_paths."),
     json: bool = opt.JSON,
     instances: bool = opt.option("--instances", "With --json: every traversal, one by one.", False),
 ) -> None:
@@ -202,9 +196,7 @@ def _matching(recordings: list[Path]) -> list[Path]:
 def check(
     recordings: list[Path] = opt.argument("REC...", "Recordings' or traces' folders.", ...),
     budget: Path | None = opt.option("--budget FILE", "What they have to keep to."),
-    baseline: list[Path] | None = opt.option(
-        "--baseline REC", "Recordings of before (may be repeated): is a callback slower now?"
-    ),
+    baseline: list[Path] | None = opt.option("--baseline REC", "Of before (may be repeated)."),
     chain: list[str] | None = opt.CHAINS,
     junit: Path | None = opt.option("--junit FILE", "Also write JUnit XML, for a CI system."),
     markdown: Path | None = opt.option("--markdown FILE", "Also write Markdown, for a review."),
@@ -320,9 +312,7 @@ def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -
 def compare(
     recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
     chain: str | None = opt.CHAIN,
-    figures: Path | None = opt.option(
-        "--figures DIR", "Draw latency.png and distribution.png into this folder."
-    ),
+    figures: Path | None = opt.option("--figures DIR", "For latency.png, distribution.png."),
     plan: Path | None = opt.PLAN_IN_FORCE,
     strict: bool = opt.STRICT,
     json: bool = opt.JSON,
