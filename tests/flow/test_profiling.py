@@ -217,8 +217,8 @@ def test_profile_says_what_it_needs(tmp_path: Path) -> None:
         ("--cores", "0,4000"): "core 4000, which the chain asks for, is not available",
         ("--cores", "0,0"): "names a core twice",
         ("--cores", "0,1", "--core", "1"): "give one of them",
-        ("--cores", ",".join(map(str, available_cores()))): "name these with --chain",
-        ("--best-effort", "/beside"): "a node beside the chain: name the chain",
+        ("--cores", ",".join(map(str, available_cores()))): "add --chain and --like",
+        ("--best-effort", "/beside"): "--best-effort is beside a chain",
     }.items():
         assert reason in refused(
             3 if "4000" in reason else 2, "profile", "-o", path, *options, *command

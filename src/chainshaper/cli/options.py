@@ -246,9 +246,7 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     if listed and "=" not in listed:
         bands = {mode: number for number, (mode, _, _) in enumerate(pairs, start=1)}
     if len(bands) != len(pairs):
-        raise InputError(
-            f"--modes {text}: write TOPIC:MODE,MODE, each mode once, all with a band or none"
-        )
+        raise InputError(f"--modes {text}: write each mode once, all with a band or none")
     with wrong_values_refused(Modes):
         return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")
 

@@ -190,9 +190,7 @@ def record(
     if command and pid:
         raise InputError("a COMMAND is started, --pid attaches to what runs: give one of them")
     if not command and source not in ("ebpf", "preload"):
-        raise InputError(
-            "no command given: `record -o REC -- ros2 launch …`; to attach, add --source ebpf"
-        )
+        raise InputError("no command given: add `-- ros2 launch …`, or to attach --source ebpf")
     how: dict[str, Any] = {"pids": pid or [], "users": user or [], "watch_stalls": watch_stalls}
     _record_and_show(
         output, command or [], json, buffer, source=source, duration_ns=duration, **how
@@ -425,9 +423,7 @@ def profile(
         raise InputError("no command given: `chainshaper profile -o REC -- ros2 launch …`")
     chains = chain or []
     if chains and like is None and not node:
-        raise InputError(
-            f"which nodes has {chains[0]}? Name an earlier recording (--like), or these (--node)"
-        )
+        raise InputError(f"which nodes has {chains[0]}? Add --like REC, or name them (--node)")
     refuse_existing(output)
     check_command(command)
     if core is not None and request.cores is not None:
@@ -436,9 +432,7 @@ def profile(
         request = cs.PlanRequest(cores=(core,))
     cores, earlier = check_profiling(request.cores), opt.recording_of(like)
     if len(cores) > 1 and not (earlier and chains):
-        raise InputError(
-            "--cores are distributed by what chains do at the same time: add --chain, --like"
-        )
+        raise InputError("--cores are distributed by what chains do: add --chain and --like")
     core_of = {f"/{name.strip('/')}": cores[0] for name in node or ()}
     seen = tuple["cs.Profile", ...]()
     if earlier is not None and chains:
@@ -447,9 +441,7 @@ def profile(
         if len(undelayed(seen, found)) > 1:
             out.notes(["chains that share a core delay each other here: profile them one by one"])
     if request.best_effort and not core_of:
-        raise InputError(
-            "--best-effort is a node beside the chain: add --chain and --like, or --node"
-        )
+        raise InputError("--best-effort is beside a chain: add --chain and --like, or --node")
     _record_and_show(
         *(output, command, json, buffer),
         source=source,
@@ -517,9 +509,7 @@ def shape(
         _shape_described(Path(words[0]), Path(words[1]), output, strict, how)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
-        raise InputError(
-            "a described application has its plan alone: `shape APP.yaml plan.yaml -o REC`"
-        )
+        raise InputError("a described application has its plan: `shape APP.yaml plan.yaml -o REC`")
     _shape_launched(
         *(words, output, json, strict),
         chain=chain,

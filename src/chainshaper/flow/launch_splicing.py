@@ -110,9 +110,8 @@ def splice_launch_files(
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
     if recording is not None and node not in ours.OF_ONE_TYPE:
-        _refuse_undelivered(
-            recording, {one.topic: types.get(one.topic, "") for one in redirects}, node
-        )
+        ends = {one.topic: types.get(one.topic, "") for one in redirects}
+        _refuse_undelivered(recording, ends, node)
     logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
 
     def written(into: Path) -> _Written:
@@ -190,7 +189,7 @@ def splice_throttlers(
         how = (one.period_ns, one.rule)
         if any(one.topic in topics for other, topics in alike.items() if other != how):
             raise InputError(
-                f"{one.topic} is throttled twice, with another period or rule: name it with one"
+                f"{one.topic} is throttled twice, by different rules: name it with one"
             )
         topics = alike.setdefault(how, {})
         nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
@@ -306,9 +305,7 @@ def _subscribers(one: ThrottledInput, known: _Names | None) -> Sequence[str]:
     if one.subscriber:
         return [one.subscriber]
     if known is None:
-        raise InputError(
-            f"who subscribes to {one.topic} is not known: name a recording, or the node"
-        )
+        raise InputError(f"who subscribes to {one.topic} is not known: name a recording, or it")
     if not known.get(one.topic):
         raise InputError(
             f"no node subscribes to {one.topic} in the recording; to these topics nodes do:"

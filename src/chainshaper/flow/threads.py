@@ -268,9 +268,7 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
             " offsets have to be stopped until then: choose freezer or scx"
         )
     if plan.takes_turns and back_end == "scx":
-        raise InputError(
-            "equal_priorities: under the back end scx servers take no turns (--backend freezer)"
-        )
+        raise InputError("under the back end scx servers take no turns (--backend freezer)")
 
 
 def followed_chains(
@@ -297,7 +295,7 @@ def followed_chains(
             tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
             if len(tables) > 1 and back_end not in ("freezer", "fifo"):
                 raise InputError(
-                    f"{back_end} does not move slots: choose freezer, or `shaping_thread: free`"
+                    f"{back_end} does not move slots: choose freezer, or a free thread"
                 )
         except InputError as error:
             why_not.append(f"slots of {chain_name(chain)} cannot follow its latencies: {error}")
