@@ -39,7 +39,11 @@ def test_it_shows_what_is_redirected_and_what_to_launch(files: Files) -> None:
     said = json_of("splice", plan, robot, "-o", folder)
     nodes, standbys = ["chainshaper_t3"], ["chainshaper_t3_standby"]
     logs = [f"{folder}/logs/{name}.csv" for name in (*nodes, *standbys)]
-    wanted = {"folder": str(folder), "launch": {str(robot): copy}, "originals": {copy: str(robot)}}
+    wanted: dict[str, object] = {
+        "folder": str(folder),
+        "launch": {str(robot): copy},
+        "originals": {copy: str(robot)},
+    }
     wanted |= {"nodes": nodes, "standbys": standbys, "logs": logs}
     wanted |= {"notes": [], "setup": None, "redirected": [], "environment": {}}
     assert said.pop("diff").startswith("--- /dev/null\n")
@@ -138,7 +142,7 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(files: Files, p
         ("PLAN ROBOT -o DIR --build", "--node python needs no building"),
         ("PLAN ROBOT -o DIR --node typed", "not known: name it"),
         ("PLAN ROBOT -o DIR --node typed --type Header", "'Header' is not a message type"),
-        ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording, or the node"),
+        ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording, or it"),
         ("ROBOT -o DIR --throttle /third:/t1", "write a topic and a period"),
         ("ROBOT -o DIR --throttle /third:/t1=1s,last", "'last' should be 'newest' or 'first'"),
         ("ROBOT -o DIR --throttle third:/t1=1s", "'third' is not a full ROS"),
