@@ -122,27 +122,16 @@ def test_named_paths_of_a_caret_architecture_file(tmp_path: Path) -> None:
 
 def test_tables_are_for_people() -> None:
     trace = reference_folder("jazzy_avp_cyclonedds")
-    lost = "lost while recording: nothing"
-    for command, texts, absent in (
-        (
-            ("latency", "--chain", CHAINS[2][1]),
-            [
-                "Where it goes, hop by hop [ms]",
-                "together",
-                lost,
-                "stalls of the machine not watched",
-            ],
-            "undisturbed",  # the machine was not watched
-        ),
-        (
-            ("callbacks",),
-            ["timer every 100ms (Throttler λ1)", "timer every 100ms (Throttler λ2)", lost],
-            "execution",  # without sched_switch there are no such columns
-        ),
+    lost, timers = "lost while recording: nothing", [f"every 100ms (Throttler λ{n})" for n in "12"]
+    watched = "stalls of the machine not watched"
+    for words, texts, absent in (
+        # The machine was not watched, so nothing is called undisturbed.
+        (("latency", "--chain", CHAINS[2][1]), ["hop by hop [ms]", lost, watched], "undisturbed"),
+        (("callbacks",), [*timers, lost], "execution"),  # without sched_switch
         (("info",), ["jazzy"], "unknown"),
         (("graph",), ["Throttler λ1"], "parameter"),
         (("graph", "--all"), ["/parameter_events"], "Traceback"),
     ):
-        shown = called(command[0], trace, *command[1:]).out
+        shown = called(words[0], trace, *words[1:]).out
         assert [text for text in texts if text not in shown] == []
         assert absent not in shown

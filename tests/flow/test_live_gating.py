@@ -1,0 +1,129 @@
+"""Live over DDS, with the freezer: a shaping node in its server, a publisher's thread held until
+its slot, and pipelines of stages.
+"""
+
+import sys
+from pathlib import Path
+
+import polars as pl
+import pytest
+from applied_plans import MS, leftovers, needs_fifo
+from calm_runs import calm_run
+from gated import needs_cgroups
+from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan, small_chain_text
+
+from chainshaper import (
+    apply_plan,
+    load_application,
+    measure_latency,
+    open_recording,
+    plan_recording,
+    run_application,
+    shape_application,
+)
+from chainshaper.enforcement.undoing import RunState
+from chainshaper.linux.scheduling import available_cores
+from chainshaper.planning import PlanRequest, save_plan
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.plan import publish_slots, publisher_servers
+from chainshaper.values.recording import Recording
+from chainshaper.workload.description import Application, CallbackDescription
+
+ROOT = Path(__file__).parents[2]
+pytestmark = [needs_fifo, needs_cgroups]
+
+
+def test_a_shaping_node_kept_in_its_server_publishes_when_its_gate_says(tmp_path: Path) -> None:
+    """R_m and R_m° of a plan in force together."""
+    plan = small_chain_plan(
+        4 * MS, 24 * MS, core=EXECUTOR_CORE, overrun="publish", shaping_thread="in-slots"
+    )
+    states: list[RunState] = []
+
+    def run(place: Path) -> Recording:
+        (place / "app.yaml").write_text(small_chain_text())
+        save_plan(plan, place / "plan.yaml")
+        words = ("shape", place / "app.yaml", place / "plan.yaml", "-o", place / "rec")
+        command = [sys.executable, "-m", "chainshaper", *map(str, words), "--cycles", "120"]
+        states.append(apply_plan(plan, command, back_end="freezer").state)
+        return open_recording(place / "rec")
+
+    measured = measure_latency(calm_run(run, tmp_path)).analysis
+    assert [one.kept_by for one in states[-1].servers] == ["freezer", "freezer"]
+    # Open early enough, and for what is late.
+    assert states[-1].servers[1].slots == ((20 * MS, 50 * MS),)
+    assert measured.statistics.incomplete <= 1, "a frozen node loses nothing"
+    calm = measured.traversals.filter(~pl.col("disturbed"))["latency_ns"]
+    assert calm.quantile(0.9) - calm.quantile(0.1) < MS // 2  # type: ignore[operator]
+    assert abs(calm.median() - 25 * MS) < MS // 2  # type: ignore[operator]
+    assert not leftovers()
+
+
+def _burning_meanwhile(application: Application) -> Application:
+    """The chain's last node has a timer of its own, whose callback needs the executor's thread."""
+    third = application.nodes["third"]
+    timer = CallbackDescription.model_validate({"timer": "5ms", "execution": {"constant": "500us"}})
+    busy = third.model_copy(update={"callbacks": (*third.callbacks, timer)})
+    return application.model_copy(update={"nodes": {**application.nodes, "third": busy}})
+
+
+def test_an_asynchronous_publisher_waits_for_its_slot_and_its_executor_does_not(
+    tmp_path: Path,
+) -> None:
+    application = _burning_meanwhile(small_chain(tmp_path, publication="asynchronous"))
+    plan = small_chain_plan(5 * MS, 19 * MS, publication="asynchronous", publish_slot_ns=10 * MS)
+    ((_, server, _),) = publisher_servers(plan)
+    recording = calm_run(
+        lambda place: shape_application(application, plan, place / "rec", cycles=26), tmp_path
+    )
+    measured = measure_latency(recording)
+    assert measured.analysis.incomplete == {}, "nothing is lost"
+    undisturbed = measured.analysis.traversals.filter(~pl.col("disturbed"))
+    # Latency counts from the first callback, which starts a little after its cycle does.
+    start, end = server.slots[0]
+    in_slot = undisturbed.filter(pl.col("latency_ns").is_between(start - MS, end))
+    assert undisturbed.height > 10
+    assert in_slot.height > 0.9 * undisturbed.height
+    # The executor of the same process ran while its publisher was held back.
+    starts = recording.events["callback_start"]
+    phase = (starts["time"] - measured.analysis.traversals["start"][0]) % PERIOD_NS
+    assert (~phase.is_between(start, end)).sum() > starts.height / 2
+    assert not leftovers()
+
+
+@pytest.mark.skipif(len(available_cores()) < 2, reason="needs two cores")
+@pytest.mark.parametrize(
+    ("example", "cores", "stages"),
+    [("pipeline", None, [1, 0]), ("pipeline_waiting", (0, 1, 0), [1, 0, 0])],
+)
+def test_a_chain_of_1_6_or_2_4_periods_is_constant_once_a_cycle_and_in_order(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    example: str,
+    cores: tuple[int, ...] | None,
+    stages: list[int],
+) -> None:
+    cycles_later = len(stages) - 1
+    monkeypatch.chdir(ROOT)  # where examples.waiting is found
+    application = load_application(ROOT / f"examples/{example}.yaml")
+    profile = calm_run(
+        lambda place: run_application(application, place / "profile", cycles=20), tmp_path
+    )
+    request = PlanRequest(policy="pipelined", cores=cores, epsilon_ns=6 * MS)
+    plan = plan_recording(profile, request=request)
+    assert [server.core for server in plan.servers[:-1]] == stages
+    assert cycles_until_output(plan) == cycles_later
+    ((start, _),) = publish_slots(plan)
+    folder = tmp_path / "shaped"
+    folder.mkdir()
+    shaped = calm_run(
+        lambda place: shape_application(application, plan, place / "rec", cycles=28), folder
+    )
+    analysis = measure_latency(shaped).analysis
+    latencies = analysis.traversals.filter(~pl.col("disturbed"))["latency_ns"]
+    planned = latencies - cycles_later * 100 * MS - start
+    assert planned.min() >= 0
+    assert (planned < MS).sum() >= 0.9 * latencies.len() > 12
+    ends = analysis.traversals["end"].drop_nulls().diff().drop_nulls()
+    assert ends.min() > 0  # type: ignore[operator]
+    assert not leftovers()
