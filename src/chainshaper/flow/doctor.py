@@ -134,8 +134,6 @@ def _check(  # noqa: PLR0917 - a check's columns
     name: str, purpose: str, good: str | None, state: State, found: str, remedy: str
 ) -> Check:
     """``good`` is what was found; None: the check's state, what was found, and the remedy."""
-    return (
-        Check(name, state, found, purpose, remedy)
-        if good is None
-        else Check(name, "good", good, purpose)
-    )
+    if good is None:
+        return Check(name, state, found, purpose, remedy)
+    return Check(name, "good", good, purpose)

@@ -77,10 +77,8 @@ def with_trace_events(recording: Recording) -> RecordingInfo:
     left = [name for name in counts if table_name(name) not in recording.events]
     notes = info.notes
     if left:
-        count = (
-            f"{sum(counts[name] for name in left)} events of kinds that chainshaper makes no use"
-        )
-        notes += (f"{count} of were left out: {', '.join(left)}.",)
+        what = "events of kinds that chainshaper makes no use of were left out"
+        notes += (f"{sum(counts[name] for name in left)} {what}: {', '.join(left)}.",)
     return info.model_copy(update={"trace_events": counts, "notes": notes})
 
 

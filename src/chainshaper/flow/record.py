@@ -140,7 +140,7 @@ def record_command(
         for note in notes:
             progress(0.0, note)
         try:
-            _trace(run, scheduling, command_stdout, watch_stalls=watch_stalls)
+            _trace(run, scheduling, command_stdout, stalls=watch_stalls)
             progress(1.0, "reading the events")
             recording = _written(output, run, chain, plan)
         except BaseException as error:  # the trace may be of hours: nothing costs it
@@ -199,11 +199,9 @@ def _tracer(
     return EbpfTracer(folder, command, pids, users), ()
 
 
-def _trace(
-    run: _Run, scheduling: Scheduling | None, stdout: int | None, *, watch_stalls: bool
-) -> None:
+def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool) -> None:
     with ExitStack() as undo:
-        if watch_stalls:
+        if stalls:
             run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
         undo.callback(run.tracer.remove)
         run.progress(0.0, "starting to trace")
