@@ -76,9 +76,7 @@ PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
 
 
 def option(names: str, help_text: str, default: Any = None, **more: Any) -> Any:
-    """An option as a parameter's default: ``--epsilon DURATION``, ``--output -o FILE``. What has a
-    metavar of :data:`PARSERS` is parsed; ``...`` where it must be given.
-    """
+    """An option as a parameter's default; ``...`` where it must be given (:data:`PARSERS`)."""
     words = names.split()
     metavar = None if words[-1].startswith("-") else words.pop()
     parse, write = PARSERS.get(metavar or "", (None, None))
@@ -187,9 +185,7 @@ _OTHERS: dict[str, tuple[Any, Any]] = {
 
 
 def takes_wishes(*names: str) -> Callable[[Callable[..., None]], Any]:
-    """Give a verb, in place of its parameter ``request``, a PlanRequest, options for these
-    wishes: fields of :class:`.Wishes`, and ``modes`` and ``late``, the modes of the system.
-    """
+    """Give a verb options for these wishes, and `--modes`, in place of its PlanRequest."""
 
     def decorate(verb: Callable[..., None]) -> Any:
         @wraps(verb)

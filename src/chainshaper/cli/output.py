@@ -180,10 +180,7 @@ def stop_on_signals() -> AbstractContextManager[threading.Event]:
 
 @contextmanager
 def set_by(*numbers: signal.Signals) -> Iterator[threading.Event]:
-    """An event that these signals set, inside.
-
-    A thread of its own does that: a handler may interrupt who holds the event's lock.
-    """
+    """An event that these signals set, by a thread: a handler may interrupt who has its lock."""
     event, (reading, writing) = threading.Event(), os.pipe()
 
     def listen() -> None:

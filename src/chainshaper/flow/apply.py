@@ -519,10 +519,7 @@ class _Run:
     def look_again(
         self, servers: BackEnd, latest: tuple[NodeThread, ...]
     ) -> tuple[tuple[NodeThread, ...], str]:
-        """Threads that have appeared get what the plan says; ``latest`` had before this look.
-
-        Returns the new ones, and why they were not taken in, if so.
-        """
+        """Threads that are new get what the plan says: these, and why they were not taken in."""
         before, now = self.found, self.find()
         new, ended = allocation.new_and_ended(before, now)
         over = {one.thread.identity for one in ended}

@@ -71,9 +71,7 @@ def shape_application(
 
 
 def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
-    """The servers without which a plan does not work, and whom they have to gate: asynchronous
-    publishers, and the stages of a pipeline, which would run beside the instance before.
-    """
+    """The servers without which a plan does not work, and whom they gate (publishers, stages)."""
     gates = {node.thread for node in plan.shaping_nodes}
     pipelines = [chain for chain in plan.chains if chain.policy == "pipelined"]
     staged = {one for chain in pipelines for server in chain.servers for one in server.threads}
@@ -119,9 +117,7 @@ def slots_followed(
     enforcement: Enforcement | None,
     nodes: StartedNodes,
 ) -> Iterator[None]:
-    """Inside, slots of the live workload's gates follow its latencies, within their reach, beside
-    ``enforcement``. Raises what that does; OperationError: one does not follow to the end.
-    """
+    """Inside, slots of gates follow latencies within their reach. Raises as ``enforcement``."""
     anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
 
     def from_when(chain: Plan, _: int) -> int:

@@ -59,9 +59,7 @@ def measure_phase(
     cycles: int = 12,
     progress: Callable[[float], None] = lambda _: None,
 ) -> Phase:
-    """Watch the threads of an executor for some cycles and find its phase; again, where they were
-    disturbed meanwhile. Raises OperationError: one ended, or none wakes up regularly.
-    """
+    """The phase of an executor. Raises OperationError: it ended, or does not wake up regularly."""
     for _ in range(MOST_TRIES):
         found = watch_wake_ups(pid, tids, cycles * cycle_ns, progress)
         if (phase := find_phase(found, cycle_ns, cycles)) is not None:
@@ -284,9 +282,7 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes that get the phase by a ``script`` (None: none is to, or it was ``refused``), since
-    ``begun`` (s of CLOCK_MONOTONIC).
-    """
+    """Nodes get the phase by a ``script``, if it was not ``refused``, since ``begun`` (s)."""
 
     nodes: tuple[str, ...]
     script: "Script | None"
@@ -316,9 +312,7 @@ NO_NODE = Telling((), None, 0.0)  # none is to get a phase
 
 
 def tell_phase(nodes: Collection[ShapingNode], found: Allocation, phase_ns: int) -> Telling:
-    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle: they are in one
-    domain, any has the environment in which all are found.
-    """
+    """Begin to give shaping nodes in ROS 2 where their chain begins in every cycle."""
     names = [node.thread.node for node in nodes]
     pids = {node: one.thread.pid for node in names for one in found.threads if node in one.nodes}
     if not pids:

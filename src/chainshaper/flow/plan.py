@@ -179,9 +179,7 @@ def _profile_of(
 def _modes_in_force(
     recording: Recording, flow: DataFlow, starts: pl.Series, modes: Modes
 ) -> pl.Series:
-    """The mode in which each cycle began, as gates count them, by the description of what ran; null
-    where that is not known, or the recording lacks events.
-    """
+    """The mode in which each cycle began, by the description of what ran; null if unknown."""
     named: list[tuple[int, str]] = []
     described = recording.info.application
     if described is not None and not any(recording.info.lost.values()):
@@ -346,9 +344,7 @@ def inputs_of(graph: ApplicationGraph, callback: Callback, topic: str) -> tuple[
 
 
 def _times(flow: DataFlow, instances: pl.DataFrame, stage: _Stage, core: int) -> CallbackTimes:
-    """Response times of a stage: of the instances that publish, behind those of the other inputs of
-    a synchronising callback, in the same slot.
-    """
+    """Response times of a stage, behind those of the other inputs of a synchronising callback."""
     published = flow.publications.filter(pl.col("topic") == stage.topic)["instance"].drop_nulls()
     publishes = pl.col("instance").is_in(published.implode())
     own = instances.filter(pl.col("callback_id").is_in(stage.members))
@@ -406,9 +402,7 @@ def _steps(
 
 
 def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:
-    """Finished instances that began in none of these traversals, with their response time. Of those
-    without an end (rclpy), the last publication is it.
-    """
+    """Finished instances that began in none of these traversals, with their response time."""
     last = flow.publications.group_by("instance").agg(last=pl.col("time").max())
     ended = flow.instances.join(last, on="instance", how="left", maintain_order="left")
     until = pl.coalesce("end", pl.when("assumed").then("last"))

@@ -155,9 +155,7 @@ def profiled_cores(
 
 
 def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[int]]:
-    """The places of chains, together where one recording can measure each as if it were alone: of
-    one graph, or sharing no core.
-    """
+    """The places of chains, those together that one recording can measure as if alone."""
     found: list[tuple[list[int], set[int]]] = []
     for group in beginning_together(seen):
         cores = {core_of[node] for place in group for node in seen[place].core_of}
@@ -172,9 +170,7 @@ def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[
 def executors_of(
     found: Allocation, nodes: frozenset[str], processes: Sequence[Process]
 ) -> list[NodeThread]:
-    """The threads that execute these nodes, or publish for them; if none are named, of all but
-    `ros2 launch` and the like, which is a node as well, and in no chain.
-    """
+    """The threads that execute these nodes or publish for them; by default all but launchers'."""
     running = [one for one in found.threads if one.thread.role in ("executor", "publisher")]
     if nodes:
         return [one for one in running if not nodes.isdisjoint(one.nodes)]

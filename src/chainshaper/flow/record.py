@@ -229,9 +229,7 @@ def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stal
 
 
 def _watch(run: _Run) -> None:
-    """Look at the application now and then, until it, its time or the tracer ends; its time begins
-    when the scheduling that was asked for is in force.
-    """
+    """Look at the application until it, its time (in force) or the tracer ends."""
     next_look = _FIRST_LOOK_NS
     while True:
         now = time.monotonic_ns()

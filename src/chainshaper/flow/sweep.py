@@ -349,9 +349,7 @@ def _replaced(data: Any, path: list[str], value: Any) -> Any:
 
 
 def _interfered(described: dict[str, Any], period_ns: int, longest_ns: int) -> dict[str, Any]:
-    """The description with a load beside the chain, as in section 2.5: once a period, for between
-    half the time and all of it, at the lowest priority on the executors' core.
-    """
+    """The description with the load of section 2.5: once a period, at the lowest priority."""
     own = described["nodes"].get(INTERFERENCE, {})
     first, *others = own.get("callbacks", [{"timer": format_duration(period_ns)}])
     times = [format_duration(longest_ns // 2), format_duration(longest_ns)]

@@ -187,9 +187,7 @@ def check_publishers(
 
 
 def _asynchronous(pid: int) -> dict[str, bool]:
-    """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others, if known.
-    In Fast DDS's files of profiles a topic's own counts, or the default one; else synchronous.
-    """
+    """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others."""
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
 
     try:
@@ -234,9 +232,7 @@ def planned_changes(
     phase_ns: int | None = None,
     users: Collection[str | int] = (),
 ) -> Changes:
-    """What :func:`.apply_plan` would do, with the same errors. LITMUS^RT's commands are given on
-    any kernel, with ``TID:NODE`` for threads that do not run.
-    """
+    """What :func:`.apply_plan` would do, with the same errors; of LITMUS^RT on any kernel."""
     given, plan = whole(plan), open_until_done(whole(plan))
     table = server_table(plan)
     found = find_threads(plan, recording, users=users)
@@ -358,9 +354,7 @@ def chain_phases(
     progress: Callable[[float], None] = lambda _: None,
     known: Mapping[int, Phase] = MappingProxyType({}),
 ) -> list[Phase]:
-    """Where in its cycle each chain begins, watched one after the other; some are ``known``, by
-    their chains' places.
-    """
+    """Where in its cycle each chain begins; some are ``known``, by their chains' places."""
     wanted = [
         (origin[0].pid, tuple(one.tid for one in origin), chain.cycle_ns)
         for chain, origin in zip(plan.chains, first_threads(plan, found), strict=True)
