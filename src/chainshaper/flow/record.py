@@ -32,7 +32,8 @@ from chainshaper.linux.threads import parents
 from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.sources import Tracer, preload
+from chainshaper.sources import Tracer, ebpf, lttng, preload
+from chainshaper.sources.ebpf.late_attachment import with_found_nodes
 from chainshaper.sources.gate_log import releases_so_far, with_gate_logs
 from chainshaper.sources.ros import Environment, ask_graph, environment_of
 from chainshaper.sources.system import own_pid_namespace
@@ -184,9 +185,7 @@ def _tracer(
                 raise
             source, notes = "lttng", (f"LTTng recorded: {error}.",)
     if source == "lttng":
-        from chainshaper.sources.lttng import LttngSession
-
-        return LttngSession(folder, command, pids, buffer, users), notes
+        return lttng.LttngSession(folder, command, pids, buffer, users), notes
     if source not in ("ebpf", "preload"):
         raise InputError(f"{source!r} is no source of events: name lttng, preload or ebpf")
     if buffer is not None:
@@ -194,9 +193,7 @@ def _tracer(
         raise InputError(f"--buffer is about LTTng's buffers: {why}")
     if source == "preload":
         return preload.PreloadTracer(folder, command, pids, users), ()
-    from chainshaper.sources.ebpf import EbpfTracer
-
-    return EbpfTracer(folder, command, pids, users), ()
+    return ebpf.EbpfTracer(folder, command, pids, users), ()
 
 
 def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool) -> None:
@@ -292,8 +289,6 @@ def _written(
     tables, missing = with_gate_logs(tables, run.gate_logs, since_ns, run.ended_ns)
     run.notes += missing
     if run.command is None:  # its nodes were created before tracing began
-        from chainshaper.sources.ebpf.late_attachment import with_found_nodes
-
         tables, info = with_found_nodes(tables, info, run.endpoints, run.processes)
     recording = Recording(output, info, tables)
     threads = _recorded_threads(run.processes, recording)
