@@ -92,9 +92,7 @@ def argument(metavar: str, help_text: str, default: Any = None) -> Any:
 
 
 SINK: list[str] | None = option(
-    "--sink FIRST..LAST",
-    "A chain to a further output of the same graph, to be shaped too.",
-    rich_help_panel="More of the graph",
+    "--sink FIRST..LAST", "A chain to another output.", rich_help_panel="More of the graph"
 )
 JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
@@ -123,16 +121,12 @@ USERS: list[str] | None = option(
     "--user NAME", "Whose processes may be nodes (may be repeated). Default: yours, and root's."
 )
 ADAPT: bool = option(
-    "--adapt",
-    "Slots follow the latencies: later to keep the promise, earlier to give some back.",
-    False,
+    "--adapt", "Slots follow the latencies: later to keep the promise, else earlier.", False
 )
 MAX_LATENCY: int | None = option("--max-latency DURATION", "With --adapt: no slot ends later.")
 SOURCE: Source | None = option("--source", "Tracer. Default: preload, or else lttng.")
 NODE: NodeKind = option(
-    "--node",
-    "A script; a package for all types; one for the type; or that as a component.",
-    "python",
+    "--node", "A script; a package; one for the type; or that as a component.", "python"
 )
 
 
@@ -159,20 +153,17 @@ def wish(name: str, **more: Any) -> Any:
 
 MODE_PROFILE: list[str] | None = option(
     "--mode-profile MODE=REC",
-    "With --modes: what was measured in one mode alone, a recording or a file of latencies"
-    " (may be repeated). Default: the cycles of the recording that began in it.",
+    "With --modes: a recording, or latencies, of one mode alone (may be repeated).",
     rich_help_panel=BANDS,
 )
 _MODES = option(
     "--modes TOPIC:MODE[=BAND],…",
-    "Each mode's band, 1 is the first, found where none has a number; the first mode named is in"
-    " force until the topic (std_msgs/String) names another. Such as /driving_mode:city,highway.",
+    "Each mode's band, from 1; the first mode is in force until the topic names one.",
     rich_help_panel=BANDS,
 )
 _LATE = option(
     "--late",
-    "With --modes, an output behind its mode's slot: at once, wait for the next cycle's, discard,"
-    " or in the cycle's next slot. Default: publish.",
+    "With --modes: what becomes of an output behind its mode's slot. Default: at once.",
     rich_help_panel=BANDS,
 )
 _OTHERS: dict[str, tuple[Any, Any]] = {
