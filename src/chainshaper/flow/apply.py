@@ -229,15 +229,13 @@ class _Run:
                 if over and missing and missing <= shaping:
                     raise OperationError(
                         f"the plan's shaping node {named} is not running, all other nodes are:"
-                        " start the application with it (`chainshaper splice plan.yaml LAUNCH... -o"
-                        " DIR`; of a described application, `chainshaper shape APP.yaml plan.yaml"
-                        " -o REC`), or plan without one (--policy server-per-chain)"
+                        " start it too (`chainshaper splice`, or `shape` of a described application),"
+                        " or plan without one (--policy server-per-chain)"
                     ) from None
                 if self.command_ended and self.command is not None:
-                    raise OperationError(
-                        f"the command {end_in_words(self.command.returncode)} before all nodes of"
-                        f" the plan were running: {named or 'all'} were not"
-                    ) from None
+                    ended = f"the command {end_in_words(self.command.returncode)} before all nodes"
+                    said = f"{ended} of the plan were running: {named or 'all'} were not"
+                    raise OperationError(said) from None
                 if waited >= wait_ns:
                     raise
             quiet = before is not None and not any(allocation.new_and_ended(before, self.found))

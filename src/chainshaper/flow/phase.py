@@ -64,11 +64,10 @@ def measure_phase(
         found = watch_wake_ups(pid, tids, cycles * cycle_ns, progress)
         if (phase := find_phase(found, cycle_ns, cycles)) is not None:
             return phase
-    watched = f"thread {', '.join(map(str, tids))} of process {pid} was watched for"
+    named = f"thread {', '.join(map(str, tids))} of process {pid}"
     raise OperationError(
-        f"{watched} {duration_text(cycles * cycle_ns)} and does not wake up once in every"
-        f" {duration_text(cycle_ns)} ({len(found)} wake-ups): is the chain running, with the period"
-        " of the plan? Its phase can also be given (--phase)"
+        f"{named} does not wake up once in every {duration_text(cycle_ns)} ({len(found)} times in"
+        f" {cycles}): is the chain running, with the period of the plan? Or give its --phase"
     )
 
 

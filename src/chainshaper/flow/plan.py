@@ -119,11 +119,10 @@ def _profile_of(
     graph, chain = analysis.graph, analysis.chain
     every = analysis.traversals.filter("complete")
     if every.height < 2:
-        raise OperationError(
-            f"{recording.path}: of {analysis.traversals.height} traversals of {chain.spec}"
-            f" {every.height or 'none'} is complete, too few to plan from: see `chainshaper"
-            " latency`, and record again, longer"
-        )
+        every_one, complete = analysis.traversals.height, every.height or "none"
+        counted = f"of {every_one} traversals of {chain.spec} {complete}"
+        why = "complete, too few to plan from: see `chainshaper latency`, and record longer"
+        raise OperationError(f"{recording.path}: {counted} is {why}")
     calm = every.filter(~pl.col("disturbed"))
     all_disturbed = calm.height < 2
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
