@@ -229,7 +229,7 @@ class _Run:
                 if over and missing and missing <= shaping:
                     raise OperationError(
                         f"the plan's shaping node {named} is not running, all other nodes are:"
-                        " start it too (`chainshaper splice`, or `shape` of a described application),"
+                        " start it too (`chainshaper splice`, or `shape` where it is described),"
                         " or plan without one (--policy server-per-chain)"
                     ) from None
                 if self.command_ended and self.command is not None:
