@@ -9,7 +9,6 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError
-from chainshaper.values.files import new_file
 from chainshaper.values.plan_choices import Fallback, NodeKind
 
 
@@ -48,6 +47,7 @@ def plan(
     from chainshaper.planning.profile import deciding_cycles, doubts_about
     from chainshaper.planning.request import on_cores
     from chainshaper.reporting import figures, overviews
+    from chainshaper.values.files import new_file
 
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
@@ -187,6 +187,7 @@ def sweep(
     from chainshaper.flow.sweep import parse_axis, rows_beside
     from chainshaper.reporting.figures import ENDINGS, draw_sweep
     from chainshaper.reporting.overviews import sweep_table
+    from chainshaper.values.files import new_file
 
     if workers is not None and scheduler is not None:
         raise InputError("a cluster has workers of its own: leave out --workers, or --scheduler")

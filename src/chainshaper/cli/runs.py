@@ -17,9 +17,7 @@ from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables, judge
-from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
-from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.plan_choices import NodeKind
 
 if TYPE_CHECKING:
@@ -90,6 +88,7 @@ def init(
     Edit its nodes, callbacks and execution times; `chainshaper run` and `simulate` take it.
     """
     from chainshaper.flow.described import synthetic_chain
+    from chainshaper.values.files import new_file, write_whole
 
     write_whole(new_file(output, opt.DESCRIPTIONS), [synthetic_chain().read_bytes()])
     out.show_line(output)
@@ -201,6 +200,8 @@ def _record_and_show(
     output: Path, command: list[str], json: bool, buffer: int | None, **how: Any
 ) -> None:
     """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
+    from chainshaper.linux.own_processes import end_in_words
+
     with out.stop_on_signals() as stop:
         recorded = cs.record_command(
             output,
@@ -254,6 +255,7 @@ def watch(
     The application needs the library in front of ROS 2: `eval "$(chainshaper watch --environment)"`
     before it is started, or start it here, as COMMAND. Watching needs no root and changes nothing.
     """
+    from chainshaper.linux import own_processes
     from chainshaper.linux.processes import run_users
     from chainshaper.reporting.overviews import watch_tables
     from chainshaper.sources.preload import installed_library, preloading
@@ -275,13 +277,13 @@ def watch(
     if budget is not None or recorder != Path():
         refuse_existing(recorder / "watch-DATE-TIME")
     if command:
-        check_command(command)
+        own_processes.check_command(command)
     with out.stop_on_signals() as stop, ExitStack() as until:
         started = None
         if command:
             variables = {"LD_PRELOAD": preloading(installed_library())}
-            started = start_command(command, variables, STDERR)
-            until.callback(end_command, started)
+            started = own_processes.start_command(command, variables, STDERR)
+            until.callback(own_processes.end_command, started)
         show = until.enter_context(out.live())
         export = until.enter_context(exporting(metrics, otlp))
         asked = until.enter_context(out.set_by(signal.SIGQUIT))
@@ -309,7 +311,7 @@ def watch(
                 else:
                     show(watch_tables(seen))
     if started is not None and started.returncode and not stop.is_set():
-        raise OperationError(f"the command {end_in_words(started.returncode)}")
+        raise OperationError(f"the command {own_processes.end_in_words(started.returncode)}")
 
 
 def _judging(
@@ -416,6 +418,7 @@ def profile(
     part of --duration.
     """
     from chainshaper.flow.profiling import check_profiling, profiled_cores, undelayed
+    from chainshaper.linux.own_processes import check_command
     from chainshaper.planning.request import best_effort_cores
     from chainshaper.values.recording import refuse_existing
 

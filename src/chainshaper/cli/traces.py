@@ -1,7 +1,6 @@
 """Verbs that look at recordings and traces, one or several, and write what they find elsewhere."""
 
 from dataclasses import asdict
-from glob import glob, has_magic
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +8,6 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.files import new_file, write_whole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -40,6 +38,7 @@ def describe(
     `chainshaper simulate` and `run` take it; edit it as you like.
     """
     from chainshaper.flow.exploration import application_file
+    from chainshaper.values.files import new_file, write_whole
 
     new_file(output, opt.DESCRIPTIONS)
     with out.opened("describe", trace) as (recording, _):
@@ -59,6 +58,7 @@ def graph(
 ) -> None:
     """Show the application: nodes, callbacks with kind, period and function, topics, services."""
     from chainshaper.reporting import graph_drawing
+    from chainshaper.values.files import new_file
 
     if output is not None:
         new_file(output, graph_drawing.ENDINGS)
@@ -172,6 +172,7 @@ def budget(
 
     It is a YAML file that you edit; `chainshaper check` says which recordings keep to it.
     """
+    from chainshaper.values.files import new_file
     from chainshaper.verify.budgets import propose_budget, save_budget
 
     new_file(output)
@@ -182,6 +183,8 @@ def budget(
 
 def _matching(recordings: list[Path]) -> list[Path]:
     """Folders, and those that a pattern in quotes means, which the shell left to us."""
+    from glob import glob, has_magic
+
     found: list[Path] = []
     for one in recordings:
         if one.exists() or not has_magic(str(one)):
@@ -209,6 +212,7 @@ def check(
     --baseline all recordings together are compared with those of before, callback by callback.
     """
     from chainshaper.reporting.latency import JSON_FORMAT
+    from chainshaper.values.files import new_file, write_whole
     from chainshaper.verify import budgets
 
     if budget is None and not baseline:
@@ -356,6 +360,7 @@ def report(
     """
     from chainshaper.reporting.latency import comparisons_json
     from chainshaper.reporting.page import ENDINGS
+    from chainshaper.values.files import new_file
 
     new_file(output, ENDINGS)
     in_force = opt.plan_in_force(plan)
@@ -382,6 +387,7 @@ def export(
     if perfetto == mcap:
         raise InputError("the format is missing: add --perfetto or --mcap")
     from chainshaper.reporting.perfetto import ENDINGS
+    from chainshaper.values.files import new_file
 
     new_file(output, (".mcap",) if mcap else ENDINGS)
     in_force = opt.plan_in_force(plan)
