@@ -3,6 +3,7 @@
 import subprocess
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,14 +15,7 @@ from story import OFFSET, Story
 
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.threads import planned_changes
-from chainshaper.planning import (
-    Plan,
-    PlanRequest,
-    Profile,
-    plan_application,
-    plan_chain,
-    plan_shaping,
-)
+from chainshaper.planning import PlanRequest, Profile, plan_application, plan_chain, plan_shaping
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording, RecordingInfo
 
@@ -70,11 +64,6 @@ def test_a_clock_of_another_speed_is_no_period(speed: float, said: str) -> None:
     assert "--rate 1.0" in str(refused.value)
 
 
-def shaped(**wishes: str) -> Plan:
-    known = {"spec": "/t1../t2", "output": "/t2", "publisher": "/origin", "nodes": ("/origin",)}
-    return plan_shaping(np.array([8, 12]) * MS, 100 * MS, **known, **wishes)  # type: ignore[arg-type]
-
-
 @pytest.mark.parametrize("given", ["parameter", "file", "otherwise"])
 def test_running_nodes_that_follow_clock_are_refused_before_anything_changes(
     tmp_path: Path, given: str
@@ -82,6 +71,11 @@ def test_running_nodes_that_follow_clock_are_refused_before_anything_changes(
     asked = {"parameter": ["-p", "use_sim_time:=True"], "file": ["--params-file", "parameters"]}
     asked["otherwise"] = ["-p", "use_sim_time:=false", "-p", "level:=true"]
     (tmp_path / "parameters").write_text("/**:\n  ros__parameters:\n    use_sim_time: true\n")
+    about: dict[str, Any] = {"spec": "/t1../t2", "output": "/t2", "publisher": "/origin"}
+    stamped, cycled = (
+        plan_shaping(np.array([8, 12]) * MS, 100 * MS, **about, nodes=("/origin",), anchor=anchor)
+        for anchor in ("stamp", "cycle")
+    )
     output = tmp_path / "ran"
     command = [*node_command("origin", output), *asked[given]]
     with subprocess.Popen(command, cwd=tmp_path) as process:
@@ -89,10 +83,9 @@ def test_running_nodes_that_follow_clock_are_refused_before_anything_changes(
             wait_for(lambda: output.exists() and output.stat().st_size > 0, "the node")
             if given != "otherwise":
                 with pytest.raises(InputError, match="/origin follows /clock"):
-                    planned_changes(shaped(), "fifo")
-            others = shaped(anchor="stamp" if given == "otherwise" else "cycle")
+                    planned_changes(stamped, "fifo")
             with pytest.raises(OperationError, match=r"/chainshaper_t2 .* is not running"):
-                planned_changes(others, "fifo")
+                planned_changes(stamped if given == "otherwise" else cycled, "fifo")
         finally:
             process.kill()
 
