@@ -162,9 +162,7 @@ def status(
     runs = list(cs.find_runs())
     strays = stray_groups(journal for journal, _ in runs)
     if runs:
-        out.show(
-            runs_table(runs), *(servers_table(state) for _, state in runs if state is not None)
-        )
+        out.show(runs_table(runs), *(servers_table(one) for _, one in runs if one is not None))
     elif not strays:
         out.show_line("no plan is in force")
     out.notes(line for journal, _ in runs for line in strange_lines(journal))

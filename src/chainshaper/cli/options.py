@@ -120,9 +120,7 @@ REALTIME: bool | None = option("--realtime/--no-realtime", "SCHED_FIFO. Default:
 USERS: list[str] | None = option(
     "--user NAME", "Whose processes may be nodes (may be repeated). Default: yours, and root's."
 )
-ADAPT: bool = option(
-    "--adapt", "Slots follow the latencies: later to keep the promise, else earlier.", False
-)
+ADAPT: bool = option("--adapt", "Slots follow the latencies, to keep the promise.", False)
 MAX_LATENCY: int | None = option("--max-latency DURATION", "With --adapt: no slot ends later.")
 SOURCE: Source | None = option("--source", "Tracer. Default: preload, or else lttng.")
 NODE: NodeKind = option(

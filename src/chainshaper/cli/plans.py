@@ -110,9 +110,8 @@ def _profiles(
         raise InputError("--latencies needs the chain's period: add --period, such as 100ms")
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
-    first, last = (
-        None if at is None else -(-at // period) for at in (how["since_ns"], how["until_ns"])
-    )
+    begin, end = how["since_ns"], how["until_ns"]
+    first, last = -(-begin // period), end and -(-end // period)
     return (cs.Profile(read_latencies(latencies)[first:last], period, spec=chains[0]),)
 
 

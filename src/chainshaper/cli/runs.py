@@ -191,9 +191,8 @@ def record(
     if not command and source not in ("ebpf", "preload"):
         raise InputError("no command given: add `-- ros2 launch …`, or to attach --source ebpf")
     how: dict[str, Any] = {"pids": pid or [], "users": user or [], "watch_stalls": watch_stalls}
-    _record_and_show(
-        output, command or [], json, buffer, source=source, duration_ns=duration, **how
-    )
+    how |= {"source": source, "duration_ns": duration}
+    _record_and_show(output, command or [], json, buffer, **how)
 
 
 def _record_and_show(

@@ -188,9 +188,7 @@ def splice_throttlers(
     for one in inputs:
         how = (one.period_ns, one.rule)
         if any(one.topic in topics for other, topics in alike.items() if other != how):
-            raise InputError(
-                f"{one.topic} is throttled twice, by different rules: name it with one"
-            )
+            raise InputError(f"{one.topic} is throttled twice, in two ways: name it with one")
         topics = alike.setdefault(how, {})
         nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
         topics[one.topic] = tuple(dict.fromkeys(nodes))

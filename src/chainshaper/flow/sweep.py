@@ -232,10 +232,8 @@ def grid_of(
         raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
     # Wishes are called as the command line calls them, or as Python does.
     python = {name: name.replace("-", "_").removesuffix("_ns") for name in axes}
-    named = {
-        python[name] if python[name] in _WISHES else name: tuple(values)
-        for name, values in axes.items()
-    }
+    known = {name: own if own in _WISHES else name for name, own in python.items()}
+    named = {known[name]: tuple(values) for name, values in axes.items()}
     if len(named) < len(axes):
         raise InputError(f"an axis is given twice, of {', '.join(axes)}: give all values at once")
     grid = Grid(application, plan, named, cycles)

@@ -290,9 +290,7 @@ def followed_chains(
             furthest = (joint.with_slots_moved(plan, {place: by}) for by in found)
             tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
             if len(tables) > 1 and back_end not in ("freezer", "fifo"):
-                raise InputError(
-                    f"{back_end} does not move slots: choose freezer, or a free thread"
-                )
+                raise InputError(f"{back_end} does not move slots: choose freezer or free threads")
         except InputError as error:
             why_not.append(f"slots of {chain_name(chain)} cannot follow its latencies: {error}")
         else:
