@@ -37,7 +37,7 @@ TIMELESS |= {"enforcement/test_dispatcher", "workload/test_event_log"}
 TIMELESS |= {"flow/test_anchors", "flow/test_drift", "gate/test_throttling"}
 TIMELESS |= {"verify/test_several_chains"}
 TIMELESS |= {"enforcement/test_node_threads", "flow/test_profiles", "linux/test_processes"}
-TIMELESS |= {"verify/test_watch_restarts", "linux/test_threads", "flow/test_launch_shaping"}
+TIMELESS |= {"verify/test_watch_restarts", "linux/test_threads"}
 TIMELESS |= {"gate/test_gates_in_containers"}
 TIMELESS |= {
     "verify/test_slowdowns",

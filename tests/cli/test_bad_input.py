@@ -154,6 +154,34 @@ def test_what_does_not_go_is_refused_and_nothing_written(
     assert {path: path.read_bytes() for path in folder.iterdir()} == before
 
 
+def test_what_cannot_be_shaped_is_refused_before_anything_is_launched(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, out = tmp_path / "robot.launch.xml", tmp_path / "out"
+    file.write_text("<launch/>\n")
+    for words, reason in {
+        "robot.yaml": "`shape APP.yaml plan.yaml -o REC`",
+        "robot.yaml plan.yaml --bands 2": "is shaped as plan.yaml says",
+        "-- sleep 1": "is not `ros2 launch",
+        "--chain /a../b --chain /c../d --sink /a../e LAUNCH": "--sink goes with one chain",
+        "--throttle /in=100ms LAUNCH": "Name it: NODE:/in=PERIOD",
+        "--throttle /node:/in LAUNCH": "write a topic and a period",
+        "--policy pipelined --sink /a../e LAUNCH": "further sinks are shaped",
+        "--modes /mode:city,highway LAUNCH": "nothing says which mode was in force",
+        "--mode-profile city=before LAUNCH": "goes with --modes",
+    }.items():
+        given = words.replace("LAUNCH", f"-- ros2 launch {file}").split()
+        assert reason in refused(2, "shape", "-o", out, *given)
+    launch = ("--", "ros2", "launch", file)
+    said = refused(3, "shape", "-o", out, "--cores", "0,4000", *launch)
+    assert "core 4000, which --cores asks for" in said
+    assert "exists already and is not overwritten" in refused(2, "shape", "-o", tmp_path, *launch)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    said = refused(3, "shape", "-o", out, "--node", "cpp", *launch)
+    assert "colcon, which building the shaping node needs" in said, "before minutes are spent"
+    assert [entry.name for entry in tmp_path.iterdir()] == [file.name]
+
+
 def test_with_json_an_error_is_json_too(words: Words) -> None:
     failed = called(*words("latency REC --chain /t1../t9 --json"))
     assert (failed.code, failed.out) == (2, "")

@@ -4,10 +4,14 @@ from pathlib import Path
 from typing import TypeAlias
 
 import pytest
+from bare_recordings import recorded
 from command_line import called, json_of, refused
 from known import known
+from small_chain import small_chain_plan
 
+from chainshaper.flow.launch_shaping import _with_types
 from chainshaper.planning import Plan, save_plan
+from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan import revised
 
 ROBOT = '<launch>\n  <node pkg="robot" exec="third" name="third"/>\n</launch>\n'
@@ -132,6 +136,18 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(files: Files, p
         path.read_text().replace("evidence:\n", f"evidence:\n  recording: {recording}\n")
     )
     assert two in refused(2, "splice", path, robot, "-o", folder)
+
+
+def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
+    """Discovery of Fast DDS has not always shown all types when a recording ends."""
+    plan = whole(small_chain_plan(5_000_000, 20_000_000, core=1))
+    ends, header = [("/n", "/t3", "publisher")], "std_msgs/msg/Header"
+    folders = [tmp_path / name for name in ("first", "before")]
+    for folder in folders:
+        folder.mkdir()
+    first, before = recorded(folders[0], *ends), recorded(folders[1], *ends, type_=header)
+    assert _with_types([first, before], plan) is before
+    assert _with_types([first], plan) is first
 
 
 @pytest.mark.parametrize(
