@@ -111,7 +111,7 @@ def _profiles(
     if len(chains) > 1:
         raise InputError("--latencies are those of one chain: give a recording for several")
     begin, end = how["since_ns"], how["until_ns"]
-    first, last = -(-begin // period), end and -(-end // period)
+    first, last = -(-begin // period), end and -(-end // period)  # periods, rounded up
     return (cs.Profile(read_latencies(latencies)[first:last], period, spec=chains[0]),)
 
 
