@@ -22,11 +22,13 @@ LINE_EVERY = 10  # states of a run, without a terminal
 def threads(
     where: str | None = opt.argument(
         "[PID|PLAN]",
-        "A process and its descendants, or a plan.yaml for its nodes. Default: all ROS 2 and DDS.",
+        "A process, which stands for its descendants too, or a plan.yaml for the nodes "
+        "of its servers. Default: all that looks like ROS 2 or DDS.",
     ),
     recording: Path | None = opt.option(
         "--recording REC",
-        "Of the processes while they ran: it knows nodes and executors. Default: the plan's.",
+        "A recording or trace of the processes while they ran: it tells nodes and "
+        "executors for sure. Default: the plan's own, where it exists.",
     ),
     user: list[str] | None = opt.USERS,
     json: bool = opt.JSON,
@@ -49,23 +51,29 @@ def apply(
         "Start this, such as `ros2 launch …`, and end when it ends. Default: attach to what runs.",
     ),
     backend: str = opt.option(
-        "--backend NAME", "auto (the strongest here), scx, litmus, freezer, fifo.", "auto"
+        "--backend NAME",
+        "auto (the strongest that works here), scx, litmus, freezer or fifo.",
+        "auto",
     ),
     phase: int | None = opt.option(
         "--phase DURATION",
-        "When in a cycle the chain's timer expires (CLOCK_MONOTONIC). Default: measured.",
+        "Where in a cycle the chain's timer expires, on CLOCK_MONOTONIC: slots then stay there."
+        " Default: measured, and followed where it drifts.",
     ),
     recording: Path | None = opt.option(
         "--recording REC",
         "Of these very processes, or of an earlier run: it tells which threads execute what.",
     ),
     wait: int | None = opt.option(
-        "--wait DURATION", "For the plan's nodes to appear. Default: 30s with a COMMAND, else 0."
+        "--wait DURATION",
+        "How long the plan's nodes have to appear. Default: 30s with a COMMAND, else no time.",
     ),
     adapt: bool = opt.ADAPT,
     max_latency: int | None = opt.MAX_LATENCY,
     user: list[str] | None = opt.USERS,
-    dry_run: bool = opt.option("--dry-run", "Show what would be done, and change nothing.", False),
+    dry_run: bool = opt.option(
+        "--dry-run", "Show what would be done to which thread, and change nothing.", False
+    ),
     json: bool = opt.JSON,
 ) -> None:
     """Keep the threads of an application inside a plan's slots, until Ctrl-C.
@@ -137,7 +145,9 @@ def _watching() -> "Iterator[tuple[Callable[[RunState], None], out.Progress]]":
 
 
 def status(
-    outputs: bool = opt.option("--outputs", "Only outputs: shaped, bypassed or silent.", False),
+    outputs: bool = opt.option(
+        "--outputs", "Only the outputs that are shaped, bypassed or silent.", False
+    ),
     json: bool = opt.JSON,
 ) -> None:
     """Show the plans in force: back end, servers, counters, and what crashed runs have left.
@@ -174,8 +184,12 @@ def status(
 
 
 def release(
-    run: str | None = opt.argument("[RUN]", "As `chainshaper status` names it. Default: all."),
-    crashed: bool = opt.option("--crashed", "Only runs that have crashed.", False),
+    run: str | None = opt.argument(
+        "[RUN]", "The run, as `chainshaper status` names it. Default: all of them."
+    ),
+    crashed: bool = opt.option(
+        "--crashed", "Only of runs that have crashed: plans in force stay so.", False
+    ),
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed."""
     from chainshaper.enforcement.freezer import groups_of, run_of
@@ -211,7 +225,9 @@ def release(
 
 
 def doctor(
-    watch: int = opt.option("--watch DURATION", "For stalls of the machine.", 5_000_000_000),
+    watch: int = opt.option(
+        "--watch DURATION", "How long to watch for stalls of the machine.", 5_000_000_000
+    ),
     json: bool = opt.JSON,
 ) -> None:
     """Examine this machine: scheduling, privileges, tracing, DDS, and its own stalls."""

@@ -92,7 +92,9 @@ def argument(metavar: str, help_text: str, default: Any = None) -> Any:
 
 
 SINK: list[str] | None = option(
-    "--sink FIRST..LAST", "A chain to another output.", rich_help_panel="More of the graph"
+    "--sink FIRST..LAST",
+    "A chain to a further output of the same graph, to be shaped too.",
+    rich_help_panel="More of the graph",
 )
 JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
@@ -103,28 +105,51 @@ CHAINS: list[str] | None = option(
     "--chain FIRST..LAST", "A chain (may be repeated). Default: the one the recording names."
 )
 STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.", False)
-PLAN_IN_FORCE: Path | None = option("--plan plan.yaml", "In force in the last recording.")
+PLAN_IN_FORCE: Path | None = option(
+    "--plan plan.yaml", "The plan that the last recording was made with, where it does not say so."
+)
 SCHEDULER: str | None = option(
-    "--scheduler ADDRESS", "Compute on this Dask scheduler's cluster: tcp://host:8786."
+    "--scheduler ADDRESS",
+    "Compute on the Dask cluster whose scheduler is there, such as tcp://host:8786.",
 )
 TRACE: list[Path] = argument(
-    "TRACE...", "A recording's folder, or those of one LTTng trace (kernel and user space).", ...
+    "TRACE...",
+    "An LTTng trace's folder (several of one trace: kernel and user space), or a recording's.",
+    ...,
 )
 APPLICATION: Path = argument("APP.yaml", "The application's description.", ...)
 RECORDING_OUTPUT: Path = option("--output -o REC", "Folder to write; must not exist.", ...)
-SINCE: int = option("--skip --from DURATION", "Leave out the beginning, such as 2s of start-up.", 0)
+SINCE: int = option(
+    "--skip --from DURATION", "Leave out what the recording begins with, such as 2s of start-up.", 0
+)
 UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
 SEED: int | None = option("--seed", "Instead of the description's.", min=0)
-REALTIME: bool | None = option("--realtime/--no-realtime", "SCHED_FIFO. Default: where permitted.")
-USERS: list[str] | None = option(
-    "--user NAME", "Whose processes may be nodes (may be repeated). Default: yours, and root's."
+REALTIME: bool | None = option(
+    "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
 )
-ADAPT: bool = option("--adapt", "Slots follow the latencies, to keep the promise.", False)
-MAX_LATENCY: int | None = option("--max-latency DURATION", "With --adapt: no slot ends later.")
-SOURCE: Source | None = option("--source", "Tracer. Default: preload, or else lttng.")
+USERS: list[str] | None = option(
+    "--user NAME",
+    "Whose processes are taken for nodes (may be repeated). Default: yours, also behind sudo, and"
+    " root's.",
+)
+ADAPT: bool = option(
+    "--adapt",
+    "Slots follow the latencies: later when the plan's promise does not hold any more, earlier when"
+    " latency can be given back.",
+    False,
+)
+MAX_LATENCY: int | None = option(
+    "--max-latency DURATION", "With --adapt: no slot ends later. Default: as the plan says."
+)
+SOURCE: Source | None = option(
+    "--source", "Tracer. Default: preload, or lttng where that cannot be had."
+)
 NODE: NodeKind = option(
-    "--node", "A script; a package; one for the type; or that as a component.", "python"
+    "--node",
+    "A script; a package for all types; one generated for the type; or that as a component, in the "
+    "publisher's container.",
+    "python",
 )
 
 
@@ -151,17 +176,20 @@ def wish(name: str, **more: Any) -> Any:
 
 MODE_PROFILE: list[str] | None = option(
     "--mode-profile MODE=REC",
-    "With --modes: a recording, or latencies, of one mode alone (may be repeated).",
+    "With --modes: what was measured in one mode alone, a recording or a file of latencies"
+    " (may be repeated). Default: the cycles of the recording that began in it.",
     rich_help_panel=BANDS,
 )
 _MODES = option(
     "--modes TOPIC:MODE[=BAND],…",
-    "Each mode's band, from 1; the first mode is in force until the topic names one.",
+    "Each mode's band, 1 is the first, found where none has a number; the first mode named is in"
+    " force until the topic (std_msgs/String) names another. Such as /driving_mode:city,highway.",
     rich_help_panel=BANDS,
 )
 _LATE = option(
     "--late",
-    "With --modes: what becomes of an output behind its mode's slot. Default: at once.",
+    "With --modes, an output behind its mode's slot: at once, wait for the next cycle's, discard,"
+    " or in the cycle's next slot. Default: publish.",
     rich_help_panel=BANDS,
 )
 _OTHERS: dict[str, tuple[Any, Any]] = {

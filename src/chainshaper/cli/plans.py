@@ -17,13 +17,19 @@ def plan(
     recording: Path | None = opt.argument("[REC]", "A recording's or a trace's folder."),
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
-        "A chain, or several to plan together. Default: the one the recording names.",
+        "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
+        " Give several to plan them together: what they share, and when each one's cycles start.",
     ),
     output: Path | None = opt.option(
-        "--output -o plan.yaml", "File to write; of several chains also a folder. Must not exist."
+        "--output -o plan.yaml",
+        "File to write; of several chains also a folder, for a plan each. Must not exist.",
     ),
-    latencies: Path | None = opt.option("--latencies FILE", "Instead of REC: text, or .npy in ns."),
-    period: int | None = opt.option("--period DURATION>0", "With --latencies, or without a timer."),
+    latencies: Path | None = opt.option(
+        "--latencies FILE", "Instead of a recording: a duration a line, or .npy in ns."
+    ),
+    period: int | None = opt.option(
+        "--period DURATION>0", "Period, with --latencies or a chain that no timer starts."
+    ),
     *,
     since: int = opt.SINCE,
     until: int | None = opt.UNTIL,
@@ -118,9 +124,12 @@ def _profiles(
 def offsets(
     plans: list[Path] = opt.argument("PLAN PLAN...", "Plans, one a chain.", ...),
     output: Path | None = opt.option(
-        "--output -o plan.yaml", "One plan of all, or a folder for a plan each. Must not exist."
+        "--output -o plan.yaml",
+        "One plan of all chains; or a folder, for a plan each. Must not exist.",
     ),
-    time_limit: float = opt.option("--time-limit SECONDS", "To search, per group.", 60.0, min=0.1),
+    time_limit: float = opt.option(
+        "--time-limit SECONDS", "How long to search, per group.", 60.0, min=0.1
+    ),
     json: bool = opt.JSON,
 ) -> None:
     """Find when each chain's cycles start, so that no slots of one core collide.
@@ -169,13 +178,21 @@ def sweep(
         " as nodes.node3.core=0,1.",
         ...,
     ),
-    output: Path = opt.option("--output -o FILE.parquet", "File to write, a row a point.", ...),
-    plan: Path | None = opt.argument("plan.yaml", "In force everywhere. Default: each is planned."),
+    output: Path = opt.option(
+        "--output -o FILE.parquet", "File to write, a row for each point.", ...
+    ),
+    plan: Path | None = opt.argument(
+        "plan.yaml", "A plan that is in force at all points. Default: each is planned."
+    ),
     cycles: int = opt.option("--cycles", "Cycles to plan from, and to judge by.", 100_000, min=1),
     seed: int | None = opt.SEED,
-    workers: int | None = opt.option("--workers", "Threads. Default: one per core.", min=1),
+    workers: int | None = opt.option(
+        "--workers", "Threads that compute. Default: one per core.", min=1
+    ),
     scheduler: str | None = opt.SCHEDULER,
-    draw: Path | None = opt.option("--draw FILE.png", "Average and jitter over the first axis."),
+    draw: Path | None = opt.option(
+        "--draw FILE.png", "Draw average and jitter over the first axis."
+    ),
     json: bool = opt.JSON,
 ) -> None:
     """Simulate an application at every combination of some values: planned, shaped, judged.
@@ -224,7 +241,8 @@ def splice(
     plan: Path | None = opt.argument("plan.yaml", "The plan; none with --throttle."),
     launch: list[str] | None = opt.argument(
         "LAUNCH...",
-        "Launch files (.py, .xml, .yaml), for --dry-run with arguments; or a `ros2 run …`.",
+        "The launch files (.py, .xml, .yaml) and, for --dry-run, launch arguments; or, behind --, "
+        "a `ros2 run …`.",
     ),
     *,
     output: Path = opt.option("--output -o DIR", "Folder for the launch file.", ...),
@@ -241,13 +259,15 @@ def splice(
     ),
     recording: Path | None = opt.option(
         "--recording REC",
-        "Tells publishers, subscribers and types. Default: the plan's own, if it exists.",
+        "A recording of the application: it tells publishers, subscribers and types. "
+        "Default: the plan's own, where it exists.",
     ),
     fallback: Fallback | None = opt.wish("fallback", default=None),
     build: bool = opt.option("--build", "Build the shaping node's package with colcon.", False),
     dry_run: bool = opt.option(
         "--dry-run",
-        "Show what would be redirected: launch files are carried out here, but start no process.",
+        "Write nothing, and show what would be redirected: the launch files are carried out in "
+        "this ROS 2 environment, but no process is started.",
         False,
     ),
     undo: bool = opt.option("--undo", "Remove DIR again, unless it was changed since.", False),

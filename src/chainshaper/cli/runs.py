@@ -32,17 +32,27 @@ STDERR = 2
 PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
 MOST_RECORDED = 100  # by `watch --budget` itself: a limit that breaks for weeks fills no disk
 
-COMMAND: list[str] | None = opt.argument("[-- COMMAND…]", "Starts it, such as `ros2 launch …`.")
-DURATION: int | None = opt.option("--duration DURATION", "Default: until it ends, or Ctrl-C.")
+COMMAND: list[str] | None = opt.argument(
+    "[-- COMMAND…]", "Starts the application, such as `ros2 launch …`; ended with the recording."
+)
+DURATION: int | None = opt.option(
+    "--duration DURATION", "How long to record. Default: until the application ends, or Ctrl-C."
+)
 BUFFER: int | None = opt.option(
-    "--buffer MIB", "LTTng's buffer of a core, if events were lost. Default: 4.", min=1
+    "--buffer MIB",
+    "LTTng's buffer of each core, in MiB, for when events were lost. Default: 4.",
+    min=1,
 )
 
 
 @opt.takes_wishes("ideal_machine")
 def demo(
-    output: Path | None = opt.option("--output -o DIR", "Default: chainshaper-demo-DATE-TIME."),
-    application: Path | None = opt.option("--application APP.yaml", "Another application."),
+    output: Path | None = opt.option(
+        "--output -o DIR", "Folder for everything. Default: chainshaper-demo-DATE-TIME here."
+    ),
+    application: Path | None = opt.option(
+        "--application APP.yaml", "Another application than the paper's synthetic chain."
+    ),
     cycles: int = opt.CYCLES,
     realtime: bool | None = opt.REALTIME,
     *,
@@ -81,7 +91,9 @@ def demo(
 
 
 def init(
-    output: Path = opt.option("--output -o app.yaml", "Must not exist.", Path("app.yaml")),
+    output: Path = opt.option(
+        "--output -o app.yaml", "File to write; must not exist.", Path("app.yaml")
+    ),
 ) -> None:
     """Write the description of an application to start from: the paper's synthetic chain.
 
@@ -123,7 +135,9 @@ def simulate(
     cycles: int = opt.CYCLES,
     seed: int | None = opt.SEED,
     switches: bool = opt.option("--switches", "Record what ran on which core, too.", False),
-    execution_times: Path | None = opt.option("--execution-times REC", "Those recorded there."),
+    execution_times: Path | None = opt.option(
+        "--execution-times REC", "Draw execution times from those recorded there."
+    ),
     block: int = opt.option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
@@ -151,7 +165,9 @@ def simulate(
 
 def generate(
     application: Path = opt.APPLICATION,
-    output: Path = opt.option("--output -o DIR", "The package's folder and name.", ...),
+    output: Path = opt.option(
+        "--output -o DIR", "Folder of the package, named like it; must not exist.", ...
+    ),
     json: bool = opt.option("--json", "Print what was written as JSON.", False),
 ) -> None:
     """Write a colcon package with the application as ROS 2 nodes in C++.
@@ -172,12 +188,15 @@ def record(
     duration: int | None = DURATION,
     pid: list[int] | None = opt.option(
         "--pid",
-        "A process and its descendants (ebpf, preload; may be repeated). Default: all nodes.",
+        "Attach to this process and what it has started (ebpf, preload; may be repeated). "
+        "Default, without a COMMAND: everything of the users that looks like ROS 2.",
     ),
     user: list[str] | None = opt.USERS,
     buffer: int | None = BUFFER,
     watch_stalls: bool = opt.option(
-        "--watch-stalls", "Notice on every core when the machine stands still.", False
+        "--watch-stalls",
+        "Have a sleeper on every core notice when the machine itself stands still.",
+        False,
     ),
     json: bool = opt.JSON,
 ) -> None:
@@ -231,22 +250,44 @@ def _record_and_show(
 def watch(
     command: list[str] | None = opt.argument(
         "[-- COMMAND…]",
-        "Starts the application with the library in front. Default: what runs so is watched.",
+        "Starts the application with the library in front, and ends it with Ctrl-C. Default: "
+        "what runs already with the library is watched, and left running.",
     ),
-    chain: list[str] | None = opt.option("--chain FIRST..LAST", "A chain (may be repeated)."),
-    plan: Path | None = opt.option("--plan plan.yaml", "The plan in force, with chains and slots."),
-    longest: int = opt.option("--longest DURATION>0", "Longer is incomplete.", 2_000_000_000),
+    chain: list[str] | None = opt.option(
+        "--chain FIRST..LAST", "A chain, by topics or nodes: /t1../t5 (may be repeated)."
+    ),
+    plan: Path | None = opt.option(
+        "--plan plan.yaml", "The plan in force: its chains, slots, and which outputs are late."
+    ),
+    longest: int = opt.option(
+        "--longest DURATION>0", "What takes longer counts as incomplete.", 2_000_000_000
+    ),
     every: int = opt.option("--every DURATION>0", "How often to look.", 1_000_000_000),
     budget: Path | None = opt.option(
         "--budget FILE",
-        "Limits for the last minute: what breaks one is said, and the last ten seconds written.",
+        "What chains, hops and callbacks may take in the last minute: a limit that breaks is said,"
+        " and the last ten seconds are written.",
     ),
-    recorder: Path = opt.option("--recorder DIR", "Where these go, also by Ctrl-\\.", Path()),
-    metrics: int | None = opt.option("--metrics PORT", "OpenMetrics for Prometheus.", min=1),
-    otlp: str | None = opt.option("--otlp URL", "Send metrics there by OTLP over HTTP."),
-    diagnostics: bool = opt.option("--diagnostics", "Publish on /diagnostics in ROS 2.", False),
+    recorder: Path = opt.option(
+        "--recorder DIR",
+        "Where these are written, also by Ctrl-\\: recordings in folders named by their time.",
+        Path(),
+    ),
+    metrics: int | None = opt.option(
+        "--metrics PORT", "Serve OpenMetrics (Prometheus) on this port of this machine.", min=1
+    ),
+    otlp: str | None = opt.option(
+        "--otlp URL", "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry)."
+    ),
+    diagnostics: bool = opt.option(
+        "--diagnostics", "Publish the chains on /diagnostics, with the ROS 2 of the nodes.", False
+    ),
     user: list[str] | None = opt.USERS,
-    environment: bool = opt.option("--environment", "Only print the variable to set.", False),
+    environment: bool = opt.option(
+        "--environment",
+        "Print the variable that puts the library in front of ROS 2; no more.",
+        False,
+    ),
     json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),
 ) -> None:
     """Watch the chains of a running application: latency now, over a minute, over an hour.
@@ -389,19 +430,23 @@ def profile(
     *,
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
-        "A chain whose nodes, and those it waits for, get the priority (may be repeated).",
+        "The chain whose nodes, and those that it waits for, get the priority (may be repeated);"
+        " --like tells which those are.",
     ),
     like: Path | None = opt.option(
         "--like REC",
-        "An earlier recording: it knows the chain's nodes, components, executors' threads.",
+        "An earlier recording of the application: it knows the chain's nodes, components "
+        "of containers, and executors with several threads.",
     ),
     node: list[str] | None = opt.option(
         "--node NAME",
-        "A node with the priority, most urgent first (may be repeated). Default: the chain's.",
+        "A node that gets the priority (may be repeated, the most urgent first). Default: the "
+        "chain's, or all, at one priority.",
     ),
     core: int | None = opt.option(
         "--core",
-        "Where executors run. Default: the last; with --chain and --like, further ones.",
+        "Where executors run. Default: the last core; with --chain and --like, others as well where"
+        " branches run at the same time. DDS threads run on the others.",
         min=0,
     ),
     request: "cs.PlanRequest",
@@ -463,24 +508,36 @@ def profile(
 def shape(
     words: list[str] = opt.argument(
         "APP.yaml plan.yaml | -- ros2 launch ...",
-        "A described application and its plan; or what launches a real one, to be planned.",
+        "A described application and the plan in force; or what launches a real one, "
+        "which is then measured and planned first.",
         ...,
     ),
     output: Path = opt.option(
-        "--output -o REC", "Folder for the recording, or for the whole flow.", ...
+        "--output -o REC",
+        "Folder for the recording; of a launched application, for everything.",
+        ...,
     ),
     cycles: int = opt.CYCLES,
     realtime: bool | None = opt.REALTIME,
     chain: list[str] | None = opt.option(
-        "--chain FIRST..LAST", "A chain, or several to shape together. Default: you are asked."
+        "--chain FIRST..LAST",
+        "The chain, by topics or nodes: /t1../t5. Several are shaped together. Default: you are"
+        " asked.",
     ),
     sink: list[str] | None = opt.SINK,
     throttle: list[str] | None = opt.option(
         "--throttle NODE:TOPIC=PERIOD",
-        "A throttler before a not quite periodic input (may be repeated).",
+        "A throttler before an input of NODE that is not quite periodic, from the first recording"
+        " on (may be repeated).",
     ),
-    period: int | None = opt.option("--period DURATION>0", "Of a chain that no timer starts."),
-    duration: int = opt.option("--duration DURATION>0", "Of each measurement.", 60_000_000_000),
+    period: int | None = opt.option(
+        "--period DURATION>0", "Period of a chain that no timer starts."
+    ),
+    duration: int = opt.option(
+        "--duration DURATION>0",
+        "How long to measure, before and after. Default: 60s.",
+        60_000_000_000,
+    ),
     since: int = opt.SINCE,
     until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,

@@ -48,10 +48,13 @@ def describe(
 
 def graph(
     trace: list[Path] = opt.TRACE,
-    output: Path | None = opt.option("--output -o FILE", "File to write: .svg, .dot or .json."),
+    output: Path | None = opt.option(
+        "--output -o FILE", "File to write: .svg, .dot or .json; must not exist."
+    ),
     everything: bool = opt.option(
         "--all",
-        "Also parameter services, /rosout, /parameter_events, which JSON always has.",
+        "Also what every node has for itself: parameter services, /rosout, "
+        "/parameter_events. In JSON they are always there, marked as internal.",
         False,
     ),
     json: bool = opt.JSON,
@@ -95,8 +98,12 @@ def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
 
 def chains(
     trace: list[Path] = opt.TRACE,
-    start: str | None = opt.option("--from X", "Topic or node. Default: what nothing triggers."),
-    end: str | None = opt.option("--to Y", "Topic or node. Default: what nothing takes."),
+    start: str | None = opt.option(
+        "--from X", "Topic or node where they begin. Default: callbacks that nothing triggers."
+    ),
+    end: str | None = opt.option(
+        "--to Y", "Topic or node where they end. Default: topics from which nothing goes on."
+    ),
     limit: int = opt.option("--limit", "How many to list.", 100, min=1),
     json: bool = opt.JSON,
 ) -> None:
@@ -122,7 +129,9 @@ def chains(
 def latency(
     trace: list[Path] = opt.TRACE,
     chain: str | None = opt.CHAIN,
-    chains: Path | None = opt.option("--chains FILE", "A CARET architecture's named_paths."),
+    chains: Path | None = opt.option(
+        "--chains FILE", "A CARET architecture file: --chain then names one of its named_paths."
+    ),
     json: bool = opt.JSON,
     instances: bool = opt.option("--instances", "With --json: every traversal, one by one.", False),
 ) -> None:
@@ -199,7 +208,9 @@ def _matching(recordings: list[Path]) -> list[Path]:
 def check(
     recordings: list[Path] = opt.argument("REC...", "Recordings' or traces' folders.", ...),
     budget: Path | None = opt.option("--budget FILE", "What they have to keep to."),
-    baseline: list[Path] | None = opt.option("--baseline REC", "Of before (may be repeated)."),
+    baseline: list[Path] | None = opt.option(
+        "--baseline REC", "Recordings of before (may be repeated): is a callback slower now?"
+    ),
     chain: list[str] | None = opt.CHAINS,
     junit: Path | None = opt.option("--junit FILE", "Also write JUnit XML, for a CI system."),
     markdown: Path | None = opt.option("--markdown FILE", "Also write Markdown, for a review."),
@@ -316,7 +327,9 @@ def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -
 def compare(
     recordings: list[Path] = opt.argument("REC REC...", "Recordings' folders.", ...),
     chain: str | None = opt.CHAIN,
-    figures: Path | None = opt.option("--figures DIR", "For latency.png, distribution.png."),
+    figures: Path | None = opt.option(
+        "--figures DIR", "Draw latency.png and distribution.png into this folder."
+    ),
     plan: Path | None = opt.PLAN_IN_FORCE,
     strict: bool = opt.STRICT,
     json: bool = opt.JSON,
@@ -347,7 +360,8 @@ def report(
     plan: Path | None = opt.PLAN_IN_FORCE,
     cycles: list[int] | None = opt.option(
         "--cycle N",
-        "A cycle that the timeline has to show, of too many for all (may be repeated).",
+        "A cycle that the timeline has to show, where there are too many to show all. "
+        "May be given several times.",
         min=0,
     ),
     json: bool = opt.JSON,
@@ -374,7 +388,9 @@ def report(
 
 def export(
     trace: list[Path] = opt.TRACE,
-    output: Path = opt.option("--output -o FILE", "Such as trace.pftrace; must not exist.", ...),
+    output: Path = opt.option(
+        "--output -o FILE", "File to write, such as trace.pftrace; must not exist.", ...
+    ),
     perfetto: bool = opt.option("--perfetto", "A trace that ui.perfetto.dev opens.", False),
     mcap: bool = opt.option("--mcap", "Times of callbacks and cycles, for Foxglove.", False),
     chain: str | None = opt.CHAIN,
