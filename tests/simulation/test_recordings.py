@@ -141,7 +141,7 @@ def test_a_long_simulation_is_written_in_parts_that_read_as_one(
     tmp_path: Path, chain: Application, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = simulate(chain, tmp_path / "whole", cycles=2000)
-    monkeypatch.setattr(arrays, "LOG_ENTRIES", 4096)
+    monkeypatch.setattr(arrays, "LOG_ROWS", 4096)
     parts = simulate(chain, tmp_path / "parts", cycles=2000)
     assert len(list((parts.path / "rmw_take.parquet").iterdir())) > 3
     assert parts.events.keys() == whole.events.keys()

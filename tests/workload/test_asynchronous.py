@@ -1,6 +1,7 @@
 """Asynchronous publication: the history, and the one thread that sends, gated or not."""
 
 import os
+import queue
 import threading
 import time
 from pathlib import Path
@@ -19,7 +20,7 @@ from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application
-from chainshaper.workload.executor import AsynchronousWriter, PublisherThread
+from chainshaper.workload.executor import AsynchronousWriter, start_publisher_thread
 from chainshaper.workload.live import run_application
 
 MS = 1_000_000
@@ -37,14 +38,15 @@ class Wire:
             depth=depth,
             lifespan_ns=lifespan_ns,
             note=lambda _, stamp, outcome, __: self.noted.append((stamp, outcome)),
+            to_send=queue.SimpleQueue(),
         )
 
 
 def test_a_message_older_than_its_lifespan_is_not_sent() -> None:
     wire = Wire(depth=10, lifespan_ns=1_000_000_000)
     now = time.time_ns()
-    wire.writer.keep(b"old", now - 2_000_000_000)
-    wire.writer.keep(b"new", now)
+    wire.writer.publish(b"old", now - 2_000_000_000)
+    wire.writer.publish(b"new", now)
     wire.writer.send_next()
     wire.writer.send_next()
     assert wire.sent == [b"new"]
@@ -59,7 +61,7 @@ def test_every_message_has_one_outcome_and_order_is_kept(depth: int, steps: list
     for publishes in [*steps, *[False] * depth]:
         if publishes:
             published += 1
-            wire.writer.keep(bytes([published]), published)
+            wire.writer.publish(bytes([published]), published)
         else:
             wire.writer.send_next()
     assert sorted(stamp for stamp, _ in wire.noted) == list(range(1, published + 1))
@@ -78,11 +80,11 @@ def test_one_thread_sends_for_all_writers() -> None:
         senders.add(threading.get_native_id())
         sent.append((payload, source_timestamp))
 
-    thread = PublisherThread()
-    writers = {name: AsynchronousWriter(write, 10, None, lambda *_: None) for name in (b"a", b"b")}
+    own = (write, 10, None, lambda *_: None, start_publisher_thread())
+    writers = {name: AsynchronousWriter(*own) for name in (b"a", b"b")}
     expected = [(name, number) for number in range(3) for name in writers]
     for name, number in expected:
-        thread.publish(writers[name], name, number)
+        writers[name].publish(name, number)
     wait_for(lambda: len(sent) == 6, "six messages")
     assert sent == expected
     assert len(senders) == 1

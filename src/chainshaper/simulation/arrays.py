@@ -7,7 +7,7 @@ leads back to a name.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,7 +16,7 @@ from chainshaper.gate.decision import CHANGES
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import Server, Thread
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, Int64s, M, P, R, S, T, X
+from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, Int64s, M, P, R, S, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
@@ -43,7 +43,7 @@ AHEAD = 16 * BLOCK
 FIRST_COST = 1 << 20
 """Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
 
-LOG_ENTRIES = 1 << 17
+LOG_ROWS = 1 << 17
 POOL = 4096
 """Messages under way, besides those in histories."""
 
@@ -132,10 +132,12 @@ def build_system(
     for number, entity in enumerate(entities):
         if entity.topic is not None:
             readers[entity.topic] = (*readers.get(entity.topic, ()), number)
-    described = [callback for _, callback in application.callbacks()]
-    announced = [mode for callback in described for mode in callback.announces]
-    gates = [callback.gate for callback in described if callback.gate is not None]
-    known = [mode for gate in gates if gate.modes is not None for mode in gate.modes.bands]
+    modes: list[str] = []
+    for _, callback in application.callbacks():
+        modes += callback.announces
+    for _, callback in application.callbacks():
+        if callback.gate is not None and callback.gate.modes is not None:
+            modes += callback.gate.modes.bands
     threads = list(_threads(application, processes, publishers))
     servers = {} if plan is None else _servers(plan, threads)
     cores = sorted({thread.cores[0] for thread in threads})
@@ -154,7 +156,7 @@ def build_system(
         publishers=tuple(publishers),
         readers=readers,
         chain=chain,
-        modes=tuple(dict.fromkeys(announced + known)),
+        modes=tuple(dict.fromkeys(modes)),
     )
 
 
@@ -163,16 +165,15 @@ def _entities(
 ) -> Iterator[Entity]:
     """A node's entities in the order of registration; their publishers are added to the list."""
     for index, described in enumerate(application.nodes[key].callbacks):
-        first = len(publishers)
+        own = tuple(range(len(publishers), len(publishers) + len(described.publishes)))
         for topic in described.publishes:
             asynchronous = application.topic(topic).publication == "asynchronous"
             publishers.append(Publisher(process, topic, asynchronous))
-        own = tuple(range(first, len(publishers)))
         if described.timer_ns is not None:
             yield Entity(process, index, 0, "timer", None, described, own)
-        listens = described.gate is not None and described.gate.modes is not None
+        of_modes = len(described.subscriptions) - len(described.inputs)
         for number, topic in enumerate(described.subscriptions):
-            if listens and number == 0:
+            if number < of_modes:
                 yield Entity(process, index, number, "subscription", topic, described, (), True)
             else:
                 yield Entity(process, index, number, described.kind, topic, described, own)
@@ -193,11 +194,9 @@ def _threads(
             dds = application.dds_scheduling_of(process.key)
             wanted.append(("dds", "dds.dds", dds.core, dds.priority))
         for place, (role, comm, core, priority) in enumerate(wanted):
-            several = 0 < place < len(executing)
+            beside = 0 < place < len(executing)
             yield ThreadInfo(
-                tid=FIRST_TID + 100 * number + place
-                if several
-                else process.pid + ROLES.index(role),
+                tid=FIRST_TID + 100 * number + place if beside else process.pid + ROLES.index(role),
                 pid=process.pid,
                 comm=comm,
                 node=process.node,
@@ -262,9 +261,10 @@ class Rows(list[int]):
         self.extend(values)
         return len(self) - len(values), len(self)
 
-    def ring(self, depth: int) -> int:
-        """A ring for so many messages; its place."""
-        return self.put([NONE] * depth)[0]
+    def set(self, row: int, values: Mapping[Any, int]) -> None:
+        """Fields of a row, by column."""
+        for column, value in values.items():
+            self[row + column] = value
 
 
 class Streams:
@@ -275,8 +275,7 @@ class Streams:
     """
 
     def __init__(self, seed: int, rows: Rows) -> None:
-        self._seed = seed
-        self._rows = rows
+        self._seed, self._rows = seed, rows
         self._drawn: list[tuple[int, Iterator[Int64s]]] = []
         self._first = 0
 
@@ -292,10 +291,10 @@ class Streams:
     def settle(self, first: int) -> int:
         """What is drawn stands from that place on; where it ends."""
         self._first = first
-        for number, (row, _) in enumerate(self._drawn):
-            end = first + (number + 1) * AHEAD
-            self._rows[row + D.NEXT], self._rows[row + D.LIMIT] = end, end - at.RESERVE
-        return first + len(self._drawn) * AHEAD
+        for row, _ in self._drawn:
+            first += AHEAD
+            self._rows[row + D.NEXT], self._rows[row + D.LIMIT] = first, first - at.RESERVE
+        return first
 
     def fill(self, m: Int64s) -> None:
         """Draw for all streams that run short (all, the first time)."""
@@ -311,159 +310,280 @@ class Streams:
             m[row + D.NEXT] -= used
 
 
-@dataclass(frozen=True)
+class Handles(NamedTuple):
+    """Of entities: callback, own, rmw; of publishers: own, rmw."""
+
+    entities: Sequence[tuple[int, int, int]]
+    publishers: Sequence[tuple[int, int]]
+
+
 class Machine:
-    """The engine's array, and what is read of it: latencies and the log."""
-
-    array: Int64s
-    streams: Streams
-    latencies: Int64s
-    logs: tuple[Int64s, ...]
-
-    def entries(self, kind: int) -> Int64s:
-        """The log's entries of a kind: a row of times, one of threads, and one for each field."""
-        return self.logs[kind][:, : self._counts()[kind]]
-
-    def forget_entries(self) -> None:
-        """The log is empty again."""
-        self._counts()[:] = 0
-
-    def _counts(self) -> Int64s:
-        first = self.array[X.LOGS] + A.COUNT
-        return self.array[first : first + len(self.logs) * A.COLUMNS : A.COLUMNS]
-
-
-def build_machine(
-    system: System,
-    plan: ApplicationPlan | None,
-    timing: Timing,
-    *,
-    switches: bool,
-    latencies: int,
-) -> Machine:
-    """The array of a system before anything has happened.
+    """The engine's array before anything has happened, and what is read of it.
 
     ``latencies`` is for how many recorded instances of the chain the latency is noted; where it is
     for none, events are logged, with ``switches`` those of threads as well.
     """
-    rows = Rows([0] * X.COLUMNS)
-    streams = Streams(system.application.seed, rows)
-    cores = rows.add(len(system.cores), C.COLUMNS)
-    threads = rows.add(len(system.threads), T.COLUMNS, NONE)
-    entities = rows.add(len(system.entities), E.COLUMNS)
-    publishers = rows.add(len(system.publishers), P.COLUMNS)
-    _fill_cores(rows, system, (cores, threads), plan, timing)
-    _fill_threads(rows, system, threads, entities, streams)
-    _fill_entities(rows, system, (threads, entities, publishers), timing, streams)
-    _fill_publishers(rows, system, publishers, entities)
-    histories = sum(rows[entity + E.DEPTH] for entity in entities)
-    synchronised = (e.topic for e in system.entities if e.described.synchronises)
-    waiting = histories + sum(system.depth(topic or "") for topic in synchronised)
-    unsent = sum(system.depth(publisher.topic) for publisher in system.publishers)
-    pool = POOL + waiting + unsent + at.RESERVE
-    entries = 0 if latencies else LOG_ENTRIES
-    logs = rows.add(len(at.LOG_FIELDS), A.COLUMNS)
-    first_message = streams.settle(len(rows))
-    heap = first_message + pool * M.COLUMNS
-    heap_end = heap + (pool + len(entities) + len(threads) + at.RESERVE) * H.COLUMNS
-    end = heap_end
-    for log, fields in zip(logs, at.LOG_FIELDS, strict=True):
-        rows[log + A.FIRST], rows[log + A.STRIDE] = end, entries
-        end += fields * entries
-    described = system.application.simulation
-    for column, value in {
-        X.CORES: cores.start,
-        X.CORES_END: cores.stop,
-        X.HEAP_LIMIT: heap_end - at.RESERVE * H.COLUMNS,
-        X.HEAP: heap,
-        X.LOGS: logs.start,
-        X.LATENCIES: end,
-        X.LATENCIES_END: end + latencies,
-        X.FREE: first_message,
-        X.UNUSED: pool,
-        X.STOP: timing.stop_ns,
-        X.LAST_TIMER: timing.last_timer_ns,
-        X.RECORD_FROM: timing.record_from_ns,
-        X.LOGGING: not latencies,
-        X.SWITCHES: switches,
-        X.SWITCH_COST: described.context_switch_ns,
-        X.PREEMPTION_COST: described.preemption_ns,
-        X.QUANTUM: described.quantum_ns if plan is not None and plan.takes_turns else at.FOREVER,
-        X.AWAY: round(1e6 * described.interrupts / (1 - described.interrupts)),
-        X.CYCLE: plan.cycle_ns if plan is not None else 0,
-    }.items():
-        rows[column] = value
-    m = np.zeros(end + latencies, dtype=np.int64)
-    m[: len(rows)] = rows
-    m[end:] = NONE
-    messages = m[first_message:heap].reshape(-1, M.COLUMNS)
-    messages[:] = NONE
-    messages[:-1, M.NEXT] = range(first_message + M.COLUMNS, heap, M.COLUMNS)
-    timers = zip(entities, system.entities, strict=True)
-    expiries = sorted((rows[place + E.DUE], place) for place, e in timers if e.kind == "timer")
-    for order, (due, place) in enumerate(expiries):  # in order, they are a heap
-        first = heap + order * H.COLUMNS
-        m[first : first + H.COLUMNS] = due, order, at.EXPIRY, place
-    m[X.COUNTER], m[X.HEAP_END] = len(expiries), heap + len(expiries) * H.COLUMNS
-    streams.fill(m)
-    views = tuple(
-        m[rows[log + A.FIRST] :][: fields * entries].reshape(fields, entries)
-        for log, fields in zip(logs, at.LOG_FIELDS, strict=True)
-    )
-    return Machine(m, streams, m[end:], views)
 
-
-def _fill_cores(
-    rows: Rows,
-    system: System,
-    areas: tuple[range, range],
-    plan: ApplicationPlan | None,
-    timing: Timing,
-) -> None:
-    """The cores, and the core, rank and server of each thread."""
-    cores, threads = areas
-    order, takes_turns = ((), False) if plan is None else (plan.most_urgent_first, plan.takes_turns)
-    places = {node: place for place, node in enumerate(order)}
-    for thread, info in zip(threads, system.threads, strict=True):
-        rows[thread + T.CORE] = cores[system.cores.index(info.cores[0])]
-        rows[thread + T.RANK] = BEST_EFFORT - info.priority
-    for place, core in zip(cores, system.cores, strict=True):
-        own = [] if plan is None else [server for server in plan.servers if server.core == core]
-        used = [server for server in own if server in system.servers.values()]
-        ranked = sorted(used, key=lambda server: server.priority)
-        governed = {
-            number: (
-                server.priority if takes_turns else ranked.index(server),
-                places.get(system.threads[number].node, len(order)),
-            )
-            for number, server in system.servers.items()
-            if server in ranked
+    def __init__(
+        self,
+        system: System,
+        handles: Handles,
+        plan: ApplicationPlan | None,
+        timing: Timing,
+        *,
+        switches: bool,
+        latencies: int,
+    ) -> None:
+        self._system, self._handles, self._plan, self._timing = system, handles, plan, timing
+        self._rows = rows = Rows([0] * X.COLUMNS)
+        self._streams = Streams(system.application.seed, rows)
+        self._cores = rows.add(len(system.cores), C.COLUMNS)
+        self._threads = rows.add(len(system.threads), T.COLUMNS, NONE)
+        self._entities = rows.add(len(system.entities), E.COLUMNS)
+        self._publishers = rows.add(len(system.publishers), P.COLUMNS)
+        self._fill_cores()
+        self._fill_threads()
+        self._fill_entities()
+        self._fill_publishers()
+        topics = [one.topic or "" for one in system.entities]
+        topics += [one.topic for one in system.publishers]
+        waiting = 2 * sum(map(system.depth, topics))  # a message, and its mark
+        waiting += sum(rows[entity + E.DEPTH] for entity in self._entities)
+        pool = POOL + waiting + at.RESERVE
+        counts, _ = rows.put([0] * (at.L_SWITCH + 1))
+        first_message = self._streams.settle(len(rows))
+        events = first_message + pool * M.COLUMNS
+        most = pool + len(self._entities) + len(self._threads)
+        log = events + (most + at.RESERVE) * H.COLUMNS
+        kinds = 0 if latencies else at.L_SWITCH + 1
+        end = log + kinds * at.LOG_COLUMNS * LOG_ROWS
+        expiries = sorted(
+            ((rows[place + E.DUE], place) for place in self._entities if rows[place + E.DUE]),
+            reverse=True,
+        )
+        described = system.application.simulation
+        turns = plan is not None and plan.takes_turns
+        values = {
+            X.CORES: self._cores.start,
+            X.CORES_END: self._cores.stop,
+            X.EVENTS: events,
+            X.EVENTS_END: events + len(expiries) * H.COLUMNS,
+            X.EVENTS_LIMIT: events + most * H.COLUMNS,
+            X.LOGGED: counts,
+            X.LOG: log,
+            X.LOG_ROWS: LOG_ROWS,
+            X.LATENCIES: end,
+            X.LATENCIES_END: end + latencies,
+            X.FREE: first_message,
+            X.UNUSED: pool,
+            X.STOP: timing.stop_ns,
+            X.LAST_TIMER: timing.last_timer_ns,
+            X.RECORD_FROM: timing.record_from_ns,
+            X.LOGGING: not latencies,
+            X.SWITCHES: switches,
+            X.SWITCH_COST: described.context_switch_ns,
+            X.PREEMPTION_COST: described.preemption_ns,
+            X.QUANTUM: described.quantum_ns if turns else at.FOREVER,
+            X.AWAY: round(1e6 * described.interrupts / (1 - described.interrupts)),
+            X.CYCLE: plan.cycle_ns if plan is not None else 0,
         }
-        urgent = sorted(set(governed.values()))
-        for number, urgency in governed.items():
-            server = system.servers[number]
-            rows[threads[number] + T.SERVER] = ranked.index(server)
-            rows[threads[number] + T.RANK] = urgent.index(urgency) - len(urgent)
+        rows.set(0, values)
+        self.array = m = np.zeros(end + latencies, dtype=np.int64)
+        m[: len(rows)] = rows
+        m[end:] = NONE
+        messages = m[first_message:events].reshape(-1, M.COLUMNS)
+        messages[:] = NONE
+        messages[:-1, M.NEXT] = range(first_message + M.COLUMNS, events, M.COLUMNS)
+        for (due, place), first in zip(expiries, range(events, end, H.COLUMNS), strict=False):
+            m[first : first + H.COLUMNS] = due, at.EXPIRY, place
+        self._streams.fill(m)
+        self.latencies = m[end:]
+        self._log = m[log:end].reshape(kinds, at.LOG_COLUMNS, LOG_ROWS)
+        self._counts = m[counts : counts + kinds]
+
+    def draw_more(self) -> None:
+        """Draw for all streams that run short."""
+        self._streams.fill(self.array)
+
+    def take_log(self) -> list[Int64s]:
+        """The columns of the log, by kind, until the engine goes on; it is empty then."""
+        found = [log[:, :count] for log, count in zip(self._log, self._counts, strict=True)]
+        self._counts[:] = 0
+        return found
+
+    def _fill_cores(self) -> None:
+        """The cores, and the core, rank and server of each thread."""
+        rows, system, plan, timing = self._rows, self._system, self._plan, self._timing
+        for thread, info in zip(self._threads, system.threads, strict=True):
+            rows[thread + T.CORE] = self._cores[system.cores.index(info.cores[0])]
+            rows[thread + T.RANK] = BEST_EFFORT - info.priority
+        for place, core in zip(self._cores, system.cores, strict=True):
+            threads = [thread for thread in self._threads if rows[thread + T.CORE] == place]
+            first, end = rows.put(threads)
+            none = {C.RUNNING: NONE, C.LAST: NONE, C.UNTIL: at.FOREVER, C.BOUNDARY: at.FOREVER}
+            rows.set(place, {C.FIRST: first, C.END: end, C.DIRTY: 1, **none})
+            governed = {number: one for number, one in system.servers.items() if one.core == core}
+            if plan is None or not governed:
+                continue
+            ranked = [server for server in plan.servers if server in governed.values()]
+            ranked.sort(key=lambda server: server.priority)
+            self._rank(plan, governed, ranked)
+            table = _slot_table(plan, ranked)
+            first, end = rows.put([number for pair in table for number in pair])
+            # The run starts anywhere in a cycle.
+            anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
+            elapsed = (timing.start_ns - anchor) % plan.cycle_ns
+            current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
+            following = (current + 1) % len(table)
+            until = table[following][0] + (plan.cycle_ns if following <= current else 0)
+            in_force = {C.MASK: table[current][1], C.NEXT: first + 2 * following}
+            boundary = {C.BOUNDARY: timing.start_ns - elapsed + until}
+            rows.set(place, {C.TABLE: first, C.TABLE_END: end, **in_force, **boundary})
+
+    def _rank(
+        self, plan: ApplicationPlan, governed: dict[int, Server], ranked: list[Server]
+    ) -> None:
+        """Server and rank of the threads that are ``governed`` on a core."""
+        order = plan.most_urgent_first
+        places = {node: place for place, node in enumerate(order)}
+        urgency = {
+            number: (
+                server.priority if plan.takes_turns else ranked.index(server),
+                places.get(self._system.threads[number].node, len(order)),
+            )
+            for number, server in governed.items()
+        }
+        urgent = sorted(set(urgency.values()))
+        for number, server in governed.items():
+            rank = urgent.index(urgency[number]) - len(urgent)
             if server.best_effort:  # under the fair class, behind all real-time threads
-                rows[threads[number] + T.RANK] = BEST_EFFORT
-        mine = [thread for thread in threads if rows[thread + T.CORE] == place]
-        rows[place + C.FIRST], rows[place + C.END] = rows.put(mine)
-        rows[place + C.RUNNING], rows[place + C.LAST] = NONE, NONE
-        rows[place + C.UNTIL], rows[place + C.BOUNDARY] = at.FOREVER, at.FOREVER
-        rows[place + C.DIRTY] = 1
-        if plan is None or not ranked:
-            continue
-        table = _slot_table(plan, ranked)
-        first, end = rows.put([number for pair in table for number in pair])
-        rows[place + C.TABLE], rows[place + C.TABLE_END] = first, end
-        # The run starts anywhere in a cycle.
-        anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
-        elapsed = (timing.start_ns - anchor) % plan.cycle_ns
-        current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
-        following = (current + 1) % len(table)
-        rows[place + C.MASK], rows[place + C.NEXT] = table[current][1], first + 2 * following
-        until = table[following][0] + (plan.cycle_ns if following <= current else 0)
-        rows[place + C.BOUNDARY] = timing.start_ns - elapsed + until
+                rank = BEST_EFFORT
+            self._rows.set(self._threads[number], {T.SERVER: ranked.index(server), T.RANK: rank})
+
+    def _fill_threads(self) -> None:
+        rows, system = self._rows, self._system
+        described = system.application.simulation
+        pids = [system.processes[entity.process].pid for entity in system.entities]
+        for number, (thread, info) in enumerate(zip(self._threads, system.threads, strict=True)):
+            rows.set(thread, dict.fromkeys((T.RUNNABLE, T.LEFT, T.PREEMPTED, T.USED, T.WAITING), 0))
+            rows.set(thread, {T.ROW: number, T.SEQUENCE: 0})
+            pool = self._thread(info.pid, "executor")
+            worker = (thread - pool) // T.COLUMNS if info.role == "executor" else 0
+            offset = FIRST_COST + len(COSTS) * (ROLES.index(info.role) + len(ROLES) * worker)
+            for place, name in enumerate(COSTS):
+                if (times := getattr(described, name)) is not None:
+                    stream = self._streams.add(times, info.node, offset + place)
+                    rows[thread + T.WAKE + place] = stream
+            if info.role == "publisher":
+                rows.set(thread, {T.KIND: at.PUBLISHER, T.STEP: at.SEND})
+            elif info.role == "dds":
+                rows.set(thread, {T.KIND: at.DDS, T.STEP: at.RECEIVE})
+            else:
+                first = self._entities[pids.index(info.pid)]
+                end = first + pids.count(info.pid) * E.COLUMNS
+                kinds = {"static": at.STATIC, "events": at.EVENTS}
+                kind = kinds.get(described.executor, at.SINGLE_THREADED)
+                executor = {T.KIND: kind, T.FIRST: first, T.END: end, T.POOL: pool}
+                rows.set(thread, {**executor, T.STEP: at.TURN if worker else at.COLLECT})
+                rows[thread + T.PUBLISHER_THREAD] = self._thread(info.pid, "publisher")
+                rows[thread + T.DDS_THREAD] = self._thread(info.pid, "dds")
+                rows.set(pool, {T.POOL_END: thread + T.COLUMNS, T.OWNER: pool})
+                for several in range(pool, thread + 1, T.COLUMNS) if worker else ():
+                    rows[several + T.KIND] = at.MULTI_THREADED
+
+    def _thread(self, pid: int, role: str) -> int:
+        """The first thread of a process that has a role, NONE if none has."""
+        threads = zip(self._threads, self._system.threads, strict=True)
+        return next((row for row, one in threads if (one.pid, one.role) == (pid, role)), NONE)
+
+    def _fill_entities(self) -> None:
+        rows, system, timing = self._rows, self._system, self._timing
+        # What the entities of a callback share, and the callbacks of a group.
+        executions: dict[tuple[int, int], int] = {}
+        bodies: dict[tuple[int, int], int] = {}
+        groups: dict[tuple[int, str], int] = {}
+        for number, (row, entity) in enumerate(zip(self._entities, system.entities, strict=True)):
+            described, process = entity.described, system.processes[entity.process]
+            callback, gate = (entity.process, entity.index), described.gate
+            on_chain = number in system.chain.callbacks
+            if callback not in executions:
+                stream = self._streams.add(described.execution, process.node, entity.index)
+                executions[callback] = stream
+            body = at.COMPUTE
+            if gate is not None:
+                body = at.MODE_LISTENER if entity.listens else at.GATE
+                if callback not in bodies:
+                    bodies[callback] = _add_gate(rows, system, described, timing)
+            elif described.synchronises:
+                body = at.SYNCHRONISE
+                if callback not in bodies:
+                    inputs = rows.add(len(described.synchronises), I.COLUMNS)
+                    bodies[callback] = rows.put([inputs.start, inputs.stop])[0]
+                source = rows[bodies[callback] + S.FIRST] + entity.number * I.COLUMNS
+                rows.set(source, {I.ON_CHAIN: on_chain, I.DEPTH: system.depth(entity.topic or "")})
+            group = system.application.nodes[process.key].exclusive_group(described)
+            if group is not None and (entity.process, group) not in groups:
+                groups[entity.process, group] = rows.put([0])[0]
+            callback_handle, handle, rmw_handle = self._handles.entities[number]
+            own = {
+                E.CALLBACK: callback_handle,
+                E.HANDLE: handle,
+                E.RMW_HANDLE: rmw_handle,
+                E.THREAD: self._thread(process.pid, "executor"),
+                E.GROUP: NONE if group is None else groups[entity.process, group],
+                E.KIND: KINDS.index(entity.kind),
+                E.INPUT: entity.number,
+                E.BODY: body,
+                E.BODY_ROW: bodies.get(callback, NONE),
+                E.EXECUTION: executions[callback],
+                E.STARTS_CHAIN: number in system.chain.callbacks[:1],
+                E.ON_CHAIN: number in system.chain.callbacks[1:],
+                E.LIFESPAN: NONE,
+            }
+            if entity.publishers:
+                first, *_, last = (*entity.publishers, entity.publishers[-1])
+                own[E.PUBLISHERS] = self._publishers[first]
+                own[E.PUBLISHERS_END] = self._publishers[last] + P.COLUMNS
+            if entity.topic is None:
+                drift = system.application.simulation.drift.get(process.key, 0)
+                period = described.timer_ns or 0
+                own[E.PERIOD] = max(1, round(period * (1 - drift / 1_000_000)))
+                own[E.DUE] = timing.start_ns + described.phase_ns
+            else:
+                topic = system.application.topic(entity.topic)
+                own[E.DEPTH] = topic.depth if gate is None or entity.listens else gate.depth
+                own[E.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
+            rows.set(row, own)
+
+    def _fill_publishers(self) -> None:
+        rows, system = self._rows, self._system
+        owner = {one: entity for entity in system.entities for one in entity.publishers}
+        last = system.chain.callbacks[-1:]
+        for number, (row, publisher) in enumerate(
+            zip(self._publishers, system.publishers, strict=True)
+        ):
+            topic = system.application.topic(publisher.topic)
+            reached = system.readers.get(publisher.topic, ())
+            readers = rows.add(len(reached), R.COLUMNS)
+            for reader, entity in zip(readers, reached, strict=True):
+                rows[reader + R.ENTITY] = self._entities[entity]
+            announces = owner[number].described.announces
+            modes, _ = rows.put([system.modes.index(mode) for mode in announces])
+            ends = any(number in system.entities[one].publishers for one in last)
+            own = {
+                P.ROW: number,
+                P.HANDLE: self._handles.publishers[number][0],
+                P.RMW_HANDLE: self._handles.publishers[number][1],
+                P.FIRST: readers.start,
+                P.END: readers.stop,
+                P.ASYNCHRONOUS: publisher.asynchronous,
+                P.DEPTH: topic.depth,
+                P.LIFESPAN: NONE if topic.lifespan_ns is None else topic.lifespan_ns,
+                P.ENDS_CHAIN: ends and publisher.topic == system.chain.topics[-1],
+                P.MODES: modes,
+                P.MODES_COUNT: len(announces),
+            }
+            rows.set(row, own)
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
@@ -481,106 +601,13 @@ def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[i
     return table
 
 
-def _fill_threads(
-    rows: Rows, system: System, threads: range, entities: range, streams: Streams
-) -> None:
-    described = system.application.simulation
-    named = zip(threads, system.threads, strict=True)
-    # Of an executor, its first thread's.
-    places = {(info.pid, info.role): place for place, info in reversed([*named])}
-    for number, (thread, info) in enumerate(zip(threads, system.threads, strict=True)):
-        for column in (T.RUNNABLE, T.LEFT, T.SEQUENCE, T.PREEMPTED, T.USED):
-            rows[thread + column] = 0
-        rows[thread + T.ROW] = number
-        pool = places[info.pid, "executor"]
-        worker = (thread - pool) // T.COLUMNS if info.role == "executor" else 0
-        offset = FIRST_COST + len(COSTS) * (ROLES.index(info.role) + len(ROLES) * worker)
-        for place, name in enumerate(COSTS):
-            if (times := getattr(described, name)) is not None:
-                stream = streams.add(times, info.node, offset + place)
-                rows[thread + T.WAKE + place] = stream
-        if info.role != "executor":
-            sends = info.role == "publisher"
-            rows[thread + T.KIND] = at.PUBLISHER if sends else at.DDS
-            rows[thread + T.STEP] = at.SEND if sends else at.RECEIVE
-            continue
-        kinds = {"static": at.STATIC, "events": at.EVENTS}
-        rows[thread + T.KIND] = kinds.get(described.executor, at.SINGLE_THREADED)
-        rows[thread + T.POOL] = pool
-        rows[pool + T.POOL_END], rows[pool + T.OWNER] = thread + T.COLUMNS, pool
-        for several in range(pool, thread + 1, T.COLUMNS) if worker else ():
-            rows[several + T.KIND] = at.MULTI_THREADED
-        pids = [system.processes[entity.process].pid for entity in system.entities]
-        rows[thread + T.FIRST] = entities[pids.index(info.pid)]
-        rows[thread + T.END] = rows[thread + T.FIRST] + pids.count(info.pid) * E.COLUMNS
-        rows[thread + T.STEP] = at.TURN if worker else at.COLLECT
-        rows[thread + T.PUBLISHER_THREAD] = places.get((info.pid, "publisher"), NONE)
-        rows[thread + T.DDS_THREAD] = places.get((info.pid, "dds"), NONE)
-
-
-def _fill_entities(
-    rows: Rows, system: System, areas: tuple[range, ...], timing: Timing, streams: Streams
-) -> None:
-    threads, entities, publishers = areas
-    named = zip(threads, system.threads, strict=True)
-    executors = {info.pid: place for place, info in reversed([*named]) if info.role == "executor"}
-    groups: dict[tuple[int, str], int] = {}
-    # What inputs of a synchroniser share, and a gate with its listener: stream, gate or inputs.
-    executions: dict[tuple[int, int], int] = {}
-    bodies: dict[tuple[int, int], int] = {}
-    for number, (row, entity) in enumerate(zip(entities, system.entities, strict=True)):
-        described, process = entity.described, system.processes[entity.process]
-        callback, gate = (entity.process, entity.index), entity.described.gate
-        on_chain = number in system.chain.callbacks
-        if callback not in executions:
-            executions[callback] = streams.add(described.execution, process.node, entity.index)
-        body = at.COMPUTE
-        if gate is not None:
-            body = at.MODE_LISTENER if entity.listens else at.GATE
-            if callback not in bodies:
-                bodies[callback] = _add_gate(rows, system, described, timing)
-        elif described.synchronises:
-            body = at.SYNCHRONISE
-            if callback not in bodies:
-                inputs = rows.add(len(described.synchronises), I.COLUMNS)
-                bodies[callback] = rows.put([inputs.start, inputs.stop])[0]
-            depth = system.depth(entity.topic or "")
-            first = rows[bodies[callback] + S.FIRST] + entity.number * I.COLUMNS
-            rows[first : first + I.COLUMNS] = [on_chain, rows.ring(depth), depth, 0, 0]
-        rows[row + E.ROW], rows[row + E.THREAD] = number, executors[process.pid]
-        group = system.application.nodes[process.key].exclusive_group(described)
-        if group is not None and (entity.process, group) not in groups:
-            groups[entity.process, group] = rows.put([0])[0]
-        rows[row + E.GROUP] = NONE if group is None else groups[entity.process, group]
-        rows[row + E.KIND], rows[row + E.INPUT] = KINDS.index(entity.kind), entity.number
-        rows[row + E.BODY], rows[row + E.BODY_ROW] = body, bodies.get(callback, NONE)
-        rows[row + E.EXECUTION] = executions[callback]
-        if entity.publishers:
-            rows[row + E.PUBLISHERS] = publishers[entity.publishers[0]]
-            rows[row + E.PUBLISHERS_END] = publishers[entity.publishers[-1]] + P.COLUMNS
-        rows[row + E.STARTS_CHAIN] = number in system.chain.callbacks[:1]
-        rows[row + E.ON_CHAIN] = number in system.chain.callbacks[1:]
-        rows[row + E.LIFESPAN] = NONE
-        if entity.topic is None:
-            drift = system.application.simulation.drift.get(process.key, 0)
-            period = described.timer_ns or 0
-            rows[row + E.PERIOD] = max(1, round(period * (1 - drift / 1_000_000)))
-            rows[row + E.DUE] = timing.start_ns + described.phase_ns
-        else:
-            topic = system.application.topic(entity.topic)
-            depth = topic.depth if gate is None or entity.listens else gate.depth
-            rows[row + E.HISTORY], rows[row + E.DEPTH] = rows.ring(depth), depth
-            if topic.lifespan_ns is not None:
-                rows[row + E.LIFESPAN] = topic.lifespan_ns
-
-
 def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing: Timing) -> int:
     gate, number_of = described.gate, WORDS["overrun"].index
     assert gate is not None  # noqa: S101 - the caller has seen it
     slots, slots_end = rows.put([instant for slot in gate.slots for instant in slot])
     moves, moves_end = rows.put([number for move in gate.moved(timing.start_ns) for number in move])
     (row,) = rows.add(1, at.GATE_COLUMNS, NONE)
-    for column, value in {
+    own = {
         G.SLOTS: slots,
         G.SLOTS_END: slots_end,
         G.MOVES: moves,
@@ -596,32 +623,9 @@ def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing
         G.PHASE: timing.start_ns + gate.phase_ns if gate.phase_ns is not None else timing.anchor_ns,
         G.CHANGED: 0,
         G.CHANGES: rows.add(CHANGES, 2).start,
-    }.items():
-        rows[row + column] = value
-    if gate.modes is not None:
-        rows[row + G.LATE] = number_of(gate.modes.late)
-        rows[row + G.DEFAULT] = system.modes.index(gate.modes.default)
-        bands, _ = rows.put([gate.modes.bands.get(mode, NONE) for mode in system.modes])
-        rows[row + G.BANDS] = bands
+    }
+    if (modes := gate.modes) is not None:
+        own |= {G.LATE: number_of(modes.late), G.DEFAULT: system.modes.index(modes.default)}
+        own[G.BANDS] = rows.put([modes.bands.get(mode, NONE) for mode in system.modes])[0]
+    rows.set(row, own)
     return row
-
-
-def _fill_publishers(rows: Rows, system: System, publishers: range, entities: range) -> None:
-    owner = {p: entity for entity in system.entities for p in entity.publishers}
-    ends: tuple[int, ...] = ()
-    if system.chain.callbacks:
-        ends = system.entities[system.chain.callbacks[-1]].publishers
-    for number, (row, publisher) in enumerate(zip(publishers, system.publishers, strict=True)):
-        topic = system.application.topic(publisher.topic)
-        reached = system.readers.get(publisher.topic, ())
-        readers = rows.add(len(reached), R.COLUMNS)
-        for reader, entity in zip(readers, reached, strict=True):
-            rows[reader + R.ENTITY] = entities[entity]
-        modes = [system.modes.index(mode) for mode in owner[number].described.announces]
-        rows[row + P.ROW] = number
-        rows[row + P.FIRST], rows[row + P.END] = readers.start, readers.stop
-        rows[row + P.ASYNCHRONOUS], rows[row + P.DEPTH] = publisher.asynchronous, topic.depth
-        rows[row + P.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
-        rows[row + P.ENDS_CHAIN] = number in ends and publisher.topic == system.chain.topics[-1]
-        rows[row + P.MODES], _ = rows.put(modes)
-        rows[row + P.MODES_COUNT] = len(modes)

@@ -4,24 +4,22 @@ Everything is of a fixed size. Where something runs short, `X.PAUSED` says what,
 left at the next safe place; limits leave enough in reserve for what happens until then.
 
 A publication reaches every reader of its topic after a delay, in order (DDS delivers the messages
-of one writer in order). Optionally a DDS thread of the subscriber's process works for it first.
-A history has the last ``depth`` messages: a newer one overwrites the oldest. An asynchronous
-publisher hands its message to the publisher thread of its process, whose history has those that
-are not sent yet; see :mod:`chainshaper.workload.executor`.
+of one writer in order), where a DDS thread of the reader's process may have to work for it first.
+An asynchronous publisher hands it to the publisher thread of its process before; see
+:mod:`chainshaper.workload.executor`.
 
-A callback has started when :func:`begin_body` is called. Its functions leave in its thread's row
-how much CPU time it needs next and what follows (`T.LEFT`, `T.STEP`), or let the thread wait.
+Functions of callbacks leave in their thread's row how much CPU time it needs next and what follows
+(`T.LEFT`, `T.STEP`), or let the thread wait; they return whether the callback goes on.
 
 The gate's decisions are `Queue` of :mod:`chainshaper.gate.decision` once more, because the engine
-cannot call Python; tests hold the two against each other, on random gates and messages and on
-`tests/gate_conformance.yaml`.
+cannot call Python; tests hold the two against each other.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
 
 from chainshaper.gate.decision import CHANGES, MAX_AGE_CYCLES, MAX_FUTURE_NS
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import NONE, A, C, D, E, G, H, I, M, P, Q, R, S, T, X
+from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, M, P, Q, R, S, T, X
 from chainshaper.values.compiled.memory import compiled
 
 
@@ -43,73 +41,35 @@ def log(m, kind, time, thread, fields):
     """An entry of the log, if it is of the recorded time."""
     if m[X.LOGGING] == 0 or time < m[X.RECORD_FROM]:
         return
-    area = m[X.LOGS] + kind * A.COLUMNS
-    count, stride = m[area + A.COUNT], m[area + A.STRIDE]
-    m[area + A.COUNT] = count + 1
-    if count + at.RESERVE >= stride:
+    rows, count = m[X.LOG_ROWS], m[m[X.LOGGED] + kind]
+    m[m[X.LOGGED] + kind] = count + 1
+    if count + at.RESERVE >= rows:
         m[X.PAUSED] = at.LOG_FULL
-    place = m[area + A.FIRST] + count
+    place = m[X.LOG] + kind * at.LOG_COLUMNS * rows + count
     m[place] = time
-    m[place + stride] = NONE if thread == NONE else m[thread + T.ROW]
+    m[place + rows] = NONE if thread == NONE else m[thread + T.ROW]
     for field in range(len(fields)):
-        m[place + (2 + field) * stride] = fields[field]
+        m[place + (2 + field) * rows] = fields[field]
+
+
+@compiled(inline=True)
+def copy(m, source, target, count):
+    """Some columns, from one place to another."""
+    for column in range(count):
+        m[target + column] = m[source + column]
 
 
 @compiled()
 def push_event(m, time, kind, row):
     """Something will happen; of what happens at one time, the first pushed comes first."""
-    place = m[X.HEAP_END]
-    m[X.HEAP_END] = place + H.COLUMNS
-    order = m[X.COUNTER]
-    m[X.COUNTER] = order + 1
-    heap = m[X.HEAP]
-    while place > heap:
-        above = heap + (((place - heap) // H.COLUMNS - 1) >> 1) * H.COLUMNS
-        if m[above + H.TIME] <= time:
-            break
-        _move(m, above, place)
-        place = above
-    m[place + H.TIME] = time
-    m[place + H.ORDER] = order
-    m[place + H.KIND] = kind
-    m[place + H.ROW] = row
-    if m[X.HEAP_END] >= m[X.HEAP_LIMIT]:
+    place = m[X.EVENTS_END]
+    m[X.EVENTS_END] += H.COLUMNS
+    while place > m[X.EVENTS] and m[place - H.COLUMNS + H.TIME] <= time:
+        copy(m, place - H.COLUMNS, place, H.COLUMNS)
+        place -= H.COLUMNS
+    m[place + H.TIME], m[place + H.KIND], m[place + H.ROW] = time, kind, row
+    if m[X.EVENTS_END] >= m[X.EVENTS_LIMIT]:
         m[X.PAUSED] = at.MESSAGES_FULL
-
-
-@compiled()
-def pop_event(m):
-    """Kind and row of the next event."""
-    heap = m[X.HEAP]
-    kind, row = m[heap + H.KIND], m[heap + H.ROW]
-    last = m[X.HEAP_END] - H.COLUMNS
-    m[X.HEAP_END] = last
-    place = heap
-    while True:
-        below = 2 * place - heap + H.COLUMNS
-        if below >= last:
-            break
-        if below + H.COLUMNS < last and _earlier(m, below + H.COLUMNS, below):
-            below += H.COLUMNS
-        if _earlier(m, last, below):
-            break
-        _move(m, below, place)
-        place = below
-    _move(m, last, place)
-    return kind, row
-
-
-@compiled()
-def _move(m, source, target):
-    for column in range(H.COLUMNS):
-        m[target + column] = m[source + column]
-
-
-@compiled()
-def _earlier(m, one, other):
-    if m[one + H.TIME] != m[other + H.TIME]:
-        return m[one + H.TIME] < m[other + H.TIME]
-    return m[one + H.ORDER] < m[other + H.ORDER]
 
 
 @compiled()
@@ -117,7 +77,6 @@ def new_message(m):
     """An unused row of the pool."""
     message = m[X.FREE]
     m[X.FREE] = m[message + M.NEXT]
-    m[message + M.NEXT] = NONE
     m[X.UNUSED] -= 1
     if m[X.UNUSED] <= at.RESERVE:
         m[X.PAUSED] = at.MESSAGES_FULL
@@ -133,47 +92,47 @@ def free_message(m, message):
 
 
 @compiled()
-def _copy(m, source, target):
-    for field in range(M.PUBLISHER, M.ARRIVAL):
-        m[target + field] = m[source + field]
-
-
-@compiled()
-def append(m, thread, message):
-    """A message goes to the end of a thread's queue."""
-    m[message + M.NEXT] = NONE
-    if m[thread + T.HEAD] == NONE:
-        m[thread + T.HEAD] = message
+def append(m, queue, message):
+    """A message goes to the end of a queue."""
+    if m[queue + Q.WAITING] == 0:
+        m[queue + Q.HEAD] = message
     else:
-        m[m[thread + T.TAIL] + M.NEXT] = message
-    m[thread + T.TAIL] = message
+        m[m[queue + Q.TAIL] + M.NEXT] = message
+    m[queue + Q.TAIL] = message
+    m[queue + Q.WAITING] += 1
 
 
 @compiled()
-def pop_head(m, thread):
-    """The first message of a thread's queue."""
-    message = m[thread + T.HEAD]
-    m[thread + T.HEAD] = m[message + M.NEXT]
+def take_oldest(m, queue):
+    """The first message of a queue that is not empty, taken out."""
+    message = m[queue + Q.HEAD]
+    m[queue + Q.HEAD] = m[message + M.NEXT]
+    m[queue + Q.WAITING] -= 1
     return message
 
 
 @compiled()
-def put_newest(m, ring, message):
-    """A message goes to the end of a ring; the oldest one of a full ring is gone."""
-    if m[ring + Q.WAITING] == m[ring + Q.DEPTH]:
-        free_message(m, take_oldest(m, ring))
-    place = (m[ring + Q.HEAD] + m[ring + Q.WAITING]) % m[ring + Q.DEPTH]
-    m[m[ring + Q.PLACES] + place] = message
-    m[ring + Q.WAITING] += 1
+def put_newest(m, queue, message):
+    """A message goes to the end of a queue; the oldest one of a full queue is gone."""
+    if m[queue + Q.WAITING] == m[queue + Q.DEPTH]:
+        free_message(m, take_oldest(m, queue))
+    append(m, queue, message)
 
 
 @compiled()
-def take_oldest(m, ring):
-    """The oldest message of a ring that is not empty, taken out."""
-    message = m[m[ring + Q.PLACES] + m[ring + Q.HEAD]]
-    m[ring + Q.HEAD] = (m[ring + Q.HEAD] + 1) % m[ring + Q.DEPTH]
-    m[ring + Q.WAITING] -= 1
-    return message
+def mark_event(m, thread, row):
+    """A thread has something to do for an entity or a publisher: to the end of its queue."""
+    event = new_message(m)
+    m[event + M.ENTITY] = row
+    append(m, thread + T.HEAD, event)
+
+
+@compiled()
+def next_event(m, thread):
+    """The row that the first mark in a thread's queue is for."""
+    event = take_oldest(m, thread + T.HEAD)
+    free_message(m, event)
+    return m[event + M.ENTITY]
 
 
 @compiled()
@@ -181,10 +140,9 @@ def drop_expired(m, entity):
     """Forget messages that have waited in a history for longer than their lifespan."""
     lifespan = m[entity + E.LIFESPAN]
     while lifespan != NONE and m[entity + E.WAITING] > 0:
-        message = m[m[entity + E.HISTORY] + m[entity + E.HEAD]]
-        if m[X.NOW] - m[message + M.ARRIVAL] <= lifespan:
+        if m[X.NOW] - m[m[entity + E.HEAD] + M.ARRIVAL] <= lifespan:
             return
-        free_message(m, take_oldest(m, entity + E.HISTORY))
+        free_message(m, take_oldest(m, entity + E.HEAD))
 
 
 ADDRESSES = 64
@@ -194,20 +152,27 @@ FIRST_ADDRESS, APART = 0x7F00_0000_0000, 0x480
 
 
 @compiled()
-def wake(m, thread):
-    """A thread that waits becomes runnable, at the end of the queue of its rank."""
-    m[thread + T.RUNNABLE] = 1
-    m[thread + T.LEFT] += draw(m, m[thread + T.WAKE])
-    m[thread + T.SEQUENCE] = m[X.COUNTER]
-    m[X.COUNTER] += 1
+def wait(m, thread):
+    """A thread has nothing to do."""
+    m[thread + T.RUNNABLE] = 0
     m[m[thread + T.CORE] + C.DIRTY] = 1
 
 
 @compiled()
-def wake_waiting(m, thread, step):
-    """Wake a thread if it waits, with that step as its next one."""
+def wake(m, thread, step):
+    """A thread that waits with that step as its next one becomes runnable, last of its rank."""
     if m[thread + T.RUNNABLE] == 0 and m[thread + T.STEP] == step:
-        wake(m, thread)
+        m[thread + T.RUNNABLE] = 1
+        m[thread + T.LEFT] += draw(m, m[thread + T.WAKE])
+        queue_up(m, thread)
+        m[m[thread + T.CORE] + C.DIRTY] = 1
+
+
+@compiled()
+def queue_up(m, thread):
+    """A thread goes behind all others of its rank."""
+    m[thread + T.SEQUENCE] = m[X.COUNTER]
+    m[X.COUNTER] += 1
 
 
 @compiled()
@@ -215,7 +180,7 @@ def wake_executor(m, thread):
     """Something may be ready for a thread's executor: wake the thread that waits for it."""
     owner = m[m[thread + T.POOL] + T.OWNER]
     if owner != NONE:
-        wake_waiting(m, owner, at.COLLECT)
+        wake(m, owner, at.COLLECT)
 
 
 @compiled()
@@ -230,44 +195,26 @@ def publish(m, thread, publisher):
     now, published = m[X.NOW], m[publisher + P.PUBLISHED]
     m[publisher + P.PUBLISHED] += 1
     address = FIRST_ADDRESS + (m[publisher + P.ROW] * ADDRESSES + published % ADDRESSES) * APART
-    log(m, at.L_PUBLISH, now, thread, (m[publisher + P.ROW], address))
+    handles = (m[publisher + P.HANDLE], m[publisher + P.RMW_HANDLE])
+    log(m, at.L_PUBLISH, now, thread, (*handles, address, now))
     message = new_message(m)
-    for field in range(M.COLUMNS - M.SOURCE):
-        m[message + M.SOURCE + field] = m[thread + T.SOURCE + field]
+    copy(m, thread + T.SOURCE, message + M.SOURCE, at.CARRIED)
     m[message + M.PUBLISHER], m[message + M.ADDRESS] = publisher, address
     m[message + M.SOURCE], m[message + M.MODE] = now, NONE
     modes = m[publisher + P.MODES_COUNT]
     if modes > 0:
         m[message + M.MODE] = m[m[publisher + P.MODES] + published % modes]
-    if m[publisher + P.ASYNCHRONOUS] == 1:
-        _hand_over(m, m[thread + T.PUBLISHER_THREAD], message)
-    else:
+    if m[publisher + P.ASYNCHRONOUS] == 0:
         send(m, thread, message)
-
-
-@compiled()
-def _hand_over(m, thread, message):
-    """Put a message into its asynchronous writer's history, which has the last ones."""
-    publisher = m[message + M.PUBLISHER]
-    if m[publisher + P.UNSENT] < m[publisher + P.DEPTH]:
-        m[publisher + P.UNSENT] += 1
-        append(m, thread, message)
-    else:
-        # All of this writer's move up by one place; the oldest one's is gone.
-        place = m[thread + T.HEAD]
-        while m[place + M.PUBLISHER] != publisher:
-            place = m[place + M.NEXT]
-        lost = (m[publisher + P.ROW], m[place + M.SOURCE], at.OVERWRITTEN, 0)
-        log(m, at.L_SEND, m[X.NOW], thread, lost)
-        following = m[place + M.NEXT]
-        while following != NONE:
-            if m[following + M.PUBLISHER] == publisher:
-                _copy(m, following, place)
-                place = following
-            following = m[following + M.NEXT]
-        _copy(m, message, place)
-        free_message(m, message)
-    wake_waiting(m, thread, at.SEND)
+        return
+    sender = m[thread + T.PUBLISHER_THREAD]
+    if m[publisher + P.WAITING] < m[publisher + P.DEPTH]:
+        mark_event(m, sender, publisher)
+    else:  # the newer ones move up by one place
+        source = m[m[publisher + P.HEAD] + M.SOURCE]
+        log(m, at.L_SEND, now, sender, (m[publisher + P.RMW_HANDLE], source, at.OVERWRITTEN, 0))
+    put_newest(m, publisher + P.HEAD, message)
+    wake(m, sender, at.SEND)
 
 
 @compiled()
@@ -279,15 +226,15 @@ def send(m, thread, message):
         if noted < m[X.LATENCIES_END] and m[noted] == NONE:
             m[noted] = now - m[message + M.START]
     for reader in range(m[publisher + P.FIRST], m[publisher + P.END], R.COLUMNS):
-        copy = new_message(m)
-        _copy(m, message, copy)
-        m[copy + M.ENTITY] = m[reader + R.ENTITY]
+        own = new_message(m)
+        copy(m, message + M.PUBLISHER, own + M.PUBLISHER, M.COLUMNS - M.PUBLISHER)
+        m[own + M.ENTITY] = m[reader + R.ENTITY]
         arrival = max(now + draw(m, m[thread + T.DELIVERY]), m[reader + R.LAST])
         m[reader + R.LAST] = arrival
         if arrival == now:
-            deliver(m, copy)
+            deliver(m, own)
         else:
-            push_event(m, arrival, at.DELIVERY, copy)
+            push_event(m, arrival, at.DELIVERY, own)
     free_message(m, message)
 
 
@@ -297,9 +244,9 @@ def deliver(m, message):
     receiver = m[m[m[message + M.ENTITY] + E.THREAD] + T.DDS_THREAD]
     if receiver == NONE:
         arrive(m, message)
-        return
-    append(m, receiver, message)
-    wake_waiting(m, receiver, at.RECEIVE)
+    else:
+        append(m, receiver + T.HEAD, message)
+        wake(m, receiver, at.RECEIVE)
 
 
 @compiled()
@@ -310,12 +257,12 @@ def arrive(m, message):
     thread = m[entity + E.THREAD]
     overwrites = m[entity + E.WAITING] == m[entity + E.DEPTH]
     if overwrites and m[entity + E.BODY] == at.GATE:
-        oldest = m[m[entity + E.HISTORY] + m[entity + E.HEAD]]
-        about = (m[entity + E.ROW], m[oldest + M.SOURCE], m[oldest + M.ARRIVAL])
+        oldest = m[entity + E.HEAD]
+        about = (m[entity + E.CALLBACK], m[oldest + M.SOURCE], m[oldest + M.ARRIVAL])
         anchor = 1 - m[m[entity + E.BODY_ROW] + G.STAMPED]
         never = (m[oldest + M.ORIGIN], NONE, NONE, 0, anchor, NONE, NONE, at.OVERFLOWED, 0)
         log(m, at.L_RELEASE, now, thread, (*about, *never))
-    put_newest(m, entity + E.HISTORY, message)
+    put_newest(m, entity + E.HEAD, message)
     # The event of the message that was overwritten is still in the queue, for this one to use.
     if m[thread + T.KIND] == at.EVENTS and not overwrites:
         mark_event(m, thread, entity)
@@ -324,16 +271,8 @@ def arrive(m, message):
 
 
 @compiled()
-def mark_event(m, thread, entity):
-    """An entity of an events executor has something to execute: to the end of its queue."""
-    event = new_message(m)
-    m[event + M.ENTITY] = entity
-    append(m, thread, event)
-
-
-@compiled()
 def begin_body(m, thread):
-    """Begin the callback of the thread's entity; false if it has ended already."""
+    """Begin the callback of the thread's entity."""
     entity = m[thread + T.ENTITY]
     body = m[entity + E.BODY]
     m[thread + T.PUBLICATION] = m[entity + E.PUBLISHERS]
@@ -352,7 +291,7 @@ def begin_body(m, thread):
 
 @compiled()
 def go_on_publishing(m, thread):
-    """Publish on the next topic; false if all have been served and the callback has ended."""
+    """Publish on the next topic, or end the callback."""
     publisher = m[thread + T.PUBLICATION]
     if publisher == m[m[thread + T.ENTITY] + E.PUBLISHERS_END]:
         return _end(m, thread)
@@ -364,31 +303,30 @@ def go_on_publishing(m, thread):
 
 @compiled()
 def _end(m, thread):
-    ended = (m[m[thread + T.ENTITY] + E.ROW], m[thread + T.USED])
+    ended = (m[m[thread + T.ENTITY] + E.CALLBACK], m[thread + T.USED])
     log(m, at.L_END, m[X.NOW], thread, ended)
     return False
 
 
 @compiled()
 def _complete(m, thread):
-    """Add the message to its synchroniser's input; true if that completes a set.
+    """Add the message to its synchroniser's input; whether that completes a set.
 
-    The oldest message of every input makes a set. Its stamp is that of the first input.
+    It has the oldest message of every input, and the stamp of the first one's.
     """
     entity = m[thread + T.ENTITY]
     synchroniser = m[entity + E.BODY_ROW]
     first, end = m[synchroniser + S.FIRST], m[synchroniser + S.END]
     mine = first + m[entity + E.INPUT] * I.COLUMNS
     message = new_message(m)
-    for field in range(M.COLUMNS - M.SOURCE):
-        m[message + M.SOURCE + field] = m[thread + T.SOURCE + field]
-    put_newest(m, mine + I.RING, message)
+    copy(m, thread + T.SOURCE, message + M.SOURCE, at.CARRIED)
+    put_newest(m, mine + I.HEAD, message)
     for source in range(first, end, I.COLUMNS):
         if m[source + I.WAITING] == 0:
             return False
     m[thread + T.START] = NONE
     for source in range(first, end, I.COLUMNS):
-        message = take_oldest(m, source + I.RING)
+        message = take_oldest(m, source + I.HEAD)
         if source == first:
             m[thread + T.ORIGIN] = m[message + M.ORIGIN]
         if m[source + I.ON_CHAIN] == 1:
@@ -400,9 +338,7 @@ def _complete(m, thread):
 
 @compiled()
 def _sleep(m, thread, until):
-    """A thread waits for an instant, whatever else happens."""
-    m[thread + T.RUNNABLE] = 0
-    m[m[thread + T.CORE] + C.DIRTY] = 1
+    wait(m, thread)
     push_event(m, until, at.SLEEP_OVER, thread)
 
 
@@ -423,10 +359,7 @@ def _enter_gate(m, thread):
 
 @compiled()
 def pass_gate(m, thread):
-    """A thread of a gate goes on: awake, watching the clock, having published or paused.
-
-    False if the callback has ended.
-    """
+    """A thread of a gate goes on: awake, watching the clock, having published or paused."""
     entity, now = m[thread + T.ENTITY], m[X.NOW]
     gate = m[entity + E.BODY_ROW]
     if m[thread + T.STEP] == at.GATE_WAKE:
@@ -464,12 +397,12 @@ def _look(m, entity, gate):
     if m[entity + E.WAITING] == m[entity + E.DEPTH]:
         drop(m, gate, at.OVERFLOWED)
         return
-    for number in range(m[entity + E.WAITING]):
-        place = (m[entity + E.HEAD] + number) % m[entity + E.DEPTH]
-        message = m[m[entity + E.HISTORY] + place]
+    message = m[entity + E.HEAD]
+    for _ in range(m[entity + E.WAITING]):
         if _replaces(m, gate, m[message + M.ARRIVAL], m[message + M.ORIGIN]):
             drop(m, gate, at.REPLACED)
             return
+        message = m[message + M.NEXT]
 
 
 @compiled()
@@ -477,7 +410,7 @@ def _leave_gate(m, thread):
     entity = m[thread + T.ENTITY]
     gate = m[entity + E.BODY_ROW]
     m[gate + G.FREE] = m[X.NOW]
-    about = (m[entity + E.ROW], m[thread + T.SOURCE], m[gate + G.ARRIVAL])
+    about = (m[entity + E.CALLBACK], m[thread + T.SOURCE], m[gate + G.ARRIVAL])
     leaves = (m[gate + G.ORIGIN], m[gate + G.AT], m[gate + G.SLOT], m[gate + G.CYCLES])
     why = (1 - m[gate + G.BY_STAMP], m[gate + G.TREATED], m[gate + G.MODE], m[gate + G.DROPPED])
     row = (*about, *leaves, *why, m[gate + G.MOVED])

@@ -4,22 +4,18 @@ On every core the eligible runnable thread of the smallest rank runs; among equa
 waits for longest, and a pre-empted thread stays in its place (SCHED_FIFO). Where a plan is in
 force, threads in servers are eligible while a slot of their server is open, ranked by the priority
 of the server; where the plan says so, equals take turns when their quantum is used up
-(round-robin). All others come behind them, by their own priority (best effort). Slots overlap
-freely: the better priority runs.
+(round-robin). All others come behind them, by their own priority (best effort).
 
 At one instant, first what was to come happens (expiries, deliveries, ends of sleeps), so that an
 executor's snapshot has all that happened up to that instant; then running threads that have used
 what they needed go on; and only then slots open and close: work that fills a slot exactly is done.
 
-Executors. *Single-threaded* (`rclcpp/src/rclcpp/executor.cpp`): a snapshot of all that is ready is
-taken when the wait set is filled, and executed to the end before the next one: timers first, then
-subscriptions, services and clients, each in the order of registration and at most once. A message
-is taken when its callback is about to run. A timer that missed whole periods fires once and stays
-in phase. *Static* (`static_single_threaded_executor.cpp`): subscriptions first, then timers,
-clients and services, and one callback per wait set. *Events* (`events_executor.cpp`): in the order
-in which things happened, every message and every expiry an event of its own. Entities stand in the
-order in which their executor looks at them. *Multi-threaded* (`multi_threaded_executor.cpp`): as
-:mod:`chainshaper.workload.executor` has it.
+Executors. *Single-threaded* (`rclcpp/src/rclcpp/executor.cpp`) and *multi-threaded*
+(`multi_threaded_executor.cpp`) ones are as :mod:`chainshaper.workload.executor` has them, with
+services and clients behind subscriptions. *Static* (`static_single_threaded_executor.cpp`):
+subscriptions first, then timers, clients and services, and one callback per wait set. *Events*
+(`events_executor.cpp`): in the order in which things happened, every message and every expiry an
+event of its own. Entities stand in the order in which their executor looks at them.
 """
 
 # mypy: disallow_untyped_defs=False, disallow_untyped_calls=False, disallow_untyped_decorators=False
@@ -48,11 +44,11 @@ def advance(m, thread):
                 goes_on = callbacks.go_on_publishing(m, thread)
             else:
                 goes_on = callbacks.pass_gate(m, thread)
+            group = m[m[thread + T.ENTITY] + E.GROUP]
+            if not goes_on and group != NONE:
+                m[group] = 0
+                callbacks.wake_executor(m, thread)
             if not goes_on:
-                group = m[m[thread + T.ENTITY] + E.GROUP]
-                if group != NONE:
-                    m[group] = 0
-                    callbacks.wake_executor(m, thread)
                 _choose(m, thread)
 
 
@@ -89,22 +85,15 @@ def _ready(m, entity):
 @compiled()
 def _collect(m, thread):
     """Fill the wait set and take a snapshot of what is ready; wait if nothing is."""
-    any_ready = m[thread + T.KIND] == at.EVENTS and m[thread + T.HEAD] != NONE
+    any_ready = m[thread + T.WAITING] > 0  # an events executor's
     if m[thread + T.KIND] != at.EVENTS:
         for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
-            ready = callbacks.may_run(m, entity) and _ready(m, entity)
-            m[entity + E.READY] = ready
-            any_ready |= ready
+            m[entity + E.READY] = callbacks.may_run(m, entity) and _ready(m, entity)
+            any_ready |= m[entity + E.READY] == 1
     if any_ready:
         _choose(m, thread)
     else:
-        _wait(m, thread)
-
-
-@compiled()
-def _wait(m, thread):
-    m[thread + T.RUNNABLE] = 0
-    m[m[thread + T.CORE] + C.DIRTY] = 1
+        callbacks.wait(m, thread)
 
 
 @compiled()
@@ -113,17 +102,14 @@ def _choose(m, thread):
     chosen, kind = NONE, m[thread + T.KIND]
     if kind == at.MULTI_THREADED and not _takes_turn(m, thread):
         return
-    if kind == at.EVENTS:
-        if m[thread + T.HEAD] != NONE:
-            event = callbacks.pop_head(m, thread)
-            chosen = m[event + M.ENTITY]
-            callbacks.free_message(m, event)
-    else:
+    if kind != at.EVENTS:
         chosen = _first_ready(m, thread)
+    elif m[thread + T.WAITING] > 0:
+        chosen = callbacks.next_event(m, thread)
     if chosen == NONE:
         _refill(m, thread)
         return
-    callbacks.log(m, at.L_EXECUTE, m[X.NOW], thread, (m[chosen + E.ROW],))
+    callbacks.log(m, at.L_EXECUTE, m[X.NOW], thread, (m[chosen + E.HANDLE],))
     m[thread + T.ENTITY] = chosen
     m[thread + T.STEP] = at.TAKE
     if m[chosen + E.KIND] != at.TIMER:
@@ -158,9 +144,8 @@ def _takes_turn(m, thread):
         m[pool + T.OWNER] = thread
         return True
     m[thread + T.STEP] = at.TURN
-    m[thread + T.SEQUENCE] = m[X.COUNTER]
-    m[X.COUNTER] += 1
-    _wait(m, thread)
+    callbacks.queue_up(m, thread)
+    callbacks.wait(m, thread)
     return False
 
 
@@ -173,19 +158,18 @@ def _give_turn(m, pool):
         if queues and (longest == NONE or m[thread + T.SEQUENCE] < m[longest + T.SEQUENCE]):
             longest = thread
     if longest != NONE:
-        callbacks.wake(m, longest)
+        callbacks.wake(m, longest, at.TURN)
 
 
 @compiled()
 def _refill(m, thread):
     m[thread + T.STEP] = at.COLLECT
-    if m[thread + T.KIND] == at.EVENTS:
-        return
-    due = m[X.STOP]
-    for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
-        if m[entity + E.KIND] == at.TIMER and m[entity + E.DUE] <= m[X.LAST_TIMER]:
-            due = min(due, m[entity + E.DUE])
-    callbacks.log(m, at.L_WAIT, m[X.NOW], thread, (max(0, due - m[X.NOW]),))
+    if m[thread + T.KIND] != at.EVENTS:
+        due = m[X.STOP]
+        for entity in range(m[thread + T.FIRST], m[thread + T.END], E.COLUMNS):
+            if m[entity + E.KIND] == at.TIMER and m[entity + E.DUE] <= m[X.LAST_TIMER]:
+                due = min(due, m[entity + E.DUE])
+        callbacks.log(m, at.L_WAIT, m[X.NOW], thread, (max(0, due - m[X.NOW]),))
 
 
 @compiled()
@@ -198,20 +182,19 @@ def _take(m, thread):
     else:
         callbacks.drop_expired(m, entity)
         if m[entity + E.WAITING] == 0:
-            callbacks.log(m, at.L_TAKE, now, thread, (m[entity + E.ROW], 0, 0, 0))
+            callbacks.log(m, at.L_TAKE, now, thread, (m[entity + E.RMW_HANDLE], 0, 0, 0))
             return False
-        message = callbacks.take_oldest(m, entity + E.HISTORY)
-        for field in range(M.COLUMNS - M.SOURCE):
-            m[thread + T.SOURCE + field] = m[message + M.SOURCE + field]
+        message = callbacks.take_oldest(m, entity + E.HEAD)
+        callbacks.copy(m, message + M.SOURCE, thread + T.SOURCE, at.CARRIED)
         if m[entity + E.ON_CHAIN] == 0:
             m[thread + T.START] = NONE
-        entry = (m[entity + E.ROW], m[message + M.ADDRESS], m[message + M.SOURCE], 1)
+        entry = (m[entity + E.RMW_HANDLE], m[message + M.ADDRESS], m[message + M.SOURCE], 1)
         callbacks.log(m, at.L_TAKE, now, thread, entry)
         callbacks.free_message(m, message)
     if m[entity + E.STARTS_CHAIN] == 1 and now >= m[X.RECORD_FROM]:
         m[thread + T.START], m[thread + T.NUMBER] = now, m[X.STARTED]
         m[X.STARTED] += 1
-    callbacks.log(m, at.L_START, now, thread, (m[entity + E.ROW], m[thread + T.USED]))
+    callbacks.log(m, at.L_START, now, thread, (m[entity + E.CALLBACK], m[thread + T.USED], 0))
     return callbacks.begin_body(m, thread)
 
 
@@ -220,25 +203,24 @@ def _work_for_executor(m, thread):
     """The next step of a publisher thread or a DDS thread."""
     step, now = m[thread + T.STEP], m[X.NOW]
     if step == at.SENT:
-        row, source = m[m[thread + T.PUBLICATION] + P.ROW], m[thread + T.SOURCE]
-        entry = (row, source, at.SENT_OUTCOME, now - m[thread + T.BEGAN])
-        callbacks.log(m, at.L_SEND, now, thread, entry)
+        writer, began = m[m[thread + T.PUBLICATION] + P.RMW_HANDLE], m[thread + T.BEGAN]
+        entry = (writer, m[thread + T.SOURCE], at.SENT_OUTCOME, now - began)
+        callbacks.log(m, at.L_SEND, began, thread, entry)
         m[thread + T.STEP] = at.SEND
     elif step == at.RECEIVED:
-        callbacks.arrive(m, callbacks.pop_head(m, thread))
+        callbacks.arrive(m, callbacks.take_oldest(m, thread + T.HEAD))
         m[thread + T.STEP] = at.RECEIVE
-    elif m[thread + T.HEAD] == NONE:
-        _wait(m, thread)
+    elif m[thread + T.WAITING] == 0:
+        callbacks.wait(m, thread)
     elif step == at.RECEIVE:
         m[thread + T.LEFT] = callbacks.draw(m, m[thread + T.RECEIVE])
         m[thread + T.STEP] = at.RECEIVED
     else:
-        message = callbacks.pop_head(m, thread)
-        publisher, source = m[message + M.PUBLISHER], m[message + M.SOURCE]
-        lifespan = m[publisher + P.LIFESPAN]
-        m[publisher + P.UNSENT] -= 1
+        publisher = callbacks.next_event(m, thread)
+        message = callbacks.take_oldest(m, publisher + P.HEAD)
+        source, lifespan = m[message + M.SOURCE], m[publisher + P.LIFESPAN]
         if lifespan != NONE and now - source > lifespan:
-            expired = (m[publisher + P.ROW], source, at.EXPIRED, 0)
+            expired = (m[publisher + P.RMW_HANDLE], source, at.EXPIRED, 0)
             callbacks.log(m, at.L_SEND, now, thread, expired)
             callbacks.free_message(m, message)
             return
@@ -259,14 +241,15 @@ def run(address):
         if now > m[X.STOP]:
             return at.OVER
         m[X.NOW] = now
-        while m[X.HEAP_END] > m[X.HEAP] and m[m[X.HEAP] + H.TIME] <= now:
-            kind, row = callbacks.pop_event(m)
+        while _next_event_ns(m) <= now:
+            m[X.EVENTS_END] -= H.COLUMNS
+            kind, row = m[m[X.EVENTS_END] + H.KIND], m[m[X.EVENTS_END] + H.ROW]
             if kind == at.DELIVERY:
                 callbacks.deliver(m, row)
             elif kind == at.EXPIRY:
                 expire(m, row)
             else:
-                callbacks.wake(m, row)
+                callbacks.wake(m, row, m[row + T.STEP])
         # A thread that goes on may cause something that happens now: one goes on at a time.
         if not _one_goes_on(m):
             for core in range(m[X.CORES], m[X.CORES_END], C.COLUMNS):
@@ -277,11 +260,17 @@ def run(address):
     return m[X.PAUSED]
 
 
+@compiled(inline=True)
+def _next_event_ns(m):
+    """When the next of the events to come happens: they stand from the last one to the next."""
+    if m[X.EVENTS_END] == m[X.EVENTS]:
+        return at.FOREVER
+    return m[m[X.EVENTS_END] - H.COLUMNS + H.TIME]
+
+
 @compiled()
 def _next_instant(m):
-    now = at.FOREVER
-    if m[X.HEAP_END] > m[X.HEAP]:
-        now = m[m[X.HEAP] + H.TIME]
+    now = _next_event_ns(m)
     for core in range(m[X.CORES], m[X.CORES_END], C.COLUMNS):
         if m[core + C.DIRTY] == 1:
             return m[X.NOW]
@@ -300,8 +289,7 @@ def _one_goes_on(m):
         if m[thread + T.LEFT] == 0:
             advance(m, thread)
         elif m[core + C.QUANTUM] <= 0:
-            m[thread + T.SEQUENCE] = m[X.COUNTER]
-            m[X.COUNTER] += 1
+            callbacks.queue_up(m, thread)
             m[core + C.QUANTUM] = m[X.QUANTUM]
             m[core + C.DIRTY] = 1
         _run_until(m, core)
@@ -325,13 +313,12 @@ def _run_until(m, core):
 def _charge(m, core):
     """Account for what the running thread has used since it was looked at last."""
     thread = m[core + C.RUNNING]
-    if thread == NONE:
-        return
-    used = m[X.NOW] - m[core + C.SINCE]
-    m[thread + T.LEFT] -= used
-    m[thread + T.USED] += used
-    m[core + C.QUANTUM] -= used
-    m[core + C.SINCE] = m[X.NOW]
+    if thread != NONE:
+        used = m[X.NOW] - m[core + C.SINCE]
+        m[thread + T.LEFT] -= used
+        m[thread + T.USED] += used
+        m[core + C.QUANTUM] -= used
+        m[core + C.SINCE] = m[X.NOW]
 
 
 @compiled()
@@ -358,9 +345,7 @@ def _reschedule(m, core):
         thread = m[place]
         server = m[thread + T.SERVER]
         eligible = server == NONE or (m[core + C.MASK] >> server) & 1 == 1
-        if m[thread + T.RUNNABLE] == 0 or not eligible:
-            continue
-        if best == NONE or _goes_before(m, thread, best):
+        if m[thread + T.RUNNABLE] == 1 and eligible and _goes_before(m, thread, best):
             best = thread
     if best != m[core + C.RUNNING]:
         _switch(m, core, best)
@@ -369,8 +354,8 @@ def _reschedule(m, core):
 
 @compiled()
 def _goes_before(m, thread, other):
-    if m[thread + T.RANK] != m[other + T.RANK]:
-        return m[thread + T.RANK] < m[other + T.RANK]
+    if other == NONE or m[thread + T.RANK] != m[other + T.RANK]:
+        return other == NONE or m[thread + T.RANK] < m[other + T.RANK]
     return m[thread + T.SEQUENCE] < m[other + T.SEQUENCE]
 
 

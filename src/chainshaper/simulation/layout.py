@@ -1,8 +1,8 @@
 """What stands where in the one array of integers on which the compiled engine runs.
 
 There is a row per thread (T), entity (E), publisher (P), reader (R), gate (G), synchroniser (S),
-input of one (I), core (C), message (M), stream of numbers (D), event to come (H) and kind of log
-entry (A), and one for the engine itself (X), which comes first. A row is referred to by its place
+input of one (I), core (C), message (M), stream of numbers (D) and event to come (H), and one for
+the engine itself (X), which comes first; and the log. A row is referred to by its place
 in the array, so ``m[thread + T.LEFT]`` is a field of a thread; NONE stands for no row. Each list
 begins with the columns that are given; the others change as time goes on. Times are integer
 nanoseconds.
@@ -18,6 +18,8 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
+from chainshaper.workload.event_log import LAYOUT, WIDTH
+
 Int64s = npt.NDArray[np.int64]
 
 NONE = -1
@@ -29,14 +31,14 @@ FOREVER = 2**62
 # from being woken to being at work, from choosing a message to its callback, one publication (or
 # send), one message received; DELIVERY is the time until a message is at the subscriber's process.
 # POOL to POOL_END are the executor's threads; the first's OWNER waits, or takes what is next.
-# HEAD and TAIL are a queue of messages to send or to receive, or of events to execute. LEFT is the
-# CPU time to the next STEP, SEQUENCE the place among those of its rank; BEGAN is when sending began
-# or the gate woke. SOURCE to ARRIVAL are those of the message that it deals with, as in M.
+# From HEAD on: its queue (Q) of messages to receive, or of marks for what to execute or to send.
+# LEFT is the CPU time to the next STEP, SEQUENCE the place among those of its rank; BEGAN is when
+# sending began or the gate woke. SOURCE to ARRIVAL are those of its present message, as in M.
 T = IntEnum(
     "T",
     "ROW CORE RANK SERVER KIND FIRST END WAKE TAKE PUBLISH RECEIVE DELIVERY PUBLISHER_THREAD"
     " DDS_THREAD POOL POOL_END OWNER RUNNABLE STEP LEFT SEQUENCE PREEMPTED USED ENTITY PUBLICATION"
-    " HEAD TAIL SOURCE ORIGIN START NUMBER MODE ARRIVAL BEGAN COLUMNS",
+    " HEAD TAIL WAITING SOURCE ORIGIN START NUMBER MODE ARRIVAL BEGAN COLUMNS",
     start=0,
 )
 
@@ -49,23 +51,23 @@ SEND, SENT, RECEIVE, RECEIVED = range(7, 11)
 
 # Entities: what an executor waits for. BODY_ROW is that of the gate or synchroniser, INPUT which
 # input of the latter. GROUP is where stands whether its mutually exclusive group is busy, NONE if
-# its executor has one thread, or the group is reentrant. HISTORY is a ring, whose columns are as in
-# Q. READY: in the snapshot.
+# its executor has one thread, or the group is reentrant. From HEAD on: its history (Q). READY: in
+# the snapshot.
 E = IntEnum(
     "E",
-    "ROW THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION PUBLISHERS PUBLISHERS_END LIFESPAN"
-    " STARTS_CHAIN ON_CHAIN HISTORY DEPTH HEAD WAITING DUE READY COLUMNS",
+    "CALLBACK HANDLE RMW_HANDLE THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION PUBLISHERS"
+    " PUBLISHERS_END LIFESPAN STARTS_CHAIN ON_CHAIN HEAD TAIL WAITING DEPTH DUE READY COLUMNS",
     start=0,
 )
 
 TIMER, SUBSCRIPTION, SERVICE, CLIENT = range(4)
 COMPUTE, GATE, MODE_LISTENER, SYNCHRONISE = range(4)
 
-# Publishers. It announces MODES in turn; UNSENT messages wait for the publisher thread.
+# Publishers. It announces MODES in turn. From HEAD on: what waits for the publisher thread (Q).
 P = IntEnum(
     "P",
-    "ROW FIRST END ASYNCHRONOUS DEPTH LIFESPAN ENDS_CHAIN MODES MODES_COUNT PUBLISHED UNSENT"
-    " COLUMNS",
+    "ROW HANDLE RMW_HANDLE FIRST END ASYNCHRONOUS LIFESPAN ENDS_CHAIN MODES MODES_COUNT PUBLISHED"
+    " HEAD TAIL WAITING DEPTH COLUMNS",
     start=0,
 )
 
@@ -94,10 +96,10 @@ REPLACED, SURPLUS, OVERFLOWED, DISCARDED = range(4)
 """Policies and reasons, as :data:`chainshaper.workload.event_log.WORDS` numbers them."""
 
 S = IntEnum("S", "FIRST END COLUMNS", start=0)
-I = IntEnum("I", "ON_CHAIN RING DEPTH HEAD WAITING COLUMNS", start=0)  # noqa: E741 - an input
+I = IntEnum("I", "ON_CHAIN HEAD TAIL WAITING DEPTH COLUMNS", start=0)  # noqa: E741 - an input
 
-Q = IntEnum("Q", "PLACES DEPTH HEAD WAITING", start=0)
-"""A ring of messages, in entities and inputs: where its places are, how many messages wait."""
+Q = IntEnum("Q", "HEAD TAIL WAITING DEPTH", start=0)
+"""A queue of messages, which M.NEXT links; those of threads have no DEPTH."""
 
 # Cores. FIRST to END is a list of threads; TABLE has pairs of an offset in the cycle and a mask of
 # open servers, of which NEXT is in force from BOUNDARY on. QUANTUM is what is left of it; DIRTY:
@@ -108,47 +110,41 @@ C = IntEnum(
     start=0,
 )
 
-# Messages. NEXT links the free ones, and those in a thread's queue. SOURCE is the source timestamp,
-# ORIGIN the header's stamp, START when the chain that it belongs to started (NONE: it is not on the
+# Messages. NEXT links the free ones, and those in a queue. SOURCE is the source timestamp, ORIGIN
+# the header's stamp, START when the chain that it belongs to started (NONE: it is not on the
 # chain), NUMBER that of the chain's instance.
 M = IntEnum(
     "M", "NEXT ENTITY PUBLISHER ADDRESS SOURCE ORIGIN START NUMBER MODE ARRIVAL COLUMNS", start=0
 )
+CARRIED = int(M.COLUMNS - M.SOURCE)
 
 D = IntEnum("D", "CONSTANT NEXT LIMIT COLUMNS", start=0)
 """Streams of numbers. A constant needs no values."""
 
-H = IntEnum("H", "TIME ORDER KIND ROW COLUMNS", start=0)
+H = IntEnum("H", "TIME KIND ROW COLUMNS", start=0)
 EXPIRY, DELIVERY, SLEEP_OVER = range(3)
 
-# The engine itself. HEAP to HEAP_END are the events to come, LOGS the rows of A, FREE the first of
-# the UNUSED messages. PAUSED: why the engine has to be left for a moment. AWAY: by how much longer
-# (ppm) everything takes because of interrupts. STARTED: recorded instances of the chain.
+# The engine itself. EVENTS to EVENTS_END are the events to come, the next one last. FREE is the
+# first of the UNUSED messages. PAUSED: why the engine has to be left for a moment. AWAY: by how
+# much longer (ppm) everything takes because of interrupts. STARTED: recorded instances of a chain.
 _Engine = namedtuple(
     "_Engine",
-    "NOW COUNTER CORES CORES_END HEAP HEAP_END HEAP_LIMIT LOGS LATENCIES LATENCIES_END FREE UNUSED"
-    " PAUSED STOP LAST_TIMER RECORD_FROM LOGGING SWITCHES SWITCH_COST PREEMPTION_COST QUANTUM AWAY"
-    " CYCLE STARTED COLUMNS",
+    "NOW COUNTER CORES CORES_END EVENTS EVENTS_END EVENTS_LIMIT LOGGED LOG LOG_ROWS LATENCIES"
+    " LATENCIES_END FREE UNUSED PAUSED STOP LAST_TIMER RECORD_FROM LOGGING SWITCHES SWITCH_COST"
+    " PREEMPTION_COST QUANTUM AWAY CYCLE STARTED COLUMNS",
 )
-X = _Engine(*range(25))
+X = _Engine(*range(len(_Engine._fields)))
 
 RESERVE = 1024
 """So much of everything is left when the engine pauses: more than one step can use."""
 
 RUNNING, MORE_DRAWS, LOG_FULL, MESSAGES_FULL, OVER = range(5)
 
-# The log, by kind of entry; fields behind time and thread.
-L_START, L_END = 0, 1  # entity, CPU time
-L_PUBLISH = 2  # publisher, address
-L_TAKE = 3  # entity, address, source timestamp, taken
-L_WAIT = 4  # timeout
-L_EXECUTE = 5  # entity
-L_SEND = 6  # publisher, source timestamp, outcome, duration
-L_SWITCH = 7  # core, previous thread, whether it is still runnable
-L_RELEASE = 8  # entity, source timestamp, and the gate's ARRIVAL to MOVED
-LOG_FIELDS = (4, 4, 4, 6, 3, 3, 6, 5, 14)
-
-A = IntEnum("A", "FIRST STRIDE COUNT COLUMNS", start=0)
-"""Logs: entries stand column by column, which are STRIDE apart."""
+L_START, L_END, L_PUBLISH, L_TAKE, L_EXECUTE, L_WAIT, L_RELEASE, L_SEND = range(8)
+L_SWITCH = len(LAYOUT)  # core, previous thread, whether it is still runnable
+"""Kinds of entries of the log: the first are those of :mod:`chainshaper.workload.event_log`. From
+X.LOGGED on stands how many there are of each. Of each the columns stand one after the other: time,
+number of the thread, and fields, in X.LOG_ROWS places each."""
+LOG_COLUMNS = WIDTH - 1
 
 SENT_OUTCOME, EXPIRED, OVERWRITTEN = range(3)

@@ -9,7 +9,7 @@ cycles. What publishing costs is not in them: a callback computes before it publ
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -21,7 +21,7 @@ from chainshaper.planning.application_plan import ApplicationPlan, open_until_do
 from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.arrays import Machine, System, build_machine, build_system
+from chainshaper.simulation.arrays import Handles, Machine, System, build_system
 from chainshaper.simulation.layout import Int64s, X
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import at_offsets, splice_application
@@ -44,7 +44,7 @@ from chainshaper.workload.description import (
     application_as_written,
     node_name,
 )
-from chainshaper.workload.event_log import LAYOUT, EventLog
+from chainshaper.workload.event_log import EventLog
 
 _run_engine = kernel("chainshaper.simulation.engine", "run")
 
@@ -79,7 +79,7 @@ def simulate(
     output = refuse_existing(output)
     joint = None if plan is None else whole(plan)
     application, timing = _checked(application, joint, cycles, seed)
-    system, machine = _built(application, joint, timing, switches=switches)
+    system, objects, machine = _built(application, joint, timing, switches=switches)
     info = RecordingInfo(
         source="simulated",
         host="simulation",  # thread ids say nothing about any real machine
@@ -95,7 +95,7 @@ def simulate(
         plan=None if joint is None else plan_values(joint),
         in_force=None if joint is None else InForceInfo(since_ns=timing.record_from_ns),
     )
-    return write_recording(output, _event_tables(system, machine, progress), info)
+    return write_recording(output, _event_tables(system, objects, machine, progress), info)
 
 
 def simulate_latencies(
@@ -116,7 +116,7 @@ def simulate_latencies(
     """
     joint = None if plan is None else whole(plan)
     application, timing = _checked(application, joint, cycles, seed)
-    _, machine = _built(application, joint, timing, latencies=cycles)
+    _, _, machine = _built(application, joint, timing, latencies=cycles)
     for _ in _runs(machine, progress):
         pass
     return machine.latencies[: machine.array[X.STARTED]]
@@ -161,10 +161,12 @@ def _built(
     *,
     switches: bool = False,
     latencies: int = 0,
-) -> tuple[System, Machine]:
+) -> tuple[System, list[live.ProcessLog], Machine]:
     in_force = None if plan is None else open_until_done(plan)
     system = build_system(application, in_force, follow_chain=latencies > 0)
-    return system, build_machine(system, in_force, timing, switches=switches, latencies=latencies)
+    objects, handles = _create_objects(system)
+    machine = Machine(system, handles, in_force, timing, switches=switches, latencies=latencies)
+    return system, objects, machine
 
 
 def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[int]:
@@ -177,7 +179,7 @@ def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[i
                 " to run, or a delivery that takes far longer than a period; correct the"
                 " description, or the plan's slots"
             )
-        machine.streams.fill(m)
+        machine.draw_more()
         yield reason
         if progress is not None:
             progress(float((m[X.NOW] - START_NS) / (m[X.STOP] - START_NS)), "simulating")
@@ -185,20 +187,16 @@ def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[i
 
 
 def _event_tables(
-    system: System, machine: Machine, progress: live.Progress | None
+    system: System,
+    objects: Sequence[live.ProcessLog],
+    machine: Machine,
+    progress: live.Progress | None,
 ) -> Iterator[dict[str, pl.DataFrame]]:
     """The event tables part by part as the log fills up, the objects' first."""
-    objects, handles = _create_objects(system)
     yield live.event_tables(objects, from_ns=0)
     for reason in _runs(machine, progress):
         if reason == at.LOG_FULL:
-            yield _logged(system, machine, handles)
-            machine.forget_entries()
-
-
-Handles = dict[str, npt.NDArray[np.uint64]]
-"""By number: ``callback``, ``handle`` and ``rmw_subscription_handle`` of entities,
-``publisher_handle`` and ``rmw_publisher_handle`` of publishers."""
+            yield _logged(system, machine.take_log())
 
 
 def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
@@ -226,81 +224,32 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
         live.ProcessLog(process.pid, core_of[process.pid], b"", tuple(log.objects))
         for process, log in zip(system.processes, logs, strict=True)
     ]
-    names = ("callback", "handle", "rmw_subscription_handle")
-    names_of_publishers = ("publisher_handle", "rmw_publisher_handle")
-    by_entity = np.array(entities, dtype=np.uint64).reshape(-1, 3).T.copy()
-    by_publisher = np.array(publishers, dtype=np.uint64).reshape(-1, 2).T.copy()
-    handles = dict(zip(names, by_entity, strict=True))
-    return created, handles | dict(zip(names_of_publishers, by_publisher, strict=True))
+    return created, Handles(entities, publishers)
 
 
-_LOGGED = {
-    "callback_start": at.L_START,
-    "callback_end": at.L_END,
-    "publish": at.L_PUBLISH,
-    "take": at.L_TAKE,
-    "execute": at.L_EXECUTE,
-    "rclcpp_executor_wait_for_work": at.L_WAIT,
-    "asynchronous_send": at.L_SEND,
-    "gate_release": at.L_RELEASE,
-}
-"""Kinds of entries by their names in :data:`LAYOUT`. Handles are those of the entity or publisher
-that the log's first field is; the others follow in order."""
+def _logged(system: System, log: Sequence[Int64s]) -> dict[str, pl.DataFrame]:
+    """What is in the log, as event tables: those in which there is something."""
+    # By the number of the thread, of which NONE, the last one, is the idle thread.
+    pids = np.array([*(info.pid for info in system.threads), 0], dtype=np.int32)
+    tids = np.array([*(info.tid for info in system.threads), 0], dtype=np.int32)
+    cpus = np.array([*(info.cores[0] for info in system.threads), 0], dtype=np.int32)
 
+    def process(threads: Int64s) -> dict[str, npt.NDArray[np.int32]]:
+        return {"pid": pids[threads], "tid": tids[threads], "cpu": cpus[threads]}
 
-def _logged(system: System, machine: Machine, handles: Handles) -> dict[str, pl.DataFrame]:
-    """What is in the log, as event tables; only those in which there is something."""
-    of_threads = {
-        "pid": np.array([info.pid for info in system.threads], dtype=np.int32),
-        "tid": np.array([info.tid for info in system.threads], dtype=np.int32),
-        "cpu": np.array([info.cores[0] for info in system.threads], dtype=np.int32),
-    }
-    tables = {"sched_switch": _switches(system, machine)}
-    for entry, kind in _LOGGED.items():
-        time, thread, *numbers = machine.entries(kind)
-        columns: dict[str, npt.NDArray[Any]] = {"time": time}
-        columns |= {key: each[thread] for key, each in of_threads.items()}
-        if named := handles.keys() & LAYOUT[entry]:
-            whose, *numbers = numbers
-            columns |= {field: handles[field][whose] for field in named}
-        others = (field for field in LAYOUT[entry] if field not in named)
-        columns |= dict(zip(others, numbers, strict=False))  # what is not logged follows
-        if entry == "callback_start":
-            columns["is_intra_process"] = np.zeros_like(time)
-        elif entry == "publish":
-            columns["timestamp"] = time
-        elif entry == "asynchronous_send":  # logged when it is over, an event when it began
-            columns["time"] = time - columns["duration"]
-        frame = pl.DataFrame(columns)
-        if kind in {at.L_SEND, at.L_RELEASE}:  # which others were logged before
-            frame = frame.sort("time", maintain_order=True)
-        for name, own in live.expanded(entry, frame):
-            tables[name] = live.typed_table(name, own, system.modes)
-    return {name: table for name, table in tables.items() if table.height}
-
-
-def _switches(system: System, machine: Machine) -> pl.DataFrame:
-    """What ran where: `sched_switch`, the idle thread being number 0."""
-    times, following, core, before, runnable = machine.entries(at.L_SWITCH)
-    # One place more than threads are: NONE, the last one, is the idle thread.
-    tids = np.array([*(info.tid for info in system.threads), 0])
-    pids = np.array([*(info.pid for info in system.threads), 0])
-    comms = np.array([*(info.comm for info in system.threads), "swapper"])
-    priorities = np.array([*(99 - info.priority for info in system.threads), 120])
-    columns = {
-        "time": times,
-        "pid": pids[before],
-        "tid": tids[before],
-        "cpu": np.array(system.cores)[core],
-        "prev_comm": comms[before],
-        "prev_tid": tids[before],
-        "prev_prio": priorities[before],
-        "prev_state": 1 - runnable,
-        "next_comm": comms[following],
-        "next_tid": tids[following],
-        "next_prio": priorities[following],
-    }
-    return live.typed_table("sched_switch", pl.DataFrame(columns))
+    tables = dict(live.logged_tables(log, process, system.modes))
+    for name in {"asynchronous_send", "gate_release"} & tables.keys():  # of when they began
+        tables[name] = tables[name].sort("time", maintain_order=True)
+    times, following, core, before, runnable, *_ = log[at.L_SWITCH]
+    if times.size:
+        comms = np.array([*(info.comm for info in system.threads), "swapper"])
+        priorities = np.array([*(99 - info.priority for info in system.threads), 120])
+        columns = {"time": times, "cpu": np.array(system.cores)[core], "prev_state": 1 - runnable}
+        columns |= {"pid": pids[before], "tid": tids[before]}
+        for key, values in (("comm", comms), ("tid", tids), ("prio", priorities)):
+            columns |= {f"prev_{key}": values[before], f"next_{key}": values[following]}
+        tables["sched_switch"] = live.typed_table("sched_switch", pl.DataFrame(columns))
+    return tables
 
 
 def with_recorded_times(

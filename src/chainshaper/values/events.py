@@ -29,171 +29,134 @@ COMMON_COLUMNS: dict[str, pl.DataType] = {
     "cpu": pl.Int32(),
 }
 
-_HANDLE = _COUNT = pl.UInt64()
-_NUMBER = pl.Int32()
-_NAME = pl.String()
-_NANOSECONDS = pl.Int64()
-
 # fmt: off
-FIELDS: dict[str, dict[str, pl.DataType]] = {
+_FIELDS_OF_TYPE: dict[pl.DataType, str] = {
+    pl.String():
+        "version node_name namespace topic_name service_name symbol start_label goal_label rmw_impl"
+        " prev_comm next_comm anchor outcome overrun mode dropped gate",
+    pl.Int32():
+        "is_intra_process taken overwritten prev_tid prev_prio next_tid next_prio slot"
+        " cycles_waited asynchronous",
+    pl.Int64():  # nanoseconds, but for the last four
+        "period timestamp source_timestamp source_stamp timeout arrival origin release duration"
+        " cpu_time thread_time published stalled moved sequence_number prev_state lost row",
+    pl.List(pl.UInt8): "gid client_gid",
+}
+_TYPES = {field: kind for kind, fields in _FIELDS_OF_TYPE.items() for field in fields.split()}
+"""Of fields; all others are addresses or counts."""
+
+
+def _typed(fields: Mapping[str, str]) -> dict[str, dict[str, pl.DataType]]:
+    return {
+        event: {field: _TYPES.get(field, pl.UInt64()) for field in own.split()}
+        for event, own in fields.items()
+    }
+
+
+FIELDS = _typed({
     # Who exists: emitted once per object, in this order of dependence.
-    "rcl_init": {"context_handle": _HANDLE, "version": _NAME},
-    "rcl_node_init": {
-        "node_handle": _HANDLE, "rmw_handle": _HANDLE, "node_name": _NAME, "namespace": _NAME,
-    },
-    "rmw_publisher_init": {"rmw_publisher_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
-    "rcl_publisher_init": {
-        "publisher_handle": _HANDLE, "node_handle": _HANDLE, "rmw_publisher_handle": _HANDLE,
-        "topic_name": _NAME, "queue_depth": _COUNT,
-    },
-    "rmw_subscription_init": {"rmw_subscription_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
-    "rcl_subscription_init": {
-        "subscription_handle": _HANDLE, "node_handle": _HANDLE, "rmw_subscription_handle": _HANDLE,
-        "topic_name": _NAME, "queue_depth": _COUNT,
-    },
-    "rclcpp_subscription_init": {"subscription_handle": _HANDLE, "subscription": _HANDLE},
-    "rclcpp_subscription_callback_added": {"subscription": _HANDLE, "callback": _HANDLE},
-    "rcl_service_init": {
-        "service_handle": _HANDLE, "node_handle": _HANDLE, "rmw_service_handle": _HANDLE,
-        "service_name": _NAME,
-    },
-    "rclcpp_service_callback_added": {"service_handle": _HANDLE, "callback": _HANDLE},
-    "rcl_client_init": {
-        "client_handle": _HANDLE, "node_handle": _HANDLE, "rmw_client_handle": _HANDLE,
-        "service_name": _NAME,
-    },
-    "rmw_client_init": {"rmw_client_handle": _HANDLE, "gid": pl.List(pl.UInt8)},
-    "rcl_timer_init": {"timer_handle": _HANDLE, "period": _NANOSECONDS},
-    "rclcpp_timer_callback_added": {"timer_handle": _HANDLE, "callback": _HANDLE},
-    "rclcpp_timer_link_node": {"timer_handle": _HANDLE, "node_handle": _HANDLE},
-    "rclcpp_callback_register": {"callback": _HANDLE, "symbol": _NAME},
-    "rcl_lifecycle_state_machine_init": {"node_handle": _HANDLE, "state_machine": _HANDLE},
-    "rcl_lifecycle_transition": {
-        "state_machine": _HANDLE, "start_label": _NAME, "goal_label": _NAME,
-    },
+    "rcl_init": "context_handle version",
+    "rcl_node_init": "node_handle rmw_handle node_name namespace",
+    "rmw_publisher_init": "rmw_publisher_handle gid",
+    "rcl_publisher_init":
+        "publisher_handle node_handle rmw_publisher_handle topic_name queue_depth",
+    "rmw_subscription_init": "rmw_subscription_handle gid",
+    "rcl_subscription_init":
+        "subscription_handle node_handle rmw_subscription_handle topic_name queue_depth",
+    "rclcpp_subscription_init": "subscription_handle subscription",
+    "rclcpp_subscription_callback_added": "subscription callback",
+    "rcl_service_init": "service_handle node_handle rmw_service_handle service_name",
+    "rclcpp_service_callback_added": "service_handle callback",
+    "rcl_client_init": "client_handle node_handle rmw_client_handle service_name",
+    "rmw_client_init": "rmw_client_handle gid",
+    "rcl_timer_init": "timer_handle period",
+    "rclcpp_timer_callback_added": "timer_handle callback",
+    "rclcpp_timer_link_node": "timer_handle node_handle",
+    "rclcpp_callback_register": "callback symbol",
+    "rcl_lifecycle_state_machine_init": "node_handle state_machine",
+    "rcl_lifecycle_transition": "state_machine start_label goal_label",
     # What happens, again and again. Timestamps of messages are DDS source timestamps:
     # CLOCK_REALTIME, as the publisher wrote them.
-    "callback_start": {"callback": _HANDLE, "is_intra_process": _NUMBER},
-    "callback_end": {"callback": _HANDLE},
-    "rclcpp_publish": {"message": _HANDLE},
-    "rclcpp_intra_publish": {"publisher_handle": _HANDLE, "message": _HANDLE},
-    "rcl_publish": {"publisher_handle": _HANDLE, "message": _HANDLE},
-    "rmw_publish": {
-        "rmw_publisher_handle": _HANDLE, "message": _HANDLE, "timestamp": _NANOSECONDS,
-    },
-    "rmw_take": {
-        "rmw_subscription_handle": _HANDLE, "message": _HANDLE, "source_timestamp": _NANOSECONDS,
-        "taken": _NUMBER,
-    },
-    "rcl_take": {"message": _HANDLE},
-    "rclcpp_take": {"message": _HANDLE},
+    "callback_start": "callback is_intra_process",
+    "callback_end": "callback",
+    "rclcpp_publish": "message",
+    "rclcpp_intra_publish": "publisher_handle message",
+    "rcl_publish": "publisher_handle message",
+    "rmw_publish": "rmw_publisher_handle message timestamp",
+    "rmw_take": "rmw_subscription_handle message source_timestamp taken",
+    "rcl_take": "message",
+    "rclcpp_take": "message",
     # Calls of services, from tracetools 8.5 (Kilted) on; of all before only by our own library. A
     # call is known by its client and its number.
-    "rmw_send_request": {
-        "rmw_client_handle": _HANDLE, "request": _HANDLE, "sequence_number": pl.Int64(),
-    },
-    "rmw_take_request": {
-        "rmw_service_handle": _HANDLE, "request": _HANDLE, "client_gid": pl.List(pl.UInt8),
-        "sequence_number": pl.Int64(), "taken": _NUMBER,
-    },
-    "rmw_send_response": {
-        "rmw_service_handle": _HANDLE, "response": _HANDLE, "client_gid": pl.List(pl.UInt8),
-        "sequence_number": pl.Int64(), "timestamp": _NANOSECONDS,
-    },
-    "rmw_take_response": {
-        "rmw_client_handle": _HANDLE, "response": _HANDLE, "sequence_number": pl.Int64(),
-        "source_timestamp": _NANOSECONDS, "taken": _NUMBER,
-    },
+    "rmw_send_request": "rmw_client_handle request sequence_number",
+    "rmw_take_request": "rmw_service_handle request client_gid sequence_number taken",
+    "rmw_send_response": "rmw_service_handle response client_gid sequence_number timestamp",
+    "rmw_take_response": "rmw_client_handle response sequence_number source_timestamp taken",
     # CARET (before Humble) instead of rmw_publish and rmw_take: the message that was written, the
     # DDS source timestamp it got, and the callback that the message with this stamp went to.
-    "dds_write": {"message": _HANDLE},
-    "dds_bind_addr_to_stamp": {"addr": _HANDLE, "source_stamp": _NANOSECONDS},
-    "dispatch_subscription_callback": {
-        "message": _HANDLE, "callback": _HANDLE, "source_stamp": _NANOSECONDS,
-    },
-    "rmw_implementation": {"rmw_impl": _NAME},
+    "dds_write": "message",
+    "dds_bind_addr_to_stamp": "addr source_stamp",
+    "dispatch_subscription_callback": "message callback source_stamp",
+    "rmw_implementation": "rmw_impl",
     # Intra-process communication: messages travel through ring buffers, not through DDS.
-    "rclcpp_construct_ring_buffer": {"buffer": _HANDLE, "capacity": _COUNT},
-    "rclcpp_buffer_to_ipb": {"buffer": _HANDLE, "ipb": _HANDLE},
-    "rclcpp_ipb_to_subscription": {"ipb": _HANDLE, "subscription": _HANDLE},
-    "rclcpp_ring_buffer_enqueue": {
-        "buffer": _HANDLE, "index": _COUNT, "size": _COUNT, "overwritten": _NUMBER,
-    },
-    "rclcpp_ring_buffer_dequeue": {"buffer": _HANDLE, "index": _COUNT, "size": _COUNT},
-    "rclcpp_ring_buffer_clear": {"buffer": _HANDLE},
-    "rclcpp_executor_get_next_ready": {},
-    "rclcpp_executor_wait_for_work": {"timeout": _NANOSECONDS},
-    "rclcpp_executor_execute": {"handle": _HANDLE},
-    "sched_switch": {
-        "prev_comm": _NAME, "prev_tid": _NUMBER, "prev_prio": _NUMBER, "prev_state": pl.Int64(),
-        "next_comm": _NAME, "next_tid": _NUMBER, "next_prio": _NUMBER,
-    },
+    "rclcpp_construct_ring_buffer": "buffer capacity",
+    "rclcpp_buffer_to_ipb": "buffer ipb",
+    "rclcpp_ipb_to_subscription": "ipb subscription",
+    "rclcpp_ring_buffer_enqueue": "buffer index size overwritten",
+    "rclcpp_ring_buffer_dequeue": "buffer index size",
+    "rclcpp_ring_buffer_clear": "buffer",
+    "rclcpp_executor_get_next_ready": "",
+    "rclcpp_executor_wait_for_work": "timeout",
+    "rclcpp_executor_execute": "handle",
+    "sched_switch": "prev_comm prev_tid prev_prio prev_state next_comm next_tid next_prio",
     # Ours, by the library in front of ROS 2: a timer was called, and its callback comes next; of
     # rclpy's no other event tells.
-    "rcl_timer_call": {"timer_handle": _HANDLE},
-    # Ours: what the shaping node decided, when a message of an asynchronous publisher really
-    # left, and what the machine did to everybody.
-    "gate_release": {  # `time` is the instant at which the gate let the message go
-        "callback": _HANDLE,  # the shaping node's subscription callback
-        "source_timestamp": _NANOSECONDS,  # of the message that the gate delayed
-        "arrival": _NANOSECONDS,
-        "origin": _NANOSECONDS,  # the anchor the slots were counted from
-        # Planned; `time` minus this is the gate's own error. Null: it was never let go.
-        "release": _NANOSECONDS,
-        "slot": _NUMBER,  # null: in none
-        "cycles_waited": _NUMBER,  # 0: in its own cycle
-        "anchor": _NAME,  # "stamp", or "cycle" (also when a stamp was unusable)
-    },
-    "asynchronous_send": {  # `time` is when the publisher thread had the message in its hands
-        "rmw_publisher_handle": _HANDLE,
-        "timestamp": _NANOSECONDS,  # the DDS source timestamp of its `rmw_publish`
-        # "sent"; "expired": older than its topic's lifespan; "overwritten": newer messages
-        # had filled the history. The last two were never sent.
-        "outcome": _NAME,
-        "duration": _NANOSECONDS,  # of sending
-    },
-    # `time` is when the sleeper should have woken, `cpu` where it sleeps; how late it woke.
-    "machine_stall": {"duration": _NANOSECONDS},
+    "rcl_timer_call": "timer_handle",
+    # Ours: what the shaping node decided about a message that came to its `callback` with this
+    # `source_timestamp`. `time` is when the gate let it go, `release` when it was to (null: never);
+    # slots count from `origin`, the `anchor` "stamp" or "cycle" (also when a stamp was unusable).
+    # `slot` is null where it left in none, `cycles_waited` 0 in its own cycle.
+    "gate_release":
+        "callback source_timestamp arrival origin release slot cycles_waited anchor",
+    # Ours: what became of the message of an asynchronous publisher with this `timestamp` (that of
+    # its `rmw_publish`). `time` is when the publisher thread had it in its hands, `duration` that
+    # of sending. The outcome is "sent"; "expired": older than its topic's lifespan; or
+    # "overwritten": newer messages had filled the history. The last two were never sent.
+    "asynchronous_send": "rmw_publisher_handle timestamp outcome duration",
+    # Ours, what the machine did to everybody. `time` is when the sleeper should have woken, `cpu`
+    # where it sleeps; how late it woke.
+    "machine_stall": "duration",
     # `time` is when a stretch of the sleeper's wake-ups began, on `cpu`; its duration, and the CPU
     # time of one wake-up in it. The work is the same each time: where it takes longer, the core
     # runs at a slower pace.
-    "machine_pace": {"duration": _NANOSECONDS, "cpu_time": _NANOSECONDS},
-}
+    "machine_pace": "duration cpu_time",
+})
 
-OPTIONAL_FIELDS: dict[str, dict[str, pl.DataType]] = {
-    # CPU time of the executing thread so far: where it is there, execution times need no
-    # sched_switch.
-    "callback_start": {"thread_time": _NANOSECONDS},
-    "callback_end": {"thread_time": _NANOSECONDS},
-    "rmw_take_request": {"source_timestamp": _NANOSECONDS},  # of the request; of our own library
-    # Not 0: a thread of its own sends what this publisher gets (`asynchronous_send`).
-    "rcl_publisher_init": {"asynchronous": _NUMBER},
-    "gate_release": {
-        # Null: the message came in time; otherwise what was done about the overrun, "wait",
-        # "discard" or "publish", or about a message behind its mode's slot, also "next-slot".
-        # "bypass" and "silence" are a standby's: it published the message at once, or did not,
-        # because no shaping node was there. Recordings from before there was a choice lack it.
-        "overrun": _NAME,
-        "mode": _NAME,  # of the message's cycle; null: the gate knows no modes
-        # Null: it left, or the recording is from before messages could wait. "replaced" by a newer
-        # one of its cycle, "surplus" behind the first one of it, "overflowed" where newer ones
-        # needed the room, "discarded" as an overrun.
-        "dropped": _NAME,
-        "published": _NANOSECONDS,  # when publishing returned, in the log of a ROS 2 node
-        # For how long behind the release neither the gate nor any other thread ran on its core,
-        # in the same log: what the machine itself took.
-        "stalled": _NANOSECONDS,
-        # In the same log: how many messages DDS lost between the one before and this one (null:
-        # not known), and the number of the row since the node started. Rows that are missing
-        # could not be written, or were in a file that has been removed since.
-        "lost": pl.Int64(),
-        "row": pl.Int64(),
-        # By how much the slots of the cycle in which it leaves are moved from where the plan has
-        # them; null: the recording is from before slots could follow the latencies.
-        "moved": _NANOSECONDS,
-        "gate": _NAME,  # the shaping node's name, in its log; one process may have several gates
-    },
-}
+# `thread_time` is the CPU time of the executing thread so far: where it is there, execution times
+# need no sched_switch. Of requests, our own library alone knows the `source_timestamp`. A publisher
+# that is `asynchronous` (not 0) has a thread of its own send what it gets (`asynchronous_send`).
+#
+# A gate's `overrun` is null where the message came in time; otherwise what was done about it,
+# "wait", "discard" or "publish", or about a message behind its mode's slot, also "next-slot".
+# "bypass" and "silence" are a standby's: it published the message at once, or did not, because no
+# shaping node was there. `mode` is that of the message's cycle; null: the gate knows no modes.
+# `dropped` is null where it left, else "replaced" by a newer one of its cycle, "surplus" behind the
+# first one of it, "overflowed" where newer ones needed the room, "discarded" as an overrun.
+# `published` is when publishing returned, `stalled` for how long behind the release neither the
+# gate nor any other thread ran on its core: what the machine itself took. `lost` is how many
+# messages DDS lost between the one before and this one (null: not known), `row` the number of the
+# row since the node started: rows that are missing could not be written, or were in a file that has
+# been removed since. `moved` is by how much the slots of the cycle in which it leaves are moved
+# from where the plan has them. `gate` is the shaping node's name; one process may have several
+# gates. Those from `published` to `row` are in the log of a ROS 2 node only; recordings from before
+# a field was there lack it.
+OPTIONAL_FIELDS = _typed({
+    "callback_start": "thread_time",
+    "callback_end": "thread_time",
+    "rmw_take_request": "source_timestamp",
+    "rcl_publisher_init": "asynchronous",
+    "gate_release": "overrun mode dropped published stalled lost row moved gate",
+})
 # fmt: on
 
 VERSION_FIELDS = {

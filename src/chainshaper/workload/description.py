@@ -1,7 +1,6 @@
 """The description of an application in one YAML file: what runs, how long, where.
 
-The live workload executes it with real processes over DDS, the simulator as discrete events;
-nothing about a particular application is said in code.
+The live workload executes it with real processes over DDS, the simulator as discrete events.
 
     name: synthetic chain
     chain: /t1../t5
@@ -19,9 +18,10 @@ nothing about a particular application is said in code.
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
@@ -39,6 +39,13 @@ from chainshaper.values.yaml_file import (
 )
 
 LONGEST_BLOCK = 1024
+MOST_CORES = 8191  # that Linux can be built for
+MOST_THREADS = 64
+_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
+_NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+Core: TypeAlias = Annotated[int, Field(ge=0, le=MOST_CORES)]
+Priority: TypeAlias = Annotated[int, Field(ge=1, le=97)]  # 98 and 99 stay free for measuring
+Pair: TypeAlias = tuple[Duration, Duration]
 
 
 class ExecutionTime(Part):
@@ -52,9 +59,9 @@ class ExecutionTime(Part):
     """
 
     constant_ns: Duration | None = None
-    uniform_ns: tuple[Duration, Duration] | None = None
-    normal_ns: tuple[Duration, Duration] | None = None
-    within_ns: tuple[Duration, Duration] | None = None
+    uniform_ns: Pair | None = None
+    normal_ns: Pair | None = None
+    within_ns: Pair | None = None
     samples_ns: Annotated[tuple[Duration, ...], Field(min_length=1)] | None = None
     block: Annotated[int, Field(ge=1, le=LONGEST_BLOCK)] = 1
 
@@ -71,16 +78,13 @@ class ExecutionTime(Part):
             if pair is not None and pair[0] > pair[1]:
                 raise wrong_value("the shorter duration comes first: exchange the two", key)
         if self.normal_ns is not None and self.within_ns is not None:
-            mean, deviation = self.normal_ns
-            if deviation == 0 or not self.within_ns[0] <= mean <= self.within_ns[1]:
-                raise wrong_value(
-                    "the mean must lie within the limits, with a deviation above 0ms", "normal"
-                )
-            if self.within_ns[1] - self.within_ns[0] < deviation:
-                # Nearly every value would be drawn again, for ever if the limits are equal.
-                raise wrong_value(
-                    "the limits are closer together than one deviation: write `uniform`", "within"
-                )
+            (mean, deviation), (low, high) = self.normal_ns, self.within_ns
+            if deviation == 0 or not low <= mean <= high:
+                reason = "the mean must lie within the limits, with a deviation above 0ms"
+                raise wrong_value(reason, "normal")
+            if high - low < deviation:  # nearly every value would be drawn again, or for ever
+                reason = "the limits are closer together than one deviation: write `uniform`"
+                raise wrong_value(reason, "within")
         return self
 
 
@@ -95,7 +99,7 @@ class SimulationDescription(Part):
     a core's time that interrupts and the stall meter take from callbacks (it counts as their CPU
     time), ``drift`` how much faster the clocks of nodes are (ppm of a period).
 
-    The defaults are medians of several live runs on a virtual machine of two cores.
+    The defaults are medians of live runs on a virtual machine of two cores.
     """
 
     executor: Literal["single-threaded", "static", "events"] = "single-threaded"
@@ -109,12 +113,6 @@ class SimulationDescription(Part):
     quantum_ns: PositiveDuration = 1_000_000
     interrupts: Annotated[float, Field(ge=0, lt=1)] = 0.016
     drift: dict[str, Annotated[float, Field(gt=-100_000, lt=100_000)]] = Field(default_factory=dict)
-
-
-MOST_CORES = 8191  # that Linux can be built for
-MOST_THREADS = 64
-_FUNCTION = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*", re.ASCII)
-_NODE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 class ModesDescription(Part):
@@ -135,7 +133,7 @@ class GateDescription(Part):
     where the first slot begins in cycles from then on, the others as far behind it as before.
     """
 
-    slots: Annotated[tuple[tuple[Duration, Duration], ...], Field(min_length=1)]
+    slots: Annotated[tuple[Pair, ...], Field(min_length=1)]
     cycle_ns: PositiveDuration
     anchor: Anchor = "stamp"
     overrun: Overrun = "wait"
@@ -145,28 +143,29 @@ class GateDescription(Part):
     messages: Messages = "all-in-order"
     depth: Annotated[int, Field(ge=1)] = 10
     into_open_slot: IntoOpenSlot = "at-once"
-    moves: tuple[tuple[Duration, Duration], ...] = ()
+    moves: tuple[Pair, ...] = ()
     spin_ns: Duration = 0
     pause_ns: Duration = 0
 
     @model_validator(mode="after")
     def _gate_exists(self) -> "GateDescription":
-        for key, modes in (("slots", None), ("modes", self.modes)):
-            try:
-                known = None if modes is None else Modes(modes.bands, modes.default, modes.late)
-                Gate(slots=self.slots, cycle_ns=self.cycle_ns, modes=known)
-            except ValueError as error:
-                raise wrong_value(str(error), key) from error
-        gate = Gate(slots=self.slots, cycle_ns=self.cycle_ns)
+        key = "slots"
+        try:
+            gate = Gate(slots=self.slots, cycle_ns=self.cycle_ns)
+            key = "modes"
+            if (own := self.modes) is not None:
+                replace(gate, modes=Modes(own.bands, own.default, own.late))
+        except ValueError as error:
+            raise wrong_value(str(error), key) from error
+        before = -1
         for number, (since, by) in enumerate(self.moved(0)):
             if not gate.may_move(by):
-                raise wrong_value(
-                    "the last slot would leave the cycle: write less", "moves", number
-                )
-            if number and since <= self.moves[number - 1][0]:
-                raise wrong_value(
-                    "comes before the one above: write later ones last", "moves", number
-                )
+                reason = "the last slot would leave the cycle: write less"
+                raise wrong_value(reason, "moves", number)
+            if since <= before:
+                reason = "comes before the one above: write later ones last"
+                raise wrong_value(reason, "moves", number)
+            before = since
         for key, rest in (("spin", self.spin_ns), ("pause", self.pause_ns)):
             if rest >= self.cycle_ns:
                 raise wrong_value("must be shorter than the cycle: shorten it", key)
@@ -223,19 +222,16 @@ class CallbackDescription(Part):
         if len(self.synchronises) == 1 or len(set(self.synchronises)) < len(self.synchronises):
             raise wrong_value("name two topics at least, each of them once", "synchronises")
         if self.phase_ns and self.timer_ns is None:
-            raise wrong_value(
-                "a phase is a timer's delay after the common start: remove it", "phase"
-            )
+            reason = "a phase is a timer's delay after the common start: remove it"
+            raise wrong_value(reason, "phase")
         if self.gate is not None and (self.subscription is None or len(self.publishes) != 1):
             raise wrong_value("a gate forwards one subscription to exactly one topic", "gate")
         if self.computes is not None:
             if not _FUNCTION.fullmatch(self.computes):
                 raise wrong_value("write MODULE:FUNCTION, such as robot.nodes:filter", "computes")
             if {"execution", "gate", "announces"} & self.model_fields_set:
-                raise wrong_value(
-                    "a callback that computes has no execution, gate or announces: keep one",
-                    "computes",
-                )
+                reason = "a callback that computes has no execution, gate or announces: keep one"
+                raise wrong_value(reason, "computes")
         if self.announces and len(self.publishes) != 1:
             raise wrong_value("modes are announced on exactly one topic", "announces")
         return self
@@ -251,41 +247,35 @@ class NodeDescription(Part):
     """
 
     callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
-    core: int | None = Field(default=None, ge=0, le=MOST_CORES)
-    priority: int | None = Field(default=None, ge=1, le=97)
-    dds_priority: int | None = Field(default=None, ge=1, le=97)
+    core: Core | None = None
+    priority: Priority | None = None
+    dds_priority: Priority | None = None
     executor: Literal["single_threaded", "multi_threaded"] = "single_threaded"
     threads: int = Field(default=1, ge=1, le=MOST_THREADS)
-    cores: tuple[Annotated[int, Field(ge=0, le=MOST_CORES)], ...] = ()
+    cores: tuple[Core, ...] = ()
     callback_groups: dict[str, Literal["mutually_exclusive", "reentrant"]] = Field(
         default_factory=dict
     )
 
     @model_validator(mode="after")
     def _executor_exists(self) -> "NodeDescription":
-        several = {name for name in ("cores", "callback_groups") if getattr(self, name)}
-        several |= {"threads"} if self.threads > 1 else set()
-        if self.executor == "single_threaded" and several:
-            raise wrong_value(
-                "is of several threads: write `executor: multi_threaded`, or remove it",
-                min(several),
-            )
-        if self.executor == "multi_threaded" and self.threads == 1:
+        if self.executor == "single_threaded":
+            for key in ("callback_groups", "cores", "threads"):
+                if getattr(self, key) not in ({}, (), 1):
+                    reason = "is of several threads: write `executor: multi_threaded`, or remove it"
+                    raise wrong_value(reason, key)
+        elif self.threads == 1:
             raise wrong_value("say how many `threads` it has: 2 or more", "executor")
         if self.core is not None and self.cores:
             raise wrong_value("give `core` or `cores`, not both", "core")
         for number, callback in enumerate(self.callbacks):
-            if callback.group is not None and callback.group not in self.callback_groups:
-                raise wrong_value(
-                    f"the node has no callback group {callback.group!r}: add it to"
-                    " `callback_groups`, as mutually_exclusive or reentrant",
-                    *("callbacks", number, "group"),
-                )
+            if callback.group not in (None, *self.callback_groups):
+                reason = f"the node has no callback group {callback.group!r}: add it to"
+                reason += " `callback_groups`, as mutually_exclusive or reentrant"
+                raise wrong_value(reason, "callbacks", number, "group")
             if callback.gate is not None and self.threads > 1:
-                raise wrong_value(
-                    "a gate needs a node with a single-threaded executor",
-                    *("callbacks", number, "gate"),
-                )
+                reason = "a gate needs a node with a single-threaded executor"
+                raise wrong_value(reason, "callbacks", number, "gate")
         return self
 
     def exclusive_group(self, callback: CallbackDescription) -> str | None:
@@ -308,10 +298,10 @@ class TopicDescription(Part):
 
 
 class Scheduling(Part):
-    """Core and SCHED_FIFO priority of a class of threads (98 and 99 stay free for measuring)."""
+    """Core and SCHED_FIFO priority of a class of threads."""
 
-    core: Annotated[int, Field(ge=0, le=MOST_CORES)]
-    priority: Annotated[int, Field(ge=1, le=97)]
+    core: Core
+    priority: Priority
 
 
 class SchedulingOfApplication(Part):
@@ -342,7 +332,7 @@ class Application(Part):
                 self._refuse_unpublished(callback, published, ("nodes", name, "callbacks", number))
                 for topic in callback.publishes:
                     order.add(topic, *callback.inputs)
-            if (other := same.setdefault(name.strip("/"), name)) != name:
+            if (other := same.setdefault(node_name(name), name)) != name:
                 raise wrong_value(f"is the same name as {other!r}: rename one", "nodes", name)
         for topic in self.topics:
             if topic not in published:
@@ -351,19 +341,15 @@ class Application(Part):
         known = {*published, *map(node_name, self.nodes)}
         for way_point in map(str.strip, self.chain.split("..")):
             if "/" + way_point.removeprefix("/") not in known:
-                raise wrong_value(
-                    f"no topic or node is called {way_point!r}: write way points of "
-                    f"{', '.join(sorted(known))}, such as FIRST..LAST",
-                    "chain",
-                )
+                reason = f"no topic or node is called {way_point!r}: write way points of "
+                reason += f"{', '.join(sorted(known))}, such as FIRST..LAST"
+                raise wrong_value(reason, "chain")
         try:
             order.prepare()
         except CycleError as error:
-            raise wrong_value(
-                "the topics form a cycle, in which messages would circle for ever: "
-                f"{' → '.join(error.args[1])}; break it at one of these topics",
-                "nodes",
-            ) from error
+            reason = "the topics form a cycle, in which messages would circle for ever: "
+            reason += f"{' → '.join(error.args[1])}; break it at one of these topics"
+            raise wrong_value(reason, "nodes") from error
         for node in self.simulation.drift:
             if node not in self.nodes:
                 raise wrong_value("no such node: remove it", "simulation", "drift", node)
@@ -375,17 +361,12 @@ class Application(Part):
         for wanted in callback.inputs:
             if wanted not in published:
                 key = "synchronises" if callback.subscription is None else "subscription"
-                raise wrong_value(
-                    f"no node publishes {wanted}; published are "
-                    f"{', '.join(sorted(published)) or 'no topics'}",
-                    *(*where, key),
-                )
+                known = ", ".join(sorted(published)) or "no topics"
+                raise wrong_value(f"no node publishes {wanted}; published are {known}", *where, key)
         modes = None if callback.gate is None else callback.gate.modes
         if modes is not None and modes.topic not in self.announced():
-            raise wrong_value(
-                f"no callback `announces` modes on {modes.topic}: describe one",
-                *(*where, "gate", "modes", "topic"),
-            )
+            reason = f"no callback `announces` modes on {modes.topic}: describe one"
+            raise wrong_value(reason, *where, "gate", "modes", "topic")
 
     def callbacks(self) -> Iterator[tuple[str, CallbackDescription]]:
         """Every callback with the name of its node, in the order of the file."""
@@ -404,8 +385,8 @@ class Application(Part):
     def scheduling_of(self, node: str) -> Scheduling:
         """Core and priority of a node's executor."""
         own, executors = self.nodes[node], self.scheduling.executors
-        core = executors.core if own.core is None else own.core
-        core = own.cores[0] if own.cores else core
+        first = own.cores[0] if own.cores else own.core
+        core = executors.core if first is None else first
         return Scheduling(core=core, priority=own.priority or executors.priority)
 
     def cores_of(self, node: str) -> tuple[int, ...]:
@@ -448,10 +429,9 @@ def origin_timer(
         inputs = {topic for _, callback in starts for topic in callback.subscriptions}
         starts = [one for one in application.callbacks() if inputs.intersection(one[1].publishes)]
     if not starts:
-        raise InputError(
-            f"the application {application.name!r} has no /{first}, with which the chain {chain}"
-            " begins: plan again from a recording of this application"
-        )
+        lacks = f"has no /{first}, with which the chain {chain} begins"
+        remedy = "plan again from a recording of this application"
+        raise InputError(f"the application {application.name!r} {lacks}: {remedy}")
     return next(one for one in starts if one[1].timer_ns is not None)
 
 

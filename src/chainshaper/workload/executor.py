@@ -6,9 +6,9 @@ each in the order of registration and each at most once. What becomes ready mean
 next snapshot. A timer that missed whole periods fires once and keeps its phase.
 
 With several threads it is as rclcpp's `MultiThreadedExecutor` (Jazzy): one of them at a time takes
-the next of the snapshot, or waits if none is left; the others wait for their turn. Callbacks of a
-mutually exclusive group run one at a time: while one does, the others are no part of a snapshot,
-and when it is done, the thread that waits looks again.
+the next of the snapshot, or waits if none is left; the others wait for their turn. While a callback
+of a mutually exclusive group runs, the others are no part of a snapshot, and when it is done, the
+thread that waits looks again.
 
 **Synchroniser** (message_filters). Each input has a subscription and a callback of its own. The
 callback that completes a set, of the oldest message of every input, computes and publishes; the
@@ -16,9 +16,7 @@ others only leave their message.
 
 **Asynchronous publication.** As Fast DDS has it (paper, section 2.2): publishing puts the message
 into its writer's history, with the source timestamp of that instant, and wakes the **publisher
-thread** (``dds.asyn.…``), which sends for all asynchronous writers of the process. The history
-has the last ``depth`` messages that are not sent yet; one that is older than the topic's lifespan
-is not sent any more.
+thread** (``dds.asyn.…``), which sends for all asynchronous writers of the process.
 
 A reservation server may stop this thread while the executor goes on (section 3.2.1). So it waits
 in the kernel, without the interpreter's lock or one of DDS: woken while its server is closed, it
@@ -29,9 +27,9 @@ a publish slot has to be far longer than a send (:mod:`chainshaper.planning.over
 **Work.** A callback spends its described time, or calls the function that it ``computes:`` with
 the serialized messages that it is for (none for a timer, the whole set for a synchronising
 callback). The function returns the serialized message to publish on every topic of the callback,
-or None: nothing then (:func:`~chainshaper.workload.dds.data_of` and
-:func:`~chainshaper.workload.dds.data_message` open and make messages). The stamp of the header,
-from which gates count, is the function's to pass on.
+or None: nothing then. The stamp of the header, from which gates count, is the function's to pass on
+(:func:`~chainshaper.workload.dds.data_of` and :func:`~chainshaper.workload.dds.data_message` open
+and make messages).
 """
 
 import importlib
@@ -90,13 +88,15 @@ class SubscriptionEntity:
 
 Entity: TypeAlias = Timer | SubscriptionEntity
 
-
 IDLE_NS = 500_000_000
 """An executor with nothing to do looks this often whether it is to end: no chain is so slow."""
 
 
 class Executor:
-    """Runs the callbacks of one process on the calling thread, and on ``threads`` − 1 others."""
+    """Runs the callbacks of one process on the calling thread, and on ``threads`` − 1 others.
+
+    Once ``over``, it ends when it next looks.
+    """
 
     def __init__(self, participant: Any, log: EventLog, threads: int = 1) -> None:
         self.timers: list[Timer] = []
@@ -120,10 +120,6 @@ class Executor:
             other.start()
             named.acquire()
             self._others.append(other)
-
-    def end_early(self, *_: object) -> None:
-        """A signal's handler: the executor ends when it next looks."""
-        self.over = True
 
     def add_subscription(self, entity: SubscriptionEntity) -> None:
         self.subscriptions.append(entity)
@@ -235,8 +231,10 @@ The outcomes are those of `asynchronous_send` in :mod:`chainshaper.values.events
 class AsynchronousWriter:
     """The history of one writer, between the executor and the publisher thread.
 
-    ``write`` gives a message and its source timestamp to DDS. Taking and appending are single
-    steps of the interpreter, so no lock is needed that a stopped thread could hold.
+    It has the last ``depth`` messages that are not sent yet; those older than ``lifespan_ns`` are
+    not sent any more. ``write`` gives a message and its source timestamp to DDS. Taking and
+    appending are single steps of the interpreter, so no lock is needed that a stopped thread could
+    hold.
     """
 
     def __init__(
@@ -245,18 +243,20 @@ class AsynchronousWriter:
         depth: int,
         lifespan_ns: int | None,
         note: Note,
+        to_send: "queue.SimpleQueue[AsynchronousWriter]",
     ) -> None:
-        self._write, self._note = write, note
+        self._write, self._note, self._to_send = write, note, to_send
         self._depth, self._lifespan_ns = depth, lifespan_ns
         self._history: deque[tuple[bytes, int]] = deque()
 
-    def keep(self, payload: bytes, source_timestamp: int) -> None:
-        """Executor: put a message into the history; a full one loses its oldest (keep last)."""
+    def publish(self, payload: bytes, source_timestamp: int) -> None:
+        """Executor: hand a message over, never waiting; a full history loses its oldest."""
         self._history.append((payload, source_timestamp))
         # Should the oldest be taken for sending just now, the one after it is lost: a message that
         # is being sent has its place in the history, as in DDS.
         if len(self._history) > self._depth and (oldest := self._oldest()) is not None:
             self._note(time.monotonic_ns(), oldest[1], "overwritten", 0)
+        self._to_send.put(self)
 
     def send_next(self) -> None:
         """Publisher thread: send the oldest message, unless it has been overwritten or expired."""
@@ -277,22 +277,20 @@ class AsynchronousWriter:
             return None
 
 
-class PublisherThread:
-    """The one thread that sends for all asynchronous writers of this process."""
+def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
+    """Start the one thread that sends for all asynchronous writers of this process.
 
-    def __init__(self) -> None:
-        self._waiting: queue.SimpleQueue[AsynchronousWriter] = queue.SimpleQueue()
-        threading.Thread(target=self._send, daemon=True).start()
+    They put themselves into the queue, once for each message.
+    """
+    waiting: queue.SimpleQueue[AsynchronousWriter] = queue.SimpleQueue()
 
-    def publish(self, writer: AsynchronousWriter, payload: bytes, source_timestamp: int) -> None:
-        """Executor: hand a message over; never waits."""
-        writer.keep(payload, source_timestamp)
-        self._waiting.put(writer)
-
-    def _send(self) -> None:
+    def send() -> None:
         set_thread_name(THREAD_NAME)
         while True:
-            self._waiting.get().send_next()
+            waiting.get().send_next()
+
+    threading.Thread(target=send, daemon=True).start()
+    return waiting
 
 
 Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]
@@ -310,8 +308,7 @@ def spending(
     """Spend the next execution time; the first message's stamp is passed on to all topics.
 
     ``templates`` has the data for each topic. What is ``announced`` is published in turn instead.
-    All that a callback does before it publishes is part of its execution time, so messages are
-    made first.
+    Messages are made first: what a callback does before it publishes is its execution time.
     """
     announcements = cycle(announced)
 
@@ -331,15 +328,13 @@ def computing(name: str, function: Callable[..., object], topics: int) -> Work:
         try:
             made = function(*(message.payload for message in messages))
         except Exception as error:
-            at = traceback.extract_tb(error.__traceback__)[-1]
-            sys.exit(f"{name} failed at {at.filename}:{at.lineno}: {_in_words(error)}")
+            file, line, words = _explained(error)
+            sys.exit(f"{name} failed at {file}:{line}: {words}")
         if made is None:
             return ()
         if not isinstance(made, bytes):
-            sys.exit(
-                f"{name} returned {type(made).__name__}: return the message to publish as bytes, "
-                "or None"
-            )
+            remedy = "return the message to publish as bytes, or None"
+            sys.exit(f"{name} returned {type(made).__name__}: {remedy}")
         return (made,) * topics
 
     return work
@@ -357,10 +352,10 @@ def load_function(name: str) -> Callable[..., object]:
     try:
         found = getattr(importlib.import_module(module), attribute, None)
     except Exception as error:
-        at = traceback.extract_tb(error.__traceback__)[-1]
-        where = "" if at.filename.startswith("<frozen") else f" ({at.filename}:{at.lineno})"
+        file, line, words = _explained(error)
+        where = "" if file.startswith("<frozen") else f" ({file}:{line})"
         sys.exit(
-            f"{name} cannot be loaded: {_in_words(error)}{where}; its module has to be installed, "
+            f"{name} cannot be loaded: {words}{where}; its module has to be installed, "
             f"on PYTHONPATH, or in the working directory {Path.cwd()}"
             + "".join(f"; not {place}: {reason}" for place, reason in places.items() if reason)
         )
@@ -372,5 +367,7 @@ def load_function(name: str) -> Callable[..., object]:
     return found  # type: ignore[no-any-return]
 
 
-def _in_words(error: Exception) -> str:
-    return " ".join(f"{type(error).__name__}: {error}".split())
+def _explained(error: Exception) -> tuple[str, int | None, str]:
+    """File and line where it was raised, and what it says on one line."""
+    at = traceback.extract_tb(error.__traceback__)[-1]
+    return at.filename, at.lineno, " ".join(f"{type(error).__name__}: {error}".split())

@@ -30,6 +30,9 @@ from chainshaper.values.errors import OperationError
 ENOUGH = signal.SIGUSR1
 """Has a child end its run early, and send what it recorded."""
 
+ANSWER_S = 60.0
+"""A process that is silent for longer, discovery included, hangs."""
+
 DYING_S = 2.0
 """A process that has closed its pipe ends by then, or talks nonsense."""
 

@@ -1,21 +1,21 @@
 """Run a described application live: real processes, real DDS topics, real scheduling.
 
 Threads are allocated as in the paper (section 2.5): executors SCHED_FIFO on their cores, DDS
-threads SCHED_FIFO on another, interference low. All of it concerns processes that we started and
-that end with the run, so nothing on the machine is different afterwards.
+threads SCHED_FIFO on another, interference low. All of them end with the run.
 """
 
 import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper.gate.decision import clock_offset
@@ -42,6 +42,7 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_log import ABSENT, ALSO_TAKEN, EVENTS, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import (
+    ANSWER_S,
     ENOUGH,
     WORKER_NAME,
     Child,
@@ -49,26 +50,20 @@ from chainshaper.workload.launcher import (
     first_casualty,
     start_child,
 )
-from chainshaper.workload.stall_meter import (
-    far_from,
-    meter_tables,
-    promote_meters,
-    read_meters,
-    start_meters,
-)
+from chainshaper.workload.stall_meter import StallWatch, far_from, meter_tables, stalls_watched
 
+Numbers: TypeAlias = npt.NDArray[np.int64]
 Progress = Callable[[float, str], None]
 """Called with the share done (0 to 1) and what is being done."""
 
 
 @dataclass(frozen=True)
 class StartedNodes:
-    """The nodes of a live run while they wait for its start.
+    """The nodes of a live run while they wait for its start, by full name.
 
-    ``pids`` has the process of each node's full name; ``anchor_ns`` (CLOCK_MONOTONIC) is the
-    first expiry of the timer that starts the chain, from which its cycles count; ``start_ns`` the
-    common start of all timers. Where servers are in force early, both come some hyper-periods
-    sooner than it says here.
+    ``start_ns`` (CLOCK_MONOTONIC) is the common start of all timers, ``anchor_ns`` the first expiry
+    of the timer that starts the chain, from which its cycles count. Where servers are in force
+    early, both come some hyper-periods sooner than it says here.
     """
 
     pids: dict[str, int]
@@ -82,15 +77,12 @@ Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]
 WARM_UP_CYCLES = 5
 LEAD_NS = 300_000_000
 ENFORCING_NS = 2_000_000_000
-"""Servers have to be in force before the first cycle; starting their processes takes so long at
-most. What is left of it is not waited for."""
+"""Servers have to be in force before the first cycle: so long at most is waited for them."""
 DISCOVERY_NS = 20_000_000_000
 LOOK_NS = 1_000_000_000
 """How often is looked who governs the nodes: others write it down every second."""
-ANSWER_S = 60.0
-"""A process that is silent for longer, discovery included, hangs."""
 SHOWN = ("tid", "pid", "comm", "policy", "priority", "cores")
-"""What the kernel shows of a thread, and a recording has."""
+"""What a recording has of a thread."""
 SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 """What a callback computes, it computes on its executor's thread."""
 
@@ -108,11 +100,11 @@ def run_application(
 ) -> Recording:
     """Run an application for ``cycles`` periods of its chain and record it.
 
-    ``realtime`` None takes SCHED_FIFO where it is permitted and notes where it is not; False
-    does without. ``plan`` is stored with the recording. A few cycles before the recorded ones
-    warm the caches and are left out. ``enforcement`` is entered when all nodes stand ready and
-    their threads have their scheduling, and left when the run is over, however it ends, before
-    any node is asked to leave: a thread whose server is closed could not.
+    ``realtime`` None takes SCHED_FIFO where it is permitted; False does without. ``plan`` is
+    stored with the recording. A few cycles before the recorded ones warm the caches and are left
+    out. ``enforcement`` is entered when all nodes stand ready and their threads have their
+    scheduling, and left when the run is over, however it ends, before any node is asked to leave:
+    a thread whose server is closed could not.
 
     Raises:
         InputError: ``output`` exists.
@@ -127,37 +119,36 @@ def run_application(
     check_cores(application.cores())
     permitted = _permitted(realtime)
     realtime = permitted if realtime is None else realtime
+    # What can be pre-empted itself cannot tell a stall from ordinary scheduling.
+    watching = stalls_watched(application.cores(), True) if realtime else nullcontext(StallWatch())
     nodes: dict[str, Child] = {}
-    meters: dict[int, Child] = {}
     finished = False
     try:
         progress(0.0, "starting nodes")
         _start_nodes(application, nodes, realtime)
-        if realtime:  # what can be pre-empted itself cannot tell a stall from ordinary scheduling
-            start_meters(application.cores(), meters)
-        memory_locked = _await_ready([*nodes.values(), *meters.values()])
-        _allocate_threads(application, nodes, realtime)
-        promote_meters(meters, realtime)
-        lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
-        timing = timing_of(application, cycles, time.monotonic_ns() + lead)
-        offset = clock_offset()
-        pids = {node_name(name): child.pid for name, child in nodes.items()}
-        started = StartedNodes(pids, timing.anchor_ns, timing.start_ns)
-        with nullcontext() if enforcement is None else enforcement(started):
-            timing = _sooner(application, cycles, timing)
-            for child in [*nodes.values(), *meters.values()]:
-                child.tell(**asdict(timing))
-            threads, governed, ended_ns = _watch(nodes, meters, timing, progress)
-            if ended_ns is not None:
-                timing = _ended_early([*nodes.values(), *meters.values()], timing, ended_ns)
-        progress(1.0, "collecting events")
-        logs = [_read_log(name, child, application) for name, child in nodes.items()]
-        seen, meter_info = read_meters(meters, realtime) if meters else ([], None)
+        with watching as stalls:
+            memory_locked = _await_ready(nodes.values())
+            _allocate_threads(application, nodes, realtime)
+            lead = LEAD_NS if enforcement is None else LEAD_NS + ENFORCING_NS
+            timing = timing_of(application, cycles, time.monotonic_ns() + lead)
+            offset = clock_offset()
+            pids = {node_name(name): child.pid for name, child in nodes.items()}
+            started = StartedNodes(pids, timing.anchor_ns, timing.start_ns)
+            with nullcontext() if enforcement is None else enforcement(started):
+                timing = _sooner(application, cycles, timing)
+                for child in nodes.values():
+                    child.tell(**asdict(timing))
+                stalls.begin(timing.anchor_ns + _between_releases(application), timing.stop_ns)
+                threads, governed, ended_ns = _watch(nodes, stalls.meters, timing, progress)
+                if ended_ns is not None:
+                    timing = _ended_early(nodes.values(), timing, ended_ns)
+            progress(1.0, "collecting events")
+            logs = [_read_log(name, child, application) for name, child in nodes.items()]
         finished = True
     finally:
-        end_all([*nodes.values(), *meters.values()], patience_s=3.0 if finished else 0.0)
+        end_all(nodes.values(), patience_s=3.0 if finished else 0.0)
     tables = event_tables(logs, timing.record_from_ns)
-    tables |= meter_tables(seen, tables.get("machine_stall"))
+    tables |= meter_tables(stalls.seen, tables.get("machine_stall"))
     notes = list(_notes(realtime, permitted, memory_locked, clock_offset() - offset))
     if ended_ns is not None:
         tables = dict(events.happened(tables, 0, timing.stop_ns))
@@ -165,6 +156,7 @@ def run_application(
     together = in_force_throughout(governed)
     in_force = None if plan is None else InForceInfo(since_ns=timing.record_from_ns)
     if plan is None and together is not None:
+        plan = together.plan
         in_force = InForceInfo(since_ns=together.since_ns, until_ns=together.until_ns)
     info = RecordingInfo(
         source="live",
@@ -175,10 +167,10 @@ def run_application(
         threads=threads,
         realtime=realtime,
         notes=tuple(notes),
-        stall_meter=meter_info,
+        stall_meter=stalls.info,
         chain=application.chain,
         application=application_as_written(application),
-        plan=plan or (together.plan if together else None),
+        plan=plan,
         in_force=in_force,
     )
     recording = write_recording(output, tables, info)
@@ -207,7 +199,6 @@ class Timing:
     record_from_ns: int
     last_timer_ns: int
     stop_ns: int
-    meter_from_ns: int
     period_ns: int
 
     @property
@@ -226,8 +217,7 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
     anchor = start + timer.phase_ns
     first = anchor + WARM_UP_CYCLES * period
     end, apart = first + cycles * period, min(1_000_000, period // 10)
-    gates = [cb.gate for _, cb in application.callbacks() if cb.gate is not None]
-    releases = [opens for gate in gates for opens, _ in gate.slots] or [0]
+    gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
     delayed = max((gate.due_cycles for gate in gates), default=0)
     return Timing(
         start_ns=start,
@@ -235,9 +225,14 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
         record_from_ns=first - apart,
         last_timer_ns=end - apart,
         stop_ns=end + max(2 * period, 200_000_000) + delayed * period,
-        meter_from_ns=anchor + far_from(releases),
         period_ns=period,
     )
+
+
+def _between_releases(application: Application) -> int:
+    """Where behind the anchor stall meters wake up, and every millisecond then."""
+    gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
+    return far_from([opens for gate in gates for opens, _ in gate.slots] or [0])
 
 
 def _sooner(application: Application, cycles: int, timing: Timing) -> Timing:
@@ -247,7 +242,7 @@ def _sooner(application: Application, cycles: int, timing: Timing) -> Timing:
     return timing_of(application, cycles, timing.start_ns - spare // hyper * hyper)
 
 
-def _ended_early(children: Sequence[Child], timing: Timing, ended_ns: int) -> Timing:
+def _ended_early(children: Iterable[Child], timing: Timing, ended_ns: int) -> Timing:
     """Have the run end now; it stops behind its last whole cycle. Raises OperationError: none."""
     early = replace(timing, stop_ns=ended_ns)
     if early.cycles < 1:
@@ -294,7 +289,7 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
         )
 
 
-def _await_ready(children: Sequence[Child]) -> bool:
+def _await_ready(children: Iterable[Child]) -> bool:
     """Wait until all have found each other; whether all of them could lock their memory."""
     answers = [(child, child.hear(ANSWER_S)) for child in children]
     missing = [f"{child.name}: {text}" for child, answer in answers for text in answer["missing"]]
@@ -327,27 +322,24 @@ def _watch(
     timing: Timing,
     progress: Progress,
 ) -> tuple[tuple[ThreadInfo, ...], tuple[Governed, ...], int | None]:
-    """Wait for the end of the run; the threads as they were while it lasted.
+    """Wait for the end of the run. Raises OperationError: a process ended before its time.
 
-    And the plans that others put in force meanwhile (`chainshaper apply`), and when the run was
-    interrupted, if it was (ns).
-
-    Raises OperationError: a process ended before its time.
+    The threads as they were while it lasted, the plans that others put in force meanwhile
+    (`chainshaper apply`), and when the run was interrupted, if it was (ns).
     """
-    children = [*nodes.values(), *meters.values()]
     threads: tuple[ThreadInfo, ...] = ()
     governed: tuple[Governed, ...] = ()
     interrupted_ns: int | None = None
     pids, next_look = {child.pid for child in nodes.values()}, timing.start_ns
     while (now := time.monotonic_ns()) < timing.stop_ns:
-        if (casualty := first_casualty(children)) is not None:
+        if (casualty := first_casualty([*nodes.values(), *meters.values()])) is not None:
             raise OperationError(f"{casualty.obituary()}; the run was ended and nothing recorded")
         if now >= timing.record_from_ns and not threads:
             threads = _snapshot(nodes, meters)
         if now >= next_look:
             governed, next_look = governing(pids, now, governed), now + LOOK_NS
-        share = (now - timing.start_ns) / (timing.stop_ns - timing.start_ns)
-        progress(max(0.0, share), "recording")
+        done_ns = max(0, now - timing.start_ns)
+        progress(done_ns / (timing.stop_ns - timing.start_ns), "recording")
         try:
             time.sleep(0.1)
         except KeyboardInterrupt:
@@ -358,22 +350,20 @@ def _watch(
 
 
 def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:
-    children = [(child, node_name(name)) for name, child in nodes.items()]
-    children += [(child, "") for child in meters.values()]
+    found = [(node_name(name), one) for name, child in nodes.items() for one in _threads_of(child)]
+    found += [("", one) for child in meters.values() for one in list_threads(child.pid)]
     return tuple(
         ThreadInfo(
             node=node,
-            role=thread.role if node else "stall-meter",
-            **{name: getattr(thread, name) for name in SHOWN},
+            role=one.role if node else "stall-meter",
+            **{name: getattr(one, name) for name in SHOWN},
         )
-        for child, node in children
-        for thread in _threads_of(child)
+        for node, one in found
     )
 
 
 def _threads_of(child: Child) -> list[Thread]:
-    """The threads of a process. What a callback's module starts executes nothing, and has the name
-    of the thread that started it."""
+    """Its threads. What a callback's module starts executes nothing, and has its thread's name."""
     return [
         replace(one, role="executor") if one.comm == WORKER_NAME else one
         for one in list_threads(child.pid)
@@ -390,6 +380,10 @@ class ProcessLog:
     objects: tuple[dict[str, Any], ...]
     modes: tuple[str, ...] = ()  # that its gate knows
 
+    def process(self, _: object = None) -> dict[str, int | None]:
+        """What all its events have."""
+        return {"pid": self.pid, "cpu": self.core}
+
 
 def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataFrame]:
     """The event tables of all processes, sorted by time.
@@ -400,32 +394,38 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
         rows = rows[rows[:, 1] >= from_ns]
-        common = {"pid": log.pid, "tid": log.pid, "cpu": log.core}  # objects: the main thread
-        found: list[tuple[str, pl.DataFrame]] = []
-        for number, (entry, fields) in enumerate(LAYOUT.items()):
-            mine = rows[rows[:, 0] == number]
-            if len(mine):
-                own = mine[:, 1 : 3 + len(fields)]
-                found += expanded(entry, pl.DataFrame(own, schema=["time", "tid", *fields]))
+        entries = [rows[rows[:, 0] == number, 1:].T for number in range(len(LAYOUT))]
+        found = list(logged_tables(entries, log.process, log.modes))
+        own = {**log.process(), "tid": log.pid}
         for name in dict.fromkeys(created["event"] for created in log.objects):
-            own_objects = [created for created in log.objects if created["event"] == name]
-            found.append((name, pl.DataFrame(own_objects)))
-        for name, frame in found:
-            missing = {key: pl.lit(value) for key, value in common.items() if key not in frame}
-            table = typed_table(name, frame.with_columns(**missing), log.modes)
+            created = pl.DataFrame([one | own for one in log.objects if one["event"] == name])
+            found.append((name, typed_table(name, created)))
+        for name, table in found:
             parts.setdefault(name, []).append(table)
     return {
-        name: pl.concat(frames).sort("time", maintain_order=True)
-        for name, frames in sorted(parts.items())
+        name: pl.concat(tables).sort("time", maintain_order=True)
+        for name, tables in sorted(parts.items())
     }
 
 
-def expanded(entry: str, frame: pl.DataFrame) -> Iterator[tuple[str, pl.DataFrame]]:
-    """The events that entries of a log stand for; each has the columns of all."""
-    for name in EVENTS[entry]:
-        own = frame.filter(pl.col("taken") == 1) if name in ALSO_TAKEN else frame
-        if own.height:
-            yield name, own
+def logged_tables(
+    entries: Sequence[Numbers],
+    process: Callable[[Numbers], Mapping[str, Any]],
+    modes: Sequence[str],
+) -> Iterator[tuple[str, pl.DataFrame]]:
+    """The events that entries of a log stand for: for each of :data:`LAYOUT` its columns.
+
+    ``process`` gives pid and core of threads.
+    """
+    for (entry, fields), columns in zip(LAYOUT.items(), entries, strict=False):
+        if not columns.size:
+            continue
+        own = dict(zip(("time", "tid", *fields), columns, strict=False))
+        frame = pl.DataFrame(own | dict(process(own["tid"])))
+        for name in EVENTS[entry]:
+            taken = frame.filter(taken=1) if name in ALSO_TAKEN else frame
+            if taken.height:
+                yield name, typed_table(name, taken, modes)
 
 
 def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl.DataFrame:
@@ -433,11 +433,12 @@ def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl
 
     Columns that the event does not have are left out.
     """
-    types = {**events.COMMON_COLUMNS, **events.FIELDS[name], **events.OPTIONAL_FIELDS.get(name, {})}
-    words = {**WORDS, "mode": tuple(modes)}
+    types, words = events.column_types(name), {**WORDS, "mode": modes}
     columns = []
     for field in filter(frame.columns.__contains__, types):
         column = frame[field]
+        if column.dtype == pl.Int64 and types[field] == pl.UInt64:  # a handle
+            column = column.reinterpret(signed=False)
         if field in words:
             named = dict(enumerate(words[field]))
             column = column.replace_strict(named, default=None, return_dtype=pl.String())
@@ -462,10 +463,8 @@ def _notes(
 ) -> Iterator[str]:
     if not realtime:
         reason = "SCHED_FIFO was declined" if permitted else "the process may not use SCHED_FIFO"
-        yield (
-            f"taken without real-time scheduling ({reason}), and without watching for "
-            "stalls of the machine"
-        )
+        how = f"without real-time scheduling ({reason})"
+        yield f"taken {how}, and without watching for stalls of the machine"
     if not memory_locked:
         yield "memory was not locked: page faults may have cost time"
     if abs(clock_moved_ns) > 1_000_000:

@@ -6,6 +6,7 @@ it is locked into memory.
 """
 
 import os
+import queue
 import signal
 import sys
 import time
@@ -77,7 +78,7 @@ class NodeProcess:
         self.executor = executor.Executor(self.participant, self.log, spec["threads"])
         self.publishers: dict[str, dds.Publisher] = {}
         self.subscriptions: list[tuple[str, dds.Subscription]] = []
-        self.publisher_thread: executor.PublisherThread | None = None
+        self.to_send: queue.SimpleQueue[executor.AsynchronousWriter] | None = None
         self.shapers: list[tuple[Shaper, list[tuple[int, int]]]] = []  # with their moves
         self.first_due: list[tuple[executor.Timer, int]] = []
         self.execution_times: list[ExecutionTimes] = []
@@ -152,10 +153,9 @@ class NodeProcess:
         asynchronous, write = qos["publication"] == "asynchronous", publisher.write
         handle, rmw_handle = self.log.publisher(topic, qos["depth"], asynchronous)
         if asynchronous:  # the process's publisher thread does the writing
-            self.publisher_thread = self.publisher_thread or executor.PublisherThread()
-            sent = partial(self._note_send, rmw_handle)
-            writer = executor.AsynchronousWriter(write, qos["depth"], qos["lifespan_ns"], sent)
-            write = partial(self.publisher_thread.publish, writer)
+            self.to_send = self.to_send or executor.start_publisher_thread()
+            note, history = partial(self._note_send, rmw_handle), (qos["depth"], qos["lifespan_ns"])
+            write = executor.AsynchronousWriter(write, *history, note, self.to_send).publish
         point = self._point["publish"]
         return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, point)
 
@@ -366,7 +366,7 @@ def main() -> None:
     signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name(spec["node"].strip("/").replace("/", "."))
     node = NodeProcess(spec)
-    signal.signal(ENOUGH, node.executor.end_early)
+    signal.signal(ENOUGH, lambda *_: setattr(node.executor, "over", True))
     missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
     send(output, missing=missing, memory_locked=lock_memory())
     times = receive()

@@ -1,14 +1,12 @@
 """The stall meter: a sleeper that notices when the machine itself stood still.
 
 Virtual machines and firmware stop all threads of a core for milliseconds now and then. A thread
-at the highest priority that only sleeps and looks at the clock wakes late exactly then; the
-figures of a run can only be judged beside what it saw. They run at half their pace as well while
-others keep their hardware busy; then the sleeper's wake-ups, which are the same work each time,
-take it twice as much CPU time.
+at the highest priority that only sleeps and looks at the clock wakes late exactly then. They run
+at half their pace as well while others keep their hardware busy; then the sleeper's wake-ups,
+which are the same work each time, take it twice as much CPU time.
 
 One process per core, ``python -m chainshaper.workload.stall_meter``, speaks the launcher's
-protocol; ``ENOUGH`` ends its watch early. :func:`stalls_watched` has them watch beside whatever
-runs, :func:`measure_stalls` answers "how badly does this machine stall?".
+protocol; ``ENOUGH`` ends its watch early.
 """
 
 import os
@@ -16,7 +14,7 @@ import signal
 import sys
 import time
 from array import array
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -32,16 +30,8 @@ from chainshaper.linux.scheduling import (
     stop_garbage_collection,
 )
 from chainshaper.linux.threads import list_threads
-from chainshaper.workload.launcher import (
-    ENOUGH,
-    Child,
-    end_all,
-    receive,
-    send,
-    send_events,
-    start_child,
-    wait_for_leave,
-)
+from chainshaper.workload import launcher
+from chainshaper.workload.launcher import ANSWER_S, ENOUGH, Child
 
 if TYPE_CHECKING:  # a meter is Python alone
     import polars as pl
@@ -101,19 +91,17 @@ def watch(
 
 def main() -> None:
     """Watch the core this process is put on, as the launcher says."""
-    spec = receive()
+    spec = launcher.receive()
     signalled_with_parent(spec["parent"], signal.SIGKILL)
     set_thread_name("stall-meter")
     signals: list[int] = []
     signal.signal(ENOUGH, lambda number, _: signals.append(number))
-    send(sys.stdout, missing=[], memory_locked=lock_memory())
-    times = receive()
+    launcher.send(sys.stdout, ready=lock_memory())
+    times = launcher.receive()
     stop_garbage_collection()
-    seen, wakeups, ordinary = watch(
-        times["meter_from_ns"], times["stop_ns"], enough=lambda: bool(signals)
-    )
-    send_events(sys.stdout, seen.tobytes(), wakeups=wakeups, median_lateness_ns=ordinary)
-    wait_for_leave()
+    seen, wakeups, late = watch(times["start_ns"], times["stop_ns"], enough=lambda: bool(signals))
+    launcher.send_events(sys.stdout, seen.tobytes(), wakeups=wakeups, median_lateness_ns=late)
+    launcher.wait_for_leave()
 
 
 # From outside -----------------------------------------------------------------------------
@@ -122,9 +110,8 @@ def main() -> None:
 def far_from(instants_ns: Iterable[int], period_ns: int = PERIOD_NS) -> int:
     """Where in its period a meter is to wake up, to be as far as may be from recurring instants.
 
-    A wake-up takes its core for some 40 us, and delays by that what is published or delivered
-    then. Most cycles are whole multiples of the period: there it would do so in every cycle of a
-    run, or in none. What happens at a release its gate sees more exactly anyway.
+    A wake-up delays what is published or delivered then by some 40 us; as most cycles are whole
+    multiples of the period, in every cycle of a run.
 
         >>> far_from([20_100_000, 40_200_000], 1_000_000)
         650000
@@ -139,85 +126,75 @@ def far_from(instants_ns: Iterable[int], period_ns: int = PERIOD_NS) -> int:
     return (begin + widest // 2) % period_ns
 
 
-def start_meters(cores: Iterable[int], meters: dict[int, Child]) -> None:
-    """Start a meter per core into ``meters``, so that those started can be ended whatever fails."""
-    for core in sorted(cores):
-        module = "chainshaper.workload.stall_meter"
-        meters[core] = start_child(f"stall meter of core {core}", module, {})
-        meters[core].tell(parent=os.getpid())
-
-
-def promote_meters(meters: Mapping[int, Child], realtime: bool) -> None:
-    """Put each meter on its core, above everything else there if that is permitted."""
-    for core, child in meters.items():
-        for thread in list_threads(child.pid):
-            apply_scheduling(thread, Scheduling(PRIORITY if realtime else None, cores=(core,)))
-
-
-def read_meters(
-    meters: Mapping[int, Child], realtime: bool
-) -> "tuple[list[tuple[int, int, bytes]], StallMeterInfo]":
-    """What the meters saw: (pid, core, rows of `watch`), and how they watched."""
-    from chainshaper.values.recording import StallMeterInfo
-
-    seen, wakeups, lateness = [], 0, []
-    for core, child in meters.items():
-        answer = child.hear()
-        seen.append((child.pid, core, child.hear_bytes(answer["bytes"])))
-        wakeups += answer["wakeups"]
-        lateness.append(answer["median_lateness_ns"])
-    info = StallMeterInfo(
-        cores=tuple(meters),
-        period_ns=PERIOD_NS,
-        threshold_ns=STALL_NS,
-        wakeups=wakeups,
-        median_lateness_ns=tuple(lateness),
-        realtime=realtime,
-    )
-    return seen, info
-
-
 @dataclass
 class StallWatch:
-    """What meters saw, once the watch is over: the `machine_stall` table, and how it was taken."""
+    """Meters by core; once the watch is over, what they saw and how it was taken.
 
+    ``seen`` has (pid, core, rows of :func:`watch`), ``table`` is `machine_stall`.
+    """
+
+    meters: dict[int, Child] = field(default_factory=dict)
+    seen: list[tuple[int, int, bytes]] = field(default_factory=list)
     table: "pl.DataFrame | None" = None
     info: "StallMeterInfo | None" = None
-    meters: dict[int, Child] = field(default_factory=dict)
     begun: bool = False
 
-    def begin(self, place_ns: int = 0) -> int:
-        """Begin to watch, with wake-ups at that place of their period; from when on they do."""
-        start = time.monotonic_ns() + LEAD_NS
-        start += (place_ns - start) % PERIOD_NS
+    def begin(self, start_ns: int = 0, stop_ns: int | None = None) -> int:
+        """Begin to watch at an instant or, as soon as can be, whole periods later; when it is."""
+        soonest = time.monotonic_ns() + LEAD_NS
+        start_ns += max(0, -(-(soonest - start_ns) // PERIOD_NS)) * PERIOD_NS
         for child in self.meters.values():
-            child.tell(start_ns=start, meter_from_ns=start, stop_ns=start + LONGEST_NS)
+            child.tell(start_ns=start_ns, stop_ns=stop_ns or start_ns + LONGEST_NS)
         self.begun = True
-        return start
+        return start_ns
+
+    def end(self, realtime: bool) -> None:
+        """End the watch."""
+        from chainshaper.values.recording import StallMeterInfo
+
+        if not self.begun:
+            self.begin()
+        for child in self.meters.values():
+            child.process.send_signal(ENOUGH)
+        wakeups, lateness = 0, []
+        for core, child in self.meters.items():
+            answer = child.hear(ANSWER_S)
+            self.seen.append((child.pid, core, child.hear_bytes(answer["bytes"], ANSWER_S)))
+            wakeups += answer["wakeups"]
+            lateness.append(answer["median_lateness_ns"])
+        self.table = meter_tables(self.seen)["machine_stall"]
+        self.info = StallMeterInfo(
+            cores=tuple(self.meters),
+            period_ns=PERIOD_NS,
+            threshold_ns=STALL_NS,
+            wakeups=wakeups,
+            median_lateness_ns=tuple(lateness),
+            realtime=realtime,
+        )
 
 
 @contextmanager
 def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]:
-    """Watch cores from when the watch is begun until the context ends.
+    """Watch cores, above everything else if that is permitted, from when the watch is begun until
+    the context ends.
 
     Raises OperationError: a meter died.
     """
     watch, finished = StallWatch(), False
-    meters = watch.meters
     try:
-        start_meters(cores, meters)
-        for child in meters.values():
-            child.hear()
-        promote_meters(meters, realtime)
+        for core in sorted(cores):
+            module = "chainshaper.workload.stall_meter"
+            watch.meters[core] = launcher.start_child(f"stall meter of core {core}", module, {})
+            watch.meters[core].tell(parent=os.getpid())
+        for core, child in watch.meters.items():
+            child.hear(ANSWER_S)
+            for thread in list_threads(child.pid):
+                apply_scheduling(thread, Scheduling(PRIORITY if realtime else None, cores=(core,)))
         yield watch
-        if not watch.begun:
-            watch.begin()
-        for child in meters.values():
-            child.process.send_signal(ENOUGH)
-        seen, watch.info = read_meters(meters, realtime)
-        watch.table, finished = meter_tables(seen)["machine_stall"], True
+        watch.end(realtime)
+        finished = True
     finally:
-        end_all(meters.values(), patience_s=2.0 if finished else 0.0)
+        launcher.end_all(watch.meters.values(), patience_s=2.0 if finished else 0.0)
 
 
 def measure_stalls(
@@ -230,8 +207,7 @@ def measure_stalls(
     with stalls_watched(cores, realtime) as watch:
         watch.begin()
         time.sleep(duration_ns / 1e9)
-    assert watch.table is not None  # noqa: S101 - the watch is over
-    assert watch.info is not None  # noqa: S101
+    assert watch.table is not None and watch.info is not None  # noqa: S101 - the watch is over
     return watch.table, watch.info
 
 
@@ -254,14 +230,13 @@ def meter_tables(
         rows.append(frame.with_columns(pid=pl.lit(pid, pl.Int32()), cpu=pl.lit(core, pl.Int32())))
     by_meters = pl.concat(rows, how="diagonal").with_columns(tid=pl.col("pid"))
     is_stall = pl.col("cpu_time") == NO_PACE
-    stalls = by_meters.filter(is_stall).select(events.empty("machine_stall").columns)
-    paces = by_meters.filter(~is_stall).select(events.empty("machine_pace").columns)
-    if seen_by_gates is not None:
-        stalls = pl.concat([seen_by_gates, stalls])
-    return {
-        "machine_stall": stalls.sort("time", maintain_order=True),
-        "machine_pace": paces.sort("time", maintain_order=True),
+    tables = {
+        name: by_meters.filter(own).select(events.empty(name).columns)
+        for name, own in (("machine_stall", is_stall), ("machine_pace", ~is_stall))
     }
+    if seen_by_gates is not None:
+        tables["machine_stall"] = pl.concat([seen_by_gates, tables["machine_stall"]])
+    return {name: table.sort("time", maintain_order=True) for name, table in tables.items()}
 
 
 if __name__ == "__main__":
