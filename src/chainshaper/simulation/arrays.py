@@ -363,31 +363,18 @@ class Machine:
         )
         described = system.application.simulation
         turns = plan is not None and plan.takes_turns
-        values = {
-            X.CORES: self._cores.start,
-            X.CORES_END: self._cores.stop,
-            X.EVENTS: events,
-            X.EVENTS_END: events + len(expiries) * H.COLUMNS,
-            X.EVENTS_LIMIT: events + most * H.COLUMNS,
-            X.LOGGED: counts,
-            X.LOG: log,
-            X.LOG_ROWS: LOG_ROWS,
-            X.LATENCIES: end,
-            X.LATENCIES_END: end + latencies,
-            X.FREE: first_message,
-            X.UNUSED: pool,
-            X.STOP: timing.stop_ns,
-            X.LAST_TIMER: timing.last_timer_ns,
-            X.RECORD_FROM: timing.record_from_ns,
-            X.LOGGING: not latencies,
-            X.SWITCHES: switches,
-            X.SWITCH_COST: described.context_switch_ns,
-            X.PREEMPTION_COST: described.preemption_ns,
-            X.QUANTUM: described.quantum_ns if turns else at.FOREVER,
-            X.AWAY: round(1e6 * described.interrupts / (1 - described.interrupts)),
-            X.CYCLE: plan.cycle_ns if plan is not None else 0,
-        }
-        rows.set(0, values)
+        away = round(1e6 * described.interrupts / (1 - described.interrupts))
+        quantum = described.quantum_ns if turns else at.FOREVER
+        rows.set(0, {X.CORES: self._cores.start, X.CORES_END: self._cores.stop})
+        rows.set(0, {X.EVENTS: events, X.EVENTS_END: events + len(expiries) * H.COLUMNS})
+        rows.set(0, {X.EVENTS_LIMIT: events + most * H.COLUMNS, X.FREE: first_message})
+        rows.set(0, {X.LOGGED: counts, X.LOG: log, X.LOG_ROWS: LOG_ROWS, X.UNUSED: pool})
+        rows.set(0, {X.LATENCIES: end, X.LATENCIES_END: end + latencies, X.LOGGING: not latencies})
+        rows.set(0, {X.STOP: timing.stop_ns, X.LAST_TIMER: timing.last_timer_ns})
+        rows.set(0, {X.RECORD_FROM: timing.record_from_ns, X.SWITCHES: switches})
+        rows.set(0, {X.SWITCH_COST: described.context_switch_ns, X.QUANTUM: quantum, X.AWAY: away})
+        rows.set(0, {X.PREEMPTION_COST: described.preemption_ns})
+        rows.set(0, {X.CYCLE: 0 if plan is None else plan.cycle_ns})
         self.array = m = np.zeros(end + latencies, dtype=np.int64)
         m[: len(rows)] = rows
         m[end:] = NONE
@@ -420,8 +407,8 @@ class Machine:
         for place, core in zip(self._cores, system.cores, strict=True):
             threads = [thread for thread in self._threads if rows[thread + T.CORE] == place]
             first, end = rows.put(threads)
-            none = {C.RUNNING: NONE, C.LAST: NONE, C.UNTIL: at.FOREVER, C.BOUNDARY: at.FOREVER}
-            rows.set(place, {C.FIRST: first, C.END: end, C.DIRTY: 1, **none})
+            rows.set(place, {C.FIRST: first, C.END: end, C.DIRTY: 1, C.RUNNING: NONE, C.LAST: NONE})
+            rows.set(place, {C.UNTIL: at.FOREVER, C.BOUNDARY: at.FOREVER})
             governed = {number: one for number, one in system.servers.items() if one.core == core}
             if plan is None or not governed:
                 continue
@@ -436,9 +423,9 @@ class Machine:
             current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
             following = (current + 1) % len(table)
             until = table[following][0] + (plan.cycle_ns if following <= current else 0)
-            in_force = {C.MASK: table[current][1], C.NEXT: first + 2 * following}
-            boundary = {C.BOUNDARY: timing.start_ns - elapsed + until}
-            rows.set(place, {C.TABLE: first, C.TABLE_END: end, **in_force, **boundary})
+            rows.set(place, {C.TABLE: first, C.TABLE_END: end, C.MASK: table[current][1]})
+            rows.set(place, {C.NEXT: first + 2 * following})
+            rows[place + C.BOUNDARY] = timing.start_ns - elapsed + until
 
     def _rank(
         self, plan: ApplicationPlan, governed: dict[int, Server], ranked: list[Server]
@@ -465,8 +452,8 @@ class Machine:
         described = system.application.simulation
         pids = [system.processes[entity.process].pid for entity in system.entities]
         for number, (thread, info) in enumerate(zip(self._threads, system.threads, strict=True)):
-            rows.set(thread, dict.fromkeys((T.RUNNABLE, T.LEFT, T.PREEMPTED, T.USED, T.WAITING), 0))
-            rows.set(thread, {T.ROW: number, T.SEQUENCE: 0})
+            rows.set(thread, {T.ROW: number, T.RUNNABLE: 0, T.LEFT: 0, T.SEQUENCE: 0})
+            rows.set(thread, {T.PREEMPTED: 0, T.USED: 0, T.WAITING: 0})
             pool = self._thread(info.pid, "executor")
             worker = (thread - pool) // T.COLUMNS if info.role == "executor" else 0
             offset = FIRST_COST + len(COSTS) * (ROLES.index(info.role) + len(ROLES) * worker)
@@ -483,8 +470,8 @@ class Machine:
                 end = first + pids.count(info.pid) * E.COLUMNS
                 kinds = {"static": at.STATIC, "events": at.EVENTS}
                 kind = kinds.get(described.executor, at.SINGLE_THREADED)
-                executor = {T.KIND: kind, T.FIRST: first, T.END: end, T.POOL: pool}
-                rows.set(thread, {**executor, T.STEP: at.TURN if worker else at.COLLECT})
+                rows.set(thread, {T.KIND: kind, T.FIRST: first, T.END: end, T.POOL: pool})
+                rows[thread + T.STEP] = at.TURN if worker else at.COLLECT
                 rows[thread + T.PUBLISHER_THREAD] = self._thread(info.pid, "publisher")
                 rows[thread + T.DDS_THREAD] = self._thread(info.pid, "dds")
                 rows.set(pool, {T.POOL_END: thread + T.COLUMNS, T.OWNER: pool})
@@ -524,44 +511,32 @@ class Machine:
             group = system.application.nodes[process.key].exclusive_group(described)
             if group is not None and (entity.process, group) not in groups:
                 groups[entity.process, group] = rows.put([0])[0]
-            callback_handle, handle, rmw_handle = self._handles.entities[number]
-            own = {
-                E.CALLBACK: callback_handle,
-                E.HANDLE: handle,
-                E.RMW_HANDLE: rmw_handle,
-                E.THREAD: self._thread(process.pid, "executor"),
-                E.GROUP: NONE if group is None else groups[entity.process, group],
-                E.KIND: KINDS.index(entity.kind),
-                E.INPUT: entity.number,
-                E.BODY: body,
-                E.BODY_ROW: bodies.get(callback, NONE),
-                E.EXECUTION: executions[callback],
-                E.STARTS_CHAIN: number in system.chain.callbacks[:1],
-                E.ON_CHAIN: number in system.chain.callbacks[1:],
-                E.LIFESPAN: NONE,
-            }
-            if entity.publishers:
-                first, *_, last = (*entity.publishers, entity.publishers[-1])
-                own[E.PUBLISHERS] = self._publishers[first]
-                own[E.PUBLISHERS_END] = self._publishers[last] + P.COLUMNS
+            publishers = [self._publishers[one] for one in entity.publishers] or [-P.COLUMNS]
+            rows[row : row + 3] = self._handles.entities[number]
+            rows[row + E.THREAD] = self._thread(process.pid, "executor")
+            rows[row + E.GROUP] = NONE if group is None else groups[entity.process, group]
+            rows.set(row, {E.KIND: KINDS.index(entity.kind), E.INPUT: entity.number, E.BODY: body})
+            rows.set(row, {E.BODY_ROW: bodies.get(callback, NONE), E.LIFESPAN: NONE})
+            rows.set(row, {E.EXECUTION: executions[callback], E.PUBLISHERS: publishers[0]})
+            rows[row + E.PUBLISHERS_END] = publishers[-1] + P.COLUMNS
+            rows[row + E.STARTS_CHAIN] = number in system.chain.callbacks[:1]
+            rows[row + E.ON_CHAIN] = number in system.chain.callbacks[1:]
             if entity.topic is None:
                 drift = system.application.simulation.drift.get(process.key, 0)
-                period = described.timer_ns or 0
-                own[E.PERIOD] = max(1, round(period * (1 - drift / 1_000_000)))
-                own[E.DUE] = timing.start_ns + described.phase_ns
+                period = (described.timer_ns or 0) * (1 - drift / 1_000_000)
+                due = timing.start_ns + described.phase_ns
+                rows.set(row, {E.PERIOD: max(1, round(period)), E.DUE: due})
             else:
                 topic = system.application.topic(entity.topic)
-                own[E.DEPTH] = topic.depth if gate is None or entity.listens else gate.depth
-                own[E.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
-            rows.set(row, own)
+                rows[row + E.DEPTH] = topic.depth if gate is None or entity.listens else gate.depth
+                rows[row + E.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
 
     def _fill_publishers(self) -> None:
         rows, system = self._rows, self._system
         owner = {one: entity for entity in system.entities for one in entity.publishers}
         last = system.chain.callbacks[-1:]
-        for number, (row, publisher) in enumerate(
-            zip(self._publishers, system.publishers, strict=True)
-        ):
+        for number, publisher in enumerate(system.publishers):
+            row = self._publishers[number]
             topic = system.application.topic(publisher.topic)
             reached = system.readers.get(publisher.topic, ())
             readers = rows.add(len(reached), R.COLUMNS)
@@ -570,20 +545,12 @@ class Machine:
             announces = owner[number].described.announces
             modes, _ = rows.put([system.modes.index(mode) for mode in announces])
             ends = any(number in system.entities[one].publishers for one in last)
-            own = {
-                P.ROW: number,
-                P.HANDLE: self._handles.publishers[number][0],
-                P.RMW_HANDLE: self._handles.publishers[number][1],
-                P.FIRST: readers.start,
-                P.END: readers.stop,
-                P.ASYNCHRONOUS: publisher.asynchronous,
-                P.DEPTH: topic.depth,
-                P.LIFESPAN: NONE if topic.lifespan_ns is None else topic.lifespan_ns,
-                P.ENDS_CHAIN: ends and publisher.topic == system.chain.topics[-1],
-                P.MODES: modes,
-                P.MODES_COUNT: len(announces),
-            }
-            rows.set(row, own)
+            rows[row : row + 3] = number, *self._handles.publishers[number]
+            rows.set(row, {P.FIRST: readers.start, P.END: readers.stop, P.DEPTH: topic.depth})
+            rows.set(row, {P.MODES: modes, P.MODES_COUNT: len(announces)})
+            rows[row + P.ASYNCHRONOUS] = publisher.asynchronous
+            rows[row + P.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
+            rows[row + P.ENDS_CHAIN] = ends and publisher.topic == system.chain.topics[-1]
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
@@ -607,25 +574,16 @@ def _add_gate(rows: Rows, system: System, described: CallbackDescription, timing
     slots, slots_end = rows.put([instant for slot in gate.slots for instant in slot])
     moves, moves_end = rows.put([number for move in gate.moved(timing.start_ns) for number in move])
     (row,) = rows.add(1, at.GATE_COLUMNS, NONE)
-    own = {
-        G.SLOTS: slots,
-        G.SLOTS_END: slots_end,
-        G.MOVES: moves,
-        G.MOVES_END: moves_end,
-        G.CYCLE: gate.cycle_ns,
-        G.STAMPED: int(gate.anchor == "stamp"),
-        G.OVERRUN: number_of(gate.overrun),
-        G.DUE: gate.due_cycles,
-        G.SPIN: gate.spin_ns,
-        G.PAUSE: gate.pause_ns,
-        G.MESSAGES: WORDS["messages"].index(gate.messages),
-        G.AT_ONCE: int(gate.into_open_slot == "at-once"),
-        G.PHASE: timing.start_ns + gate.phase_ns if gate.phase_ns is not None else timing.anchor_ns,
-        G.CHANGED: 0,
-        G.CHANGES: rows.add(CHANGES, 2).start,
-    }
+    phase = timing.anchor_ns if gate.phase_ns is None else timing.start_ns + gate.phase_ns
+    rows.set(row, {G.SLOTS: slots, G.SLOTS_END: slots_end, G.MOVES: moves, G.MOVES_END: moves_end})
+    rows.set(row, {G.CYCLE: gate.cycle_ns, G.DUE: gate.due_cycles, G.PHASE: phase})
+    rows.set(row, {G.SPIN: gate.spin_ns, G.PAUSE: gate.pause_ns})
+    rows.set(row, {G.STAMPED: gate.anchor == "stamp", G.OVERRUN: number_of(gate.overrun)})
+    rows[row + G.MESSAGES] = WORDS["messages"].index(gate.messages)
+    rows[row + G.AT_ONCE] = gate.into_open_slot == "at-once"
+    rows.set(row, {G.CHANGED: 0, G.CHANGES: rows.add(CHANGES, 2).start})
     if (modes := gate.modes) is not None:
-        own |= {G.LATE: number_of(modes.late), G.DEFAULT: system.modes.index(modes.default)}
-        own[G.BANDS] = rows.put([modes.bands.get(mode, NONE) for mode in system.modes])[0]
-    rows.set(row, own)
+        bands, _ = rows.put([modes.bands.get(mode, NONE) for mode in system.modes])
+        default = system.modes.index(modes.default)
+        rows.set(row, {G.LATE: number_of(modes.late), G.DEFAULT: default, G.BANDS: bands})
     return row
