@@ -511,14 +511,15 @@ class Machine:
             group = system.application.nodes[process.key].exclusive_group(described)
             if group is not None and (entity.process, group) not in groups:
                 groups[entity.process, group] = rows.put([0])[0]
-            publishers = [self._publishers[one] for one in entity.publishers] or [-P.COLUMNS]
             rows[row : row + 3] = self._handles.entities[number]
             rows[row + E.THREAD] = self._thread(process.pid, "executor")
             rows[row + E.GROUP] = NONE if group is None else groups[entity.process, group]
             rows.set(row, {E.KIND: KINDS.index(entity.kind), E.INPUT: entity.number, E.BODY: body})
             rows.set(row, {E.BODY_ROW: bodies.get(callback, NONE), E.LIFESPAN: NONE})
-            rows.set(row, {E.EXECUTION: executions[callback], E.PUBLISHERS: publishers[0]})
-            rows[row + E.PUBLISHERS_END] = publishers[-1] + P.COLUMNS
+            rows[row + E.EXECUTION] = executions[callback]
+            if publishers := [self._publishers[one] for one in entity.publishers]:
+                end = publishers[-1] + P.COLUMNS
+                rows.set(row, {E.PUBLISHERS: publishers[0], E.PUBLISHERS_END: end})
             rows[row + E.STARTS_CHAIN] = number in system.chain.callbacks[:1]
             rows[row + E.ON_CHAIN] = number in system.chain.callbacks[1:]
             if entity.topic is None:
