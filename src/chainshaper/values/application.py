@@ -1,8 +1,4 @@
-"""What an application is: nodes, callbacks, topics and chains (paper, sections 2.1 and 2.3).
-
-A callback is a vertex of the paper's graph G; it is connected to another when it publishes a topic
-that the other subscribes to.
-"""
+"""What an application is: nodes, callbacks, topics and chains (paper, sections 2.1 and 2.3)."""
 
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
@@ -80,7 +76,7 @@ class Callback:
 
 @dataclass(frozen=True)
 class ApplicationGraph:
-    """The directed graph of callbacks and topics of one application.
+    """The paper's graph G: callbacks, connected where one publishes a topic that another takes.
 
     ``publishers`` and ``subscribers`` name the nodes of each topic, also of topics that no
     callback was seen to publish (a node may publish outside its callbacks).

@@ -1,7 +1,6 @@
 """What people are shown: what went wrong, with the exit code it ends in, and text of others.
 
-Every message names the thing (file, line, topic, thread), the reason and the remedy. A caller has
-three ways to react: correct the input, look at what failed, or change the machine.
+Every message names the thing (file, line, topic, thread), the reason and the remedy.
 
 Characters in text of others (traces, names of hosts, topics, files) rewrite a terminal, answer in
 the user's place, turn the direction of reading around, are not seen, or end an XML file. They are

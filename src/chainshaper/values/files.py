@@ -1,8 +1,8 @@
-"""Files that may run here, and files that are written whole.
+"""Files that may run here, and files that are written whole, and never over another.
 
 Only files that root and the user of this process alone can change may run, as ssh asks of its keys.
 A folder above may be writable by others where its sticky bit prevents them from replacing what is
-in it, as in /tmp. A new file is written whole or not at all, and never over another.
+in it, as in /tmp.
 """
 
 import grp
@@ -73,8 +73,9 @@ def free_place(path: Path, taken: bool) -> Path:
     Raises InputError: it is taken, or its folder does not exist.
     """
     if taken:
-        remedy = "name another, or remove it"
-        raise InputError(f"{path} exists already and is not overwritten: {remedy}")
+        raise InputError(
+            f"{path} exists already and is not overwritten: name another, or remove it"
+        )
     if not (folder := path.absolute().parent).is_dir():
         raise InputError(f"{folder}: no such folder to write {path.name} into")
     return path

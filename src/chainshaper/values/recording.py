@@ -1,7 +1,6 @@
 """A recording on disk: a folder with one Parquet file per event table and a `recording.json`.
 
-The folder is written beside its final place and renamed when it is complete. `recording.json` has
-the conditions of the run, what was lost, and a checksum of every other file.
+The latter has the conditions of the run, what was lost, and a checksum of every other file.
 """
 
 import io
@@ -91,10 +90,9 @@ class RecordingInfo(BaseModel, frozen=True):
     """The facts of a recording that are not events.
 
     ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME. ``lost`` counts events
-    that are known to be missing, by reason. ``realtime``: SCHED_FIFO was in force for every thread
-    that was to have it. ``trace_events`` counts all events of a trace that was converted. Processes
-    and threads have the numbers of ``pid_namespace`` (its inode); None: each its own.
-    ``worst_ns`` are the starts of cycles for which a flight recorder has written it.
+    that are known to be missing, by reason. ``trace_events`` counts all events of a trace that was
+    converted. Processes and threads have the numbers of ``pid_namespace`` (its inode); None: each
+    its own. ``worst_ns`` are the starts of cycles for which a flight recorder has written it.
     """
 
     format: Integer = FORMAT
@@ -109,7 +107,7 @@ class RecordingInfo(BaseModel, frozen=True):
     pid_namespace: Integer | None = None
     threads: tuple[ThreadInfo, ...] = ()
     endpoints: tuple[EndpointInfo, ...] = ()
-    realtime: bool | None = None  # None: unknown
+    realtime: bool | None = None  # SCHED_FIFO for all threads that were to have it; None: unknown
     notes: tuple[str, ...] = ()
     worst_ns: tuple[Integer, ...] = ()
     lost: dict[str, Integer] = {}
@@ -146,12 +144,11 @@ class _TablesOnDisk(Mapping[str, pl.DataFrame]):
         if missing := sorted(checksums.keys() - known):
             reason = f"no such file, but {INFO_FILE} names it"
             raise InputError(f"{path / missing[0]}: {reason}: copy the recording whole{_OR_AGAIN}")
-        for name, files in self._files.items():
-            for file in files:
-                with _readable(file), file.open("rb") as stream:
-                    problems = column_problems(pl.read_parquet_schema(stream), name)
-                if problems:
-                    raise InputError(f"{file}: {'; '.join(problems)}; record the run again")
+        for name, file in ((name, file) for name, files in self._files.items() for file in files):
+            with _readable(file), file.open("rb") as stream:
+                problems = column_problems(pl.read_parquet_schema(stream), name)
+            if problems:
+                raise InputError(f"{file}: {'; '.join(problems)}; record the run again")
 
     def __getitem__(self, name: str) -> pl.DataFrame:
         if name not in self._read:
@@ -228,10 +225,8 @@ def open_recording(path: str | Path) -> Recording:
         what, place = "a folder without recording.json" if path.is_dir() else "no such folder", path
         if path.is_file():
             what, place = "a file, where the folder of a recording is wanted", Path("REC")
-        raise InputError(
-            f"{path}: {what}; a recording is made with `chainshaper run APP.yaml -o {place}`, a "
-            "trace, which is accepted as well, with `ros2 trace`"
-        )
+        made = f"a recording is made with `chainshaper run APP.yaml -o {place}`, a trace, which is"
+        raise InputError(f"{path}: {what}; {made} accepted as well, with `ros2 trace`")
     try:
         values = json.loads(file.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:
@@ -264,8 +259,8 @@ def write_recording(
     """Write a recording, whole or not at all, and open it.
 
     ``tables`` may come in parts, one after the other in time, for a recording that is larger than
-    memory: a table of several parts is a folder of Parquet files. Raises InputError: ``path``
-    exists already. OperationError: it cannot be written.
+    memory: a table of several is a folder of files. Raises InputError: ``path`` exists already.
+    OperationError: it cannot be written.
     """
     path = refuse_existing(path)
     try:

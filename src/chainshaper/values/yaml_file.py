@@ -45,9 +45,7 @@ AS_YAML = "yaml"
 """The Pydantic context in which durations are texts with units, on the way in and out."""
 
 LONGEST_DURATION_NS = 2**63 - 1
-LARGEST_FILE = 8 << 20
-DEEPEST = 100
-MOST_VALUES = 200_000
+LARGEST_FILE, DEEPEST, MOST_VALUES = 8 << 20, 100, 200_000
 _MOST_PROBLEMS = 20
 
 
@@ -128,8 +126,7 @@ def read_model(
     not YAML, or wrong values, each with its line, key, reason and remedy.
     """
     path = Path(path)
-    root = compose(read_text(path, made_by), path)
-    plain = PlainData(path)
+    root, plain = compose(read_text(path, made_by), path), PlainData(path)
     values = plain.of(root) if root is not None else None
     if not isinstance(values, dict):
         found = "the file is empty" if root is None else "expected a YAML mapping (key: value)"
@@ -222,8 +219,8 @@ def _scalar(node: yaml.ScalarNode) -> str | int | float | bool | None:
 class PlainData:
     """The plain data of YAML nodes; ``lines`` learns the line of every value on the way.
 
-    In files of ``ours`` each collection is used once, and a key with a unit has it in its value.
-    Aliases could make any file refer to itself, or be a billion values on a page.
+    In files of ``ours`` each collection is used once, and units stand in values. Aliases could make
+    any file refer to itself, or be a billion values on a page.
     """
 
     name: str | Path

@@ -4,7 +4,7 @@ Messages are handled in serialized form, as a generic ROS 2 subscription does: w
 forwards is what it received, byte for byte, and the time spent here is DDS's own.
 
 A domain of the live workload is closed: loopback only, no multicast, and a domain id that no
-other process of this machine uses, so a robot's own topics are never touched.
+other process of this machine uses.
 """
 
 import random
@@ -96,9 +96,7 @@ def free_domain() -> int:
 
     Raises OperationError: all of them are in use.
     """
-    candidates = list(range(20, 101))  # 0 to 19 are what people choose by hand
-    random.shuffle(candidates)
-    for domain in candidates:
+    for domain in random.sample(range(20, 101), 81):  # 0 to 19 are what people choose by hand
         try:
             # The first participant's unicast discovery port (DDSI-RTPS 2.3, 9.6.1.1).
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -106,9 +104,7 @@ def free_domain() -> int:
             return domain
         except OSError:
             continue
-    raise OperationError(
-        "no DDS domain between 20 and 100 is free: end an application that uses one"
-    )
+    raise OperationError("no DDS domain from 20 to 100 is free: end an application that uses one")
 
 
 def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> bytes:
@@ -168,8 +164,8 @@ class Publisher:
         *,
         carries_text: bool = False,
     ) -> None:
-        own = _topic(participant, topic, carries_text)
-        self._writer = DataWriter(participant, own, qos=_qos(reliability, depth, lifespan_ns))
+        own, qos = _topic(participant, topic, carries_text), _qos(reliability, depth, lifespan_ns)
+        self._writer = DataWriter(participant, own, qos=qos)
         self._handle = self._writer._ref
 
     def write(self, payload: bytes, source_timestamp: int) -> None:
@@ -186,13 +182,7 @@ class Subscription:
     """A reader of one topic that gives serialized messages, oldest first."""
 
     def __init__(
-        self,
-        participant: Any,
-        topic: str,
-        reliability: str,
-        depth: int,
-        *,
-        carries_text: bool = False,
+        self, participant: Any, topic: str, reliability: str, depth: int, carries_text: bool = False
     ) -> None:
         own = _topic(participant, topic, carries_text)
         self._reader = DataReader(participant, own, qos=_qos(reliability, depth))
@@ -208,10 +198,8 @@ class Subscription:
         taken = ddspy_take(self._handle, _ANY, 1)
         if isinstance(taken, int):
             raise OperationError(f"DDS take failed with code {taken}")
-        for payload, info in taken:
-            if info.valid_data:
-                return Message(payload, info.source_timestamp)
-        return None
+        valid = (Message(data, info.source_timestamp) for data, info in taken if info.valid_data)
+        return next(valid, None)
 
     def matched(self) -> int:
         """Number of publishers that have found this subscription."""

@@ -3,9 +3,8 @@
 A trace point appends a few integers to an array in locked memory, in one step, so that threads
 may share the log; names are written once, at start-up. Nothing touches a file or a pipe before
 the run is over. No array gets long: one that does is given so many pages at a time that after half
-an hour its thread pauses for ten milliseconds. :func:`chainshaper.workload.live.event_tables` reads
-the layout back. Nothing heavy is imported: the pages are locked into memory. The simulator notes
-its objects here as well.
+an hour its thread pauses for ten milliseconds. Nothing heavy is imported: the pages are locked into
+memory. The simulator notes its objects here as well, and has its log laid out alike.
 """
 
 from array import array
@@ -50,16 +49,10 @@ ABSENT = -1
 """Stands for null in fields that may be."""
 
 WORDS: dict[str, tuple[str, ...]] = {
-    "anchor": ANCHORS,
-    "overrun": LATE,
-    "messages": MESSAGES,
-    "dropped": DROPPED,
+    **{"anchor": ANCHORS, "overrun": LATE, "messages": MESSAGES, "dropped": DROPPED},
     "outcome": ("sent", "expired", "overwritten"),
 }
-"""Fields that hold words are recorded as places in these lists.
-
-So is ``mode``, in the list of the gate's own modes.
-"""
+"""Fields that hold words are recorded as places in these lists; ``mode`` in that of its gate."""
 
 FIRST_HANDLE = 0x55D0_0000_0100
 """Handles are like real addresses: unique in their process and reused by the others."""
@@ -71,10 +64,7 @@ def number_of(field: str, word: str | None) -> int:
 
 
 class EventLog:
-    """Events of one process, and the objects of its node with their handles.
-
-    :meth:`point` makes a fast recording function for one entry of :data:`LAYOUT`.
-    """
+    """Events of one process, and the objects of its node with their handles."""
 
     def __init__(self, clock: Callable[[], int] = monotonic_ns) -> None:
         self._blocks = [array("q")]
@@ -127,10 +117,8 @@ class EventLog:
         return handle, rmw_handle
 
     def point(self, entry: str) -> Callable[..., None]:
-        """A function of (time, *fields) that records what its thread does; fields as in
-        :data:`LAYOUT`."""
-        number = list(LAYOUT).index(entry)
-        blocks = self._blocks
+        """A fast function of (time, *fields as in :data:`LAYOUT`) that records for its thread."""
+        number, blocks = list(LAYOUT).index(entry), self._blocks
         padding = (0,) * (WIDTH - 3 - len(LAYOUT[entry]))
 
         def record(time_ns: int, *fields: int) -> None:

@@ -40,23 +40,18 @@ def blocks(
 ) -> Iterator[npt.NDArray[np.int64]]:
     """The endless sequence of execution times of one callback, in blocks of `BLOCK` values (ns).
 
-    Seed, node and the callback's index in its node determine the sequence, so two runs of an
-    application, or a run and its simulation, spend the same time in the same instance. Stretches
-    of samples depend on the seed only: callbacks that were measured together draw together.
+    Seed, node and the callback's index in its node determine the sequence, in a run and in its
+    simulation. Stretches of samples depend on the seed only: callbacks that were measured together
+    draw together.
     """
     together = execution.get("block", 1) > 1
     random = np.random.default_rng([seed] if together else [seed, zlib.crc32(node.encode()), index])
-    # Block by block: values redrawn outside their limits would otherwise make the sequence depend
-    # on how many were asked for at once.
-    while True:
+    while True:  # values that are drawn again must not depend on how many are asked for at once
         yield draw(execution, BLOCK, random)
 
 
 class ExecutionTimes:
-    """The same sequence one by one.
-
-    Values are drawn beforehand: drawing must not cost time in the callback that spends them.
-    """
+    """The same sequence one by one, drawn beforehand: a callback has to spend them, not to draw."""
 
     def __init__(self, execution: dict[str, Any], seed: int, node: str, index: int) -> None:
         self._blocks = blocks(execution, seed, node, index)

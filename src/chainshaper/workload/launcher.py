@@ -42,8 +42,7 @@ WORKER_NAME = "executor"
 
 @dataclass(frozen=True)
 class Child:
-    """A process of ours: its name for people, its pipes and error output, and what of its output
-    was received and not taken yet."""
+    """A process of ours, and what of its output was received and not taken yet."""
 
     name: str
     process: subprocess.Popen[bytes]
@@ -61,8 +60,8 @@ class Child:
             self.process.stdin.write(json.dumps(fields).encode() + b"\n")
             self.process.stdin.flush()
 
-    def hear(self, within_s: float | None = None) -> dict[str, Any]:
-        """Its next line, waited for as long as it takes or, between its parts, ``within_s``.
+    def hear(self, within_s: float = ANSWER_S) -> dict[str, Any]:
+        """Its next line; ``within_s`` are waited for each part of it.
 
         Raises OperationError: it died instead, or was silent.
         """
@@ -74,13 +73,13 @@ class Child:
             raise OperationError(self.obituary())
         return heard
 
-    def hear_bytes(self, size: int, within_s: float | None = None) -> bytes:
+    def hear_bytes(self, size: int, within_s: float = ANSWER_S) -> bytes:
         """The bytes that follow a line; raises as :meth:`hear` does."""
         if not size:
             return b""
         return self._take(lambda received: size if len(received) >= size else 0, within_s)
 
-    def _take(self, enough: Callable[[bytearray], int], within_s: float | None) -> bytes:
+    def _take(self, enough: Callable[[bytearray], int], within_s: float) -> bytes:
         """What has arrived, once ``enough`` says how much of it is to be taken.
 
         Waiting in `select`, not in `read`: no library's signal handlers make the kernel go on
@@ -90,10 +89,8 @@ class Child:
         pipe = self.process.stdout.fileno()
         while not (length := enough(self.received)):
             if not select.select([pipe], [], [], within_s)[0]:
-                raise OperationError(
-                    f"{self.name} (pid {self.pid}) has not answered for {within_s:g} s: it hangs, "
-                    "or was stopped"
-                )
+                silent = f"has not answered for {within_s:g} s: it hangs, or was stopped"
+                raise OperationError(f"{self.name} (pid {self.pid}) {silent}")
             arrived = os.read(pipe, 1 << 20)
             if not arrived:
                 raise OperationError(self.obituary())
@@ -165,7 +162,7 @@ def end_all(children: Iterable[Child], patience_s: float = 2.0) -> None:
                     stream.close()
 
 
-# The other end ----------------------------------------------------------------------------
+# The other end
 
 
 def receive() -> dict[str, Any]:

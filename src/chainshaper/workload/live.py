@@ -42,7 +42,6 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_log import ABSENT, ALSO_TAKEN, EVENTS, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import (
-    ANSWER_S,
     ENOUGH,
     WORKER_NAME,
     Child,
@@ -76,15 +75,11 @@ Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]
 
 WARM_UP_CYCLES = 5
 LEAD_NS = 300_000_000
-ENFORCING_NS = 2_000_000_000
-"""Servers have to be in force before the first cycle: so long at most is waited for them."""
+ENFORCING_NS = 2_000_000_000  # at most until servers are in force, before the first cycle
 DISCOVERY_NS = 20_000_000_000
-LOOK_NS = 1_000_000_000
-"""How often is looked who governs the nodes: others write it down every second."""
-SHOWN = ("tid", "pid", "comm", "policy", "priority", "cores")
-"""What a recording has of a thread."""
-SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
-"""What a callback computes, it computes on its executor's thread."""
+LOOK_NS = 1_000_000_000  # between looks who governs the nodes: they write it down every second
+SHOWN = ("tid", "pid", "comm", "policy", "priority", "cores")  # of a thread, by the kernel
+SINGLE_THREADED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}  # what callbacks compute
 
 
 def run_application(
@@ -236,7 +231,7 @@ def _between_releases(application: Application) -> int:
 
 
 def _sooner(application: Application, cycles: int, timing: Timing) -> Timing:
-    """The same run so many whole hyper-periods of its timers earlier as there is time to spare."""
+    """The same run earlier by the whole hyper-periods of its timers that there is time to spare."""
     hyper = math.lcm(*(cb.timer_ns for _, cb in application.callbacks() if cb.timer_ns))
     spare = max(0, timing.start_ns - LEAD_NS - time.monotonic_ns())
     return timing_of(application, cycles, timing.start_ns - spare // hyper * hyper)
@@ -291,7 +286,7 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
 
 def _await_ready(children: Iterable[Child]) -> bool:
     """Wait until all have found each other; whether all of them could lock their memory."""
-    answers = [(child, child.hear(ANSWER_S)) for child in children]
+    answers = [(child, child.hear()) for child in children]
     missing = [f"{child.name}: {text}" for child, answer in answers for text in answer["missing"]]
     if missing:
         raise OperationError(
@@ -449,8 +444,8 @@ def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl
 
 
 def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
-    answer = child.hear(ANSWER_S)
-    rows = child.hear_bytes(answer["bytes"], ANSWER_S)
+    answer = child.hear()
+    rows = child.hear_bytes(answer["bytes"])
     core, *others = {*application.cores_of(name)}
     modes = [cb.gate.modes for cb in application.nodes[name].callbacks if cb.gate is not None]
     names = tuple(modes[0].bands) if modes and modes[0] is not None else ()

@@ -1,8 +1,7 @@
 """One node of the live workload, in a process of its own: ``python -m …node_process``.
 
-Started by :mod:`chainshaper.workload.live`, with which it talks as
-:mod:`chainshaper.workload.launcher` says. This module imports little on purpose: every page of
-it is locked into memory.
+It talks with :mod:`chainshaper.workload.live` as :mod:`chainshaper.workload.launcher` says. It
+imports little on purpose: every page of it is locked into memory.
 """
 
 import os
@@ -76,8 +75,8 @@ class NodeProcess:
         self.participant = dds.Participant(spec["domain"])
         sys.setswitchinterval(NEVER_S)  # the kernel alone decides which thread of an executor runs
         self.executor = executor.Executor(self.participant, self.log, spec["threads"])
-        self.publishers: dict[str, dds.Publisher] = {}
-        self.subscriptions: list[tuple[str, dds.Subscription]] = []
+        # What waits for its counterparts: its name, itself, how many of what it is to find.
+        self.ends: list[tuple[str, dds.Publisher | dds.Subscription, int, str]] = []
         self.to_send: queue.SimpleQueue[executor.AsynchronousWriter] | None = None
         self.shapers: list[tuple[Shaper, list[tuple[int, int]]]] = []  # with their moves
         self.first_due: list[tuple[executor.Timer, int]] = []
@@ -142,14 +141,16 @@ class NodeProcess:
         qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
         own = (topic, qos["reliability"], max(depth, qos["depth"]))
         subscription = dds.Subscription(self.participant, *own, carries_text=text)
-        self.subscriptions.append((topic, subscription))
+        writers = self.spec["expected"][topic][0]
+        self.ends.append((f"subscription to {topic}", subscription, writers, "writers"))
         return subscription
 
     def _publisher(self, topic: str) -> TracedPublisher:
         qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
         own = (topic, qos["reliability"], qos["depth"], qos["lifespan_ns"])
         publisher = dds.Publisher(self.participant, *own, carries_text=text)
-        self.publishers[topic] = publisher
+        readers = self.spec["expected"][topic][1]
+        self.ends.append((f"publisher of {topic}", publisher, readers, "readers"))
         asynchronous, write = qos["publication"] == "asynchronous", publisher.write
         handle, rmw_handle = self.log.publisher(topic, qos["depth"], asynchronous)
         if asynchronous:  # the process's publisher thread does the writing
@@ -175,20 +176,28 @@ class NodeProcess:
 
         With ``complete`` nothing is done until a message completes a set, for which it is then.
         """
-        start, end = self._point["callback_start"], self._point["callback_end"]
 
         def body(message: dds.Message | None = None) -> None:
-            now, wall, used = time.monotonic_ns(), time.time_ns(), time.thread_time_ns()
-            start(now, handle, used, 0)
+            wall, used = time.time_ns(), time.thread_time_ns()
             messages: tuple[dds.Message, ...] = () if message is None else (message,)
             if complete is not None and message is not None:
                 messages = complete(message)
             if messages or complete is None:
                 for payload, publisher in zip(work(messages, wall, used), publishers, strict=False):
                     publisher.record(payload, *publisher.send(payload))
+
+        return self._recorded(handle, body)
+
+    def _recorded(self, handle: int, body: Callable[..., None]) -> Callable[..., None]:
+        """A callback, whose instances are recorded."""
+        start, end = self._point["callback_start"], self._point["callback_end"]
+
+        def callback(*arguments: Any) -> None:
+            start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
+            body(*arguments)
             end(time.monotonic_ns(), handle, time.thread_time_ns())
 
-        return body
+        return callback
 
     # Gates --------------------------------------------------------------------------------
 
@@ -196,14 +205,11 @@ class NodeProcess:
         """The latency-shaping callback (paper, section 3.2.2): delay, then republish unchanged.
 
         Between waking and writing nothing is computed, and after writing the thread pauses, so
-        that threads it outranks can deliver; only then are its events recorded. It does not
-        pause when another message has to leave meanwhile.
+        that threads it outranks can deliver, unless another message has to leave meanwhile; only
+        then are its events recorded. Delay that no other thread caused is a stall of the machine.
 
         What comes while one waits for its release waits behind it. The executor has it worked off
         before it takes the next: a message is recorded as taken when it is its turn.
-
-        Delay that no other thread caused is recorded like the stall meter's own findings. A
-        message that is dropped is recorded, and not published.
         """
         publisher, turn = self._publisher(output), self._turn(output)
         shaper, subscription = self._shaper(gate, turn), self._subscription(topic, READER_DEPTH)
@@ -212,9 +218,9 @@ class NodeProcess:
         handle = self.log.callback(symbol)
         depth = self.spec["topics"][topic]["depth"]
         own_handle, rmw_handle = self.log.subscription(handle, topic, depth)
-        start, end = self._point["callback_start"], self._point["callback_end"]
         stalled, pause_ns = self._point["machine_stall"], gate["pause_ns"]
         note = partial(self._note_release, handle, gate, turn)
+        note_alone = self._recorded(handle, note)
         waiting, overflowed = shaper.queue.waiting, shaper.overflowed
 
         def look() -> None:
@@ -223,8 +229,8 @@ class NodeProcess:
                     now = time.monotonic_ns()
                     shaper.arrive(message.payload, now, message.source_timestamp, message)
 
-        def let_one_pass() -> None:
-            start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
+        @partial(self._recorded, handle)
+        def hold() -> None:
             if (outcome := shaper.hold()) is not None:
                 if outcome.release.at_ns is not None:
                     payload = outcome.message.payload
@@ -235,12 +241,12 @@ class NodeProcess:
                     if lost >= STALL_NS:
                         stalled(outcome.release.at_ns, lost)
                 note(outcome)
-            end(time.monotonic_ns(), handle, time.thread_time_ns())
+
+        def let_one_pass() -> None:
+            hold()
             for gone in overflowed:
                 self.executor.record_take(rmw_handle, gone.message.about)
-                start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
-                note(gone)
-                end(time.monotonic_ns(), handle, time.thread_time_ns())
+                note_alone(gone)
             overflowed.clear()
 
         def body(message: dds.Message) -> None:
@@ -283,20 +289,17 @@ class NodeProcess:
     def _listen(self, topic: str, shaper: Shaper) -> None:
         """Listen to the modes that are announced."""
         handle = self.log.new_handle()
-        start, end = self._point["callback_start"], self._point["callback_end"]
 
-        def body(message: dds.Message) -> None:
-            now = time.monotonic_ns()
-            start(now, handle, time.thread_time_ns(), 0)
-            shaper.switch(text_of(message.payload), now)
-            end(time.monotonic_ns(), handle, time.thread_time_ns())
+        @partial(self._recorded, handle)
+        def switch(message: dds.Message) -> None:
+            shaper.switch(text_of(message.payload), time.monotonic_ns())
 
-        self._subscribe(handle, topic, body)
+        self._subscribe(handle, topic, switch)
 
     def _turn(self, output: str) -> Turn | None:
         """The page by which others know an output, as that of a shaping node, but without standby.
 
-        None: there cannot be one, or another run has the same output.
+        None where there cannot be one, or another run has the same output.
         """
         with suppress(OSError):
             turn = Turn(f"live{output.replace('/', '.')}", output)
@@ -308,38 +311,26 @@ class NodeProcess:
         self, handle: int, gate: dict[str, Any], turn: Turn | None, outcome: Outcome
     ) -> None:
         """Record what became of a message at a gate."""
-        modes = [] if gate["modes"] is None else list(gate["modes"]["bands"])
         message, release = outcome.message, outcome.release
+        mode = release.mode and [*gate["modes"]["bands"]].index(release.mode)
         if turn is not None:
             turn.count(outcome)
-        self._point["gate_release"](
-            outcome.awake_ns,
-            handle,
-            message.about.source_timestamp,
-            message.arrival_ns,
-            release.origin_ns,
-            ABSENT if release.at_ns is None else release.at_ns,
-            ABSENT if release.slot is None else release.slot,
-            release.cycles_waited,
-            number_of("anchor", release.anchor),
-            number_of("overrun", release.overrun),
-            ABSENT if release.mode is None else modes.index(release.mode),
-            number_of("dropped", release.dropped),
-            release.moved_ns,
-        )
+        came = (message.about.source_timestamp, message.arrival_ns)
+        leaves = (release.origin_ns, release.at_ns, release.slot, release.cycles_waited)
+        why = (number_of("anchor", release.anchor), number_of("overrun", release.overrun), mode)
+        row = (*came, *leaves, *why, number_of("dropped", release.dropped), release.moved_ns)
+        absent = (ABSENT if number is None else number for number in row)
+        self._point["gate_release"](outcome.awake_ns, handle, *absent)
 
     # Running ------------------------------------------------------------------------------
 
     def wait_for_counterparts(self, deadline_ns: int) -> list[str]:
         """Wait until DDS discovery is complete; what is still missing at the deadline."""
-        ends: list[tuple[str, dds.Publisher | dds.Subscription, str, int, str]] = []
-        ends += [(f"publisher of {t}", one, t, 1, "readers") for t, one in self.publishers.items()]
-        ends += [(f"subscription to {t}", one, t, 0, "writers") for t, one in self.subscriptions]
         while True:
             missing = [
-                f"{name} found {end.matched()} of {self.spec['expected'][topic][place]} {others}"
-                for name, end, topic, place, others in ends
-                if end.matched() < self.spec["expected"][topic][place]
+                f"{name} found {end.matched()} of {expected} {others}"
+                for name, end, expected, others in self.ends
+                if end.matched() < expected
             ]
             if not missing or time.monotonic_ns() > deadline_ns:
                 return missing

@@ -49,10 +49,9 @@ def generate_package(application: Application, folder: str | Path) -> list[Path]
     folder = Path(folder).absolute()
     free_place(folder, os.path.lexists(folder))
     if not _NAME.fullmatch(folder.name) or folder.name in _TAKEN:
-        raise InputError(
-            f"{folder.name!r} cannot be the name of a package: end the path in small letters, "
-            "digits and single underscores, beginning with a letter, such as src/my_robot"
-        )
+        remedy = "end the path in small letters, digits and single underscores, beginning with a"
+        remedy += " letter, such as src/my_robot"
+        raise InputError(f"{folder.name!r} cannot be the name of a package: {remedy}")
     files = _files(application, folder.name)  # what is refused is refused before writing
     try:
         with folder_beside(folder) as partial:
@@ -72,20 +71,19 @@ def _files(application: Application, package: str) -> dict[str, str]:
     for name, node in application.nodes.items():
         for number, callback in enumerate(node.callbacks):
             _refuse(application, f"{name}: callback {number}", callback)
-    asynchronous = {
-        topic
-        for _, callback in application.callbacks()
+    publishers = {
+        (name, topic)
+        for name, callback in application.callbacks()
         for topic in callback.publishes
         if application.topic(topic).publication == "asynchronous"
     }
-    publishing = {n for n, cb in application.callbacks() if asynchronous.intersection(cb.publishes)}
     values = {
         "PACKAGE": package,
         "DESCRIPTION": escape(" ".join(application.name.split())),
         "APPLICATION": ",\n".join(_node(application, name) for name in application.nodes),
         "LEAD_NS": str(_LEAD_NS + max(cb.timer_ns or 0 for _, cb in application.callbacks())),
         "NODES": repr([node_name(name) for name in application.nodes]),
-        "ASYNCHRONOUS": repr(sorted(map(node_name, publishing))),
+        "ASYNCHRONOUS": repr(sorted({node_name(name) for name, _ in publishers})),
         "SEED": str(application.seed),
     }
     files = {}
@@ -95,8 +93,8 @@ def _files(application: Application, package: str) -> dict[str, str]:
         if path.suffix == ".in":
             text = re.sub("@([A-Z_]+)@", lambda found: values[found[1]], text)
         files[f"launch/{package}.launch.py" if name == "launch.py" else name] = text
-    if asynchronous:
-        profiles = "".join(map(_PROFILE.format, sorted(asynchronous)))
+    if topics := sorted({topic for _, topic in publishers}):
+        profiles = "".join(map(_PROFILE.format, topics))
         files["launch/asynchronous.xml"] = _PROFILES.format(profiles)
     return files
 
@@ -124,7 +122,7 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
             raise InputError(f"{place}: `{field}` cannot be generated for ROS 2: it is {reason}")
 
 
-# The table in C++ --------------------------------------------------------------------------------
+# The table in C++
 
 
 def _node(application: Application, name: str) -> str:

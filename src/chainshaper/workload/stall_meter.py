@@ -31,22 +31,19 @@ from chainshaper.linux.scheduling import (
 )
 from chainshaper.linux.threads import list_threads
 from chainshaper.workload import launcher
-from chainshaper.workload.launcher import ANSWER_S, ENOUGH, Child
+from chainshaper.workload.launcher import ENOUGH, Child
 
 if TYPE_CHECKING:  # a meter is Python alone
     import polars as pl
 
     from chainshaper.values.recording import StallMeterInfo
 
-PERIOD_NS = 1_000_000
-"""A wake-up costs some 20 us on a virtual machine: more of them would disturb what they watch."""
-PRIORITY = 98
-"""Above everything it watches, so that none of it looks like a stall."""
+PERIOD_NS = 1_000_000  # a wake-up costs some 20 us on a virtual machine
+PRIORITY = 98  # above everything it watches, so that none of it looks like a stall
 WAKEUPS_PER_PACE = 10
 """Wake-ups whose CPU time is taken together: reading that clock is a call of the kernel."""
 NO_PACE = -1
-ORDINARY = 1_000_000
-"""So many ordinary wake-ups are enough to know their median, however long a run takes."""
+ORDINARY = 1_000_000  # so many ordinary wake-ups are enough to know their median
 LONGEST_NS = 7 * 24 * 3600 * 1_000_000_000
 LEAD_NS = 50_000_000
 
@@ -65,8 +62,7 @@ def watch(
     NO_PACE) or the pace of some wake-ups (their beginning, how long they lasted, the CPU time of
     one).
     """
-    seen = array("q")
-    lateness = array("q")
+    seen, lateness = array("q"), array("q")
     clock, cpu_clock = time.monotonic_ns, time.thread_time_ns
     due = since = start_ns
     wakeups, used = 0, cpu_clock()
@@ -104,7 +100,7 @@ def main() -> None:
     launcher.wait_for_leave()
 
 
-# From outside -----------------------------------------------------------------------------
+# From outside
 
 
 def far_from(instants_ns: Iterable[int], period_ns: int = PERIOD_NS) -> int:
@@ -158,8 +154,8 @@ class StallWatch:
             child.process.send_signal(ENOUGH)
         wakeups, lateness = 0, []
         for core, child in self.meters.items():
-            answer = child.hear(ANSWER_S)
-            self.seen.append((child.pid, core, child.hear_bytes(answer["bytes"], ANSWER_S)))
+            answer = child.hear()
+            self.seen.append((child.pid, core, child.hear_bytes(answer["bytes"])))
             wakeups += answer["wakeups"]
             lateness.append(answer["median_lateness_ns"])
         self.table = meter_tables(self.seen)["machine_stall"]
@@ -187,7 +183,7 @@ def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]
             watch.meters[core] = launcher.start_child(f"stall meter of core {core}", module, {})
             watch.meters[core].tell(parent=os.getpid())
         for core, child in watch.meters.items():
-            child.hear(ANSWER_S)
+            child.hear()
             for thread in list_threads(child.pid):
                 apply_scheduling(thread, Scheduling(PRIORITY if realtime else None, cores=(core,)))
         yield watch

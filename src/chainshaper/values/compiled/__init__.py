@@ -6,9 +6,9 @@ what Numba makes of those needs nothing of Python. It is compiled once on a mach
 its own, whose 90 MB end with it, then loaded from an object file in some tens of milliseconds.
 
 The file stands beside the kernel's module, or in the user's cache where that folder cannot be
-written; where neither can, every process compiles anew. Its name is a digest of the sources of the
-kernel's folder and of this one, Numba, LLVM, and the processor. Only files are loaded that root and
-the user of this process alone can change, and that end with the digest of what is in front of it.
+written; where neither can, every process compiles anew. Its name is a digest of all that it was
+made of. Only files are loaded that root and the user of this process alone can change, and that end
+with the digest of what is in front of it.
 """
 
 import ctypes
@@ -50,10 +50,9 @@ _engines: list[Any] = []  # code lives as long as its engine
 
 @functools.cache
 def kernel(module: str, name: str) -> Callable[..., int]:
-    """The function ``name`` of ``module``, as machine code.
+    """The function ``name`` of ``module``, as machine code, loaded or compiled at the first call.
 
-    It takes and returns 64-bit integers, none of which are checked, and runs without Python's
-    lock. The code is loaded, or compiled, at the first call.
+    It takes and returns 64-bit integers, none of which are checked, and runs without Python's lock.
     """
 
     @functools.cache
@@ -121,19 +120,16 @@ def _content_digest(code: bytes, name: str) -> bytes:
 def _target() -> Any:
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(),
-        features=llvm.get_host_cpu_features().flatten(),
-        opt=3,
-        jit=True,
-    )
+    cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
+    target = llvm.Target.from_default_triple()
+    return target.create_target_machine(cpu=cpu, features=features, opt=3, jit=True)
 
 
 def _compiled_apart(module: str, name: str) -> bytes:
     """What :func:`compiled_here` gives, from another process; nothing where none can be had.
 
-    An interpreter inside another program, for example, has no command of its own. The process
-    imports from where this one does, but from no current folder: it may be anybody's.
+    (An interpreter inside another program has no command of its own.) The process imports from
+    where this one does, but from no current folder: it may be anybody's.
     """
     script = (
         "import sys; sys.path[:0] = sys.argv[1].split(':'); "
