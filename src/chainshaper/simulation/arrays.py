@@ -1,8 +1,6 @@
 """What is simulated: an application in words (:class:`System`), then in the engine's array.
 
-The words are plain values between the description, which people write, and the array, which the
-engine runs on. Their order is that of the array's rows, so a row's number in the engine's log
-leads back to a name.
+The order of the words is that of the array's rows: a number in the engine's log leads to a name.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -30,43 +28,33 @@ from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.execution import BLOCK, blocks
 from chainshaper.workload.live import Timing
 
-FIRST_PID, FIRST_TID = 1000, 100_000
-"""Of processes, whose number the main thread has, and of threads beside it that execute."""
+FIRST_PID, FIRST_TID = 1000, 100_000  # of processes, and of executors' threads but the first
 ROLES = ("executor", "publisher", "dds")
 KINDS = ("timer", "subscription", "service", "client")
 STATIC_ORDER = ("subscription", "timer", "client", "service")
 """The orders in which executors look at what is ready, the static one and others (Jazzy)."""
 
-AHEAD = 16 * BLOCK
-"""So many values of every stream are drawn beforehand."""
-
+AHEAD = 16 * BLOCK  # values of every stream that are drawn beforehand
 FIRST_COST = 1 << 20
 """Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
-
 LOG_ROWS = 1 << 17
-POOL = 4096
-"""Messages under way, besides those in histories."""
-
+POOL = 4096  # messages under way, besides those in histories
 BEST_EFFORT = 1000
 COSTS = ("wake_up", "take", "publish", "receive", "delivery")  # in the order of their columns
 
 
 @dataclass(frozen=True)
 class Entity:
-    """A timer or a subscription with its callback.
-
-    ``index`` is the callback's place in its node, ``number`` the input of a synchronising
-    callback, ``topic`` None for a timer. ``listens`` for modes on behalf of the gate.
-    """
+    """A timer or a subscription with its callback."""
 
     process: int
-    index: int
-    number: int
+    index: int  # of the callback in its node
+    number: int  # of the input of a synchronising callback
     kind: str
-    topic: str | None
+    topic: str | None  # None: a timer
     described: CallbackDescription
     publishers: tuple[int, ...]
-    listens: bool = False
+    listens: bool = False  # for modes on behalf of the gate
 
 
 class Publisher(NamedTuple):
@@ -89,9 +77,8 @@ class Process(NamedTuple):
 class System:
     """An application with everything that runs in it, numbered as in the engine's array.
 
-    ``servers`` has the server of each thread that is in one, ``cores`` the numbers of the cores.
-    ``readers`` are the entities that each topic's messages reach. ``chain`` has its callbacks by
-    entity; it is empty where it is not followed.
+    ``servers`` are by thread, ``readers`` the entities that each topic's messages reach. ``chain``
+    has its callbacks by entity; it is empty where it is not followed.
     """
 
     application: Application
@@ -270,8 +257,7 @@ class Rows(list[int]):
 class Streams:
     """All streams of a simulation: drawn in Python, consumed by the engine.
 
-    A callback's stream is that of the live workload, value for value: it depends on the seed, the
-    node's full name and the callback's place in it. So does a cost's; constants need no drawing.
+    A callback's stream is that of the live workload, value for value.
     """
 
     def __init__(self, seed: int, rows: Rows) -> None:

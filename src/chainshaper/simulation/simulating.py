@@ -2,8 +2,8 @@
 
 Instead of described times, measured ones may be drawn: the CPU times of each callback's instances
 in a recording, in the order in which they happened, so that stretches of them stay correlated in
-time. Callbacks that all ran once a cycle have as many, so that their stretches are of the same
-cycles. What publishing costs is not in them: a callback computes before it publishes.
+time, and those of callbacks that all ran once a cycle are of the same cycles. What publishing costs
+is not in them: a callback computes before it publishes.
 """
 
 from collections import Counter
@@ -50,8 +50,7 @@ _run_engine = kernel("chainshaper.simulation.engine", "run")
 
 START_NS = 1_000_000_000
 LONGEST_NS = 1 << 62
-MOST = 100_000
-"""Enough samples for any distribution."""
+MOST = 100_000  # samples: enough for any distribution
 
 
 def simulate(
@@ -274,8 +273,7 @@ def with_recorded_times(
     return application.model_copy(update={"nodes": nodes})
 
 
-_Trigger: TypeAlias = str | int
-"""A topic, or a timer's period."""
+_Trigger: TypeAlias = str | int  # a topic, or a timer's period
 
 
 def _triggers(callback: CallbackDescription) -> tuple[_Trigger, ...]:

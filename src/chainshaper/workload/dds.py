@@ -56,7 +56,7 @@ class Header(IdlStruct, typename="std_msgs::msg::dds_::Header_"):
 
 @dataclass
 class Stamped(IdlStruct, typename="chainshaper_msgs::msg::dds_::Stamped_"):
-    """What the live workload's topics carry: a header, a number, and as many bytes as asked for."""
+    """What the live workload's topics carry."""
 
     header: Header
     number: uint64
@@ -108,10 +108,7 @@ def free_domain() -> int:
 
 
 def data_message(data: bytes | memoryview, stamp_ns: int, number: int = 0) -> bytes:
-    """A message that carries a number and ``data`` behind a header with that stamp.
-
-    ``stamp_ns`` is of CLOCK_REALTIME; see ``gate.origin_of``.
-    """
+    """A message with a number and ``data`` behind a header with a stamp of CLOCK_REALTIME."""
     seconds, nanoseconds = divmod(stamp_ns, 1_000_000_000)
     size = memoryview(data).nbytes
     head = _DATA_HEAD.pack(_LITTLE_ENDIAN, seconds, nanoseconds, 1, number, size)

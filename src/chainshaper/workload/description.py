@@ -4,9 +4,7 @@ The live workload executes it with real processes over DDS, the simulator as dis
 
     name: synthetic chain
     chain: /t1../t5
-    scheduling:
-      executors: {core: 1, priority: 80}
-      dds: {core: 0, priority: 90}
+    scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
     nodes:
       node1:
         callbacks:
@@ -51,11 +49,11 @@ Pair: TypeAlias = tuple[Duration, Duration]
 class ExecutionTime(Part):
     """CPU time of one callback instance: exactly one of the distributions.
 
-    ``constant``; ``uniform`` between two durations; ``normal`` with mean and standard deviation,
-    redrawn outside ``within``; ``samples``, measured ones for example, drawn in stretches of
-    ``block`` consecutive ones (1: independently). Callbacks with as many samples and the same
-    block draw the same stretches, so that what was measured together stays together (the moving
-    block bootstrap of Künsch, 1989, with the circular end of Politis and Romano, 1992).
+    ``uniform`` has two limits, ``normal`` mean and standard deviation, and is redrawn outside
+    ``within``. ``samples`` are drawn in stretches of ``block`` consecutive ones (1: independently).
+    Callbacks with as many samples and the same block draw the same stretches, so that what was
+    measured together stays together (the moving block bootstrap of Künsch, 1989, with the circular
+    end of Politis and Romano, 1992).
     """
 
     constant_ns: Duration | None = None
@@ -129,8 +127,8 @@ class GateDescription(Part):
     """A :class:`~chainshaper.gate.decision.Gate` in a callback: republishing in ``slots`` only.
 
     ``phase_ns`` is where cycles begin without a stamp, behind the common start (None: with the
-    timer that starts the application's chain). ``moves`` are from when on after that start, and
-    where the first slot begins in cycles from then on, the others as far behind it as before.
+    timer that starts the application's chain). ``moves``: from when on after that start, and where
+    the first slot begins then; the others move with it.
     """
 
     slots: Annotated[tuple[Pair, ...], Field(min_length=1)]
@@ -177,17 +175,17 @@ class GateDescription(Part):
 
 
 class CallbackDescription(Part):
-    """One callback: a timer or a subscription, its execution time and the topics it publishes.
+    """One callback: what triggers it, its execution time and the topics it publishes.
 
     ``timer_ns`` is a timer's period, ``phase_ns`` delays its first expiry after the common start.
-    With a ``gate`` it executes nothing and forwards what it received. One that ``announces`` modes
-    publishes their names in turn, one an instance, each as a ``std_msgs/String``.
+    A callback that ``synchronises`` inputs executes and publishes when a message of each has come,
+    with the stamp of the first input's. Executors look at the ``kind`` service and client behind
+    subscriptions of topics.
 
-    ``synchronises`` has the inputs of a synchronising callback, which executes and publishes when
-    a message of every input has come, with the stamp of the first input's. Executors look at the
-    ``kind`` service and client behind subscriptions of topics. One that ``computes`` calls a Python
-    function instead of spending time (:mod:`chainshaper.workload.executor`). ``group`` is one of
-    its node's ``callback_groups``; without, it is in the node's own, which is mutually exclusive.
+    With a ``gate`` it executes nothing and forwards what it received. One that ``announces`` modes
+    publishes their names in turn, each as a ``std_msgs/String``. One that ``computes`` calls a
+    Python function instead of spending time (:mod:`chainshaper.workload.executor`). ``group`` is
+    one of its node's ``callback_groups``; else it is in the node's own, a mutually exclusive one.
     """
 
     timer_ns: PositiveDuration | None = None
@@ -240,10 +238,9 @@ class CallbackDescription(Part):
 class NodeDescription(Part):
     """A node in a process of its own.
 
-    ``core`` and ``priority`` override ``scheduling.executors``, ``dds_priority`` overrides that
-    of ``scheduling.dds`` for the DDS threads of this node. A multi-threaded executor has
-    ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a callback group,
-    callbacks run one at a time, or, where it is reentrant, whenever a thread is free.
+    ``core``, ``priority`` and ``dds_priority`` override ``scheduling``. A multi-threaded executor
+    has ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a callback
+    group, callbacks run one at a time, or, where it is reentrant, whenever a thread is free.
     """
 
     callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
@@ -413,10 +410,7 @@ def node_name(name: str) -> str:
 def origin_timer(
     application: Application, chain: str | None = None
 ) -> tuple[str, CallbackDescription]:
-    """The timer callback that starts a chain, or leads to its first callback, and its node.
-
-    The application's own chain, unless another is named.
-    """
+    """The timer callback that starts a chain (the application's), or leads to it, and its node."""
     chain = chain or application.chain
     first = chain.split("..")[0].strip().strip("/")
     starts = [

@@ -31,9 +31,7 @@ LAYOUT: dict[str, tuple[str, ...]] = {
 }
 """What is recorded, and the order of its fields; its number is its place in this list."""
 
-ALSO_TAKEN = ("rcl_take", "rclcpp_take")
-"""The events of a take that there are only where a message was taken."""
-
+ALSO_TAKEN = ("rcl_take", "rclcpp_take")  # only where a message was taken
 EVENTS: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in LAYOUT},
     "publish": ("rclcpp_publish", "rcl_publish", "rmw_publish"),
@@ -45,17 +43,14 @@ EVENTS: dict[str, tuple[str, ...]] = {
 WIDTH = 15  # number of what is recorded, time, thread, and up to twelve fields
 BLOCK = 1_000 * WIDTH  # numbers in an array, when the next one is begun
 
-ABSENT = -1
-"""Stands for null in fields that may be."""
-
+ABSENT = -1  # for null in fields that may be
 WORDS: dict[str, tuple[str, ...]] = {
     **{"anchor": ANCHORS, "overrun": LATE, "messages": MESSAGES, "dropped": DROPPED},
     "outcome": ("sent", "expired", "overwritten"),
 }
 """Fields that hold words are recorded as places in these lists; ``mode`` in that of its gate."""
 
-FIRST_HANDLE = 0x55D0_0000_0100
-"""Handles are like real addresses: unique in their process and reused by the others."""
+FIRST_HANDLE = 0x55D0_0000_0100  # like a real address; other processes have the same
 
 
 def number_of(field: str, word: str | None) -> int:

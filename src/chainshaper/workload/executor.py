@@ -88,8 +88,7 @@ class SubscriptionEntity:
 
 Entity: TypeAlias = Timer | SubscriptionEntity
 
-IDLE_NS = 500_000_000
-"""An executor with nothing to do looks this often whether it is to end: no chain is so slow."""
+IDLE_NS = 500_000_000  # between looks of an executor with nothing to do whether it is to end
 
 
 class Executor:
@@ -128,8 +127,8 @@ class Executor:
     def spin_until(self, stop_ns: int, last_timer_ns: int) -> None:
         """Wait and run until ``stop_ns`` of CLOCK_MONOTONIC; a running callback is finished.
 
-        Timers expire up to ``last_timer_ns`` only, so that what they began can be completed. What
-        a callback has taken beyond its own message, its backlog, is worked off first.
+        Timers expire up to ``last_timer_ns``, so that what they began can be completed. Backlogs,
+        what callbacks have taken beyond their own message, are worked off first.
         """
         for _ in self._others:
             self._begin.put((stop_ns, last_timer_ns))
@@ -222,10 +221,7 @@ class Synchroniser(Generic[Input]):
 THREAD_NAME = "dds.asyn.0.1"  # Fast DDS's for user data
 
 Note: TypeAlias = Callable[[int, int, str, int], None]
-"""Records what became of a message: time, source timestamp, outcome, duration of sending (ns).
-
-The outcomes are those of `asynchronous_send` in :mod:`chainshaper.values.events`.
-"""
+"""Records an `asynchronous_send`: time, source timestamp, outcome, duration of sending (ns)."""
 
 
 class AsynchronousWriter:
@@ -294,8 +290,8 @@ def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
 
 
 Work = Callable[[Sequence[dds.Message], int, int], Iterable[bytes]]
-"""Called with the messages, and the wall clock and the thread's CPU clock (ns) at the callback's
-start; gives what is published on each topic, in their order. Nothing: nothing is published."""
+"""Of messages, and the wall clock and the thread's CPU clock (ns) at the callback's start: what is
+published on each topic, in their order, or nothing."""
 
 
 def spending(
@@ -343,8 +339,7 @@ def computing(name: str, function: Callable[..., object], topics: int) -> Work:
 def load_function(name: str) -> Callable[..., object]:
     """The function that ``MODULE:FUNCTION`` names; ends the process if there is none.
 
-    Modules are found where Python finds them, on PYTHONPATH, or in the working directory, unless
-    others may change what is there.
+    Nothing is loaded from a folder of PYTHONPATH, or the working one, that others may change.
     """
     module, _, attribute = name.partition(":")
     places = {folder: why_distrusted(folder) for folder in (*named_folders(), str(Path.cwd()))}

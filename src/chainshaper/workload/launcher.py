@@ -27,17 +27,10 @@ from typing import IO, Any, TextIO
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
 
-ENOUGH = signal.SIGUSR1
-"""Has a child end its run early, and send what it recorded."""
-
-ANSWER_S = 60.0
-"""A process that is silent for longer, discovery included, hangs."""
-
-DYING_S = 2.0
-"""A process that has closed its pipe ends by then, or talks nonsense."""
-
-WORKER_NAME = "executor"
-"""The name of a node's threads that execute beside its main one."""
+ENOUGH = signal.SIGUSR1  # has a child end its run early, and send what it recorded
+ANSWER_S = 60.0  # a process that is silent for longer, discovery included, hangs
+DYING_S = 2.0  # a process that has closed its pipe ends by then, or talks nonsense
+WORKER_NAME = "executor"  # of a node's threads that execute beside its main one
 
 
 @dataclass(frozen=True)

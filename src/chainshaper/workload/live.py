@@ -52,8 +52,7 @@ from chainshaper.workload.launcher import (
 from chainshaper.workload.stall_meter import StallWatch, far_from, meter_tables, stalls_watched
 
 Numbers: TypeAlias = npt.NDArray[np.int64]
-Progress = Callable[[float, str], None]
-"""Called with the share done (0 to 1) and what is being done."""
+Progress = Callable[[float, str], None]  # of the share done (0 to 1) and what is being done
 
 
 @dataclass(frozen=True)
@@ -71,7 +70,7 @@ class StartedNodes:
 
 
 Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]]
-"""Puts reservation servers in force for as long as its context lasts: see `run_application`."""
+"""Puts reservation servers in force for as long as its context lasts."""
 
 WARM_UP_CYCLES = 5
 LEAD_NS = 300_000_000
@@ -248,10 +247,7 @@ def _ended_early(children: Iterable[Child], timing: Timing, ended_ns: int) -> Ti
 
 
 def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bool) -> None:
-    """Start a process per node, into ``nodes``: what fails later can end those started.
-
-    Each gets its description, durations in ns, and its name in the arguments that ROS 2 has.
-    """
+    """Start a process per node, into ``nodes``, with its name in the arguments that ROS 2 has."""
     from chainshaper.workload.dds import closed_domain_configuration, free_domain
 
     domain = free_domain()
@@ -381,10 +377,7 @@ class ProcessLog:
 
 
 def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataFrame]:
-    """The event tables of all processes, sorted by time.
-
-    Events before ``from_ns`` (the warm-up) are left out, objects are not: they exist throughout.
-    """
+    """The event tables of all processes, sorted by time, from ``from_ns`` on, but for objects."""
     parts: dict[str, list[pl.DataFrame]] = {}
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
@@ -424,10 +417,7 @@ def logged_tables(
 
 
 def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl.DataFrame:
-    """An event's table from columns of numbers, which stand for words and nulls as in the log.
-
-    Columns that the event does not have are left out.
-    """
+    """An event's table from columns of numbers, which stand for words and nulls as in the log."""
     types, words = events.column_types(name), {**WORDS, "mode": modes}
     columns = []
     for field in filter(frame.columns.__contains__, types):
