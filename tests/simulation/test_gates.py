@@ -23,7 +23,6 @@ from chainshaper.simulation import simulate_latencies
 from chainshaper.simulation.arrays import Rows, _add_gate
 from chainshaper.simulation.callbacks import decide, missed_slot, switch_mode
 from chainshaper.simulation.layout import G, X
-from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
 from chainshaper.workload.event_log import WORDS
@@ -180,40 +179,19 @@ chain: /in../out
 nodes:
   source:
     callbacks:
-      - {timer: 100ms, execution: {constant: EXECUTION}, publishes: [/in]}
+      - {timer: 100ms, execution: {constant: 10ms}, publishes: [/in]}
   shaper:
     core: 2
     callbacks:
       - subscription: /in
         publishes: [/out]
-        gate: {slots: [[30ms, 40ms]], cycle: 100ms, overrun: POLICY, spin: 1ms, pause: 2ms}
+        gate: {slots: [[30ms, 40ms]], cycle: 100ms, spin: 1ms, pause: 2ms}
 """
 
 
-@pytest.mark.parametrize(
-    ("execution", "policy", "leaves"),
-    [
-        ("10ms", "wait", 30),  # early: held
-        ("35ms", "wait", 35),  # in its slot: at once
-        ("50ms", "wait", 30),  # late: that of the cycle before comes in this one
-        ("50ms", "publish", 50),
-        ("50ms", "discard", None),
-    ],
-)
-def test_a_gate_holds_messages_until_their_slot_and_treats_overruns(
-    tmp_path: Path, execution: str, policy: str, leaves: float | None
-) -> None:
-    text = CHAIN.replace("EXECUTION", execution).replace("POLICY", policy)
-    recording = simulated(tmp_path, application(text))
-    found = [time for time in published(recording, "/shaper") if time < 100]
-    assert found == ([] if leaves is None else [leaves])
-    assert (recording.events["gate_release"]["release"].null_count() > 0) == (leaves is None)
-
-
 def test_a_gate_watches_the_clock_before_its_slot_and_pauses_behind_it(tmp_path: Path) -> None:
-    text = CHAIN.replace("EXECUTION", "10ms").replace("POLICY", "wait")
     costs = {"wake_up": {"constant": "500us"}, "publish": {"constant": "100us"}}
-    recording = simulated(tmp_path, application(text, **costs))
+    recording = simulated(tmp_path, application(CHAIN, **costs))
     release = recording.events["gate_release"].row(0, named=True)
     assert release["time"] == release["release"]  # it woke 0.5 ms before, and watched
     (end,) = (
@@ -233,35 +211,6 @@ def test_a_shaping_node_in_its_server_publishes_as_a_free_one_and_runs_later(
     assert {round(at % 50, 1) for at in published(recording, "/chainshaper_t3")} == {21.0}
     earliest = min(at % 50 for name, at, _ in ran(recording) if name == "chainshaper_t3")
     assert first_ms <= earliest < first_ms + 10
-
-
-def test_modes_that_are_announced_choose_the_slot(tmp_path: Path) -> None:
-    described = application(
-        """
-        chain: /in../out
-        nodes:
-          source: {callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/in]}]}
-          driver:
-            callbacks:
-              - {timer: 100ms, phase: 60ms, publishes: [/mode], announces: [fast, slow, unknown]}
-          shaper:
-            core: 2
-            callbacks:
-              - subscription: /in
-                publishes: [/out]
-                gate:
-                  slots: [[10ms, 20ms], [30ms, 40ms]]
-                  cycle: 100ms
-                  modes: {topic: /mode, bands: {fast: 0, slow: 1}, default: slow}
-        """
-    )
-    recording = simulated(tmp_path, described, cycles=4)
-    releases = recording.events["gate_release"]
-    # Announced 60 ms into each cycle: fast, slow, unknown, fast, slow | unknown, fast, slow, …
-    assert releases["mode"].to_list() == ["slow", "slow", "fast", "slow"]
-    held = ((releases["time"] - releases["origin"]) / 1e6).to_list()
-    assert held == [30, 30, 10, 30]
-    assert events.table(recording.events, "gate_release")["overrun"].null_count() == 4
 
 
 TWO_SINKS = """

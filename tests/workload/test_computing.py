@@ -174,19 +174,3 @@ def test_what_is_no_function_for_callbacks_is_named_with_the_reason(
     monkeypatch.delitem(sys.modules, "sums", raising=False)
     with pytest.raises(SystemExit, match=said):
         computing(name, load_function(name), 1)((), 0, 0)
-
-
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        ('computes: "sums"', "write MODULE:FUNCTION"),
-        ('computes: "sums:numbers", execution: {constant: 1ms}', "keep one"),
-    ],
-)
-def test_a_description_says_one_thing_about_what_a_callback_does(
-    change: str, said: str, tmp_path: Path
-) -> None:
-    path = tmp_path / "sums.yaml"
-    path.write_text(TEXT.replace('computes: "sums:numbers"', change))
-    with pytest.raises(InputError, match=said):
-        load_application(path)

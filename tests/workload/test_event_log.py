@@ -116,34 +116,19 @@ def test_another_threads_number_and_the_largest_numbers_fit() -> None:
     assert row["message"] == 2**47
 
 
-def test_the_warm_up_is_cut_and_objects_are_kept() -> None:
-    log = EventLog()
-    log.init("rcl_timer_init", timer_handle=7, period=100)
-    created = log.objects[0]["time"]
-    start = log.point("callback_start")
-    for time in (created + 10, created + 19, created + 20, created + 30):
-        start(time, 1, 0, 0)
-    tables = event_tables([_process(log)], from_ns=created + 20)
-    assert tables["callback_start"]["time"].to_list() == [created + 20, created + 30]
-    assert tables["rcl_timer_init"].select("time", "timer_handle", "period").rows() == [
-        (created, 7, 100)
-    ]
-
-
-def test_several_processes_are_merged_by_time() -> None:
-    logs = []
-    for pid, times in ((1, (10, 40)), (2, (20, 30))):
-        log = EventLog()
+def test_processes_are_merged_by_time_and_the_warm_up_is_cut_but_objects_are_kept() -> None:
+    logs = [EventLog(), EventLog(clock=lambda: 5), EventLog()]  # the last one records nothing
+    logs[1].init("rcl_timer_init", timer_handle=7, period=100)
+    for log, times in zip(logs, ((10, 40), (19, 20, 30), ()), strict=True):
         for time in times:
             log.point("callback_end")(time, 5, 0)
-        logs.append(_process(log, pid=pid, core=pid))
-    table = event_tables(logs, from_ns=0)["callback_end"]
-    merged = [(10, 1, 1), (20, 2, 2), (30, 2, 2), (40, 1, 1)]
-    assert table.select("time", "pid", "cpu").rows() == merged
-
-
-def test_a_process_that_recorded_nothing_is_no_problem() -> None:
-    assert event_tables([_process(EventLog())], from_ns=0) == {}
+    processes = [_process(log, pid=number, core=number) for number, log in enumerate(logs)]
+    tables = event_tables(processes, from_ns=20)
+    assert tables["callback_end"].select("time", "pid", "cpu").rows() == [
+        (20, 1, 1), (30, 1, 1), (40, 0, 0)
+    ]  # fmt: skip
+    own = tables["rcl_timer_init"].select("time", "pid", "timer_handle", "period")
+    assert own.rows() == [(5, 1, 7, 100)]
     assert event_tables([], from_ns=0) == {}
 
 

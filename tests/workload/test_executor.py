@@ -152,32 +152,18 @@ def test_timers_run_before_subscriptions_each_in_order_of_registration(bench: Be
 
 
 def test_what_becomes_ready_meanwhile_waits_for_the_next_snapshot(bench: Bench) -> None:
-    """`late` is registered between the two others, but was not ready with them."""
-    starts = bench.subscribe("early", then=lambda: _send(late))
-    late = bench.subscribe("late")
-    last = bench.subscribe("last")
-    _send(starts, last)
-    bench.spin()
-    assert bench.diary == ["early", "last", "late"]
-
-
-def test_a_timer_that_expires_meanwhile_waits_for_the_next_snapshot(bench: Bench) -> None:
+    """Each runs at most once in one. `late` is registered between two others."""
     timer = bench.timer("timer", due_ns=time.monotonic_ns() + 3600_000 * MS, period_ns=10_000 * MS)
 
-    def expire() -> None:
+    def begin() -> None:
+        _send(late)
         timer.due_ns = time.monotonic_ns()
 
-    one, two = bench.subscribe("one", then=expire), bench.subscribe("two")
-    _send(one, two)
+    early, late = bench.subscribe("early", then=begin), bench.subscribe("late")
+    last = bench.subscribe("last")
+    _send(early, last, last, last)
     bench.spin()
-    assert bench.diary == ["one", "two", "timer"]
-
-
-def test_each_runs_at_most_once_per_snapshot(bench: Bench) -> None:
-    one, two = bench.subscribe("one"), bench.subscribe("two")
-    _send(one, one, one, two, two)
-    bench.spin()
-    assert bench.diary == ["one", "two", "one", "two", "one"]
+    assert bench.diary == ["early", "last", "timer", "late", "last", "last"]
 
 
 def test_a_timer_that_missed_periods_fires_once(bench: Bench) -> None:
@@ -227,14 +213,12 @@ def test_a_slow_reader_has_the_last_messages_of_its_depth_byte_for_byte(bench: B
 
 def test_takes_are_recorded_with_the_source_timestamp(bench: Bench) -> None:
     publisher = bench.subscribe("one")
-    payload = dds.data_message(bytes(8), 5)
-    publisher.write(payload, source_timestamp=123_456_789)
+    publisher.write(dds.data_message(bytes(8), 5), source_timestamp=123_456_789)
     bench.spin()
-    (take,) = bench.recorded("take")
-    handle = bench.executor.subscriptions[0].rmw_handle
-    assert (take[1], take[3], take[4]) == (handle, 123_456_789, 1)
-    (execute,) = bench.recorded("execute")
-    assert execute[1] == bench.executor.subscriptions[0].handle
+    (entity,) = bench.executor.subscriptions
+    (take,), (execute,) = bench.recorded("take"), bench.recorded("execute")
+    assert (take[1], take[3], take[4]) == (entity.rmw_handle, 123_456_789, 1)
+    assert execute[1] == entity.handle
 
 
 def test_a_set_is_the_oldest_message_of_every_input() -> None:

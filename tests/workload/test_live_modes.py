@@ -98,23 +98,3 @@ def test_modes_that_nobody_announces_are_refused(tmp_path: Path, plan: Plan) -> 
     silent = with_driver(tmp_path, DRIVER.replace(f"announces: [{', '.join(ANNOUNCED)}], ", ""))
     with pytest.raises(InputError, match=r"named on /mode, but no callback .*`announces`"):
         splice_application(silent, with_modes(plan))
-
-
-@pytest.mark.parametrize(
-    ("gate", "reason"),
-    [
-        ("bands: {city: 1}, default: sea", r"gate\.modes: the default mode 'sea' has no band"),
-        ("bands: {city: 5}, default: city", r"gate\.modes: mode 'city': band 5"),
-        ("bands: {city: 0}, default: city", r"gate\.modes\.topic: no callback `announces`"),
-    ],
-)
-def test_a_described_gate_has_modes_that_exist(tmp_path: Path, gate: str, reason: str) -> None:
-    gated = f"""\
-  shaper:
-    callbacks:
-      - subscription: /t3
-        publishes: [/shaped]
-        gate: {{slots: [[20ms, 21ms]], cycle: 50ms, modes: {{topic: /other, {gate}}}}}
-"""
-    with pytest.raises(InputError, match=reason):
-        with_driver(tmp_path, gated + DRIVER)

@@ -77,13 +77,6 @@ def test_every_cycle_is_recorded_once_in_every_node(privileged: Recording) -> No
     assert takes["taken"].to_list() == [1] * (3 * CYCLES)
 
 
-def test_without_privileges_every_message_arrives_as_well(ordinary: Recording) -> None:
-    counts = _count_of(ordinary, "callback_start")
-    # Without real-time scheduling a busy machine may make the timer miss whole periods.
-    assert 1 <= counts["/first"] <= CYCLES
-    assert counts == dict.fromkeys((f"/{name}" for name in NODES), counts["/first"])
-
-
 @pytest.mark.parametrize("run", ["ordinary", "privileged"])
 def test_every_traversal_is_complete(run: str, request: pytest.FixtureRequest) -> None:
     recording: Recording = request.getfixturevalue(run)
@@ -126,21 +119,17 @@ def test_threads_are_allocated_as_described(privileged: Recording) -> None:
 def test_without_privileges_threads_have_their_cores_and_the_recording_says_so(
     ordinary: Recording,
 ) -> None:
-    assert {thread.policy for thread in ordinary.info.threads} == {"SCHED_OTHER"}
+    info = ordinary.info
+    assert {thread.policy for thread in info.threads} == {"SCHED_OTHER"}
     assert {t.cores for t in _threads(ordinary, "executor")} == {(EXECUTOR_CORE,)}
     assert {t.cores for t in _threads(ordinary, "dds")} == {(DDS_CORE,)}
-    assert ordinary.info.realtime is False
-    assert any("without real-time scheduling" in note for note in ordinary.info.notes)
-    assert ordinary.info.stall_meter is None, "ordinary scheduling would look like stalls"
-
-
-def test_the_recording_says_what_ran(ordinary: Recording) -> None:
-    info = ordinary.info
+    assert info.realtime is False
+    assert any("without real-time scheduling" in note for note in info.notes)
+    assert info.stall_meter is None, "ordinary scheduling would look like stalls"
     assert (info.source, info.rmw, info.chain) == ("live", "cyclonedds", "/t1../t3")
     assert set(info.processes.values()) == {f"/{name}" for name in NODES}
     assert known(info.application)["nodes"]["first"]["callbacks"][0]["timer"] == "50ms"
-    topics = ordinary.events["rcl_publisher_init"]["topic_name"]
-    assert set(topics) == {"/t1", "/t2", "/t3"}
+    assert set(ordinary.events["rcl_publisher_init"]["topic_name"]) == {"/t1", "/t2", "/t3"}
 
 
 @needs_fifo
