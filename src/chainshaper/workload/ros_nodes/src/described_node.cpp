@@ -1,6 +1,4 @@
-// One node of the described application:
-//
-//   described_node NAME SEED START_NS true|false
+// One node of the described application: described_node NAME SEED START_NS true|false
 //
 // Timers expire first at START_NS of CLOCK_MONOTONIC and their phase, late ones whole periods
 // later. With `true` threads get the described cores and SCHED_FIFO priorities.
@@ -43,14 +41,12 @@ using Text = std_msgs::msg::String;
 
 std::int64_t used_ns() { return clock_ns(CLOCK_THREAD_CPUTIME_ID); }
 
-rclcpp::QoS quality(const Topic &topic) {
+rclcpp::QoS quality(const Topic &topic, bool lasting = false) {
   rclcpp::QoS qos{topic.depth};
+  if (lasting && topic.lifespan_ns > 0) {
+    qos.lifespan(rclcpp::Duration::from_nanoseconds(topic.lifespan_ns));
+  }
   return topic.reliable ? qos.reliable() : qos.best_effort();
-}
-
-rclcpp::QoS lasting(const Topic &topic) {
-  const auto lifespan = rclcpp::Duration::from_nanoseconds(topic.lifespan_ns);
-  return topic.lifespan_ns > 0 ? quality(topic).lifespan(lifespan) : quality(topic);
 }
 
 void require(bool done, const std::string &what) {
@@ -88,10 +84,10 @@ class Work {
       : times_{std::move(times)}, announces_{described.announces} {
     for (const auto &topic : described.outputs) {
       if (announces_.empty()) {
-        outputs_.push_back(node.create_publisher<Data>(topic.name, lasting(topic)));
+        outputs_.push_back(node.create_publisher<Data>(topic.name, quality(topic, true)));
         messages_.emplace_back().data.resize(topic.payload);
       } else {  // the one topic of modes, also for who comes later
-        modes_ = node.create_publisher<Text>(topic.name, lasting(topic).transient_local());
+        modes_ = node.create_publisher<Text>(topic.name, quality(topic, true).transient_local());
       }
     }
   }
@@ -181,16 +177,15 @@ class DescribedNode : public rclcpp::Node {
       const auto work = std::make_shared<Work>(*this, callback, std::move(times));
       rclcpp::SubscriptionOptions options;
       options.callback_group = group_of(callback);
+      const auto &inputs = callback.inputs;
       if (callback.period_ns > 0) {
         add_timer(callback, work, start_ns);
-      } else if (callback.inputs.size() > 1) {
-        synchronisers_.push_back(
-            std::make_unique<Synchroniser>(this, callback.inputs, work, options));
+      } else if (inputs.size() > 1) {
+        synchronisers_.push_back(std::make_unique<Synchroniser>(this, inputs, work, options));
       } else {
-        const Topic &input = callback.inputs[0];
         const auto run = [work](const Data &message) { work->run(message.header.stamp, used_ns()); };
-        subscriptions_.push_back(
-            create_subscription<Data>(input.name, quality(input), run, options));
+        const auto qos = quality(inputs[0]);
+        subscriptions_.push_back(create_subscription<Data>(inputs[0].name, qos, run, options));
       }
     }
   }
@@ -221,10 +216,7 @@ class DescribedNode : public rclcpp::Node {
     const auto period_ns = callback.period_ns, now = clock_ns(CLOCK_MONOTONIC);
     const auto run = [work] {
       const auto since_ns = used_ns(), wall_ns = clock_ns(CLOCK_REALTIME);
-      Stamp stamp;
-      stamp.sec = static_cast<std::int32_t>(wall_ns / 1'000'000'000);
-      stamp.nanosec = static_cast<std::uint32_t>(wall_ns % 1'000'000'000);
-      work->run(stamp, since_ns);
+      work->run(rclcpp::Time{wall_ns}, since_ns);
     };
     const auto timer =
         create_wall_timer(std::chrono::nanoseconds{period_ns}, run, group_of(callback));
@@ -268,12 +260,12 @@ int main(int argc, char **argv) {
       const auto start_ns = std::stoll(words[3]);
       const auto node = std::make_shared<DescribedNode>(described, std::stoull(words[2]), start_ns);
       if (words[4] == "true") schedule(described);
+      using namespace rclcpp::executors;
       std::unique_ptr<rclcpp::Executor> executor;
       if (const auto threads = described.cores.size(); threads > 1) {
-        executor = std::make_unique<rclcpp::executors::MultiThreadedExecutor>(
-            rclcpp::ExecutorOptions{}, threads);
+        executor = std::make_unique<MultiThreadedExecutor>(rclcpp::ExecutorOptions{}, threads);
       } else {
-        executor = std::make_unique<rclcpp::executors::SingleThreadedExecutor>();
+        executor = std::make_unique<SingleThreadedExecutor>();
       }
       executor->add_node(node);
       node->start(*executor);
