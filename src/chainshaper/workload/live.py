@@ -34,6 +34,7 @@ from chainshaper.values.recording import (
     refuse_existing,
     write_recording,
 )
+from chainshaper.workload import launcher
 from chainshaper.workload.description import (
     Application,
     application_as_written,
@@ -41,14 +42,7 @@ from chainshaper.workload.description import (
     origin_timer,
 )
 from chainshaper.workload.event_log import ABSENT, ALSO_TAKEN, EVENTS, LAYOUT, WIDTH, WORDS
-from chainshaper.workload.launcher import (
-    ENOUGH,
-    WORKER_NAME,
-    Child,
-    end_all,
-    first_casualty,
-    start_child,
-)
+from chainshaper.workload.launcher import Child
 from chainshaper.workload.stall_meter import StallWatch, far_from, meter_tables, stalls_watched
 
 Numbers: TypeAlias = npt.NDArray[np.int64]
@@ -140,7 +134,7 @@ def run_application(
             logs = [_read_log(name, child, application) for name, child in nodes.items()]
         finished = True
     finally:
-        end_all(nodes.values(), patience_s=3.0 if finished else 0.0)
+        launcher.end_all(nodes.values(), patience_s=3.0 if finished else 0.0)
     tables = event_tables(logs, timing.record_from_ns)
     tables |= meter_tables(stalls.seen, tables.get("machine_stall"))
     notes = list(_notes(realtime, permitted, memory_locked, clock_offset() - offset))
@@ -242,7 +236,7 @@ def _ended_early(children: Iterable[Child], timing: Timing, ended_ns: int) -> Ti
     if early.cycles < 1:
         raise OperationError("interrupted before one whole cycle: nothing is recorded")
     for child in children:
-        child.process.send_signal(ENOUGH)
+        child.process.send_signal(launcher.ENOUGH)
     return replace(early, stop_ns=timing.record_from_ns + early.cycles * timing.period_ns)
 
 
@@ -259,7 +253,8 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
         namespace, _, base = node_name(name).rpartition("/")
         arguments = ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
         module = "chainshaper.workload.node_process"
-        nodes[name] = start_child(f"node {name}", module, environment, arguments, LIBRARIES)
+        own = (module, environment, arguments, LIBRARIES)
+        nodes[name] = launcher.start_child(f"node {name}", *own)
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
         nodes[name].tell(
             node=node_name(name),
@@ -323,7 +318,7 @@ def _watch(
     interrupted_ns: int | None = None
     pids, next_look = {child.pid for child in nodes.values()}, timing.start_ns
     while (now := time.monotonic_ns()) < timing.stop_ns:
-        if (casualty := first_casualty([*nodes.values(), *meters.values()])) is not None:
+        if (casualty := launcher.first_casualty([*nodes.values(), *meters.values()])) is not None:
             raise OperationError(f"{casualty.obituary()}; the run was ended and nothing recorded")
         if now >= timing.record_from_ns and not threads:
             threads = _snapshot(nodes, meters)
@@ -356,7 +351,7 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
 def _threads_of(child: Child) -> list[Thread]:
     """Its threads. What a callback's module starts executes nothing, and has its thread's name."""
     return [
-        replace(one, role="executor") if one.comm == WORKER_NAME else one
+        replace(one, role="executor") if one.comm == launcher.WORKER_NAME else one
         for one in list_threads(child.pid)
     ]
 

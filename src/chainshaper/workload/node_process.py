@@ -19,23 +19,10 @@ from chainshaper.gate import decision
 from chainshaper.gate.clear_core import ClearCore
 from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
 from chainshaper.gate.handover import Turn
-from chainshaper.linux.scheduling import (
-    lock_memory,
-    set_thread_name,
-    signalled_with_parent,
-    stop_garbage_collection,
-)
-from chainshaper.workload import dds, executor
+from chainshaper.linux import scheduling
+from chainshaper.workload import dds, executor, launcher
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import ExecutionTimes
-from chainshaper.workload.launcher import (
-    ENOUGH,
-    own_output,
-    receive,
-    send,
-    send_events,
-    wait_for_leave,
-)
 
 NEVER_S = 1e6
 Body: TypeAlias = Callable[[dds.Message], None]
@@ -346,24 +333,24 @@ class NodeProcess:
         for shaper, moves in self.shapers:
             shaper.queue.phase_ns = start_ns + shaper.gate.phase_ns
             shaper.queue.moves.extend((start_ns + since, by) for since, by in moves)
-        stop_garbage_collection()
+        scheduling.stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
 
 
 def main() -> None:
     """Run one node as the launcher says."""
-    output = own_output()  # what callbacks compute may print
-    spec = receive()
-    signalled_with_parent(spec["parent"], signal.SIGKILL)
-    set_thread_name(spec["node"].strip("/").replace("/", "."))
+    output = launcher.own_output()  # what callbacks compute may print
+    spec = launcher.receive()
+    scheduling.signalled_with_parent(spec["parent"], signal.SIGKILL)
+    scheduling.set_thread_name(spec["node"].strip("/").replace("/", "."))
     node = NodeProcess(spec)
-    signal.signal(ENOUGH, lambda *_: setattr(node.executor, "over", True))
+    signal.signal(launcher.ENOUGH, lambda *_: setattr(node.executor, "over", True))
     missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
-    send(output, missing=missing, memory_locked=lock_memory())
-    times = receive()
+    launcher.send(output, missing=missing, memory_locked=scheduling.lock_memory())
+    times = launcher.receive()
     node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])
-    send_events(output, node.log.rows, objects=node.log.objects)
-    wait_for_leave()
+    launcher.send_events(output, node.log.rows, objects=node.log.objects)
+    launcher.wait_for_leave()
     os._exit(0)  # DDS teardown of a closed domain is of no use, and not always quick
 
 

@@ -21,14 +21,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 from chainshaper.gate.decision import STALL_NS, sleep_until
-from chainshaper.linux.scheduling import (
-    Scheduling,
-    apply_scheduling,
-    lock_memory,
-    set_thread_name,
-    signalled_with_parent,
-    stop_garbage_collection,
-)
+from chainshaper.linux import scheduling
 from chainshaper.linux.threads import list_threads
 from chainshaper.workload import launcher
 from chainshaper.workload.launcher import ENOUGH, Child
@@ -88,13 +81,13 @@ def watch(
 def main() -> None:
     """Watch the core this process is put on, as the launcher says."""
     spec = launcher.receive()
-    signalled_with_parent(spec["parent"], signal.SIGKILL)
-    set_thread_name("stall-meter")
+    scheduling.signalled_with_parent(spec["parent"], signal.SIGKILL)
+    scheduling.set_thread_name("stall-meter")
     signals: list[int] = []
     signal.signal(ENOUGH, lambda number, _: signals.append(number))
-    launcher.send(sys.stdout, ready=lock_memory())
+    launcher.send(sys.stdout, ready=scheduling.lock_memory())
     times = launcher.receive()
-    stop_garbage_collection()
+    scheduling.stop_garbage_collection()
     seen, wakeups, late = watch(times["start_ns"], times["stop_ns"], enough=lambda: bool(signals))
     launcher.send_events(sys.stdout, seen.tobytes(), wakeups=wakeups, median_lateness_ns=late)
     launcher.wait_for_leave()
@@ -184,8 +177,9 @@ def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]
             watch.meters[core].tell(parent=os.getpid())
         for core, child in watch.meters.items():
             child.hear()
+            wanted = scheduling.Scheduling(PRIORITY if realtime else None, cores=(core,))
             for thread in list_threads(child.pid):
-                apply_scheduling(thread, Scheduling(PRIORITY if realtime else None, cores=(core,)))
+                scheduling.apply_scheduling(thread, wanted)
         yield watch
         watch.end(realtime)
         finished = True
