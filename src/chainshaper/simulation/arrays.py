@@ -77,8 +77,8 @@ class Process(NamedTuple):
 class System:
     """An application with everything that runs in it, numbered as in the engine's array.
 
-    ``servers`` are by thread, ``readers`` the entities that each topic's messages reach. ``chain``
-    has its callbacks by entity; it is empty where it is not followed.
+    ``servers`` are by thread. ``chain`` has its callbacks by entity; it is empty where it is not
+    followed.
     """
 
     application: Application
@@ -88,7 +88,6 @@ class System:
     cores: tuple[int, ...]
     entities: tuple[Entity, ...]
     publishers: tuple[Publisher, ...]
-    readers: Mapping[str, tuple[int, ...]]
     chain: Chain
     modes: tuple[str, ...]
 
@@ -115,10 +114,6 @@ def build_system(
     for number, process in enumerate(processes):
         own = list(_entities(application, number, process.key, publishers))
         entities += sorted(own, key=lambda entity: order.index(entity.kind))
-    readers: dict[str, tuple[int, ...]] = {}
-    for number, entity in enumerate(entities):
-        if entity.topic is not None:
-            readers[entity.topic] = (*readers.get(entity.topic, ()), number)
     modes: list[str] = []
     for _, callback in application.callbacks():
         modes += callback.announces
@@ -141,7 +136,6 @@ def build_system(
         cores=tuple(dict.fromkeys([*cores, *(server.core for server in servers.values())])),
         entities=tuple(entities),
         publishers=tuple(publishers),
-        readers=readers,
         chain=chain,
         modes=tuple(dict.fromkeys(modes)),
     )
@@ -525,10 +519,11 @@ class Machine:
         for number, publisher in enumerate(system.publishers):
             row = self._publishers[number]
             topic = system.application.topic(publisher.topic)
-            reached = system.readers.get(publisher.topic, ())
+            entities = zip(self._entities, system.entities, strict=True)
+            reached = [place for place, entity in entities if entity.topic == publisher.topic]
             readers = rows.add(len(reached), R.COLUMNS)
             for reader, entity in zip(readers, reached, strict=True):
-                rows[reader + R.ENTITY] = self._entities[entity]
+                rows[reader + R.ENTITY] = entity
             announces = owner[number].described.announces
             modes, _ = rows.put([system.modes.index(mode) for mode in announces])
             ends = any(number in system.entities[one].publishers for one in last)

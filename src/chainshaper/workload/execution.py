@@ -2,6 +2,7 @@
 
 import time
 import zlib
+from collections import deque
 from collections.abc import Iterator
 from typing import Any
 
@@ -55,18 +56,17 @@ class ExecutionTimes:
 
     def __init__(self, execution: dict[str, Any], seed: int, node: str, index: int) -> None:
         self._blocks = blocks(execution, seed, node, index)
-        self._values: list[int] = []
+        self._values: deque[int] = deque()
 
-    def refill(self, count: int = BLOCK) -> None:
+    def refill(self, count: int) -> None:
         """Have at least ``count`` values ready, so that the next ones cost nothing."""
         while len(self._values) < count:
-            self._values = [*reversed(next(self._blocks).tolist()), *self._values]
+            self._values.extend(next(self._blocks).tolist())
 
     def next(self) -> int:
         """The execution time of the next instance."""
-        if not self._values:
-            self.refill()
-        return self._values.pop()
+        self.refill(1)
+        return self._values.popleft()
 
 
 def spend(cpu_ns: int, since_ns: int, *, beside_others: bool = False) -> None:
