@@ -6,7 +6,7 @@ import pytest
 import yaml
 from hypothesis import given
 from hypothesis import strategies as st
-from small_chain import NODES, small_chain, small_chain_text
+from small_chain import small_chain_text
 
 from chainshaper.flow.described import synthetic_chain
 from chainshaper.values.errors import InputError
@@ -121,15 +121,6 @@ def test_a_chain_begins_with_the_timer_that_leads_to_it_however_it_is_written(
     said = "has no /scam, with which the chain scam../command begins"
     with pytest.raises(InputError, match=said):
         origin_timer(application, "scam../command")
-
-
-def test_the_examples_are_right(tmp_path: Path) -> None:
-    assert load_application(synthetic_chain()).chain == "/t1../t5"
-    examples = Path(__file__).parents[2] / "examples"
-    asynchronous = load_application(examples / "asynchronous_chain.yaml")
-    assert asynchronous.topic("/t5").publication == "asynchronous"
-    assert tuple(small_chain(tmp_path).nodes) == NODES
-    assert "asynchronous" in small_chain_text(publication="asynchronous")
 
 
 @pytest.mark.parametrize("text", [RIGHT, small_chain_text(), synthetic_chain().read_text()])

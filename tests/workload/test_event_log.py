@@ -96,26 +96,6 @@ def test_a_discarded_message_has_no_release_and_no_slot() -> None:
     ]
 
 
-def test_another_threads_number_and_the_largest_numbers_fit() -> None:
-    log = EventLog()
-    sends = []
-
-    def send() -> None:
-        sends.append(threading.get_native_id())
-        log.point("asynchronous_send")(9, 1, 2, number_of("outcome", "sent"), 5)
-
-    other = threading.Thread(target=send)
-    other.start()
-    other.join()
-    log.point("take")(2**62, 0x55D0_0000_0100, 2**47, 2**62, 1)
-    tables = event_tables([_process(log)], from_ns=0)
-    assert tables["asynchronous_send"]["tid"].to_list() == sends
-    (row,) = tables["rmw_take"].to_dicts()
-    assert row["tid"] == threading.get_native_id() != sends[0]
-    assert row["time"] == row["source_timestamp"] == 2**62
-    assert row["message"] == 2**47
-
-
 def test_processes_are_merged_by_time_and_the_warm_up_is_cut_but_objects_are_kept() -> None:
     logs = [EventLog(), EventLog(clock=lambda: 5), EventLog()]  # the last one records nothing
     logs[1].init("rcl_timer_init", timer_handle=7, period=100)

@@ -66,7 +66,6 @@ class NodeProcess:
         self.ends: list[tuple[str, dds.Publisher | dds.Subscription, int, str]] = []
         self.to_send: queue.SimpleQueue[executor.AsynchronousWriter] | None = None
         self.shapers: list[tuple[Shaper, list[tuple[int, int]]]] = []  # with their moves
-        self.first_due: list[tuple[executor.Timer, int]] = []
         self.execution_times: list[ExecutionTimes] = []
         self._point = {name: self.log.point(name) for name in LAYOUT}
         self.log.node(spec["node"], "live workload")
@@ -100,10 +99,9 @@ class NodeProcess:
         if topic is not None:
             self._subscribe(handle, topic, body, callback["group"])
             return
-        period, group = callback["timer_ns"], callback["group"]
-        timer = executor.Timer(self.log.timer(handle, period), period, body, group=group)
-        self.executor.timers.append(timer)
-        self.first_due.append((timer, callback["phase_ns"]))
+        period, due = callback["timer_ns"], callback["phase_ns"]  # behind the common start
+        own = (self.log.timer(handle, period), period, body, due, callback["group"])
+        self.executor.timers.append(executor.Timer(*own))
 
     def _work(
         self, index: int, callback: dict[str, Any], publishers: Sequence[TracedPublisher]
@@ -325,8 +323,8 @@ class NodeProcess:
 
     def run(self, start_ns: int, last_timer_ns: int, stop_ns: int) -> None:
         """Execute callbacks from the common start until the end."""
-        for timer, phase in self.first_due:
-            timer.due_ns = start_ns + phase
+        for timer in self.executor.timers:
+            timer.due_ns += start_ns
         periods = [timer.period_ns for timer in self.executor.timers] or [100_000_000]
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))

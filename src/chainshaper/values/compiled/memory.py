@@ -1,11 +1,9 @@
 """Loads and stores at machine addresses for the compiled kernels.
 
 Packets are bytes at any alignment, and columns are arrays of several types; an address is the one
-thing that they share. Whoever calls these has checked the bounds. The machine is taken to be
-little-endian, as all are that run ROS 2.
-
-Where Numba is not installed, Python interprets the same functions: some hundred times slower, which
-is quick enough for what a robot decides on, and not for a long trace.
+thing that they share. Whoever calls these has checked the bounds. The machine is little-endian, as
+all are that run ROS 2. Where Numba is not installed, Python interprets the same functions: some
+hundred times slower, quick enough for what a robot decides on, and not for a long trace.
 """
 
 # mypy: disallow_untyped_calls=False, disallow_untyped_decorators=False
@@ -36,13 +34,10 @@ def compiled(*, inline: bool = False) -> Callable[[Callable[..., Any]], Any]:
 
     Python calls them by way of :func:`~chainshaper.values.compiled.kernel`.
     """
-
-    def decorate(function: Callable[..., Any]) -> Any:
-        if INTERPRETED:
-            return function
-        return njit(nogil=True, forceinline=inline, error_model="numpy")(function)
-
-    return decorate
+    if INTERPRETED:
+        return lambda function: function
+    decorate: Any = njit(nogil=True, forceinline=inline, error_model="numpy")
+    return decorate  # type: ignore[no-any-return]
 
 
 def _instruction(signature: Any, build: Callable[..., Any]) -> Any:
