@@ -2,8 +2,7 @@
 
 The same description, the same execution times for the same seed, the same event tables:
 a simulated recording differs from a live one in its `source` only. `arrays` and `layout` say what
-runs, in words and in integers; `engine` and `callbacks` are compiled by Numba and run it;
-`simulating` writes the events, and takes execution times from a recording where that is asked for.
+runs, in words and in integers; `engine` and `callbacks` are compiled by Numba and run it.
 """
 
 from chainshaper.simulation.simulating import simulate, simulate_latencies

@@ -4,8 +4,7 @@ There is a row per thread (T), entity (E), publisher (P), reader (R), gate (G), 
 input of one (I), core (C), message (M), stream of numbers (D) and event to come (H), and one for
 the engine itself (X), which comes first; and the log. A row is referred to by its place
 in the array, so ``m[thread + T.LEFT]`` is a field of a thread; NONE stands for no row. Each list
-begins with the columns that are given; the others change as time goes on. Times are integer
-nanoseconds.
+begins with the columns that are given; the others change as time goes on.
 
 (One array, because every array that a compiled function is called with costs it more time than
 most of these functions need. Lists of columns are enumerations, which Numba takes for numbers

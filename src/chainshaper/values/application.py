@@ -17,7 +17,6 @@ INTERNAL_SERVICES = frozenset((*_PARAMETERS, *_STATES)) | {
 
 REQUEST, RESPONSE = ":request", ":response"
 """Behind a service's name: what its clients publish, and what its server does, as if on topics."""
-
 CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", "unknown"]
 """``unknown``: it was seen to run, but not to be created (tracing started after it), or only its
 publications were seen (``handle`` 0: a thread of the node's own)."""

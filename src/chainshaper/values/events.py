@@ -1,13 +1,10 @@
 """The event tables: their names, columns and units, whoever traced them.
 
 They are the events of `ros2_tracing` (tracetools 8.x, Jazzy, `tracetools.h`) under their own names
-and fields, and the kernel's `sched:sched_switch`. Every table has the columns of
-:data:`COMMON_COLUMNS` followed by the event's own fields:
-
-* ``time``: nanoseconds of CLOCK_MONOTONIC; with the recording's ``clock_offset_ns`` wall-clock
-  time, which is what DDS source timestamps are.
-* ``pid``, ``tid``: process and thread, as the kernel numbers them in the traced container.
-* ``cpu``: the core, null where the source does not know it.
+and fields, the kernel's `sched:sched_switch`, and ours. Every table has :data:`COMMON_COLUMNS`,
+followed by the event's own fields: ``time``, nanoseconds of CLOCK_MONOTONIC (with the recording's
+``clock_offset_ns`` wall-clock time, as DDS source timestamps are), process and thread, as the
+kernel numbers them in the traced container, and the core, null where the source does not know it.
 
 Handles (``*_handle``, ``callback``, ``message``, ``subscription``) are addresses: unique only
 within one process and only until they are freed. Tables lack columns that their source cannot

@@ -19,27 +19,19 @@ Policy: TypeAlias = Literal[
 ]
 """How the chain is scheduled: the paper's way, or one of those that it compares (section 2.5)."""
 
-Fallback: TypeAlias = Literal["bypass", "silence"]
-"""What becomes of an output while its shaping node is not there."""
-
-STANDBY = "_standby"
-"""What the name of who then stands in for a shaping node has behind that node's."""
+Fallback: TypeAlias = Literal["bypass", "silence"]  # of an output without its shaping node
+STANDBY = "_standby"  # behind a shaping node's name: that of who then stands in for it
 
 Publication: TypeAlias = Literal["synchronous", "asynchronous", "in-process"]
 """By a shaping node, by the publisher's own thread (section 3.2), or by a gate in its process."""
-
 ShapingThread: TypeAlias = Literal["free", "in-slots"]
 """Whether a shaping node's thread is timed by its gate alone, or runs in its server's slots."""
-
 EqualPriorities: TypeAlias = Literal["apart", "round-robin"]
 """What servers of one core and one priority do: their slots are apart, or they take turns."""
-
 NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
 """How a shaping node is made (:mod:`chainshaper.splicing.shaping_process`)."""
-
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
-
 Goal: TypeAlias = Literal["mean", "jitter", "gap"]
 """What latency bands make small: the average, the jitter, or the distance between bands (LV)."""
 
@@ -54,8 +46,7 @@ class Option(NamedTuple):
     flag: str | None = None
 
 
-BANDS, MARGIN = "Latency bands", "Margin"
-"""Panels of the help."""
+BANDS, MARGIN = "Latency bands", "Margin"  # panels of the help
 
 
 # fmt: off

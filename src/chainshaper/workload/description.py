@@ -114,8 +114,7 @@ class SimulationDescription(Part):
 
 
 class ModesDescription(Part):
-    """A gate's :class:`~chainshaper.gate.decision.Modes`, read from the ``topic`` that announces
-    them."""
+    """A gate's :class:`~chainshaper.gate.decision.Modes`, and the ``topic`` that announces them."""
 
     topic: FullName
     bands: Annotated[dict[str, int], Field(min_length=1)]
@@ -282,15 +281,12 @@ class NodeDescription(Part):
 
 
 class TopicDescription(Part):
-    """How a topic is published, and its quality of service (keep-last ``depth``).
-
-    A message that is older than ``lifespan_ns`` is neither sent nor received any more.
-    """
+    """How a topic is published, and its quality of service (keep-last ``depth``)."""
 
     publication: Publication = "synchronous"
     reliability: Literal["reliable", "best_effort"] = "reliable"
     depth: int = Field(default=10, ge=1, le=1_000_000)
-    lifespan_ns: PositiveDuration | None = None
+    lifespan_ns: PositiveDuration | None = None  # older messages are neither sent nor received
     payload: int = Field(default=1024, ge=0, le=16_000_000)  # bytes behind the header
 
 

@@ -30,7 +30,6 @@ LAYOUT: dict[str, tuple[str, ...]] = {
     "machine_stall": ("duration",),
 }
 """What is recorded, and the order of its fields; its number is its place in this list."""
-
 ALSO_TAKEN = ("rcl_take", "rclcpp_take")  # only where a message was taken
 EVENTS: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in LAYOUT},
