@@ -14,7 +14,7 @@ from chainshaper.gate.decision import CHANGES
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import Server, Thread
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, Int64s, M, P, R, S, T, X
+from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, Int64s, M, P, R, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
@@ -482,12 +482,12 @@ class Machine:
                 if callback not in bodies:
                     bodies[callback] = _add_gate(rows, system, described, timing)
             elif described.synchronises:
-                body = at.SYNCHRONISE
+                body, inputs = at.SYNCHRONISE, len(described.synchronises)
                 if callback not in bodies:
-                    inputs = rows.add(len(described.synchronises), I.COLUMNS)
-                    bodies[callback] = rows.put([inputs.start, inputs.stop])[0]
-                source = rows[bodies[callback] + S.FIRST] + entity.number * I.COLUMNS
-                rows.set(source, {I.ON_CHAIN: on_chain, I.DEPTH: system.depth(entity.topic or "")})
+                    bodies[callback] = rows.add(inputs, I.COLUMNS).start
+                first, depth = bodies[callback], system.depth(entity.topic or "")
+                own = {I.ON_CHAIN: on_chain, I.DEPTH: depth, I.END: first + inputs * I.COLUMNS}
+                rows.set(first + entity.number * I.COLUMNS, own)
             group = system.application.nodes[process.key].exclusive_group(described)
             if group is not None and (entity.process, group) not in groups:
                 groups[entity.process, group] = rows.put([0])[0]

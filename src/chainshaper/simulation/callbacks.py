@@ -19,7 +19,7 @@ cannot call Python; tests hold the two against each other.
 
 from chainshaper.gate.decision import CHANGES, MAX_AGE_CYCLES, MAX_FUTURE_NS
 from chainshaper.simulation import layout as at
-from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, M, P, Q, R, S, T, X
+from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, M, P, Q, R, T, X
 from chainshaper.values.compiled.memory import compiled
 
 
@@ -315,8 +315,8 @@ def _complete(m, thread):
     It has the oldest message of every input, and the stamp of the first one's.
     """
     entity = m[thread + T.ENTITY]
-    synchroniser = m[entity + E.BODY_ROW]
-    first, end = m[synchroniser + S.FIRST], m[synchroniser + S.END]
+    first = m[entity + E.BODY_ROW]
+    end = m[first + I.END]
     mine = first + m[entity + E.INPUT] * I.COLUMNS
     message = new_message(m)
     copy(m, thread + T.SOURCE, message + M.SOURCE, at.CARRIED)

@@ -233,7 +233,7 @@ def _work_for_executor(m, thread):
 
 @compiled()
 def run(address):
-    """Go on until the end, or until the caller has to look after the array; why (`X_PAUSED`)."""
+    """Go on until the end, or until the caller has to look after the array; why (`X.PAUSED`)."""
     m = table_at(address)
     m[X.PAUSED] = at.RUNNING
     while m[X.PAUSED] == at.RUNNING:

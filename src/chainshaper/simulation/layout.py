@@ -1,10 +1,10 @@
 """What stands where in the one array of integers on which the compiled engine runs.
 
-There is a row per thread (T), entity (E), publisher (P), reader (R), gate (G), synchroniser (S),
-input of one (I), core (C), message (M), stream of numbers (D) and event to come (H), and one for
-the engine itself (X), which comes first; and the log. A row is referred to by its place
-in the array, so ``m[thread + T.LEFT]`` is a field of a thread; NONE stands for no row. Each list
-begins with the columns that are given; the others change as time goes on.
+There is a row per thread (T), entity (E), publisher (P), reader (R), gate (G), input of a
+synchroniser (I), core (C), message (M), stream of numbers (D) and event to come (H), and one for
+the engine itself (X), which comes first; and the log. A row is referred to by its place in the
+array, so ``m[thread + T.LEFT]`` is a field of a thread; NONE stands for no row. Each list begins
+with the columns that are given; the others change as time goes on.
 
 (One array, because every array that a compiled function is called with costs it more time than
 most of these functions need. Lists of columns are enumerations, which Numba takes for numbers
@@ -48,10 +48,10 @@ COLLECT, TURN, TAKE, PUBLISH, GATE_WAKE, GATE_PUBLISHED, GATE_PAUSED = range(7)
 SEND, SENT, RECEIVE, RECEIVED = range(7, 11)
 """What a thread does next, when it has used the CPU time that is left to it."""
 
-# Entities: what an executor waits for. BODY_ROW is that of the gate or synchroniser, INPUT which
-# input of the latter. GROUP is where stands whether its mutually exclusive group is busy, NONE if
-# its executor has one thread, or the group is reentrant. From HEAD on: its history (Q). READY: in
-# the snapshot.
+# Entities: what an executor waits for. BODY_ROW is that of the gate, or of the synchroniser's first
+# input, INPUT which of its inputs it is. GROUP is where stands whether its mutually exclusive group
+# is busy, NONE if its executor has one thread, or the group is reentrant. From HEAD on: its history
+# (Q). READY: in the snapshot.
 E = IntEnum(
     "E",
     "CALLBACK HANDLE RMW_HANDLE THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION PUBLISHERS"
@@ -94,8 +94,8 @@ ALL_IN_ORDER, NEWEST, FIRST = range(3)
 REPLACED, SURPLUS, OVERFLOWED, DISCARDED = range(4)
 """Policies and reasons, as :data:`chainshaper.workload.event_log.WORDS` numbers them."""
 
-S = IntEnum("S", "FIRST END COLUMNS", start=0)
-I = IntEnum("I", "ON_CHAIN HEAD TAIL WAITING DEPTH COLUMNS", start=0)  # noqa: E741 - an input
+I = IntEnum("I", "ON_CHAIN END HEAD TAIL WAITING DEPTH COLUMNS", start=0)  # noqa: E741 - an input
+"""Inputs of a synchroniser; END is where the last one ends."""
 
 Q = IntEnum("Q", "HEAD TAIL WAITING DEPTH", start=0)
 """A queue of messages, which M.NEXT links; those of threads have no DEPTH."""
