@@ -139,12 +139,12 @@ class StallWatch:
 
     def end(self, realtime: bool) -> None:
         """End the watch."""
-        from chainshaper.values.recording import StallMeterInfo
-
         if not self.begun:
             self.begin()
         for child in self.meters.values():
             child.process.send_signal(ENOUGH)
+        from chainshaper.values.recording import StallMeterInfo  # takes a while
+
         wakeups, lateness = 0, []
         for core, child in self.meters.items():
             answer = child.hear()
