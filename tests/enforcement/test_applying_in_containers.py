@@ -62,8 +62,9 @@ def test_threads_of_two_containers_are_governed_and_released(tmp_path: Path) -> 
             run.send_signal(signal.SIGINT)
             run.communicate(timeout=30)
             assert run.returncode == 0
-        lines = [line.split() for line in (tmp_path / "other").read_text().splitlines()[:-1]]
-        pauses = [int(after[0]) - int(before[1]) for before, after in pairwise(lines)]
+        lines = (tmp_path / "other").read_text().splitlines()[:-1]
+        starts = [int(line.split()[0]) for line in lines]  # the slot may end while it computes
+        pauses = [after - before for before, after in pairwise(starts)]
         assert sum(pause > 60 * MS for pause in pauses) > 8, "closed for 70 ms in every cycle"
         assert {name: scheduling(pid) for name, pid in pids.items()} == before
     wait_for(lambda: not leftovers(), "runs and cgroups to be removed")
