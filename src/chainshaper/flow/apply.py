@@ -578,7 +578,8 @@ class _Run:
                     servers.change(table, anchor_ns)
                 elif self.gated and table != threads.server_table(self.plan):
                     raise OperationError(
-                        f"{self.choice.name} cannot move slots of some chains only: apply again"
+                        f"the back end {self.choice.name} cannot move slots of some chains only:"
+                        " end the run, and apply the plan again"
                     )
                 else:
                     servers.arm(anchor_ns)

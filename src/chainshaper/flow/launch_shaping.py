@@ -129,7 +129,10 @@ def shape_launch(
         )
         if stop.is_set() or done.exit_code is not None:
             ended = "was stopped" if done.exit_code is None else "ended by itself"
-            raise OperationError(f"the application {ended}: {done.recording.path} stays")
+            raise OperationError(
+                f"the application {ended} during the recording {done.recording.path}, which stays;"
+                " nothing was shaped"
+            )
         return done.recording
 
     shaped, setup = list(command), list[str]()
@@ -220,7 +223,10 @@ def _refuse_early(
     if sinks and len(chains) > 1:
         raise InputError("--sink goes with one chain: name each output with a --chain of its own")
     if unknown := [one.topic for one in throttled if one.subscriber is None]:
-        raise InputError(f"which node gets {unknown[0]}? Name it: NODE:{unknown[0]}=PERIOD")
+        raise InputError(
+            f"which node gets {unknown[0]} is not known before the first recording: name it, as in"
+            f" --throttle NODE:{unknown[0]}=PERIOD"
+        )
 
 
 def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanRequest) -> None:

@@ -188,7 +188,8 @@ def splice_throttlers(
     for one in inputs:
         how = (one.period_ns, one.rule)
         if any(one.topic in topics for other, topics in alike.items() if other != how):
-            raise InputError(f"{one.topic} is throttled twice, in two ways: name it with one")
+            reason = f"{one.topic} is throttled twice, with another period or rule"
+            raise InputError(f"{reason}: name it with one")
         topics = alike.setdefault(how, {})
         nodes = (*topics.get(one.topic, ()), *_subscribers(one, subscribers))
         topics[one.topic] = tuple(dict.fromkeys(nodes))
@@ -303,7 +304,10 @@ def _subscribers(one: ThrottledInput, known: _Names | None) -> Sequence[str]:
     if one.subscriber:
         return [one.subscriber]
     if known is None:
-        raise InputError(f"who subscribes to {one.topic} is not known: name a recording, or it")
+        raise InputError(
+            f"who subscribes to {one.topic} is not known: name a recording of the application with"
+            f" --recording REC, or the node with --throttle NODE:{one.topic}=PERIOD"
+        )
     if not known.get(one.topic):
         raise InputError(
             f"no node subscribes to {one.topic} in the recording; to these topics nodes do:"

@@ -33,7 +33,14 @@ from chainshaper.planning import application_plan as joint
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import chain_name, linked, with_windows
 from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
-from chainshaper.planning.plan import Adaptation, Plan, Server, publisher_servers, revised
+from chainshaper.planning.plan import (
+    Adaptation,
+    Plan,
+    Server,
+    publisher_servers,
+    revised,
+    shaping_nodes,
+)
 from chainshaper.planning.request import simulated_stamps
 from chainshaper.values.errors import InputError, OperationError
 
@@ -147,7 +154,7 @@ def recorded_processes(
 
 def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
     """Raises InputError: slots count from stamps of nodes that, by commands, follow `/clock`."""
-    stamped = [one for one in plan.chains if one.anchor == "stamp" and one.shaping_node]
+    stamped = [one for one in plan.chains if one.anchor == "stamp" and shaping_nodes(one)]
     servers = [server for one in stamped for server in one.servers]
     nodes = {thread.node for server in servers for thread in server.threads}
     for one in found.threads:
@@ -264,7 +271,10 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
             " offsets have to be stopped until then: choose freezer or scx"
         )
     if plan.takes_turns and back_end == "scx":
-        raise InputError("under the back end scx servers take no turns (--backend freezer)")
+        raise InputError(
+            "equal_priorities: round-robin, but under the back end scx servers of one priority run"
+            " in the plan's order: choose another (--backend freezer)"
+        )
 
 
 def followed_chains(
@@ -290,7 +300,8 @@ def followed_chains(
             furthest = (joint.with_slots_moved(plan, {place: by}) for by in found)
             tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
             if len(tables) > 1 and back_end not in ("freezer", "fifo"):
-                raise InputError(f"{back_end} does not move slots: choose freezer or free threads")
+                remedy = "choose freezer, or `shaping_thread: free`"
+                raise InputError(f"the back end {back_end} does not move slots: {remedy}")
         except InputError as error:
             why_not.append(f"slots of {chain_name(chain)} cannot follow its latencies: {error}")
         else:
@@ -305,7 +316,8 @@ def server_table(plan: ApplicationPlan) -> ServerTable:
     servers = [s for s in plan.servers if set(s.threads) - plan.free_threads]
     if not servers:
         raise OperationError(
-            "the plan's servers name no threads, nothing can be applied: plan from a recording"
+            "the plan's servers name no threads of the application, so there is nothing to apply:"
+            " plan from a recording (`chainshaper plan REC --chain FIRST..LAST`)"
         )
     return table_of(plan.cycle_ns, servers, plan.most_urgent_first)
 
@@ -340,7 +352,8 @@ def first_threads(plan: ApplicationPlan, found: Allocation) -> list[tuple[Thread
         planned = allocation.first_planned(chain)
         if planned is None:
             raise OperationError(
-                f"no server of {chain_name(chain)} holds an executor to begin it: give --phase"
+                f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
+                " cycle the chain begins: give its phase (--phase)"
             )
         begin.append(tuple(one.thread for one in allocation.threads_for(planned, found)))
     return begin

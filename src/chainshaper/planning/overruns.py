@@ -238,7 +238,9 @@ def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) ->
         raise InputError(f"{gated}: plan again from a recording of this application")
     if writer.asynchronous is False:
         reason = f"{node} publishes {topic} synchronously, so gating its thread would hold nothing"
-        raise InputError(f"{reason}: publish so, or plan with --publication synchronous")
+        raise InputError(
+            f"{reason}: publish asynchronously, or plan with --publication synchronous"
+        )
     if writer.depth is not None and writer.depth < waiting:
         reason = f"{topic} has a history of {writer.depth}, but {waiting} messages come while the"
         raise InputError(f"{reason} thread of {node} may not run: give it a depth of {waiting + 1}")
