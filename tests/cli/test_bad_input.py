@@ -164,7 +164,7 @@ def test_what_cannot_be_shaped_is_refused_before_anything_is_launched(
         "robot.yaml plan.yaml --bands 2": "is shaped as plan.yaml says",
         "-- sleep 1": "is not `ros2 launch",
         "--chain /a../b --chain /c../d --sink /a../e LAUNCH": "--sink goes with one chain",
-        "--throttle /in=100ms LAUNCH": "Name it: NODE:/in=PERIOD",
+        "--throttle /in=100ms LAUNCH": "name it, as in --throttle NODE:/in=PERIOD",
         "--throttle /node:/in LAUNCH": "write a topic and a period",
         "--policy pipelined --sink /a../e LAUNCH": "further sinks are shaped",
         "--modes /mode:city,highway LAUNCH": "nothing says which mode was in force",

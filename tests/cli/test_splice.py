@@ -158,7 +158,7 @@ def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
         ("PLAN ROBOT -o DIR --build", "--node python needs no building"),
         ("PLAN ROBOT -o DIR --node typed", "not known: name it"),
         ("PLAN ROBOT -o DIR --node typed --type Header", "'Header' is not a message type"),
-        ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording, or it"),
+        ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording of the application"),
         ("ROBOT -o DIR --throttle /third:/t1", "write a topic and a period"),
         ("ROBOT -o DIR --throttle /third:/t1=1s,last", "'last' should be 'newest' or 'first'"),
         ("ROBOT -o DIR --throttle third:/t1=1s", "'third' is not a full ROS"),
