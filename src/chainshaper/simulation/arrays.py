@@ -319,6 +319,10 @@ class Machine:
         self._streams = Streams(system.application.seed, rows)
         self._cores = rows.add(len(system.cores), C.COLUMNS)
         self._threads = rows.add(len(system.threads), T.COLUMNS, NONE)
+        self._first_threads = {
+            (one.pid, one.role): row
+            for row, one in zip(reversed(self._threads), reversed(system.threads), strict=True)
+        }
         self._entities = rows.add(len(system.entities), E.COLUMNS)
         self._publishers = rows.add(len(system.publishers), P.COLUMNS)
         self._fill_cores()
@@ -460,8 +464,7 @@ class Machine:
 
     def _thread(self, pid: int, role: str) -> int:
         """The first thread of a process that has a role, NONE if none has."""
-        threads = zip(self._threads, self._system.threads, strict=True)
-        return next((row for row, one in threads if (one.pid, one.role) == (pid, role)), NONE)
+        return self._first_threads.get((pid, role), NONE)
 
     def _fill_entities(self) -> None:
         rows, system, timing = self._rows, self._system, self._timing
@@ -516,14 +519,16 @@ class Machine:
         rows, system = self._rows, self._system
         owner = {one: entity for entity in system.entities for one in entity.publishers}
         last = system.chain.callbacks[-1:]
+        reading: dict[str | None, list[int]] = {}
+        for place, entity in zip(self._entities, system.entities, strict=True):
+            reading.setdefault(entity.topic, []).append(place)
         for number, publisher in enumerate(system.publishers):
             row = self._publishers[number]
             topic = system.application.topic(publisher.topic)
-            entities = zip(self._entities, system.entities, strict=True)
-            reached = [place for place, entity in entities if entity.topic == publisher.topic]
+            reached = reading.get(publisher.topic, [])
             readers = rows.add(len(reached), R.COLUMNS)
-            for reader, entity in zip(readers, reached, strict=True):
-                rows[reader + R.ENTITY] = entity
+            for reader, place in zip(readers, reached, strict=True):
+                rows[reader + R.ENTITY] = place
             announces = owner[number].described.announces
             modes, _ = rows.put([system.modes.index(mode) for mode in announces])
             ends = any(number in system.entities[one].publishers for one in last)
