@@ -264,7 +264,8 @@ def _changes_application(name: str) -> bool:
 def _refuse_unknown(name: str, plan: Plan | None) -> None:
     if plan is not None and name in _WISHES:
         raise InputError(
-            f"axis {name} is a wish for a plan, but a plan is given: leave it out, or vary plan.…"
+            f"axis {name} is a wish for a plan, but a plan is given: leave it out, or vary a value"
+            " of its file, such as plan.overrun"
         )
     if plan is None and name.startswith(PLAN):
         raise InputError(f"axis {name} is a value of a plan's file: give the plan, too")
