@@ -130,12 +130,20 @@ class ApplicationPlan(Part):
         """The nodes that have an order among the threads of their server, which is the plan's.
 
         None has where they take turns, and only that which begins the chain where slots are made of
-        what single callbacks took: one that is interrupted by another takes longer.
+        what single callbacks took: one that is interrupted by another takes longer. In a pipeline
+        those downstream come first: they work on the older instance. Shaping nodes have none: the
+        one that wakes first publishes first, and watches the clock until then.
         """
         found: dict[str, None] = {}
+        gates = {node.thread for node in self.shaping_nodes}
         for chain in () if self.takes_turns else self.chains:
-            nodes = [thread.node for server in chain.servers for thread in server.threads]
-            found |= dict.fromkeys(nodes[:1] if chain.policy in PER_CALLBACK else nodes)
+            threads = [thread for server in chain.servers for thread in server.threads]
+            nodes = [thread.node for thread in threads if thread not in gates]
+            if chain.policy == "pipelined":
+                nodes.reverse()
+            elif chain.policy in PER_CALLBACK:
+                nodes = nodes[:1]
+            found |= dict.fromkeys(nodes)
         return tuple(found)
 
     @property

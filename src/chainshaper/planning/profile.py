@@ -11,14 +11,14 @@ the longest time for which the others can have it (Joseph and Pandya, The Comput
 over all that may run before the chain on its cores, each every T, for C at most, and up to J later
 in one cycle than in another: the branches that begin with it, in any order, behind the fork; chains
 of a better priority, where they run at the same time; the shaping nodes of all other chains, which
-spin before a slot and publish.
+take a message when it comes, and later watch the clock before a slot and publish.
 
 The longest latency, and the last slot with it, is behind all of it; bands before that are placed by
 what was measured, as far as it is in between.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
 from typing import Literal, NamedTuple, TypeAlias
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.margins import check_latencies
-from chainshaper.planning.plan import PER_CALLBACK, SHORTEST_SLOT_NS
+from chainshaper.planning.plan import PER_CALLBACK, SHORTEST_SLOT_NS, UNSHAPED
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
@@ -38,6 +38,10 @@ _Stage: TypeAlias = tuple[str, str | None]
 START_UP_NS = 3_000_000_000  # in so long an application starts, or ends
 APART = 1.3  # so many times as long as others is no part of their tail
 FEWEST = 20  # cycles, to tell one from the others
+MOST_ROUNDS = 20  # until the chains' delays, which depend on each other, stay as they are
+# A gate wakes up for a message, takes it, wakes up once more behind its pause, and takes notes: this
+# long in the simulator (docs/simulator.md), and less in a live one, beside watching and publishing.
+GATE_TAKES_NS = 400_000
 OFTEN = 0.05  # of a chain's cycles: so often a callback of others on its threads is worth a note
 
 
@@ -266,39 +270,72 @@ def interference(own_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
 
 
 def with_interference(
-    profiles: Sequence[Profile], groups: Sequence[Sequence[int]], wishes: Wishes, *, at_once: bool
+    profiles: Sequence[Profile],
+    groups: Sequence[Sequence[int]],
+    wishes: Wishes,
+    *,
+    at_once: bool,
+    shifting: bool = False,
 ) -> list[Profile]:
     """The profiles with the latencies that the chains can have while all of them run.
 
     ``groups`` are the places of chains that begin together. With ``at_once`` groups do not take
-    turns: those of a shorter period run at a better priority. Where every callback has slots of
+    turns: those of a shorter period run at a better priority, and, with ``shifting``, one may have
+    to wait before it takes its stamp, from which its slots count. Where every callback has slots of
     its own nothing is added.
     """
     if len(profiles) == 1 or wishes.policy in PER_CALLBACK:
         return list(profiles)
     undelayed = [alone(profile) for profile in profiles]
-    delayed = list(undelayed)
-    gates = wishes.policy != "server-per-chain" and wishes.publication != "asynchronous"
-    better: list[list[Profile]] = []  # the chains of each group so far
+    delays = [0] * len(profiles)
+    for _ in range(MOST_ROUNDS):
+        before, delays = delays, _delays(undelayed, groups, wishes, delays, at_once, shifting)
+        if delays == before:
+            break
+    measured = (profile.latencies_ns for profile in profiles)
+    return list(map(_later, undelayed, delays, measured))
+
+
+def _delays(
+    profiles: Sequence[Profile],
+    groups: Sequence[Sequence[int]],
+    wishes: Wishes,
+    before_ns: Sequence[int],
+    at_once: bool,
+    shifting: bool,
+) -> list[int]:
+    """How long each chain may be delayed, where the others come up to ``before_ns`` later."""
+    delays, better = [0] * len(profiles), list[Sequence[int]]()
+    gates = wishes.policy not in UNSHAPED and wishes.publication != "asynchronous"
     for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):
         for k in group:
-            one, siblings = undelayed[k], [undelayed[j] for j in group if j != k]
+            one, siblings = profiles[k], [profiles[j] for j in group if j != k]
             forked = {*_stages([one])} - {*_stages(siblings)}  # none of these before the fork
             rivals = [Rival(one.period_ns, _demand(one, siblings, forked))]
-            for chains in better if at_once else ():  # what waits elsewhere comes late
+            for places in better if at_once else ():  # what waits elsewhere comes late
+                chains = [profiles[j] for j in places]
                 cost = _demand(one, chains, _stages([one]))
-                jitter = max(0, max(map(_longest_in_time, chains)) - cost)
-                rivals.append(Rival(chains[0].period_ns, cost, jitter))
-            for place, other in enumerate(undelayed):
+                latest = max(_longest_in_time(profiles[j], delays[j]) for j in places)
+                rivals.append(Rival(chains[0].period_ns, cost, max(0, latest - cost)))
+            for place, other in enumerate(profiles):
                 cores = _cores(one, forked if place in group else _stages([one]))
                 if gates and place != k and other.core_of.get(other.last or "") in cores:
-                    longest = other.longest_publication_ns
-                    cost = wishes.spin_ns + (SHORTEST_SLOT_NS if longest is None else longest)
-                    rivals.append(Rival(other.period_ns, cost))
-            delay = interference(_longest_in_time(one), rivals, one.period_ns)
-            delayed[k] = _later(one, delay, profiles[k].latencies_ns)
-        better.append([delayed[k] for k in group])
-    return delayed
+                    rivals += _of_gate(other, wishes, before_ns[place], shifting)
+            delays[k] = interference(_longest_in_time(one), rivals, one.period_ns)
+        better.append(group)
+    return delays
+
+
+def _of_gate(other: Profile, wishes: Wishes, delay_ns: int, shifting: bool) -> Iterator[Rival]:
+    """For how long the gate of another chain, which may be delayed by so much, has its core: for
+    each message when it comes, and when it leaves.
+    """
+    apart = max(0, _longest_in_time(other) - int(other.every.min()))
+    yield Rival(other.period_ns, GATE_TAKES_NS, apart + delay_ns)
+    longest = other.longest_publication_ns
+    cost = wishes.spin_ns + (SHORTEST_SLOT_NS if longest is None else longest)
+    shift = delay_ns if shifting and wishes.anchor == "stamp" else 0
+    yield Rival(other.period_ns, cost, shift + (0 if wishes.bands == 1 else apart + delay_ns))
 
 
 def alone(profile: Profile) -> Profile:
@@ -325,9 +362,11 @@ def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> P
     )
 
 
-def _longest_in_time(profile: Profile) -> int:
-    """The longest of all cycles that fit into the period: one that does not is late anyway."""
-    every = profile.every
+def _longest_in_time(profile: Profile, delay_ns: int = 0) -> int:
+    """The longest of all cycles that fit into the period when all are so much later: one that does
+    not is late anyway.
+    """
+    every = profile.every + delay_ns
     return int(every[every < profile.period_ns].max(initial=0))
 
 

@@ -414,14 +414,21 @@ class Machine:
     def _rank(
         self, plan: ApplicationPlan, governed: dict[int, Server], ranked: list[Server]
     ) -> None:
-        """Server and rank of the threads that are ``governed`` on a core."""
+        """Server and rank of the threads that are ``governed`` on a core: by the priority of the
+        server and, within one, in the plan's order, as `server_priorities` has them live.
+        """
         order = plan.most_urgent_first
-        places = {node: place for place, node in enumerate(order)}
+        place_of = {node: place for place, node in enumerate(order)}
+        named = {
+            number: place_of.get(self._system.threads[number].node, len(order))
+            for number in governed
+        }
+        taken = {
+            server.name: sorted({named[n] for n, one in governed.items() if one is server})
+            for server in ranked
+        }
         urgency = {
-            number: (
-                server.priority if plan.takes_turns else ranked.index(server),
-                places.get(self._system.threads[number].node, len(order)),
-            )
+            number: (server.priority, taken[server.name].index(named[number]))
             for number, server in governed.items()
         }
         urgent = sorted(set(urgency.values()))
