@@ -30,7 +30,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import yaml
 
@@ -38,13 +38,13 @@ from chainshaper import load_application, measure_latency, simulate
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import PlanRequest, plan_application
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.workload.description import Application
 
 MS = 1_000_000
 HARMONIC_MS = ((20, 40, 80), (25, 50, 100), (50, 100, 200), (100,))
 OTHERS_MS = ((20, 30, 50), (30, 40, 60), (40, 50, 100), (25, 40, 60, 100))
 LIMIT = 0.01 / 60_000
 """A promise is broken where what was seen has a lower probability."""
+PIPELINED = 0.08  # of all applications have a chain that is longer than its period
 RECORDED, SIMULATED = 400, 600
 
 
@@ -61,91 +61,102 @@ class Drawn:
 def drawn(number: int) -> Drawn:
     """The application of this number."""
     draw = random.Random(number)  # noqa: S311 - no secrets; the same number, the same application
+    pipelined = draw.random() < PIPELINED
     count, cores = draw.randint(2, 6), draw.choice((1, 1, 2, 3))
-    harmonic = draw.random() < 0.5
-    periods = draw.choice(HARMONIC_MS if harmonic else OTHERS_MS)
+    periods = draw.choice(HARMONIC_MS if draw.random() < 0.5 else OTHERS_MS)
+    if pipelined:
+        count, cores, periods = 2, 3, (100,)
     load = draw.uniform(0.05, 0.5)  # of each core
-    nodes: dict[str, dict[str, Any]] = {}
-    chains, sink = [], []
-    shared: str | None = None
+    graph = _Graph({}, [], [])
     for chain in range(count):
         period = draw.choice(periods)
-        length = draw.randint(2, 4)
-        budget_ms = load * cores * period / count
-        weights = [draw.uniform(0.2, 1) for _ in range(length)]
+        took_ms = load * cores * period / count
         home = draw.randrange(cores)
-        for place, weight in enumerate(weights):
-            name = f"c{chain}_{place}"
-            took_ms = budget_ms * weight / sum(weights)
-            callback: dict[str, Any] = {
-                "execution": execution(draw, took_ms),
-                "publishes": [f"/{name}"],
-            }
-            if place:
-                callback["subscription"] = f"/c{chain}_{place - 1}"
-            else:
-                callback |= {"timer": f"{period}ms", "phase": f"{draw.randrange(period)}ms"}
-            core = home if draw.random() < 0.8 else draw.randrange(cores)
-            if shared is not None and place and draw.random() < 0.08:
-                nodes[shared]["callbacks"].append(callback)
-                continue
-            nodes[name] = {"core": 1 + core, "callbacks": [callback]}
-            if place and draw.random() < 0.3:
-                shared = name
-        chains.append("..".join(f"/c{chain}_{place}" for place in range(length)))
-        sink.append({"subscription": f"/c{chain}_{length - 1}", "execution": {"constant": "1ms"}})
-        if length > 1 and draw.random() < 0.12 and len(chains) < 6:
-            fork = f"fork{chain}"
-            took_ms = 0.3 * budget_ms
-            callback = {
-                "subscription": f"/c{chain}_0",
-                "execution": execution(draw, took_ms),
-                "publishes": [f"/{fork}"],
-            }
-            nodes[fork] = {"core": 1 + draw.randrange(cores), "callbacks": [callback]}
-            chains.append(f"/c{chain}_0../{fork}")
-            sink.append({"subscription": f"/{fork}"})
-        elif length > 2 and draw.random() < 0.15:  # a branch that the last callback waits for
-            side, last = f"side{chain}", nodes.get(f"c{chain}_{length - 1}")
-            if last is not None and "subscription" in last["callbacks"][0]:
-                callback = {
-                    "subscription": f"/c{chain}_0",
-                    "execution": execution(draw, 0.3 * budget_ms),
-                    "publishes": [f"/{side}"],
-                }
-                nodes[side] = {"core": 1 + draw.randrange(cores), "callbacks": [callback]}
-                joined = last["callbacks"][0].pop("subscription")
-                last["callbacks"][0]["synchronises"] = [joined, f"/{side}"]
-    nodes["sink"] = {"core": draw.choice((0, 0, 1)), "callbacks": sink}
+        if pipelined:  # the first is longer than its period, the second on a core of its own
+            took_ms, home = (30.0, 3) if chain else (draw.uniform(90, 140), home)
+        _add_chain(draw, graph, (chain, period, home, cores), took_ms)
     policy = draw.choice(("shaped",) * 6 + ("let-per-chain", "let-per-callback"))
     wishes: dict[str, Any] = {"policy": policy, "anchor": draw.choice(("stamp", "stamp", "cycle"))}
     wishes["spin_ns"] = draw.choice((MS, 300_000, 300_000, 0))
-    if policy == "shaped":
+    if pipelined:
+        wishes = {"policy": "pipelined", "spin_ns": wishes["spin_ns"]}
+    elif policy == "shaped":
         wishes["bands"] = draw.choice((1, 1, 2, 3))
         wishes["publish_slot_ns"] = draw.choice((None, None, 2 * MS, 500_000))
         wishes["overrun"] = draw.choice((None, None, "wait", "discard"))
         wishes["shaping_thread"] = draw.choice(("free", "free", "free", "in-slots"))
+    graph.nodes["sink"] = {"core": draw.choice((0, 0, 1)), "callbacks": graph.sink}
     described = {
         "name": f"random application {number}",
-        "chain": chains[0],
+        "chain": graph.chains[0],
         "seed": number,
         "scheduling": {
             "executors": {"core": 1, "priority": 80},
             "dds": {"core": 0, "priority": 90},
         },
         "simulation": {"wake_up": {"uniform": ["20us", "150us"]}},
-        "nodes": nodes,
+        "nodes": graph.nodes,
     }
-    kind = ", ".join(
-        [
-            policy,
-            f"{wishes['anchor']} anchor",
-            "one core" if cores == 1 else "several cores",
-            "bands" if wishes.get("bands", 1) > 1 else "one slot",
-        ]
-    )
+    anchor = wishes.get("anchor", "stamp")
+    several = "bands" if wishes.get("bands", 1) > 1 else "one slot"
+    cores_text = "one core" if cores == 1 else "several cores"
+    kind = f"{wishes['policy']}, {anchor} anchor, {cores_text}, {several}"
     text = yaml.safe_dump(described, sort_keys=False)
-    return Drawn(text, tuple(chains), PlanRequest(**wishes), kind)
+    return Drawn(text, tuple(graph.chains), PlanRequest(**wishes), kind)
+
+
+class _Graph(NamedTuple):
+    """What has been drawn of an application: nodes, chains, and the callbacks that get outputs."""
+
+    nodes: dict[str, dict[str, Any]]
+    chains: list[str]
+    sink: list[dict[str, Any]]
+
+
+def _add_chain(
+    draw: random.Random, graph: _Graph, which: tuple[int, int, int, int], took_ms: float
+) -> None:
+    """A chain of 2 to 4 callbacks, which may pass a node of another, fork, or wait for a branch."""
+    chain, period, home, cores = which
+    length = draw.randint(2, 4)
+    weights = [draw.uniform(0.2, 1) for _ in range(length)]
+    for place, weight in enumerate(weights):
+        name = f"c{chain}_{place}"
+        callback = {
+            "execution": execution(draw, took_ms * weight / sum(weights)),
+            "publishes": [f"/{name}"],
+        }
+        if place:
+            callback["subscription"] = f"/c{chain}_{place - 1}"
+        else:
+            callback |= {"timer": f"{period}ms", "phase": f"{draw.randrange(period)}ms"}
+        core = home if home >= cores or draw.random() < 0.8 else draw.randrange(cores)
+        others = [own for own in graph.nodes if own[0] == "c" and not own.startswith(f"c{chain}_")]
+        if others and place and draw.random() < 0.06:
+            graph.nodes[draw.choice(others)]["callbacks"].append(callback)
+        else:
+            graph.nodes[name] = {"core": 1 + core, "callbacks": [callback]}
+    ways = [f"/c{chain}_{place}" for place in range(length)]
+    graph.chains.append("..".join(ways))
+    graph.sink.append({"subscription": ways[-1], "execution": {"constant": "1ms"}})
+    kind, core = draw.random(), 1 + draw.randrange(cores)
+    branch = {"subscription": ways[0], "execution": execution(draw, 0.3 * took_ms)}
+    if kind < 0.12 and len(graph.chains) < 6:
+        graph.nodes[f"fork{chain}"] = {
+            "core": core,
+            "callbacks": [{**branch, "publishes": [f"/fork{chain}"]}],
+        }
+        graph.chains.append(f"{ways[0]}../fork{chain}")
+        graph.sink.append({"subscription": f"/fork{chain}"})
+    elif kind < 0.35 and length > 2:  # a branch that a later callback waits for
+        joins = graph.nodes.get(f"c{chain}_{draw.randrange(2, length)}")
+        if joins is not None and len(joins["callbacks"]) == 1:
+            last = joins["callbacks"][0]
+            last["synchronises"] = [last.pop("subscription"), f"/side{chain}"]
+            graph.nodes[f"side{chain}"] = {
+                "core": core,
+                "callbacks": [{**branch, "publishes": [f"/side{chain}"]}],
+            }
 
 
 def execution(draw: random.Random, mean_ms: float) -> dict[str, Any]:

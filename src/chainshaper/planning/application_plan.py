@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from chainshaper.planning import plan as plans
-from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.offsets import BEFORE_NS, BEHIND_NS, chain_name
 from chainshaper.planning.overruns import in_cycle, slots_without, united, with_output_moved
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
 from chainshaper.planning.plan import PER_CALLBACK, Plan, Server, ShapingNode, Slot, Thread, Wrong
@@ -28,10 +28,6 @@ _GRID_NS = 1_000  # moved slots are found to microseconds
 MOST_SLOTS = 10_000  # of all servers in a hyper-period
 MOST_OPENED = 64  # of a server that is opened for overruns: sched_ext's tables have no more room
 WAITING_NS = 1_000_000  # so long before a timer expires its thread's server is closed already
-# Where a shaping node's server is in force, it is open for so long before the node watches for its
-# slot: 2 ms to take messages, and 2 ms for cycles whose beginning no server holds back (`LEAD_NS`
-# of `flow/threads.py`); and behind its pause, for its notes.
-BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
 
 
 class ApplicationPlan(Part):

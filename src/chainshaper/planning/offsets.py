@@ -21,7 +21,7 @@ from contextlib import suppress
 from functools import partial
 from itertools import combinations, product
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,8 +50,15 @@ TIME_LIMIT_SECONDS = 60.0
 MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
 SHARES = (0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of a slot that begins while no better one is open
 START_NS = 1_000_000  # at the least, so that the first callback begins in time
+# Where a shaping node's server is in force, it is open for so long before the node watches for its
+# slot: 2 ms to take messages, and 2 ms for cycles whose beginning no server holds back (`LEAD_NS`
+# of `flow/threads.py`); and behind its pause, for its notes.
+BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
 WAKE_UP_NS = 150_000  # of a gate that waits for the others
 MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
+
+
+_Slots: TypeAlias = Mapping[tuple[int, int], Sequence[Slot]]
 
 
 class Timetable(NamedTuple):
@@ -64,8 +71,8 @@ class Timetable(NamedTuple):
     name: str
     cycle_ns: int
     slots: dict[tuple[int, int], list[Slot]]
-    begins: dict[tuple[int, int], list[Slot]] = {}
-    busy: dict[tuple[int, int], list[Slot]] = {}
+    begins: _Slots = MappingProxyType({})
+    busy: _Slots = MappingProxyType({})
 
 
 def _timetable(own: Sequence[Plan], plans: Sequence[Plan], alone: float | None) -> Timetable:
@@ -129,10 +136,10 @@ def place_chains(
             raise OperationError(f"{error}. {_turns_only(plans, shared)}") from error
         remark = f"{error}. Instead, the chains run at the same time at priorities of their own,"
         remark += " and only their publish slots do not overlap."
-        limits = {"together": together, "time_limit_s": time_limit_s}
-        apart = partial(with_offsets, _ranked(at_once(False), groups), **limits)
-        if (placed := _longest_alone(apart)) is None:
-            placed = with_offsets(_ranked(at_once(True), groups), **limits)
+        apart = partial(with_offsets, together=together, time_limit_s=time_limit_s)
+        placed = _longest_alone(partial(apart, _ranked(at_once(False), groups)))
+        if placed is None:
+            placed = apart(_ranked(at_once(True), groups))
         turns, remarks = placed, [remark]
     else:
         remarks = []
@@ -178,6 +185,12 @@ def _refuse_outputs_behind_others(plans: Sequence[Plan]) -> None:
         stamp_shift_ns(one, plans) if one.anchor == "stamp" and one.shaping_node else 0
         for one in plans
     ]
+    for plan, shift in zip(plans, shifts, strict=True):
+        if plan.shaping_thread == "in-slots" and shift > BEHIND_NS:
+            said = f"{chain_name(plan)}: its stamps shift by up to {duration_text(shift)} where"
+            said += " chains run at the same time, and the slots of its shaping node's server do"
+            said += " not: leave the node's thread free (--shaping-thread free), or count slots"
+            raise OperationError(f"{said} from the cycle (--anchor cycle)")
     cost = [WAKE_UP_NS + (one.evidence.longest_publication_ns or START_NS) for one in plans]
     for k, plan in enumerate(plans):
         if plan.shaping_node is None or not (slots := publish_slots(plan)):
@@ -372,7 +385,11 @@ class _Puzzle:
         for (j, one), (k, two) in combinations(enumerate(tables), 2):
             common = math.gcd(one.cycle_ns, two.cycle_ns)
             taken: list[Slot] = []
-            both = ((one.slots, two.slots), (one.begins, two.busy), (one.busy, two.begins))
+            both: Sequence[tuple[_Slots, _Slots]] = (
+                (one.slots, two.slots),
+                (one.begins, two.busy),
+                (one.busy, two.begins),
+            )
             for ours, theirs in both:
                 for place in ours.keys() & theirs.keys():
                     for (start, end), (its, ends) in product(ours[place], theirs[place]):

@@ -35,12 +35,13 @@ from chainshaper.values.plan_choices import Wishes
 
 _Stage: TypeAlias = tuple[str, str | None]
 """A callback of a graph, by its node and what it publishes."""
+UNKNOWN = -1  # of a duration that a recording does not tell
 START_UP_NS = 3_000_000_000  # in so long an application starts, or ends
 APART = 1.3  # so many times as long as others is no part of their tail
 FEWEST = 20  # cycles, to tell one from the others
 MOST_ROUNDS = 20  # until the chains' delays, which depend on each other, stay as they are
-# A gate wakes up for a message, takes it, wakes up once more behind its pause, and takes notes: this
-# long in the simulator (docs/simulator.md), and less in a live one, beside watching and publishing.
+# A gate wakes up for a message, takes it, wakes up again behind its pause, and takes notes: so long
+# in the simulator (docs/simulator.md), and less in a live one, beside watching and publishing.
 GATE_TAKES_NS = 400_000
 OFTEN = 0.05  # of a chain's cycles: so often a callback of others on its threads is worth a note
 
@@ -71,7 +72,10 @@ class Profile:
     callback's number in the graph, and its name, ``upstream`` the topics that the output waits for:
     on the chain, on those branches, and before. ``callbacks`` are those of the chain and its
     branches, see :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and
-    ``every_step_ns`` are what each callback of the chain took, a row per latency.
+    ``every_step_ns`` are what each callback of the chain took, a row per latency;
+    ``graph_steps_ns`` and ``every_graph_step_ns`` the same of ``callbacks``, where some are on
+    branches: ``begins_ns`` is how long after the chain each began, at most, which waits for none,
+    :data:`UNKNOWN` where that varies.
     ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
     are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
     ``interfering`` what else the chain's threads run. The rest is
@@ -97,6 +101,11 @@ class Profile:
     callbacks: tuple[CallbackTimes, ...] = ()
     steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     every_step_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    graph_steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    every_graph_step_ns: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros((0, 0), np.int64)
+    )
+    begins_ns: tuple[int, ...] = ()
     fifo_priority: int = 84
     output_depth: int | None = None
     recording: str | None = None
@@ -152,8 +161,10 @@ class Profile:
     def chosen(self, these: NDArray[np.bool_]) -> "Profile":
         """The profile with the longest latency of these cycles; the others stay in ``every``."""
         steps = self.steps_ns[these] if len(self.steps_ns) == len(these) else self.steps_ns
+        of_graph = self.graph_steps_ns
         return replace(
             self,
+            graph_steps_ns=of_graph[these] if len(of_graph) == len(these) else of_graph,
             latencies_ns=self.latencies_ns[these],
             starts_ns=self.starts[these],
             measured_ns=None if self.measured_ns is None else self.measured_ns[these],
@@ -289,7 +300,8 @@ def with_interference(
     undelayed = [alone(profile) for profile in profiles]
     delays = [0] * len(profiles)
     for _ in range(MOST_ROUNDS):
-        before, delays = delays, _delays(undelayed, groups, wishes, delays, at_once, shifting)
+        before = delays
+        delays = _delays(undelayed, groups, wishes, before, (at_once, shifting))
         if delays == before:
             break
     measured = (profile.latencies_ns for profile in profiles)
@@ -301,10 +313,12 @@ def _delays(
     groups: Sequence[Sequence[int]],
     wishes: Wishes,
     before_ns: Sequence[int],
-    at_once: bool,
-    shifting: bool,
+    together: tuple[bool, bool],
 ) -> list[int]:
-    """How long each chain may be delayed, where the others come up to ``before_ns`` later."""
+    """How long each chain may be delayed, where the others come up to ``before_ns`` later, by
+    whether they run at once, and stamps shift.
+    """
+    at_once, shifting = together
     delays, better = [0] * len(profiles), list[Sequence[int]]()
     gates = wishes.policy not in UNSHAPED and wishes.publication != "asynchronous"
     for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):

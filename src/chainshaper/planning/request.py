@@ -27,9 +27,16 @@ from chainshaper.planning.bands import (
 )
 from chainshaper.planning.cores import assign_cores
 from chainshaper.planning.offsets import refuse_common
-from chainshaper.planning.pipeline import pipelined, stage_places
+from chainshaper.planning.pipeline import Work, pipelined, stage_places, work_of
 from chainshaper.planning.plan import UNSHAPED, Evidence, Margin, Modes, Plan, Prediction, Slot
-from chainshaper.planning.profile import Profile, alone, deciding_cycles, up_to, with_interference
+from chainshaper.planning.profile import (
+    UNKNOWN,
+    Profile,
+    alone,
+    deciding_cycles,
+    up_to,
+    with_interference,
+)
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy, Wishes
@@ -134,14 +141,42 @@ def _prepared(every: Sequence[Profile], request: PlanRequest) -> list[Profile]:
 
 
 def _apart(profile: Profile) -> Profile:
-    """The profile of a chain whose instances do not overlap: what its callbacks took, in sum."""
+    """The profile of a chain whose instances do not overlap: what its callbacks took, in sum, or,
+    where branches join, on the longest way.
+    """
     name = profile.name or "a chain"
     if not profile.steps_ns.size:
         raise InputError(f"{name}: stages are cut by what callbacks took: plan from a recording")
-    if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
-        reason = f"{name} waits for {', '.join(beside)} beside it, which would begin too early"
-        raise InputError(f"{reason}: begin the chain behind what waits for them")
-    return alone(profile)
+    if not profile.graph_steps_ns.size:
+        if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
+            reason = f"{name} waits for {', '.join(beside)} beside it, and what these took"
+            raise InputError(f"{reason} is not known: plan from a recording")
+        return alone(profile)
+    if UNKNOWN in profile.begins_ns:
+        node = profile.callbacks[profile.begins_ns.index(UNKNOWN)].node
+        reason = f"{name} waits for what {node} begins, and how long after {profile.nodes[0]} that"
+        reason += " is varies in the recording, in which instances wait for each other: record its"
+        raise InputError(f"{reason} nodes on more cores (`chainshaper profile --policy pipelined`)")
+    return replace(
+        profile,
+        latencies_ns=_work(profile, profile.graph_steps_ns).finished_ns[:, -1],
+        every_latency_ns=_work(profile, profile.every_graph_step_ns).finished_ns[:, -1],
+    )
+
+
+def _work(profile: Profile, steps_ns: NDArray[np.int64]) -> Work:
+    """What a pipeline is made of: these steps, of the chain or, with branches, of the graph."""
+    if not profile.graph_steps_ns.size:
+        along = [range(k - 1, k) if k else () for k in range(len(profile.nodes))]
+        return work_of(profile.nodes, along, steps_ns, [0] * len(along))
+    callbacks = profile.callbacks
+    nodes, first = [one.node for one in callbacks], profile.topics[0]
+    begins = next(
+        k
+        for k, one in enumerate(callbacks)
+        if (one.node, one.publishes) == (profile.nodes[0], first)
+    )
+    return work_of(nodes, [one.after for one in callbacks], steps_ns, profile.begins_ns, begins)
 
 
 def best_effort_cores(
@@ -165,8 +200,12 @@ def best_effort_cores(
 
 def _places(profiles: Sequence[Profile], cores: Sequence[int]) -> dict[str, int]:
     """The place in ``cores`` of the stage that each node of a pipeline is in."""
-    staged = (stage_places(p.nodes, _apart(p).steps_ns, p.period_ns, len(cores)) for p in profiles)
-    return {node: place for own in staged for node, place in own.items()}
+    places: dict[str, int] = {}
+    for one in profiles:
+        apart = _apart(one)
+        steps = apart.graph_steps_ns if apart.graph_steps_ns.size else apart.steps_ns
+        places |= stage_places(_work(apart, steps), one.period_ns, len(cores))
+    return places
 
 
 def stages_before(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
@@ -444,10 +483,12 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
         reason = f"the policy {request.policy} needs the chain's callbacks"
         raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
-        steps, every = profile.steps_ns, profile.every_step_ns
+        with_branches = bool(profile.graph_steps_ns.size)
+        steps = profile.graph_steps_ns if with_branches else profile.steps_ns
         if profile.all_disturbed:
-            steps = every[every.sum(axis=1) <= profile.longest_ns]
-        return pipelined(plan, profile.nodes, steps, profile.core_of, request.cores)
+            every = profile.every_graph_step_ns if with_branches else profile.every_step_ns
+            steps = every[_work(profile, every).finished_ns[:, -1] <= profile.longest_ns]
+        return pipelined(plan, _work(profile, steps), profile.core_of, request.cores)
     if request.policy == "server-per-callback":
         margin_ns = plan.margin.epsilon_ns
         return shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)

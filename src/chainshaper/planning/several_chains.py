@@ -136,9 +136,7 @@ def _planned(
     own, groups = replace(request, best_effort=()), beginning_together(profiles)
 
     def plans(shifting: bool = False, *, at_once: bool) -> list[Plan]:
-        delayed = with_interference(
-            profiles, groups, request, at_once=at_once, shifting=shifting
-        )
+        delayed = with_interference(profiles, groups, request, at_once=at_once, shifting=shifting)
         found = [_beside_others(profile, delayed, own) for profile in delayed]
         for group in groups:
             for k, plan in zip(group, _sharing_servers([found[k] for k in group]), strict=True):
