@@ -37,6 +37,7 @@ import yaml
 from chainshaper import load_application, measure_latency, simulate
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import PlanRequest, plan_application
+from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000
@@ -210,6 +211,12 @@ def outcome(shaped: Any, plan: Any) -> dict[str, Any]:
         "promised": promised,
         "likely": likely,
     }
+    judged = measured.prediction.receivers if measured.prediction else None
+    if judged is not None:
+        share = max(OVERRUN_PROBABILITY, promised)
+        behind = float(binom.sf(judged.behind - 1, judged.count, share)) if judged.behind else 1.0
+        found |= {"received": judged.count, "behind": judged.behind, "likely_behind": behind}
+        likely = min(likely, behind)
     return {**found, "broken": likely < LIMIT}
 
 
@@ -230,6 +237,10 @@ def table(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
     late = sum((one["late"] or 0) + one["never"] for one in outputs)
     promised = sum(one["cycles"] * one["promised"] for one in outputs)
     yield f"{late} outputs late or never published; up to {promised:.0f} were promised"
+    received = [one for one in outputs if "received" in one]
+    behind = sum(one["behind"] for one in received)
+    yield f"{len(received)} chains with a place for receivers: {behind} outputs of"
+    yield f"{sum(one['received'] for one in received)} received later than promised (1 % may)"
     yield f"{len(broken)} applications with a broken promise: {[row['number'] for row in broken]}"
     yield ""
     yield f"{'kind':<55} {'drawn':>6} {'refused':>8} {'at once':>8} {'broken':>7}"

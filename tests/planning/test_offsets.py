@@ -197,7 +197,7 @@ def test_chains_at_once_whose_delays_no_plan_has_are_refused() -> None:
         with pytest.raises(OperationError, match=reason):
             place_chains(plans)
     with pytest.raises(OperationError, match=r"share the executor of /filter, and so have to"):
-        place_chains(shared, at_once=lambda: shared)
+        place_chains(shared, at_once=lambda _: shared)
 
 
 def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:

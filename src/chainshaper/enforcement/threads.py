@@ -16,8 +16,9 @@ the most urgent:
   one; where slots are made of what single callbacks took, all but the first do, as while that was
   measured (:attr:`~chainshaper.planning.application_plan.ApplicationPlan.most_urgent_first`). Turns
   (SCHED_RR), only if the plan wants them, end within a callback, which then waits for another;
-* who receives what a shaping node publishes, on the shaping node's core, or, of several chains,
-  whose servers keep that core busy, on the first core without servers;
+* who receives what a shaping node publishes: where the plan has a place for them, there, behind
+  the shaping nodes and above all others; else below all servers, on the shaping node's core, or, of
+  several chains, whose servers keep that core busy, on the first core without servers;
 * an asynchronous publisher, below every other thread of its process on its core: it spins on the
   writer's lock, and above them would never let them release it;
 * the thread by which Fast DDS sends what synchronous writers could not (`dds.asyn.N.0`), under the
@@ -47,7 +48,7 @@ from chainshaper.linux.processes import (
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole, gate_thread_name, is_of_zenoh
 from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Plan, Server, ShapingNode, shaping_nodes
+from chainshaper.planning.plan import Plan, ReceiverPlace, Server, ShapingNode, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -439,6 +440,7 @@ def plan_scheduling(
         *(members, plan.servers, allocation, available_cores),
         order=plan.most_urgent_first,
         receivers=cores,
+        places=plan.receivers_at,
         take_turns=plan.takes_turns,
         clear={node.core for node in plan.shaping_nodes},
     )
@@ -447,7 +449,12 @@ def plan_scheduling(
 def waiting_receivers(plan: ApplicationPlan, wanted: Iterable[WantedScheduling]) -> list[str]:
     """A note on who receives an output on a core that the servers of other chains keep busy."""
     busy = {(server.core,) for server in plan.servers if len(plan.chains) > 1}
-    ours = [one for one in wanted if one.reason == _RECEIVES and one.wanted.cores in busy]
+    ours = [
+        one
+        for one in wanted
+        if one.reason == _RECEIVES and one.wanted.cores in busy
+        if plan.receivers_at.keys().isdisjoint(one.thread.nodes)
+    ]
     if not ours:
         return []
     nodes = ", ".join(sorted({node for one in ours for node in one.thread.nodes}))
@@ -488,6 +495,7 @@ def scheduling_around(
     *,
     order: Sequence[str] = (),
     receivers: Mapping[str, int] = MappingProxyType({}),
+    places: Mapping[str, ReceiverPlace] = MappingProxyType({}),
     take_turns: bool = False,
     clear: Collection[int] = (),
 ) -> tuple[WantedScheduling, ...]:
@@ -496,7 +504,8 @@ def scheduling_around(
     ``members`` are by server's name, within a server in the ``order`` of their nodes, the most
     urgent first; others come behind these, and share a priority. ``receivers`` are nodes that
     receive an output, and the core for their executors; one that is real-time already, on cores of
-    no server, stays as it is: its other callbacks were placed there. With ``take_turns``, servers
+    no server, stays as it is: its other callbacks were placed there. Some of them have ``places``
+    in the plan, with another priority, and core, if it is available. With ``take_turns``, servers
     of one priority share it by turns. DDS threads leave the cores of all servers or, where these
     are all that there are, those to be ``clear``.
 
@@ -507,6 +516,8 @@ def scheduling_around(
     sizes: dict[int, int] = {}
     for its in (one for one in servers if not getattr(one, "best_effort", False)):
         sizes[its.priority] = max(1, sizes.get(its.priority, 0), len(taken[its.name]))
+    for rank in {place.priority for place in places.values()} & sizes.keys():
+        sizes[rank] += 1  # behind all of it
     priorities = server_priorities(sizes)
 
     def wanted_in(server: Server | ReservationServer, one: NodeThread) -> Scheduling:
@@ -529,8 +540,12 @@ def scheduling_around(
         if one.thread.role != "executor" or one.thread.identity in planned or core is None:
             continue
         receiving_pids.add(one.thread.pid)
-        if one.thread.priority in (0, below) or not busy.isdisjoint(one.thread.cores):
-            receiving.append(WantedScheduling(one, Scheduling(below, (core,)), None, _RECEIVES))
+        place, priority = next((places[n] for n in one.nodes if n in places), None), below
+        if place is not None and place.priority in priorities:
+            priority = priorities[place.priority][-1]
+            core = place.core if place.core in available_cores else core
+        if one.thread.priority in (0, priority) or not busy.isdisjoint(one.thread.cores):
+            receiving.append(WantedScheduling(one, Scheduling(priority, (core,)), None, _RECEIVES))
     planned |= {one.thread.thread.identity for one in receiving}
     free_cores = tuple(sorted(set(available_cores) - busy))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))

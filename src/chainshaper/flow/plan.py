@@ -26,7 +26,7 @@ from chainshaper.analysis.latency import Executor
 from chainshaper.linux.threads import dds_kind
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.margins import read_latencies
-from chainshaper.planning.profile import UNKNOWN, Interfering
+from chainshaper.planning.profile import UNKNOWN, Interfering, Reception
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
@@ -142,6 +142,11 @@ def _profile_of(
         graph_steps, begins = _graph_steps(flow, analysis, stages, cores, planned)
     measured_rows, every_row = (one["traversal"].to_numpy() for one in (measured, every))
     sends = events.table(flow.events, "asynchronous_send")
+    receivers = tuple(  # tools such as `ros2 topic echo`, which come and go, have hidden names
+        node
+        for node in graph.subscribers.get(chain.topics[-1], ())
+        if node not in nodes and not node.rpartition("/")[2].startswith("_")
+    )
     return Profile(
         latencies_ns=measured["latency_ns"].to_numpy().astype(np.int64),
         every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
@@ -157,11 +162,8 @@ def _profile_of(
         cores=cores,
         every_node=tuple(node.name for node in graph.nodes),
         together=_together(graph, nodes),
-        receivers=tuple(  # tools such as `ros2 topic echo`, which come and go, have hidden names
-            node
-            for node in graph.subscribers.get(chain.topics[-1], ())
-            if node not in nodes and not node.rpartition("/")[2].startswith("_")
-        ),
+        receivers=receivers,
+        reception=_reception(flow, analysis, receivers, cores, period),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
         steps_ns=steps[measured_rows],
         every_step_ns=steps[every_row],
@@ -181,6 +183,53 @@ def _profile_of(
         simulated=simulated,
         interfering=_interfering(flow, analysis, running, {*planned, *chain.callbacks}),
         all_disturbed=all_disturbed or None,
+    )
+
+
+def _reception(
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    receivers: Sequence[str],
+    core_of: Mapping[str, int],
+    period_ns: int,
+) -> Reception | None:
+    """How a chain's output gets to those that receive it; None: no message did."""
+    output, callbacks = analysis.chain.topics[-1], analysis.graph.callbacks
+    own = [one.id for one in callbacks if one.trigger == output and one.node in receivers]
+    known = analysis.traversals.filter(pl.col("complete") & ~pl.col("reception_disturbed"))
+    known = known.drop_nulls("received")
+    if not own or not known.height:
+        return None
+    cores = {core_of.get(node) for node in receivers}
+    core = cores.pop() if len(cores) == 1 else None
+    same = [one.id for one in callbacks if core is not None and core_of.get(one.node) == core]
+    busy = flow.instances.drop_nulls("end").sort("start")
+    others = busy.filter(pl.col("callback_id").is_in(same))
+    end, received = known["end"].to_numpy(), known["received"].to_numpy()
+    ended = np.maximum.accumulate(others["end"].to_numpy())
+    began = np.maximum(others["start"].to_numpy(), np.append(0, ended)[:-1])
+    waited = stalled_within(end, received, began, ended, np.zeros_like(began))
+    shortest = int((received - end).min())
+    on_its_way = np.maximum(received - end - waited, shortest)
+    members = {
+        k for one in executors(flow) if not one.callbacks.isdisjoint(own) for k in one.callbacks
+    }
+    took = pl.coalesce("execution_ns", pl.col("end") - pl.col("start"))
+    ran = busy.with_columns(took=took, cycle=pl.col("start") // period_ns)
+    of_output, beside = (
+        ran.filter(pl.col("callback_id").is_in(list(which)))
+        for which in (own, members.difference(own))
+    )
+    in_cycle = beside.group_by("cycle").agg(pl.col("took").sum())["took"]
+    together = of_output.group_by("cycle").agg(pl.col("took").sum())["took"]
+    return Reception(
+        core=core,
+        shortest_ns=int(on_its_way.min()),
+        mean_ns=round(float(on_its_way.mean())),
+        longest_ns=int(on_its_way.max()),
+        time_ns=int(together.max() or 0),  # type: ignore[arg-type]
+        beside_ns=int(in_cycle.max() or 0),  # type: ignore[arg-type]
+        longest_beside_ns=int(beside["took"].max() or 0),  # type: ignore[arg-type]
     )
 
 

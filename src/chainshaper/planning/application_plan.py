@@ -19,7 +19,16 @@ from chainshaper.planning import plan as plans
 from chainshaper.planning.offsets import BEFORE_NS, BEHIND_NS, chain_name
 from chainshaper.planning.overruns import in_cycle, slots_without, united, with_output_moved
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
-from chainshaper.planning.plan import PER_CALLBACK, Plan, Server, ShapingNode, Slot, Thread, Wrong
+from chainshaper.planning.plan import (
+    PER_CALLBACK,
+    Plan,
+    ReceiverPlace,
+    Server,
+    ShapingNode,
+    Slot,
+    Thread,
+    Wrong,
+)
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
@@ -115,6 +124,15 @@ class ApplicationPlan(Part):
     def shaping_nodes(self) -> tuple[ShapingNode, ...]:
         """Those of all chains."""
         return tuple(node for chain in self.chains for node in plans.shaping_nodes(chain))
+
+    @property
+    def receivers_at(self) -> dict[str, ReceiverPlace]:
+        """The places of nodes that receive outputs; of several, the first."""
+        found: dict[str, ReceiverPlace] = {}
+        for shaping in self.shaping_nodes:
+            if shaping.receivers_at is not None:
+                found = dict.fromkeys(shaping.receivers, shaping.receivers_at) | found
+        return found
 
     @property
     def takes_turns(self) -> bool:

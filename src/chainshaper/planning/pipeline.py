@@ -371,10 +371,16 @@ def _in_order(stages: Sequence[Stage], work: Work) -> Iterator[int]:
 
 @wrong_values_refused(Plan)
 def pipelined(
-    plan: Plan, work: Work, core_of: Mapping[str, int], cores: Sequence[int] | None = None
+    plan: Plan,
+    work: Work,
+    core_of: Mapping[str, int],
+    cores: Sequence[int] | None = None,
+    *,
+    room_ns: int = 0,
 ) -> Plan:
     """A shaped plan's chain in stages, on these cores (default: those of ``core_of``).
 
+    Each slot has ``room_ns`` more, for what may have the core meanwhile: who receives the output.
     A core that is named twice has two stages at a time, of which the first has the better priority:
     right where callbacks wait for something rather than compute. OperationError: no cut fits; the
     message names what prevents it.
@@ -382,7 +388,7 @@ def pipelined(
     before = list(dict.fromkeys(core_of[node] for own in work.nodes for node in own))
     # In the order of the chain, so that nodes stay where they are, if that can be.
     cores = sorted(cores or before, key=lambda one: (*before, one).index(one))
-    margin, cycle, node = plan.margin.epsilon_ns, plan.cycle_ns, plan.shaping_node
+    margin, cycle, node = plan.margin.epsilon_ns + room_ns, plan.cycle_ns, plan.shaping_node
     if node is None:
         raise InputError("a pipeline needs a shaping node: plan with --publication synchronous")
     _refuse_too_long(work, margin, cycle)

@@ -57,6 +57,23 @@ class Interfering(NamedTuple):
     longest_ns: int
 
 
+class Reception(NamedTuple):
+    """How an output gets to those that receive it (ns).
+
+    ``core`` is theirs (None: several, or not known). A message is on its way for ``shortest_ns`` to
+    ``longest_ns``, without the time for which others had that core. Its callbacks take ``time_ns``
+    at most, and others of their executors ``beside_ns`` in a cycle, each ``longest_beside_ns``.
+    """
+
+    core: int | None
+    shortest_ns: int
+    mean_ns: int
+    longest_ns: int
+    time_ns: int
+    beside_ns: int = 0
+    longest_beside_ns: int = 0
+
+
 @dataclass(frozen=True)
 class Profile:
     """What was measured of one chain, under a high SCHED_FIFO priority. Times in nanoseconds.
@@ -78,8 +95,9 @@ class Profile:
     :data:`UNKNOWN` where that varies.
     ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
     are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
-    ``interfering`` what else the chain's threads run. The rest is
-    :class:`~chainshaper.planning.plan.Evidence`, and :class:`~.plan.ChainOfPlan`.
+    ``interfering`` what else the chain's threads run; ``reception`` is None where nothing says how
+    the output is received. The rest is :class:`~chainshaper.planning.plan.Evidence`, and
+    :class:`~.plan.ChainOfPlan`.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -98,6 +116,7 @@ class Profile:
     every_node: tuple[str, ...] = ()
     together: tuple[tuple[str, ...], ...] = ()
     receivers: tuple[str, ...] = ()
+    reception: Reception | None = None
     callbacks: tuple[CallbackTimes, ...] = ()
     steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     every_step_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
@@ -335,6 +354,7 @@ def _delays(
                 cores = _cores(one, forked if place in group else _stages([one]))
                 if gates and place != k and other.core_of.get(other.last or "") in cores:
                     rivals += _of_gate(other, wishes, before_ns[place], shifting)
+                    rivals += _of_receivers(other, profiles, before_ns[place])
             delays[k] = interference(_longest_in_time(one), rivals, one.period_ns)
         better.append(group)
     return delays
@@ -350,6 +370,19 @@ def _of_gate(other: Profile, wishes: Wishes, delay_ns: int, shifting: bool) -> I
     cost = wishes.spin_ns + (SHORTEST_SLOT_NS if longest is None else longest)
     shift = delay_ns if shifting and wishes.anchor == "stamp" else 0
     yield Rival(other.period_ns, cost, shift + (0 if wishes.bands == 1 else apart + delay_ns))
+
+
+def _of_receivers(other: Profile, profiles: Sequence[Profile], delay_ns: int) -> Iterator[Rival]:
+    """For how long those have the core that receive another chain's output, if they are on it."""
+    one = other.reception
+    if one is not None and one.core in (None, *planned_cores(profiles)):
+        apart = max(0, _longest_in_time(other) - int(other.every.min()))
+        yield Rival(other.period_ns, one.time_ns + one.beside_ns, apart + delay_ns)
+
+
+def planned_cores(profiles: Sequence[Profile]) -> set[int]:
+    """The cores on which servers run these chains."""
+    return {core for one in profiles for core in one.core_of.values()}
 
 
 def alone(profile: Profile) -> Profile:

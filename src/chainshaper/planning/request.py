@@ -37,6 +37,7 @@ from chainshaper.planning.profile import (
     up_to,
     with_interference,
 )
+from chainshaper.planning.receivers import with_receivers_placed, without_reception
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy, Wishes
@@ -75,6 +76,8 @@ def plan_chain(
     try:
         return _plan_chain(profile, request, sinks)
     except OperationError as error:
+        if profile.reception is not None:  # there may be room for the chain alone
+            return plan_chain(without_reception(profile), request, sinks)
         remark = next(filter(None, map(deciding_cycles, (profile, *sinks))), None)
         if remark is None or request.percentile is not None:
             raise
@@ -85,7 +88,9 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
     refuse_simulated((profile, *sinks), request)
-    profile, *sinks = _prepared((profile, *sinks), request)
+    if not keeps_places(request):
+        profile = without_reception(profile)
+    profile, *sinks = _prepared((profile, *map(without_reception, sinks)), request)
     if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":
         profile, margin, modes, finish = _together(profile, request, modes)
     else:
@@ -127,7 +132,14 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
     plan = shaping.with_executors(plan, [one.executors for one in (profile, *sinks)])
     plan = shaping.with_turns(plans.revised(plan, modes=modes), request.equal_priorities)
+    (plan,) = with_receivers_placed([plan], [profile])
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
+
+
+def keeps_places(request: PlanRequest) -> bool:
+    """Whether a plan keeps places for those that receive what shaping nodes publish."""
+    gates = request.policy not in UNSHAPED and request.publication != "asynchronous"
+    return gates and request.with_receivers
 
 
 def _prepared(every: Sequence[Profile], request: PlanRequest) -> list[Profile]:
@@ -488,7 +500,11 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
         if profile.all_disturbed:
             every = profile.every_graph_step_ns if with_branches else profile.every_step_ns
             steps = every[_work(profile, every).finished_ns[:, -1] <= profile.longest_ns]
-        return pipelined(plan, _work(profile, steps), profile.core_of, request.cores)
+        work, cores = _work(profile, steps), request.cores
+        one, room_ns = profile.reception, 0
+        if one is not None and one.core in (None, *(cores or profile.core_of.values())):
+            room_ns = one.time_ns + one.beside_ns
+        return pipelined(plan, work, profile.core_of, cores, room_ns=room_ns)
     if request.policy == "server-per-callback":
         margin_ns = plan.margin.epsilon_ns
         return shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)
