@@ -21,6 +21,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import random
 import re
 import shutil
@@ -34,11 +35,17 @@ from typing import Any, NamedTuple
 
 import yaml
 
+if __name__ == "__main__":  # before Polars is imported: its tables are small
+    os.environ.setdefault("POLARS_MAX_THREADS", "1")
+
 from chainshaper import load_application, measure_latency, simulate
+from chainshaper.analysis import data_flow
+from chainshaper.analysis.flow import DataFlow
 from chainshaper.flow.plan import profile_chains
-from chainshaper.planning import PlanRequest, plan_application
+from chainshaper.planning import Plan, PlanRequest, plan_application
 from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.recording import Recording
 
 MS = 1_000_000
 HARMONIC_MS = ((20, 40, 80), (25, 50, 100), (50, 100, 200), (100,))
@@ -46,6 +53,7 @@ OTHERS_MS = ((20, 30, 50), (30, 40, 60), (40, 50, 100), (25, 40, 60, 100))
 LIMIT = 0.01 / 60_000
 """A promise is broken where what was seen has a lower probability."""
 PIPELINED = 0.08  # of all applications have a chain that is longer than its period
+SEARCHED_S = 0.5  # for offsets; some that there are may not be found in it
 RECORDED, SIMULATED = 400, 600
 
 
@@ -183,21 +191,22 @@ def judged(number: int, cycles: int, folder: Path) -> dict[str, Any]:
     recording = simulate(application, folder / "recorded", cycles=RECORDED)
     try:
         profiles = profile_chains(recording, one.chains)
-        plan, remarks = plan_application(profiles, one.request, time_limit_s=10.0)
+        plan, remarks = plan_application(profiles, one.request, time_limit_s=SEARCHED_S)
         run = application.model_copy(update={"seed": number + 1_000_000_007})
         shaped = simulate(run, folder / "shaped", plan, cycles=cycles)
     except (InputError, OperationError) as error:
         return {**row, "refused": str(error)}
     row["at_once"] = bool(remarks)
-    row["outputs"] = [outcome(shaped, plan_of) for plan_of in plan.chains]
+    flow = data_flow(shaped.events, shaped.info.clock_offset_ns)
+    row["outputs"] = [outcome(shaped, flow, plan_of) for plan_of in plan.chains]
     return row
 
 
-def outcome(shaped: Any, plan: Any) -> dict[str, Any]:
+def outcome(shaped: Recording, flow: DataFlow, plan: Plan) -> dict[str, Any]:
     """A chain's outputs: how many, how many late, never published, promised, and how likely."""
     from scipy.stats import binom
 
-    measured = measure_latency(shaped, plan.chain.spec)
+    measured = measure_latency(shaped, plan.chain.spec, flow=flow)
     figures = measured.analysis.statistics
     every = figures.count + figures.incomplete
     promised = plan.margin.overrun_probability or 0.0

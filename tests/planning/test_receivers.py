@@ -10,6 +10,7 @@ from chainshaper import load_application, simulate
 from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.planning import Plan, PlanRequest, plan_application, plan_warnings
 from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json
+from chainshaper.splicing.application import splice_application
 from chainshaper.values.plan_choices import Policy
 from chainshaper.verify.measure import measure_latency
 from chainshaper.workload.description import Application
@@ -126,3 +127,15 @@ def test_what_receivers_take_is_what_other_chains_wait_for(tmp_path: Path) -> No
             assert judged.broken == ()
             assert known(judged.receivers).behind == 0
     assert added[1][1] - added[0][1] == pytest.approx(3, abs=0.2), "/c../d waits for /b's receiver"
+
+
+def test_live_nodes_that_receive_stand_between_the_chain_and_its_gate(tmp_path: Path) -> None:
+    """80 for the chain, 85 for the shaping node."""
+    pytest.importorskip("numba")
+    application = described(tmp_path)
+    plan = plan_recording(simulate(application, tmp_path / "profile", cycles=100))
+    spliced = splice_application(application, plan)
+    priorities = [spliced.scheduling_of(name).priority for name in ("b", "actuator")]
+    gate = known(plan.shaping_node)
+    assert [*priorities, gate.fifo_priority] == [80, 84, 85]
+    assert spliced.scheduling_of("actuator").core == 1

@@ -57,7 +57,7 @@ LEFT_ALONE = "left alone, since users run them whom this run does not name: "
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
 _BELOW = 1  # room for a publisher below a server's threads
-_RECEIVES = "receives the output"
+_RECEIVES, _RECEIVES_IN_PLACE = "receives the output", "receives the output, in its place"
 _MOST_NAMED = 5
 _COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
 
@@ -449,12 +449,7 @@ def plan_scheduling(
 def waiting_receivers(plan: ApplicationPlan, wanted: Iterable[WantedScheduling]) -> list[str]:
     """A note on who receives an output on a core that the servers of other chains keep busy."""
     busy = {(server.core,) for server in plan.servers if len(plan.chains) > 1}
-    ours = [
-        one
-        for one in wanted
-        if one.reason == _RECEIVES and one.wanted.cores in busy
-        if plan.receivers_at.keys().isdisjoint(one.thread.nodes)
-    ]
+    ours = [one for one in wanted if one.reason == _RECEIVES and one.wanted.cores in busy]
     if not ours:
         return []
     nodes = ", ".join(sorted({node for one in ours for node in one.thread.nodes}))
@@ -540,12 +535,13 @@ def scheduling_around(
         if one.thread.role != "executor" or one.thread.identity in planned or core is None:
             continue
         receiving_pids.add(one.thread.pid)
-        place, priority = next((places[n] for n in one.nodes if n in places), None), below
+        place = next((places[node] for node in one.nodes if node in places), None)
+        priority, reason = below, _RECEIVES
         if place is not None and place.priority in priorities:
-            priority = priorities[place.priority][-1]
+            priority, reason = priorities[place.priority][-1], _RECEIVES_IN_PLACE
             core = place.core if place.core in available_cores else core
         if one.thread.priority in (0, priority) or not busy.isdisjoint(one.thread.cores):
-            receiving.append(WantedScheduling(one, Scheduling(priority, (core,)), None, _RECEIVES))
+            receiving.append(WantedScheduling(one, Scheduling(priority, (core,)), None, reason))
     planned |= {one.thread.thread.identity for one in receiving}
     free_cores = tuple(sorted(set(available_cores) - busy))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
@@ -626,7 +622,8 @@ def left_by_back_end(
 ) -> tuple[WantedScheduling, ...]:
     """What threads get from us where a back end schedules its servers' threads itself: no priority,
     and under sched_ext none may be left, since the kernel runs real-time threads above it. ``free``
-    threads, which no back end keeps in their slots, do stand above; a receiver is left as it is.
+    threads, which no back end keeps in their slots, do stand above, and so do receivers that have a
+    place there; others are left as they are.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)

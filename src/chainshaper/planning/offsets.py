@@ -50,9 +50,10 @@ TIME_LIMIT_SECONDS = 60.0
 MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
 SHARES = (0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of a slot that begins while no better one is open
 START_NS = 1_000_000  # at the least, so that the first callback begins in time
+LEAD_NS = 2_000_000  # a cycle starts so long after the chain's timer expires (DESIGN section 6)
 # Where a shaping node's server is in force, it is open for so long before the node watches for its
-# slot: 2 ms to take messages, and 2 ms for cycles whose beginning no server holds back (`LEAD_NS`
-# of `flow/threads.py`); and behind its pause, for its notes.
+# slot: 2 ms to take messages, and 2 ms for cycles whose beginning no server holds back
+# (:data:`LEAD_NS`); and behind its pause, for its notes.
 BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
 WAKE_UP_NS = 150_000  # of a gate that waits for the others
 MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
@@ -191,7 +192,8 @@ def _refuse_outputs_behind_others(plans: Sequence[Plan]) -> None:
             said += " chains run at the same time, and the slots of its shaping node's server do"
             said += " not: leave the node's thread free (--shaping-thread free), or count slots"
             raise OperationError(f"{said} from the cycle (--anchor cycle)")
-    cost = [WAKE_UP_NS + (one.evidence.longest_publication_ns or START_NS) for one in plans]
+    longest = (one.evidence.longest_publication_ns for one in plans)
+    cost = [WAKE_UP_NS + (START_NS if one is None else one) for one in longest]
     for k, plan in enumerate(plans):
         if plan.shaping_node is None or not (slots := publish_slots(plan)):
             continue

@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from chainshaper.planning import margins
+from chainshaper.planning.offsets import LEAD_NS
 from chainshaper.planning.plan import (
     Plan,
     Prediction,
@@ -90,8 +91,10 @@ def node_work_ns(plan: Plan, node: ShapingNode) -> int:
 
 
 def _reaches_next_cycle(plan: Plan, after_ns: int) -> bool:
-    """Whether what follows the last output for so long reaches the next cycle."""
-    return plan.predicted.max_ns % plan.cycle_ns + after_ns > plan.cycle_ns
+    """Whether what follows the last output for so long reaches the next instance, whose timer may
+    expire somewhat before its cycle starts.
+    """
+    return plan.predicted.max_ns % plan.cycle_ns + after_ns > plan.cycle_ns - LEAD_NS
 
 
 def _has_room(plan: Plan, profile: Profile, time_ns: int) -> bool:
