@@ -117,8 +117,8 @@ def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
     Raises OperationError: none of these processes publishes the output, or several do.
     """
     with closing(_page_of(topic, pids)) as page:
-        page.put("asked_phase_ns", phase_ns)
-        page.put("phases_asked", page["phases_asked"] + 1)
+        page["asked_phase_ns"] = phase_ns
+        page["phases_asked"] += 1
 
 
 def _page_of(topic: str, pids: Collection[int]) -> Page:
@@ -143,7 +143,7 @@ class FollowedOutput:
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
         self._page = _page_of(topic, pids)
         if not self._page.is_locked(MOVING):  # by how much a run before moved them is over
-            self._page.put("moved_from_ns", 0)
+            self._page["moved_from_ns"] = 0
         if not self._page.lock(MOVING):
             self._page.close()
             raise OperationError(
@@ -169,9 +169,9 @@ class FollowedOutput:
 
     def move(self, by_ns: int, from_ns: int) -> None:
         """Have slots be by so much not where the gate has them, in cycles from an instant on."""
-        self._page.put("moved_from_ns", 0)
-        self._page.put("moved_ns", by_ns)
-        self._page.put("moved_from_ns", from_ns)
+        self._page["moved_from_ns"] = 0
+        self._page["moved_ns"] = by_ns
+        self._page["moved_from_ns"] = from_ns
 
     def close(self) -> None:
         """The slots go back to where the gate has them."""
