@@ -126,19 +126,19 @@ def _private(folder: str) -> str:
 class Page:
     """A page and its lock; numbers are read and written under the names of :data:`FIELDS`.
 
-    The file is read and written, never mapped: a process that maps a file which another one cuts, or
-    for which the disk has no room, is ended by SIGBUS. What is not there reads as 0, what cannot be
-    written is missing, and shaping goes on.
+    The file is read and written, never mapped: a process that maps a file which another one cuts,
+    or for which the disk has no room, is ended by SIGBUS. What is not there reads as 0, what cannot
+    be written is missing, and shaping goes on.
     """
 
     def __init__(
         self, folder: str, name: str, topic: str | None = None, flags: int = os.O_RDONLY
     ) -> None:
-        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at, as it was at
-        the last :meth:`look`. In `/proc`, the folder of a process's open files, all are links.
+        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at, as it was
+        at the last :meth:`look`. In `/proc`, the folder of a process's open files, all are links.
 
-        Raises OSError: it cannot be opened. PermissionError: it is not a file of the folder's owner.
-        ValueError: it is too short for a page.
+        Raises OSError: it cannot be opened, or it is not a file of the folder's owner. ValueError:
+        it is too short for a page.
         """
         self.path = f"{folder}/{name}"
         flags |= os.O_CLOEXEC | os.O_NONBLOCK
@@ -281,7 +281,9 @@ class Turn:
     def wait_s(self) -> float:
         """For how long to wait before starting: nodes before this one have failed at once."""
         failed = self.page["failed_starts"] - 1 - BACK_OFF_AFTER
-        return 0.0 if failed < 0 else min(10.0, 0.5 * 2 ** min(failed, 10))  # a page may say anything
+        return (
+            0.0 if failed < 0 else min(10.0, 0.5 * 2 ** min(failed, 10))
+        )  # a page may say anything
 
     def go_on(self, shaper: Shaper) -> None:
         """Have cycles of a gate begin where they did for the one before it in the same launch, in
