@@ -91,11 +91,13 @@ def data_flow(
         published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
-    notes = (*objects.notes, *_notes(tables, instances))
+    notes = (*objects.notes, *_notes(tables, instances, taken))
     return DataFlow(objects, instances, published, taken, tables, notes)
 
 
-def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]:
+def _notes(
+    tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame
+) -> Iterator[str]:
     """What cannot be known of instances and messages, in plain words."""
     if "sched_switch" in tables and instances.height and not instances["execution_ns"].count():
         yield (
@@ -103,7 +105,7 @@ def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]
             "container threads have other numbers): execution times cannot be known."
         )
     within = int(instances["intra_process"].sum())
-    if within and not events.table(tables, "rclcpp_ring_buffer_dequeue").height:
+    if within and not taken["intra_process"].any():
         yield (
             f"{within} callback instances got their message within their process, of which no "
             "other event tells (before Iron, or not enabled): chains cannot be followed through "

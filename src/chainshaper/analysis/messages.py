@@ -13,7 +13,9 @@ of ROS 2 show different halves of that:
   `dispatch_subscription_callback` is the take;
 * intra-process messages have no timestamp at all: the publication is the `rclcpp_intra_publish`
   before a ring buffer's enqueue on the same thread, the take is the dequeue of the same place in
-  the same buffer.
+  the same buffer;
+* CARET (Galactic, Humble) has no events of ring buffers: the take is its dispatch of the message's
+  address, or of a copy's, to the callback.
 
 Requests and responses of services are messages, too: a client publishes ``SERVICE:request``, which
 the server takes, and takes ``SERVICE:response``. In place of a source timestamp they have the
@@ -42,6 +44,8 @@ _NO_TIME = pl.lit(None, dtype=pl.Int64)
 
 _CALLS = {"rmw_send_request": "client", "rmw_take_request": "service"}
 _CALLS |= {"rmw_send_response": "service", "rmw_take_response": "client"}
+_DISPATCHES = ("dispatch_intra_process_subscription_callback", "dispatch_intra_process")
+_COPIES = 3  # so often a message may be copied on its way to a callback of its process
 _CALL_BITS = 40
 _GID = 16  # bytes that mean anything
 _CLOCKS_AGREE = 2_000
@@ -208,8 +212,8 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
 
     Columns: ``take`` (numbered from 0), ``time``, ``pid``, ``tid``, ``callback_id`` (null if the
     subscription has no callback), ``node``, ``topic``, ``source_timestamp``, ``intra_process``,
-    and for those the ``buffer`` and ``index`` the message lay in. A take that found nothing
-    (``taken`` = 0) carries no message and is left out.
+    and for those the ``buffer`` and ``index`` the message lay in (null where CARET's events tell of
+    them). A take that found nothing (``taken`` = 0) carries no message and is left out.
     """
     types = {name: objects.subscriptions.schema[name] for name in ("node", "topic")}
     callbacks = objects.callbacks.cast(types)  # type: ignore[arg-type]
@@ -223,29 +227,45 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
     if calls.height:
         calls = calls.rename({"call": "source_timestamp"})
         parts.append(latest_before(calls, from_dds, key, "time", "created"))
+    owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
     if taken.is_empty():
-        owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
         dispatched = events.table(tables, "dispatch_subscription_callback")
         dispatched = dispatched.rename({"source_stamp": "source_timestamp"})
         parts.append(latest_before(dispatched, owners, ["pid", "callback"], "time", "created"))
+    dispatched = _dispatched(tables)
+    dispatched = latest_before(dispatched, owners, ["pid", "callback"], "time", "created")
+    within = {"source_timestamp": _NO_TIME, "intra_process": pl.lit(True)}
+    parts.append(dispatched.with_columns(**within))
     owners = callbacks.unique("callback_id", maintain_order=True).select(columns)
     buffers = objects.buffers.join(owners, on="callback_id", how="left")
     dequeued = events.table(tables, "rclcpp_ring_buffer_dequeue")
     dequeued = latest_before(dequeued, buffers, ["pid", "buffer"], "time", "valid_from")
-    parts.append(dequeued.drop_nulls("callback_id").with_columns(source_timestamp=_NO_TIME))
+    parts.append(dequeued.drop_nulls("callback_id").with_columns(**within))
     nowhere = pl.lit(None, dtype=pl.UInt64)
     parts = [
         part.select(
             *("time", "pid", "tid", *columns),
             pl.when(pl.col("source_timestamp") != 0).then("source_timestamp"),
             *(pl.col(n) if n in part.columns else nowhere.alias(n) for n in ("buffer", "index")),
+            intra_process=pl.lit("intra_process" in part.columns),
         )
         for part in parts
     ]
     every = pl.concat([part for part in parts if part.height] or parts[:1])
     every = every.drop_nulls("topic") if every["topic"].null_count() else every
-    every = in_order(every, "time", "pid", "tid").with_row_index("take")
-    return every.with_columns(intra_process=pl.col("buffer").is_not_null())
+    return in_order(every, "time", "pid", "tid").with_row_index("take")
+
+
+def _dispatched(tables: events.EventTables) -> pl.DataFrame:
+    """CARET's dispatches of messages within a process: ``time, pid, tid, message, callback``.
+
+    None where ring buffers' events tell of the same messages.
+    """
+    rows = [events.table(tables, name) for name in _DISPATCHES]
+    if events.table(tables, "rclcpp_ring_buffer_dequeue").height:
+        rows = [row.clear() for row in rows]
+    every = pl.concat(row.select("time", "pid", "tid", "message", "callback") for row in rows)
+    return in_order(every, "time")
 
 
 def link_takes(
@@ -271,11 +291,44 @@ def link_takes(
         again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
         guess = pl.when(~again.fill_null(False)).then("guess")
         linked = rows.with_columns(pl.coalesce("publication", guess)).sort("take").select(columns)
-    if taken["intra_process"].any():
+    if _dispatched(tables).height:
+        linked = _with_dispatched(tables, linked, published)
+    if taken["buffer"].count():
         stored = _enqueued(tables, published)
         rows = latest_before(linked, stored, ["pid", "buffer", "index"], "time", "enqueued")
         linked = rows.with_columns(pl.coalesce("publication", "stored")).sort("take")
     return linked.select(columns)
+
+
+def _with_dispatched(
+    tables: events.EventTables, linked: pl.DataFrame, published: pl.DataFrame
+) -> pl.DataFrame:
+    """``linked`` with the publications of messages that CARET saw dispatched in their process.
+
+    Addresses are used again: a message is the latest one handed over, or copied, at its address.
+    """
+    address, thread = ["pid", "message"], ["pid", "tid"]
+    handed = events.table(tables, "rclcpp_intra_publish").select("time", *thread, "message")
+    known = published.drop_nulls("intra_time").select(*thread, "intra_time", stored="publication")
+    handed = latest_before(handed, known, thread, "time", "intra_time")
+    handed = handed.filter(pl.col("time") == pl.col("intra_time"))
+    origins = handed.select(*address, "stored", since="time")
+    copied = events.table(tables, "message_construct")
+    copied = copied.select("time", "pid", "constructed_message", message="original_message")
+    for _ in range(_COPIES if copied.height else 0):
+        of_original = latest_before(copied, origins, address, "time", "since").drop_nulls("stored")
+        copies = of_original.select(
+            "pid", "stored", message="constructed_message", since="time"
+        ).select(origins.columns)
+        origins = pl.concat([origins, copies]).unique().sort("since", maintain_order=True)
+    took = _dispatched(tables).select(*thread, "message", dispatched="time")
+    rows = linked.filter(pl.col("intra_process") & pl.col("buffer").is_null())
+    rows = latest_before(rows, took, thread, "time", "dispatched")
+    rows = latest_before(rows, origins, address, "time", "since").drop_nulls("stored")
+    # A callback gets a message once: the second time it is one whose events were lost.
+    rows = rows.unique(["callback_id", "stored"], keep="first", maintain_order=True)
+    stored = by_number(rows, "take", "stored", linked.height)
+    return linked.with_columns(pl.coalesce("publication", stored))
 
 
 def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFrame:

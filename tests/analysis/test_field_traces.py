@@ -1,0 +1,38 @@
+"""What public bug reports contain, as small traces of which the right figures are known."""
+
+from pathlib import Path
+
+import pytest
+from reference_traces import reference_folder
+
+from chainshaper import open_source
+from chainshaper.analysis import LatencyAnalysis, analyse_latency
+
+MS = 1_000_000
+
+
+def field_folder(name: str) -> Path:
+    """The folder of a trace from the field; skips the test where it is not."""
+    return reference_folder(f"field/{name}")
+
+
+def latency(name: str, chain: str = "/image../objects") -> LatencyAnalysis:
+    return analyse_latency(open_source(field_folder(name)), chain)
+
+
+def cycles(found: LatencyAnalysis) -> tuple[int, int | None, int | None, int]:
+    """Complete cycles, the shortest and longest latency, and incomplete ones."""
+    figures = found.statistics
+    return figures.count, figures.min_ns, figures.max_ns, figures.incomplete
+
+
+@pytest.mark.parametrize(
+    ("name", "chain"),
+    [
+        ("intra_process_of_caret/trace", "/image../objects"),
+    ],
+)
+def test_messages_without_events_of_dds_are_followed(name: str, chain: str) -> None:
+    found = latency(name, chain)
+    assert cycles(found) == (20, 5 * MS, 5 * MS, 0)
+    assert set(found.hops.filter(hop=1)["communication_ns"]) == {510_000}
