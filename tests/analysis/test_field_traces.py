@@ -36,3 +36,12 @@ def test_messages_without_events_of_dds_are_followed(name: str, chain: str) -> N
     found = latency(name, chain)
     assert cycles(found) == (20, 5 * MS, 5 * MS, 0)
     assert set(found.hops.filter(hop=1)["communication_ns"]) == {510_000}
+
+
+def test_a_take_tells_whose_callback_an_unknown_address_is() -> None:
+    assert cycles(latency("callback_of_unknown_address/generic", "/a../b")) == (
+        20,
+        5 * MS,
+        5 * MS,
+        0,
+    )
