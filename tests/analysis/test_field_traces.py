@@ -6,7 +6,12 @@ import pytest
 from reference_traces import reference_folder
 
 from chainshaper import open_source
-from chainshaper.analysis import LatencyAnalysis, analyse_latency
+from chainshaper.analysis import (
+    LatencyAnalysis,
+    analyse_latency,
+    callback_statistics,
+    data_flow,
+)
 
 MS = 1_000_000
 
@@ -45,3 +50,12 @@ def test_a_take_tells_whose_callback_an_unknown_address_is() -> None:
         5 * MS,
         0,
     )
+
+
+def test_the_executor_s_events_prove_that_a_callback_had_ended() -> None:
+    recording = open_source(field_folder("lost_end_and_start/lostpair"))
+    found = analyse_latency(recording, "/image../objects")
+    assert cycles(found) == (39, 5 * MS, 5 * MS, 1)
+    callbacks = callback_statistics(data_flow(recording.events))
+    (took,) = callbacks.filter(node="/detector")["response_ns"]
+    assert took["max"] == 3_690_000

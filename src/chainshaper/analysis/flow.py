@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 
 import polars as pl
 
+from chainshaper.analysis.lost_ends import LOOKS, without_disproved_ends
 from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
 from chainshaper.analysis.messages import (
     link_takes,
@@ -39,7 +40,6 @@ from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 
 _ACTION = "/_action/"
-_LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
 
 
 @dataclass(frozen=True)
@@ -47,8 +47,10 @@ class DataFlow:
     """A recording, resolved.
 
     * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`.
-    * ``instances``: see :func:`callback_instances`, with those that no event shows added. An
-      instance's number is its row.
+    * ``instances``: see :func:`callback_instances`, with those that no event shows added, and
+      without the ends that other events disprove (:mod:`~chainshaper.analysis.lost_ends`: then,
+      and where an end was lost, ``until`` is when it had ended at the latest, null if not known).
+      An instance's number is its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
       ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),
       and when it was ``sent`` (null: it never was).
@@ -82,6 +84,8 @@ def data_flow(
         published = publications(tables, objects, sent)
         taken = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
+    ends = without_disproved_ends(tables, instances, taken)
+    instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
     published = _published_in(published, instances, objects)
@@ -265,7 +269,7 @@ def _with_assumed_readers(
         return instances, taken.with_columns(assumed_instance=pl.lit(None, dtype=pl.UInt32))
     if assumed["by_executor"].any():
         looks = pl.concat(
-            events.table(tables, name).select("pid", "tid", end="time") for name in _LOOKS
+            events.table(tables, name).select("pid", "tid", end="time") for name in LOOKS
         )
         assumed = first_after(assumed, looks.sort("end"), ["pid", "tid"], "start", "end")
         end = pl.when("by_executor").then("end")
@@ -315,7 +319,8 @@ def _published_in(
 ) -> pl.DataFrame:
     """Add ``instance`` and ``callback_id``: the innermost instance running on the thread then.
 
-    An instance without an end is taken to run until the thread's next instance. A publication in
+    An instance without an end is taken to run until the thread's next instance, or until its thread
+    looked for other work. A publication in
     the nanosecond in which one instance ends and the next begins is the first one's. Where a
     callback runs others inside itself (it spins an executor), what it publishes after them is its
     own: the search is repeated among the instances that contain others, per level of nesting.
@@ -325,7 +330,8 @@ def _published_in(
     running = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
     running = running.drop("execution_ns", "intra_process")
     key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
-    inside = (pl.col("end").is_null() | (pl.col("time") <= pl.col("end"))) & (
+    over = pl.coalesce("end", "until")
+    inside = (over.is_null() | (pl.col("time") <= over)) & (
         ~pl.col("assumed") | (pl.col("owner") == pl.col("node"))
     )
     rest, found, strictly = published.select("publication", "time", *key, "node"), [], True
