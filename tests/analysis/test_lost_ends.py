@@ -23,15 +23,15 @@ def relayed(lost: Lost = frozenset(), *, looks: bool = True) -> Story:
     reader, y = story.relay("/relay", 2, "/x", "/y")
     for sent in range(100, 2001, 100):
         story.runs(source, sent - 5, sent + 5, writes=((x, sent),))
-        steps = {
-            "take": lambda time, sent=sent: story.take(reader, time, sent=sent),
-            "start": lambda time: story.start(reader, time),
-            "publish": lambda time: story.publish(y, time),
-            "end": lambda time: story.end(reader, time),
-        }
-        for after, (step, tell) in zip((9, 10, 30, 40), steps.items(), strict=True):
-            if (step, sent) not in lost:
-                tell(sent + after)
+        left = {step for step in ("take", "start", "publish", "end") if (step, sent) not in lost}
+        if "take" in left:
+            story.take(reader, sent + 9, sent=sent)
+        if "start" in left:
+            story.start(reader, sent + 10)
+        if "publish" in left:
+            story.publish(y, sent + 30)
+        if "end" in left:
+            story.end(reader, sent + 40)
         if looks:
             waits(story, sent + 50)
     return story
