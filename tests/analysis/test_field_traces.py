@@ -12,6 +12,8 @@ from chainshaper.analysis import (
     callback_statistics,
     data_flow,
 )
+from chainshaper.flow.plan import profile_chains
+from chainshaper.planning.profile import doubts_about
 
 MS = 1_000_000
 
@@ -35,6 +37,7 @@ def cycles(found: LatencyAnalysis) -> tuple[int, int | None, int | None, int]:
     ("name", "chain"),
     [
         ("intra_process_of_caret/trace", "/image../objects"),
+        ("takes_without_events/loan", "/image../objects"),
     ],
 )
 def test_messages_without_events_of_dds_are_followed(name: str, chain: str) -> None:
@@ -59,3 +62,10 @@ def test_the_executor_s_events_prove_that_a_callback_had_ended() -> None:
     callbacks = callback_statistics(data_flow(recording.events))
     (took,) = callbacks.filter(node="/detector")["response_ns"]
     assert took["max"] == 3_690_000
+
+
+def test_a_plan_has_the_period_that_a_timer_s_starts_show() -> None:
+    recording = open_source(field_folder("timer_of_another_period/perchanged"))
+    (profile,) = profile_chains(recording, ["/image../objects"])
+    assert profile.period_ns == 50 * MS
+    assert any("starts every 50 ms" in doubt for doubt in doubts_about(profile))

@@ -25,6 +25,7 @@ from dataclasses import dataclass, replace
 
 import polars as pl
 
+from chainshaper.analysis.contradictions import Contradiction, contradictions
 from chainshaper.analysis.lost_ends import LOOKS, without_disproved_ends
 from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
 from chainshaper.analysis.messages import (
@@ -36,6 +37,7 @@ from chainshaper.analysis.messages import (
     with_departures,
 )
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objects
+from chainshaper.analysis.unseen_takes import with_unseen_takes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 
@@ -58,6 +60,8 @@ class DataFlow:
       was read and the ``instance`` that got the message (null: none did).
     * ``events``: the tables all this came from.
     * ``notes``: what cannot be known, in plain words.
+    * ``contradictions``: what in the events contradicts itself; their notes are in ``notes``.
+    * ``untold``: subscriptions' callbacks that ran without any event of a take.
     """
 
     objects: Objects
@@ -66,6 +70,8 @@ class DataFlow:
     takes: pl.DataFrame
     events: events.EventTables
     notes: tuple[str, ...]
+    contradictions: tuple[Contradiction, ...] = ()
+    untold: frozenset[int] = frozenset()
 
 
 def data_flow(
@@ -88,6 +94,7 @@ def data_flow(
     instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
+    taken, unseen = with_unseen_takes(taken, instances, published, objects)
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
         published = _begun_outside(published, instances)
@@ -95,8 +102,18 @@ def data_flow(
         published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
-    notes = (*objects.notes, *_notes(tables, instances, taken))
-    return DataFlow(objects, instances, published, taken, tables, notes)
+    seen = contradictions(
+        tables=tables,
+        objects=objects,
+        instances=instances,
+        published=published,
+        taken=taken,
+        ends=ends,
+        unseen=unseen,
+    )
+    notes = (*objects.notes, *_notes(tables, instances, taken), *(one.note for one in seen))
+    untold = frozenset(one.callback_id for one in unseen)
+    return DataFlow(objects, instances, published, taken, tables, notes, seen, untold)
 
 
 def _notes(
