@@ -69,3 +69,14 @@ def test_a_plan_has_the_period_that_a_timer_s_starts_show() -> None:
     (profile,) = profile_chains(recording, ["/image../objects"])
     assert profile.period_ns == 50 * MS
     assert any("starts every 50 ms" in doubt for doubt in doubts_about(profile))
+
+
+def test_a_step_of_the_wall_clock_does_not_mislead_humble_s_links() -> None:
+    humble, jazzy = (latency(f"humble_clock_step/ntp_fwd_{name}") for name in ("humble", "jazzy"))
+    assert humble.statistics == jazzy.statistics
+    assert humble.subscriber == jazzy.subscriber
+    figures, received = humble.statistics, humble.subscriber
+    assert (figures.count, figures.incomplete) == (40, 0)
+    times = (figures.mean_ns, figures.min_ns, figures.max_ns, received and received.mean_ns)
+    assert [round((time or 0) / 1e6, 3) for time in times] == [13.065, 9.760, 15.825, 13.437]
+    assert any("by +120.000 ms at 3601.1" in note for note in humble.notes)

@@ -2,6 +2,8 @@
 
 * **A message was taken before it was published**: a clock, or an event, is wrong. A plan from it is
   refused.
+* **The wall clock was moved** while messages were recognised by its time alone: they are followed
+  with the clock as it was then, and those that are not certain are left out.
 * **A callback ran, but no event tells of its takes**: it is followed where publication and callback
   determine each other; where not, a plan is refused.
 * **A timer's callback starts at another period than declared**: the period that its starts show
@@ -27,6 +29,7 @@ from chainshaper.analysis.matching import latest_before
 from chainshaper.analysis.objects import Objects
 from chainshaper.analysis.periods import OtherPeriod, other_periods
 from chainshaper.analysis.unseen_takes import UnseenTakes
+from chainshaper.analysis.wall_clock import StampedMessages
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS
 from chainshaper.values.durations import duration_text
@@ -57,10 +60,12 @@ def contradictions(
     taken: pl.DataFrame,
     ends: LostEnds,
     unseen: tuple[UnseenTakes, ...],
+    stamped: StampedMessages | None,
 ) -> tuple[Contradiction, ...]:
     """All contradictions in a recording whose events have been resolved."""
     nodes = objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
     return (
+        *_moved_clock(stamped),
         *_before_their_publication(taken, published),
         *(_without_takes(one) for one in unseen),
         *(_of_another_period(one) for one in other_periods(nodes, instances, taken)),
@@ -92,6 +97,25 @@ def shown_periods(found: Iterable[Contradiction]) -> dict[int, int]:
 def clock_text(time_ns: int) -> str:
     """When something happened, as the trace's clock shows it: ``at 3600.101 s``."""
     return f"at {time_ns / 1e9:.6f} s of the trace's clock"
+
+
+def _moved_clock(stamped: StampedMessages | None) -> Iterator[Contradiction]:
+    if stamped is None or not stamped.moves:
+        return
+    first, total = stamped.moves[0], sum(one.by_ns for one in stamped.moves)
+    said = f"by {first.by_ns / 1e6:+.3f} ms {clock_text(first.time_ns)}"
+    if len(stamped.moves) > 1:
+        said += f", and {len(stamped.moves) - 1} times more, by {total / 1e6:+.3f} ms in all"
+    count, untold = stamped.frame.height, stamped.frame["publication"].null_count()
+    left = f"all {count} could be followed, with the clock as it was then"
+    if untold:
+        left = f"of {untold} among {count} the publication is not certain, and they are left out"
+    yield Contradiction(
+        frozenset(),
+        f"the wall clock was moved while this was recorded, {said}; before Jazzy messages are"
+        f" recognised by its time: {left}.",
+        refused=False,
+    )
 
 
 def _before_their_publication(

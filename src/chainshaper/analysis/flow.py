@@ -88,7 +88,7 @@ def data_flow(
         sent, received = service_calls(tables, objects, clock_offset_ns)
         taken = takes(tables, objects, received)
         published = publications(tables, objects, sent)
-        taken = link_takes(tables, taken, published, clock_offset_ns)
+        taken, followed = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
     ends = without_disproved_ends(tables, instances, taken)
     instances = ends.instances
@@ -110,6 +110,7 @@ def data_flow(
         taken=taken,
         ends=ends,
         unseen=unseen,
+        stamped=followed,
     )
     notes = (*objects.notes, *_notes(tables, instances, taken), *(one.note for one in seen))
     untold = frozenset(one.callback_id for one in unseen)

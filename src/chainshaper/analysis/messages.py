@@ -7,7 +7,8 @@ of ROS 2 show different halves of that:
   `rmw_take` the same timestamp: the match is exact;
 * before Jazzy `rmw_publish` has neither. Its publisher is that of the `rcl_publish` with the same
   message just before it on the same thread; a take is linked to the latest publication on its
-  topic at or before its source timestamp;
+  topic at or before its source timestamp, as the clocks were then
+  (:mod:`~chainshaper.analysis.wall_clock`);
 * CARET (Galactic) has neither `rmw_publish` nor `rmw_take`: `dds_write` is the publication,
   `dds_bind_addr_to_stamp` right after it on the same thread gives the source timestamp, and
   `dispatch_subscription_callback` is the take;
@@ -31,6 +32,7 @@ import polars as pl
 
 from chainshaper.analysis.matching import by_number, first_after, grows, in_order, latest_before
 from chainshaper.analysis.objects import Objects
+from chainshaper.analysis.wall_clock import StampedMessages, messages_of_stamps
 from chainshaper.values import events
 from chainshaper.values.application import REQUEST
 
@@ -50,6 +52,8 @@ _CALL_BITS = 40
 _GID = 16  # bytes that mean anything
 _CLOCKS_AGREE = 2_000
 """So far apart (ns) the clocks of events and stamps may be; no writer publishes twice meanwhile."""
+_HELD_UP = 1_000_000
+"""So long (ns) a message is hardly ever on its way from its event to its stamp."""
 
 
 def service_calls(
@@ -270,34 +274,53 @@ def _dispatched(tables: events.EventTables) -> pl.DataFrame:
 
 def link_takes(
     tables: events.EventTables, taken: pl.DataFrame, published: pl.DataFrame, clock_offset_ns: int
-) -> pl.DataFrame:
+) -> tuple[pl.DataFrame, StampedMessages | None]:
     """``taken`` with a column ``publication``: which publication each take read (null: unknown).
 
     ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME, the clock of source
-    timestamps; it is used only where publications carry no source timestamp.
+    timestamps, when the recording began; it is used only where publications carry no source
+    timestamp. Also returns what was found there, if the clocks' distance alone did not tell.
     """
     found = _with_same_stamp(taken, published)
     linked = taken.with_columns(by_number(found, "take", "publication", taken.height))
-    columns = linked.columns
+    columns, followed = linked.columns, None
     through_buffer = pl.col("intra_time").is_not_null() & (pl.col("time") <= pl.col("intra_time"))
     stampless = published.filter(pl.col("source_timestamp").is_null() & ~through_buffer)
-    if stampless.height:
-        stampless = stampless.select("topic", guess="publication", published="time")
-        rows = linked.with_columns(
-            sent=pl.col("source_timestamp") - clock_offset_ns + _CLOCKS_AGREE
-        )
-        rows = latest_before(rows, stampless, ["topic"], "sent", "published")
-        # A subscription gets a message once: a second take of it read one whose events were lost.
-        again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
-        guess = pl.when(~again.fill_null(False)).then("guess")
-        linked = rows.with_columns(pl.coalesce("publication", guess)).sort("take").select(columns)
+    unknown = linked.filter(pl.col("publication").is_null() & (pl.col("source_timestamp") > 0))
+    if stampless.height and unknown.height:
+        stampless = stampless.select("topic", "publisher", "time", guess="publication")
+        rows = _by_fixed_clocks(unknown, stampless, clock_offset_ns)
+        if rows is None:
+            stampless = stampless.rename({"guess": "publication"})
+            followed = messages_of_stamps(unknown, stampless, clock_offset_ns)
+            message = ["topic", "source_timestamp"]
+            guesses = followed.frame.rename({"publication": "guess"})
+            rows = unknown.join(guesses, on=message, how="left", maintain_order="left")
+        guess = by_number(rows, "take", "guess", linked.height)
+        linked = linked.with_columns(pl.coalesce("publication", guess))
     if _dispatched(tables).height:
         linked = _with_dispatched(tables, linked, published)
     if taken["buffer"].count():
         stored = _enqueued(tables, published)
         rows = latest_before(linked, stored, ["pid", "buffer", "index"], "time", "enqueued")
         linked = rows.with_columns(pl.coalesce("publication", "stored")).sort("take")
-    return linked.select(columns)
+    return linked.select(columns), followed
+
+
+def _by_fixed_clocks(
+    unknown: pl.DataFrame, stampless: pl.DataFrame, clock_offset_ns: int
+) -> pl.DataFrame | None:
+    """``unknown`` takes with the latest publication before their stamps as ``guess``; None where
+    the clocks did not keep their distance, or a message's publication is not there."""
+    sent = pl.col("source_timestamp") - clock_offset_ns + _CLOCKS_AGREE
+    known = stampless.select("topic", "guess", published="time")
+    rows = latest_before(unknown.with_columns(sent=sent), known, ["topic"], "sent", "published")
+    # A subscription gets a message once: a second take of it read one whose events were lost.
+    again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
+    late = pl.col("sent") - pl.col("published") > _CLOCKS_AGREE + _HELD_UP
+    early = pl.col("published") > pl.col("time")
+    odd = pl.col("guess").is_null() | again.fill_null(False) | late | early
+    return None if rows.select(odd.any()).item() else rows
 
 
 def _with_dispatched(
