@@ -205,9 +205,20 @@ def _inside_themselves(
     """Instances without an end in which the same callback ran on the same thread, as an end of it
     that belongs to no other start tells."""
     thread, key = ["pid", "tid"], ["pid", "tid", "callback_id"]
+    if not instances["end"].null_count():
+        return
     open_ones = instances.filter(pl.col("end").is_null() & ~pl.col("assumed"))
-    following = instances.select(*key, after="start")
-    rows = open_ones.join(following, on=key, how="left").filter(pl.col("after") > pl.col("start"))
+    numbers = open_ones["callback_id"].unique().implode()
+    following = instances.filter(pl.col("callback_id").is_in(numbers)).select(*key, after="start")
+    last = following.group_by(key).agg(pl.col("after").max())
+    open_ones = open_ones.join(last, on=key).filter(pl.col("start") < pl.col("after"))
+    if open_ones.is_empty():
+        return
+    rows = (
+        open_ones.drop("after")
+        .join(following, on=key, how="left")
+        .filter(pl.col("after") > pl.col("start"))
+    )
     if rows.is_empty():
         return
     handles = nodes.select("callback_id", callback="handle")

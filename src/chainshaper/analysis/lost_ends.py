@@ -84,10 +84,12 @@ def _suspicious(rows: pl.DataFrame) -> bool:
         last = pl.col("start").max().over("pid", "tid")
         if rows.select((pl.col("end").is_null() & (pl.col("start") < last)).any()).item():
             return True
-    times = rows.lazy().select("callback_id", "start", lasted=pl.col("end") - pl.col("start"))
-    start, lasted = pl.col("start"), pl.col("lasted")
+    start, lasted = pl.col("start"), pl.col("end") - pl.col("start")
     apart = (start.max() - start.min()) / (pl.len() - 1)
-    figures = times.group_by("callback_id").agg(lasted.median(), longest=lasted.max(), apart=apart)
-    longest = pl.col("longest")
-    long = (longest > _LONGER * pl.col("lasted")) & (longest > _OFTEN * pl.col("apart"))
-    return bool(figures.select(long.fill_null(False).any()).collect().item())
+    figures = rows.lazy().group_by("callback_id").agg(longest=lasted.max(), apart=apart)
+    long = figures.filter(pl.col("longest") > _OFTEN * pl.col("apart")).collect()
+    if long.is_empty():
+        return False
+    usual = rows.lazy().join(long.lazy(), on="callback_id").group_by("callback_id")
+    longer = usual.agg(pl.col("longest").first() > _LONGER * lasted.median())
+    return bool(longer.select(pl.col("longest").any()).collect().item())

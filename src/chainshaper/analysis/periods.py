@@ -7,6 +7,7 @@ executor is busy when the timer is due, it is cancelled, or reset. Those are no 
 takes regular starts for which the thread waited although the declared period was over.
 """
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,24 +41,17 @@ class OtherPeriod:
 
 def other_periods(
     callbacks: pl.DataFrame, instances: pl.DataFrame, taken: pl.DataFrame
-) -> tuple[OtherPeriod, ...]:
+) -> Iterator[OtherPeriod]:
     """The timers whose starts contradict their period; nodes that follow `/clock` have its pace."""
     timers = callbacks.filter(pl.col("kind") == "timer", pl.col("period_ns") > 0)
-    simulated = taken.filter(pl.col("topic").cast(pl.String) == "/clock")["node"].unique()
+    simulated = taken.filter(topic="/clock")["node"].unique().cast(pl.String)
     timers = timers.filter(~pl.col("node").is_in(simulated.implode()))
     timers = timers.unique("callback_id", keep="first", maintain_order=True)
-    started = instances.lazy().select("callback_id", "start")
-    started = started.join(timers.lazy().select("callback_id"), on="callback_id", how="semi")
-    starts_of = dict(started.group_by("callback_id").agg("start").collect().iter_rows())
-    columns = ("callback_id", "node", "period_ns")
-    found = []
-    for number, node, declared in timers.sort("callback_id").select(columns).iter_rows():
-        starts = np.sort(np.array(starts_of.get(number, ()), dtype=np.int64))
-        if len(starts) <= FEWEST:
-            continue
+    for number, node, declared in _off_their_grid(timers, instances):
+        starts = instances.filter(pl.col("callback_id") == number)["start"].sort().to_numpy()
         apart = np.diff(starts)
-        usual, count = float(np.median(apart)), len(apart)
-        often = float(apart.sum()) < count * declared * (1 - _SAME) - declared
+        usual = float(np.median(apart))
+        often = _too_often(starts, declared)
         rare = usual > declared * (1 + _SAME) and not often
         regular = float(np.mean(np.abs(apart - usual) <= _REGULAR * usual)) >= _MOSTLY
         if not often and not (
@@ -65,10 +59,32 @@ def other_periods(
         ):
             continue
         period = _period(apart, usual) if regular else None
-        found.append(
-            OtherPeriod(number, node, declared, round(usual), period, len(starts), int(starts[0]))
-        )
-    return tuple(found)
+        yield OtherPeriod(number, node, declared, round(usual), period, len(starts), int(starts[0]))
+
+
+def _off_their_grid(
+    timers: pl.DataFrame, instances: pl.DataFrame
+) -> Iterator[tuple[int, str, int]]:
+    """``callback_id, node, period_ns`` of timers whose number of starts does not fit the period."""
+    start = pl.col("start")
+    started = instances.lazy().select("callback_id", "start")
+    started = started.join(timers.lazy().select("callback_id"), on="callback_id", how="semi")
+    counted = started.group_by("callback_id").agg(
+        count=pl.len() - 1, span=start.max() - start.min()
+    )
+    declared, expected = pl.col("period_ns"), pl.col("count") * pl.col("period_ns")
+    off = (pl.col("span") < expected * (1 - _SAME) - declared) | (
+        pl.col("span") > expected * (1 + _SAME) + declared
+    )
+    found = counted.join(timers.lazy(), on="callback_id").filter(off, pl.col("count") >= FEWEST)
+    columns = ("callback_id", "node", "period_ns")
+    return found.sort("callback_id").select(columns).collect().iter_rows()
+
+
+def _too_often(starts: npt.NDArray[np.int64], declared: int) -> bool:
+    """Whether there are more starts than a timer of this period has in the time."""
+    span, count = float(starts[-1] - starts[0]), len(starts) - 1
+    return span < count * declared * (1 - _SAME) - declared
 
 
 def _waited_in_vain(
