@@ -29,6 +29,9 @@ _LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
 _MOST_WARNINGS = 20
 _FAILURES = {
+    tb.OTHER_TIME: "an event outside the time that its packet says it was open",
+    tb.NO_PROCESS: "an event of process 0, which no program is (zeros instead of what was recorded?)",
+    tb.ALL_ZEROS: "zeros instead of events",
     tb.TRUNCATED: "an event reaches past the end of its packet's content",
     tb.NO_OPTION: "a variant's tag names none of its options",
     tb.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",

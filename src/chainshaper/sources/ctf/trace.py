@@ -6,16 +6,28 @@ import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Literal
+from uuid import UUID
 
 import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf.layout import Layout, lay_out
-from chainshaper.sources.ctf.tsdl import CtfError, TraceClass, TsdlError, parse_tsdl
+from chainshaper.sources.ctf.tsdl import (
+    ArrayType,
+    CtfError,
+    IntegerType,
+    TraceClass,
+    TsdlError,
+    parse_tsdl,
+)
 from chainshaper.values.compiled import kernel
 
 _scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
+_MOST_DAMAGED = 1000
+"""Places in a file behind which it is read on."""
+_MOST_WARNINGS = 20
 _REASONS = {
     tb.BAD_MAGIC: "packet does not begin with the CTF magic number",
     tb.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
@@ -73,7 +85,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     for number, folder in enumerate(folders):
         files = (p for p in folder.path.iterdir() if p.is_file() and p.name[0] != ".")
         for path in sorted(p for p in files if p.name != "metadata"):
-            table, warning = _packet_table(path, layout, number)
+            table, warning = _packet_table(path, layout, number, folder)
+            table[:, [tb.P_EARLIEST, tb.P_LATEST]] = _times_of_events(table, folder, layout, number)
             warnings += warning
             if len(table):
                 streams.append(CtfStream(path, number, table))
@@ -149,6 +162,10 @@ class MappedFile:
         self.address = int(np.frombuffer(self._map, np.uint8).ctypes.data)
         self.size = len(self._map)
 
+    def find(self, content: bytes, start: int) -> int:
+        """Where ``content`` lies from ``start`` on, -1 for nowhere."""
+        return self._map.find(content, start)
+
     def forget(self, packets: NDArray[np.int64]) -> None:
         """Give back the memory of packets in a row; the file's pages stay cached."""
         first = -(-int(packets[0, tb.P_BYTE]) // mmap.PAGESIZE) * mmap.PAGESIZE
@@ -197,26 +214,86 @@ class Scratch:
         self._words[tb.M_ENTRIES], self._words[tb.M_ROOM] = self.entries.ctypes.data, room
 
 
-def _packet_table(path: Path, layout: Layout, folder: int) -> tuple[NDArray[np.int64], list[str]]:
-    """The packets of a stream file (see `layout`), up to one that makes no sense, and warnings."""
+def _packet_table(
+    path: Path, layout: Layout, number: int, folder: TraceClass
+) -> tuple[NDArray[np.int64], list[str]]:
+    """The packets of a stream file (see `layout`) that make sense, and warnings about what does not.
+
+    Behind a part that is damaged the file is read on from the next packet of its trace.
+    """
     packets = np.zeros((256, tb.PACKET_COLUMNS), np.int64)
     if path.stat().st_size == 0:
         return packets[:0], []
     file, scratch = MappedFile(path), Scratch(layout)
     scratch.state[tb.X_BUDGET] = tb.BUDGET * file.size
-    reached = np.zeros(2, np.int64)
-    status = tb.FULL
-    while status == tb.FULL:
-        numbers = (len(packets), reached.ctypes.data, *layout.folders[folder])
+    reached, beginning, damaged = np.zeros(2, np.int64), _beginning(folder), list[str]()
+    while True:
+        numbers = (len(packets), reached.ctypes.data, *layout.folders[number])
         status = scratch.run(_scan_packets, file, packets, *numbers)
         if status == tb.FULL:
             packets = np.concatenate([packets, np.zeros_like(packets)])
-    offset, found = reached.tolist()
-    if status == tb.DONE:
-        return packets[:found].copy(), []
-    unread = f"the last {file.size - offset} bytes of the file are not read"
-    remedy = "events up to the cut are read" if status == tb.CUT else unread
-    return packets[:found].copy(), [str(CtfError(path, offset, _REASONS[status], remedy))]
+            continue
+        if status == tb.DONE:
+            break
+        offset, found = reached.tolist()
+        searched = beginning and status != tb.COSTLY and len(damaged) < _MOST_DAMAGED
+        following = file.find(beginning, offset + 1) if searched else -1
+        if status == tb.CUT and following >= 0:
+            status, size = tb.BAD_SIZE, following - offset
+            packets[found - 1, tb.P_BYTES] = size
+            packets[found - 1, tb.P_END] = min(int(packets[found - 1, tb.P_END]), 8 * size)
+        stop = following if following >= 0 else file.size
+        unread = f"{stop - offset} bytes are not read"
+        if following < 0:
+            unread = f"the last {stop - offset} bytes of the file are not read"
+        if status == tb.CUT or packets[found - 1, tb.P_BYTE] == offset:
+            unread = "events up to the cut are read"
+        damaged.append(str(CtfError(path, offset, _REASONS[status], unread)))
+        if following < 0:
+            break
+        reached[0] = following
+    if len(damaged) > _MOST_WARNINGS:
+        more = len(damaged) - _MOST_WARNINGS
+        damaged[_MOST_WARNINGS:] = [f"{path}: {more} more places are like that"]
+    return packets[: int(reached[1])].copy(), damaged
+
+
+def _beginning(folder: TraceClass) -> bytes:
+    """The bytes that each packet of a trace begins with; none where they are too few to be sure."""
+    header = folder.packet_header.fields if folder.packet_header is not None else ()
+    match header[:2]:
+        case [
+            ("magic", IntegerType(size=32, align=8 | 16 | 32)),
+            ("uuid", ArrayType(IntegerType(8, 8), 16)),
+        ] if folder.uuid is not None:
+            order: Literal["little", "big"] = "big" if folder.byte_order == "be" else "little"
+            return tb.MAGIC.to_bytes(4, order) + UUID(folder.uuid).bytes
+    return b""
+
+
+def _times_of_events(
+    table: NDArray[np.int64], folder: TraceClass, layout: Layout, number: int
+) -> NDArray[np.int64]:
+    """The earliest and the latest time (cycles) that an event of each packet can have.
+
+    Tracers of LTTng before 2.11 closed a packet without the events that were being written, which
+    the next packet's beginning bounds; so do packets of a crash, which say no end.
+    """
+    times = np.full((len(table), 2), tb.ALWAYS, np.int64)
+    major, minor = (folder.env.get(f"tracer_{part}") for part in ("major", "minor"))
+    known_version = isinstance(major, int) and isinstance(minor, int)
+    late = known_version and (major, minor) < (2, 11)
+    begin, last = table[:, tb.P_BEGIN], table[:, tb.P_LAST]
+    following = np.append(begin[1:], -1)
+    following[following < begin] = tb.ALWAYS[1]
+    latest = np.where((last < begin) | late, np.maximum(last, following), last)
+    for row, stream in enumerate(folder.streams.values(), layout.folders[number][0]):
+        context = dict(stream.packet_context.fields) if stream.packet_context is not None else {}
+        stamps = (context.get(name) for name in ("timestamp_begin", "timestamp_end"))
+        if all(isinstance(one, IntegerType) and one.clock and one.size == 64 for one in stamps):
+            known = (table[:, tb.P_STREAM] == row) & (begin > 0)
+            times[known, 0], times[known, 1] = begin[known], latest[known]
+    return times
 
 
 # The metadata file
