@@ -177,8 +177,8 @@ def believed(machine, stream, packet, start, end, position, read, regs):
     elif get(regs, tb.R_ID) == 0 and get(stream, tb.S_ALIGN) != 0:
         align = get(stream, tb.S_ALIGN)
         at = ((position + align - 1) & -align) >> 3
-        stop = min((read >> 3) + tb.ZEROS, end >> 3)
-        while at < stop and load_byte(start + at) == tb.U0:
+        stop = (read >> 3) + tb.ZEROS
+        while at < stop <= end >> 3 and load_byte(start + at) == tb.U0:
             at += 1
         if at == stop:
             return np.int64(tb.ALL_ZEROS)

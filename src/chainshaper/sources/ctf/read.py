@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf import tsdl
+from chainshaper.sources.ctf.copies import CtfStream
 from chainshaper.sources.ctf.layout import Layout, Table, lay_out
-from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scratch
+from chainshaper.sources.ctf.trace import CtfTrace, MappedFile, Scratch
 from chainshaper.values.compiled import kernel
 
 _run_events = kernel("chainshaper.sources.ctf.kernels", "run_events")
@@ -30,7 +31,7 @@ _HUGE_PAGE = 2 << 20
 _MOST_WARNINGS = 20
 _FAILURES = {
     tb.OTHER_TIME: "an event outside the time that its packet says it was open",
-    tb.NO_PROCESS: "an event of process 0, which no program is (zeros instead of what was recorded?)",
+    tb.NO_PROCESS: "an event of process 0, which is no program: zeros instead of what was recorded",
     tb.ALL_ZEROS: "zeros instead of events",
     tb.TRUNCATED: "an event reaches past the end of its packet's content",
     tb.NO_OPTION: "a variant's tag names none of its options",

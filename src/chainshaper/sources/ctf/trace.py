@@ -4,7 +4,7 @@ import ctypes
 import mmap
 import struct
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 from uuid import UUID
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import layout as tb
+from chainshaper.sources.ctf.copies import CtfStream, stream_classes, without_copies
 from chainshaper.sources.ctf.layout import Layout, lay_out
 from chainshaper.sources.ctf.tsdl import (
     ArrayType,
@@ -37,15 +38,6 @@ _REASONS = {
     tb.COSTLY: "packet headers that take far more work than their size warrants",
     tb.CUT: "last packet cut short by the end of the file",
 }
-
-
-@dataclass(frozen=True)
-class CtfStream:
-    """One stream file of a folder (by number) and the table of its packets (see `layout`)."""
-
-    path: Path
-    folder: int
-    table: NDArray[np.int64] = field(repr=False, compare=False)
 
 
 @dataclass(frozen=True)
@@ -81,7 +73,6 @@ def open_trace(*paths: Path | str) -> CtfTrace:
         if (one.clock.name, one.clock.uuid) != (first.name, first.uuid)
     ]
     streams: list[CtfStream] = []
-    groups: dict[object, list[CtfStream]] = {}
     for number, folder in enumerate(folders):
         files = (p for p in folder.path.iterdir() if p.is_file() and p.name[0] != ".")
         for path in sorted(p for p in files if p.name != "metadata"):
@@ -90,9 +81,14 @@ def open_trace(*paths: Path | str) -> CtfTrace:
             warnings += warning
             if len(table):
                 streams.append(CtfStream(path, number, table))
-                kind, instance = table[0, [tb.P_STREAM, tb.P_INSTANCE]].tolist()
-                name = path if instance < 0 else instance
-                groups.setdefault((kind, name), []).append(streams[-1])
+    classes_of_streams = stream_classes(folders)
+    streams, copied = without_copies(streams, classes_of_streams)
+    warnings += copied
+    groups: dict[object, list[CtfStream]] = {}
+    for stream in streams:
+        kind, instance = stream.table[0, [tb.P_STREAM, tb.P_INSTANCE]].tolist()
+        name = stream.path if instance < 0 else instance
+        groups.setdefault((classes_of_streams[kind], name), []).append(stream)
     losses = [(group[0].path, *_losses(group)) for group in groups.values()]
     for path, discarded, lost in losses:
         if discarded:
@@ -217,7 +213,7 @@ class Scratch:
 def _packet_table(
     path: Path, layout: Layout, number: int, folder: TraceClass
 ) -> tuple[NDArray[np.int64], list[str]]:
-    """The packets of a stream file (see `layout`) that make sense, and warnings about what does not.
+    """The packets of a stream file (see `layout`) that make sense, and what does not.
 
     Behind a part that is damaged the file is read on from the next packet of its trace.
     """
