@@ -20,7 +20,7 @@ from chainshaper.analysis.chains import close_names
 from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.flow.plan import inputs_of
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.sources.lttng.trace import table_name
+from chainshaper.sources.lttng.sessions import table_name
 from chainshaper.values.application import INTERNAL_TOPICS
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
