@@ -171,8 +171,12 @@ def believed(machine, stream, packet, start, end, position, read, regs):
         return np.int64(tb.OTHER_TIME)
     align = get(stream, tb.S_PROCESS_ALIGN)
     if align != 0:
-        at = (((read + align - 1) & -align) + get(stream, tb.S_PROCESS)) >> 3
-        if at + 8 <= end >> 3 and load_word(start + at) & tb.LOW == tb.U0:
+        begin, last = (read + align - 1) & -align, (end >> 3) - 8
+        process = (begin + get(stream, tb.S_PROCESS)) >> 3
+        thread = (begin + get(stream, tb.S_THREAD)) >> 3
+        if (process <= last and load_word(start + process) & tb.LOW == tb.U0) or (
+            thread <= last and load_word(start + thread) & tb.LOW == tb.U0
+        ):
             return np.int64(tb.NO_PROCESS)
     elif get(regs, tb.R_ID) == 0 and get(stream, tb.S_ALIGN) != 0:
         align = get(stream, tb.S_ALIGN)

@@ -54,14 +54,14 @@ ALWAYS = (-(1 << 63), (1 << 63) - 1)
 # Stream classes of all folders: operations (first, end) of packet HEADER, packet CONTEXT and EVENT
 # header; LTTng's event headers in one load, ALIGN 0 where the header is another; event ids in the
 # table of ids, a dense part, then pairs; bit n of KNOWN: register n is read in header or context;
-# the COST of a packet; where an event's 32 bits of the process lie behind its header (ALIGN and
-# PROCESS, in bits; ALIGN 0 where that is not known, or process 0 is the kernel's).
+# the COST of a packet; where an event's 32 bits of the process and the thread lie behind its header
+# (ALIGN, PROCESS and THREAD, in bits; ALIGN 0 where that is not known, or the trace is a kernel's).
 (
     S_ID, S_HEADER, S_HEADER_STOP, S_CONTEXT, S_CONTEXT_STOP, S_EVENT, S_EVENT_STOP,
     S_ALIGN, S_ID_BITS, S_SHIFT, S_CLOCK_BITS, S_ID_FIRST, S_ID_DENSE, S_ID_PAIRS, S_DEFAULT,
     S_FREQUENCY, S_KNOWN, S_UUID_LOW, S_UUID_HIGH, S_COST, S_PROCESS_ALIGN, S_PROCESS,
-    STREAM_COLUMNS,
-) = range(23)
+    S_THREAD, STREAM_COLUMNS,
+) = range(24)
 
 # Event classes of all stream classes: operations (first, end) of context and payload; ALIGN and
 # SIZE where these are one constant step, else 0, and MOVED 1 where they only move what they read;
@@ -492,7 +492,7 @@ def _add_stream(
         except ValueError:
             raise LayoutError(f"trace uuid {trace.uuid!r} is none") from None
     has_cpu, kernel = bool(row[S_KNOWN] >> R_CPU & 1), trace.env.get("domain") == "kernel"
-    row[S_PROCESS_ALIGN], row[S_PROCESS] = (0, 0) if kernel else _place_of_process(stream)
+    row[S_PROCESS_ALIGN : S_THREAD + 1] = [0, 0, 0] if kernel else _places_of_process(stream)
     ids = {}
     for event in stream.events.values():
         ids[event.id] = len(layout.events)
@@ -515,23 +515,27 @@ def _add_stream(
     layout.streams.append(row)
 
 
-def _place_of_process(stream: tsdl.StreamClass) -> tuple[int, int]:
-    """The alignment of what follows an event's header, and the bit of ``vpid`` in it; (0, 0) where
-    none of 32 bits is at a constant place.
+def _places_of_process(stream: tsdl.StreamClass) -> list[int]:
+    """The alignment of what follows an event's header, and the bits of ``vpid`` and ``vtid`` in it.
+
+    All are 0 where these are not both of 32 bits at a constant place.
     """
     position, context = 0, stream.event_context or tsdl.StructType()
+    places: dict[str, int] = {}
     for name, kind in context.fields:
         position += -position % tsdl.alignment(kind)
         match kind:
-            case tsdl.IntegerType(size=32, align=8 | 16 | 32) if tsdl.field_name(name) == "vpid":
-                return context.align, position
             case tsdl.IntegerType(size=size):
+                if size == 32 and kind.align >= 8:
+                    places[tsdl.field_name(name)] = position
                 position += size
             case tsdl.ArrayType(tsdl.IntegerType(size, align), int(count)) if size % align == 0:
                 position += count * size
             case _:
                 break
-    return 0, 0
+    if {"vpid", "vtid"} <= places.keys():
+        return [context.align, places["vpid"], places["vtid"]]
+    return [0, 0, 0]
 
 
 def _columns(

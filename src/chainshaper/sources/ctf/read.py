@@ -31,13 +31,13 @@ _HUGE_PAGE = 2 << 20
 _MOST_WARNINGS = 20
 _FAILURES = {
     tb.OTHER_TIME: "an event outside the time that its packet says it was open",
-    tb.NO_PROCESS: "an event of process 0, which is no program: zeros instead of what was recorded",
+    tb.NO_PROCESS: "an event of process or thread 0: there are zeros instead of what was recorded",
     tb.ALL_ZEROS: "zeros instead of events",
     tb.TRUNCATED: "an event reaches past the end of its packet's content",
     tb.NO_OPTION: "a variant's tag names none of its options",
     tb.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
     tb.UNTERMINATED: "a string does not end within its packet",
-    tb.UNKNOWN_EVENT: "an event id that the metadata does not declare",
+    tb.UNKNOWN_EVENT: "an event id that the metadata does not declare: perhaps it ends too early",
     tb.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory than its size"
     f" warrants ({tb.BUDGET} times)",
 }
@@ -45,12 +45,13 @@ _Progress = Callable[[float], None]
 
 
 class Events(dict[str, pl.DataFrame]):
-    """Frames by event name; ``warnings`` say what could not be read.
+    """Frames by event name; ``warnings`` say what cannot be read, of so many packets ``damaged``.
 
     ``counts`` are of all events in the streams that were read, zeros included.
     """
 
     warnings: tuple[str, ...] = ()
+    damaged: int = 0
     counts: dict[str, int]
 
 
@@ -123,6 +124,7 @@ def read_events(
         folder = trace.folders[0].path
         raise tsdl.CtfError(folder, None, reason, "read its folders one by one") from None
     events.warnings = tuple(_warnings(files))
+    events.damaged = sum(int((file.packets[:, tb.P_ERROR] < 0).sum()) for file in files)
     events.counts = dict.fromkeys(trace.event_names, 0)
     for file in files:
         for event, number in zip(layout.events, file.counts.tolist(), strict=False):

@@ -6,7 +6,7 @@ import struct
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NamedTuple
 from uuid import UUID
 
 import numpy as np
@@ -32,7 +32,7 @@ _MOST_WARNINGS = 20
 _REASONS = {
     tb.BAD_MAGIC: "packet does not begin with the CTF magic number",
     tb.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
-    tb.BAD_STREAM: "packet of a stream class that the metadata does not declare",
+    tb.BAD_STREAM: "packet of a stream class that the metadata does not declare (or no more)",
     tb.BAD_SIZE: "packet with impossible content or packet size",
     tb.BAD_HEADER: "packet header cut short",
     tb.COSTLY: "packet headers that take far more work than their size warrants",
@@ -45,7 +45,8 @@ class CtfTrace:
     """Traces opened together.
 
     ``clock_offset_ns`` added to an event's time gives ns since the Epoch; ``discarded_events`` and
-    ``lost_packets`` are what the tracer says that it dropped.
+    ``lost_packets`` are what the tracer says that it dropped, ``damaged_places`` the parts of
+    stream files that are no packets.
     """
 
     folders: tuple[TraceClass, ...]
@@ -54,6 +55,7 @@ class CtfTrace:
     clock_offset_ns: int
     discarded_events: int
     lost_packets: int
+    damaged_places: int
     warnings: tuple[str, ...]
 
 
@@ -72,15 +74,15 @@ def open_trace(*paths: Path | str) -> CtfTrace:
         for one in folders[1:]
         if (one.clock.name, one.clock.uuid) != (first.name, first.uuid)
     ]
-    streams: list[CtfStream] = []
+    streams, damaged = list[CtfStream](), 0
     for number, folder in enumerate(folders):
         files = (p for p in folder.path.iterdir() if p.is_file() and p.name[0] != ".")
         for path in sorted(p for p in files if p.name != "metadata"):
-            table, warning = _packet_table(path, layout, number, folder)
-            table[:, [tb.P_EARLIEST, tb.P_LATEST]] = _times_of_events(table, folder, layout, number)
-            warnings += warning
-            if len(table):
-                streams.append(CtfStream(path, number, table))
+            packets = _packets_of(path, layout, number, folder)
+            warnings += packets.warnings
+            damaged += packets.damaged
+            if len(packets.table):
+                streams.append(CtfStream(path, number, packets.table))
     classes_of_streams = stream_classes(folders)
     streams, copied = without_copies(streams, classes_of_streams)
     warnings += copied
@@ -105,6 +107,7 @@ def open_trace(*paths: Path | str) -> CtfTrace:
         clock_offset_ns=first.offset_ns,
         discarded_events=sum(discarded for _, discarded, _ in losses),
         lost_packets=sum(lost for *_, lost in losses),
+        damaged_places=damaged,
         warnings=tuple(warnings),
     )
 
@@ -162,6 +165,10 @@ class MappedFile:
         """Where ``content`` lies from ``start`` on, -1 for nowhere."""
         return self._map.find(content, start)
 
+    def begins_with_zeros(self, start: int) -> bool:
+        """Whether nothing but zeros is where a packet would have its magic number."""
+        return not any(self._map[start : start + 4])
+
     def forget(self, packets: NDArray[np.int64]) -> None:
         """Give back the memory of packets in a row; the file's pages stay cached."""
         first = -(-int(packets[0, tb.P_BYTE]) // mmap.PAGESIZE) * mmap.PAGESIZE
@@ -210,19 +217,26 @@ class Scratch:
         self._words[tb.M_ENTRIES], self._words[tb.M_ROOM] = self.entries.ctypes.data, room
 
 
-def _packet_table(
-    path: Path, layout: Layout, number: int, folder: TraceClass
-) -> tuple[NDArray[np.int64], list[str]]:
-    """The packets of a stream file (see `layout`) that make sense, and what does not.
+class _Packets(NamedTuple):
+    """The packets of a stream file (see `layout`), how many places are damaged, and warnings."""
 
-    Behind a part that is damaged the file is read on from the next packet of its trace.
+    table: NDArray[np.int64]
+    damaged: int = 0
+    warnings: tuple[str, ...] = ()
+
+
+def _packets_of(path: Path, layout: Layout, number: int, folder: TraceClass) -> _Packets:
+    """Find the packets of a stream file.
+
+    Behind a part that makes no sense the file is read on from the next packet of its trace.
     """
     packets = np.zeros((256, tb.PACKET_COLUMNS), np.int64)
     if path.stat().st_size == 0:
-        return packets[:0], []
+        return _Packets(packets[:0])
     file, scratch = MappedFile(path), Scratch(layout)
     scratch.state[tb.X_BUDGET] = tb.BUDGET * file.size
-    reached, beginning, damaged = np.zeros(2, np.int64), _beginning(folder), list[str]()
+    reached, beginning = np.zeros(2, np.int64), _beginning(folder)
+    places = list[str]()
     while True:
         numbers = (len(packets), reached.ctypes.data, *layout.folders[number])
         status = scratch.run(_scan_packets, file, packets, *numbers)
@@ -232,26 +246,39 @@ def _packet_table(
         if status == tb.DONE:
             break
         offset, found = reached.tolist()
-        searched = beginning and status != tb.COSTLY and len(damaged) < _MOST_DAMAGED
+        searched = beginning and status != tb.COSTLY and len(places) < _MOST_DAMAGED
         following = file.find(beginning, offset + 1) if searched else -1
-        if status == tb.CUT and following >= 0:
-            status, size = tb.BAD_SIZE, following - offset
-            packets[found - 1, tb.P_BYTES] = size
-            packets[found - 1, tb.P_END] = min(int(packets[found - 1, tb.P_END]), 8 * size)
-        stop = following if following >= 0 else file.size
-        unread = f"{stop - offset} bytes are not read"
-        if following < 0:
-            unread = f"the last {stop - offset} bytes of the file are not read"
-        if status == tb.CUT or packets[found - 1, tb.P_BYTE] == offset:
-            unread = "events up to the cut are read"
-        damaged.append(str(CtfError(path, offset, _REASONS[status], unread)))
+        places.append(_damage(path, file, status, offset, following))
         if following < 0:
             break
+        if status == tb.CUT:
+            packets[found - 1, tb.P_BYTES] = following - offset
+            most = 8 * (following - offset)
+            packets[found - 1, tb.P_END] = min(int(packets[found - 1, tb.P_END]), most)
         reached[0] = following
-    if len(damaged) > _MOST_WARNINGS:
-        more = len(damaged) - _MOST_WARNINGS
-        damaged[_MOST_WARNINGS:] = [f"{path}: {more} more places are like that"]
-    return packets[: int(reached[1])].copy(), damaged
+    table = packets[: int(reached[1])].copy()
+    table[:, [tb.P_EARLIEST, tb.P_LATEST]] = _times_of_events(table, folder, layout, number)
+    # A file without any packet is another program's, but for one that has nothing but zeros.
+    ours = len(table) > 0 or file.begins_with_zeros(0)
+    if (more := len(places) - _MOST_WARNINGS) > 0:
+        places[_MOST_WARNINGS:] = [f"{path}: {more} more places are like that"]
+        return _Packets(table, _MOST_WARNINGS + more, tuple(places))
+    return _Packets(table, len(places) if ours else 0, tuple(places))
+
+
+def _damage(path: Path, file: MappedFile, status: int, offset: int, following: int) -> str:
+    """A warning of what is wrong at an offset; the next packet is at ``following`` (-1: none)."""
+    reason = _REASONS[status]
+    if status == tb.BAD_MAGIC and file.begins_with_zeros(offset):
+        reason = "zeros instead of a packet: the disk was full, or the recording was not stopped"
+    unread = f"{following - offset} bytes are not read"
+    if following < 0:
+        unread = f"the last {file.size - offset} bytes of the file are not read"
+    if status == tb.CUT:
+        unread = "events up to the cut are read"
+        if following >= 0:
+            reason = "packet with a size that reaches over the next one"
+    return str(CtfError(path, offset, reason, unread))
 
 
 def _beginning(folder: TraceClass) -> bytes:
@@ -302,12 +329,47 @@ _RECORD_SEPARATOR = b"\x1e"  # begins every fragment of CTF 2's JSON text sequen
 def read_metadata(path: Path) -> TraceClass:
     """Read and parse a metadata file; raises `CtfError` naming the file and the byte offset."""
     text, pieces = read_metadata_text(path)
+    if not text.strip(" \t\r\n\0"):
+        raise _not_whole(path, _in_file(0, pieces), "the metadata is empty (no trace block)")
     try:
         return replace(parse_tsdl(text), path=path.parent)
     except TsdlError as error:
-        place, why = _in_file(len(text[: error.args[0]].encode()), pieces), error.args[1]
+        offset, why = error.args
+        place = _in_file(len(text[:offset].encode()), pieces)
+        # What is whole ends with a block; what stops too early is all right up to where it stops.
+        written = text.rstrip(" \t\r\n\0")
+        if offset >= len(written) or not written.endswith((";", "*/")):
+            raise _not_whole(path, place, f"the metadata ends in the middle ({why})") from None
         remedy = "record again, or report this with the file"
         raise CtfError(path, place, f"metadata cannot be understood: {why}", remedy) from None
+
+
+def _not_whole(path: Path, place: int, what: str) -> CtfError:
+    """What to do about metadata that the tracer did not finish."""
+    uuid = next(filter(None, map(_uuid_in, sorted(path.parent.iterdir()))), None)
+    whose = "this trace's UUID" if uuid is None else f"the UUID of this trace, {uuid},"
+    return CtfError(
+        path,
+        place,
+        f"{what}: the session was not stopped and destroyed in order (`lttng destroy`), or the disk"
+        " was full; babeltrace2 cannot read it either",
+        "record again; or copy the metadata of a run with the same set-up, whose nodes started in "
+        f"the same order, and write {whose} in place of its own: `sed -i s/OLD/NEW/ metadata`",
+    )
+
+
+def _uuid_in(path: Path) -> UUID | None:
+    """The UUID that a stream file's first packet says; None where it is no stream."""
+    if path.name == "metadata" or not path.is_file():
+        return None
+    with path.open("rb") as file:
+        head = file.read(20)
+    if len(head) == 20 and head[:4] in {
+        tb.MAGIC.to_bytes(4, "little"),
+        tb.MAGIC.to_bytes(4, "big"),
+    }:
+        return UUID(bytes=head[4:])
+    return None
 
 
 def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
@@ -331,6 +393,8 @@ def read_metadata_text(path: Path) -> tuple[str, list[tuple[int, int]]]:
     try:
         return data.decode(), pieces
     except UnicodeDecodeError as error:
+        if error.end == len(data) and error.start > 0:
+            raise _not_whole(path, len(data), "the metadata ends in the middle") from None
         place, remedy = _in_file(error.start, pieces), "is this a CTF 1.8 trace?"
         raise CtfError(path, place, "metadata is not UTF-8 text", remedy) from None
 
@@ -346,9 +410,11 @@ def _unpacked(path: Path, data: bytes, order: str) -> tuple[bytes, list[tuple[in
     while offset < len(data):
         begin = offset + header.size
         if begin > len(data):
-            raise CtfError(path, offset, "metadata packet header cut short", "file is truncated")
+            raise _not_whole(path, offset, "the metadata ends in the middle")
         magic, _, _, content, size, compression, encryption, *_ = header.unpack_from(data, offset)
         end = offset + content // 8
+        if not any(data[offset:]) or (not size and not any(data[begin:])):
+            raise _not_whole(path, offset, "the metadata ends in zeros")
         if magic != METADATA_MAGIC:
             raise CtfError(path, offset, f"metadata packet begins with 0x{magic:08X}")
         if compression or encryption:
@@ -356,7 +422,7 @@ def _unpacked(path: Path, data: bytes, order: str) -> tuple[bytes, list[tuple[in
         if not begin <= end <= offset + size // 8:
             raise CtfError(path, offset, f"metadata packet of {content} content, {size} bits")
         if end > len(data):
-            raise CtfError(path, offset, "metadata packet reaches past the end of the file")
+            raise _not_whole(path, offset, "the metadata ends in the middle of a packet")
         pieces.append((len(text), begin))
         text += data[begin:end]
         offset += size // 8

@@ -81,6 +81,9 @@ def open_lttng_trace(
     tables = TraceTables(_by_host(trace, paths), progress, overview)
     creation, hosts = tables.creation(), {_fact(folder, "hostname") for folder in trace.folders}
     kernels = (_fact(folder, "kernel_release") for folder in trace.folders)
+    lost = {"discarded_events": trace.discarded_events, "lost_packets": trace.lost_packets}
+    if damaged := trace.damaged_places + tables.damaged:
+        lost["damaged_packets"] = damaged
     info = RecordingInfo(
         source="lttng",
         host=", ".join(sorted(host for host in hosts if host)),
@@ -89,7 +92,7 @@ def open_lttng_trace(
         rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
         clock_offset_ns=trace.clock_offset_ns,
         processes=processes_of(creation, tables.commands()),
-        lost={"discarded_events": trace.discarded_events, "lost_packets": trace.lost_packets},
+        lost=lost,
         notes=(*trace.warnings, *tables.notes()),
     )
     return Recording(Path(paths[0]), info, tables)
@@ -102,7 +105,8 @@ def _fact(folder: ctf.TraceClass, name: str) -> str:
 class TraceTables(Mapping[str, pl.DataFrame]):
     """The event tables of an open trace that happened, decoded at first use.
 
-    ``counts`` are the events per full name, provider included; ``fields`` what is declared of each.
+    ``counts`` are the events per full name, provider included; ``fields`` what is declared of each;
+    so many packets are ``damaged``.
     """
 
     def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress, overview: bool) -> None:
@@ -116,6 +120,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 self._sources.setdefault(name, []).append(full_name)
         self.counts = Counter[str]()
         self.warnings: tuple[str, ...] = ()
+        self.damaged = 0
         self._names: dict[int, str] = {}
         self._anonymous = 0
         self._pids: set[int] = set()
@@ -225,6 +230,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         """Count all events; move numbers that another host has, too."""
         self.counts.update(found.counts)
         self.warnings += found.warnings
+        self.damaged += found.damaged
         self._moved[host] = 0
         if len(self._hosts) > 1:
             known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
