@@ -21,7 +21,7 @@ are assumed (``assumed``, no ``end``, no response time):
 
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import polars as pl
 
@@ -35,6 +35,7 @@ from chainshaper.analysis.messages import (
     with_departures,
 )
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objects
+from chainshaper.analysis.restarts import FOLLOWED, followed_processes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 
@@ -56,6 +57,8 @@ class DataFlow:
       was read and the ``instance`` that got the message (null: none did).
     * ``events``: the tables all this came from.
     * ``notes``: what cannot be known, in plain words.
+    * ``followed``: see :func:`~chainshaper.analysis.restarts.followed_processes`. Callbacks of a
+      node that was started again have one ``callback_id`` in all frames.
     """
 
     objects: Objects
@@ -64,15 +67,21 @@ class DataFlow:
     takes: pl.DataFrame
     events: events.EventTables
     notes: tuple[str, ...]
+    followed: pl.DataFrame = field(default_factory=FOLLOWED.to_frame)
 
 
 def data_flow(
-    tables: events.EventTables, clock_offset_ns: int = 0, objects: Objects | None = None
+    tables: events.EventTables,
+    clock_offset_ns: int = 0,
+    objects: Objects | None = None,
+    *,
+    ended: Collection[int] | None = None,
 ) -> DataFlow:
     """Resolve a recording's events.
 
     ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
-    ``objects`` are the tables' own, where they have been resolved already.
+    ``objects`` are the tables' own, where they have been resolved already. ``ended`` are the
+    processes that have ended, where that is known better than from events.
     """
     objects = objects or resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
@@ -92,7 +101,8 @@ def data_flow(
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
     notes = (*objects.notes, *_notes(tables, instances))
-    return DataFlow(objects, instances, published, taken, tables, notes)
+    followed = followed_processes(tables, objects, ended)
+    return _with_restarts(DataFlow(objects, instances, published, taken, tables, notes, followed))
 
 
 def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]:
@@ -348,39 +358,48 @@ def _published_in(
     )
 
 
-def with_restarts(flow: DataFlow, ended: Collection[int]) -> DataFlow:
-    """The flow in which callbacks of processes that have ended are those that replace them.
+def _with_restarts(flow: DataFlow) -> DataFlow:
+    """The flow in which the callbacks of a node that was started again are those of its last
+    process, with a note for each such node.
 
-    A callback replaces another one where its node, kind and trigger are the same, in a process that
-    runs or, where none does, began later: its node was started again.
+    A callback replaces an earlier one where its node, kind and trigger are the same.
     """
-    gone, alike = pl.col("pid").is_in(list(ended)), ["node", "kind", "period_ns", "of"]
+    if flow.followed.is_empty():
+        return flow
+    alike = ["node", "kind", "period_ns", "of"]
     writes = flow.publications.group_by("callback_id").agg(wrote=pl.col("topic").first())
     known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
-    known = known.join(writes, on="callback_id", how="left", maintain_order="left").sort(
-        ~gone, "valid_from", maintain_order=True
-    )
+    known = known.join(writes, on="callback_id", how="left", maintain_order="left")
+    known = known.join(flow.followed, on=["node", "pid"], how="left", maintain_order="left")
     outside = (pl.col("kind") == "unknown") & (pl.col("handle") == 0)
     of = pl.when(outside).then(pl.col("wrote").cast(pl.String)).otherwise("topic")
-    known = known.with_columns(of=of)
+    known = known.with_columns(pl.coalesce("last_pid", "pid"), of=of)
+    runs_last = pl.col("pid") == pl.col("last_pid")
+    known = known.sort(runs_last, "valid_from", maintain_order=True)
     known = known.with_columns(place=pl.int_range(pl.len()).over("pid", *alike))
-    known = known.with_columns(
-        pl.col("callback_id", "pid").last().over(*alike, "place").name.prefix("new_")
+    latest = pl.col("callback_id").last().over("last_pid", *alike, "place")
+    known = known.with_columns(latest=latest)
+    # Numbers stay without gaps: they are places in the graph.
+    dense = pl.col("latest").rank("dense").cast(pl.UInt32) - 1
+    ids = dict(known.select("callback_id", dense).iter_rows())
+    number = pl.col("callback_id").replace_strict(ids, return_dtype=pl.UInt32)
+    # Of a callback's registrations those of its last process come first: they describe it.
+    replaced = known.filter(pl.col("callback_id") != pl.col("latest"))["callback_id"]
+    superseded = pl.col("callback_id").is_in(replaced.implode())
+    callbacks = flow.objects.callbacks.sort(superseded, maintain_order=True).with_columns(number)
+    buffers = flow.objects.buffers.with_columns(number)
+    names = flow.followed.group_by("node", "last_pid", maintain_order=True).agg("pid")
+    notes = (
+        f"{node} was started again (processes {', '.join(map(str, pids))}): it counts as one node."
+        for node, _, pids in names.iter_rows()
     )
-    replaced = known.filter(gone & (pl.col("callback_id") != pl.col("new_callback_id")))
-    if replaced.is_empty():
-        return flow
-    ids = dict(replaced.select("callback_id", "new_callback_id").iter_rows())
-    pids = dict(replaced.select("new_callback_id", "new_pid").iter_rows())
-    number = pl.col("callback_id").replace(ids)
-    callbacks = flow.objects.callbacks.sort(gone, maintain_order=True).with_columns(number)
-    pid = number.replace_strict(pids, default=pl.col("pid"), return_dtype=pl.Int32())
     return replace(
         flow,
-        objects=replace(flow.objects, callbacks=callbacks),
+        objects=replace(flow.objects, callbacks=callbacks, buffers=buffers),
         instances=flow.instances.with_columns(number),
-        publications=flow.publications.with_columns(number, pid=pid),
+        publications=flow.publications.with_columns(number),
         takes=flow.takes.with_columns(number),
+        notes=(*flow.notes, *notes),
     )
 
 

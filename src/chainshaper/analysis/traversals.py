@@ -37,7 +37,7 @@ REASONS: dict[str, str] = {
     "overwritten": "published, but overwritten in a full intra-process ring buffer",
     "not taken": "published, but not taken by the time the recording ended",
     "not executed": "taken, but no callback instance got it",
-    "not published": "its callback instance ended without publishing",
+    "not published": "its callback instance, or its process, ended without publishing",
     "inactive": "its node is a lifecycle node, which was not active then",
     "discarded": "withheld on purpose: it had overrun its slot or outlived its lifespan, or newer "
     "messages had filled its asynchronous publisher's history",
@@ -103,7 +103,9 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         state = _unless_published(flow, state, hop)
         state = _unless_active(flow, state, hop, callback)
         if hop == 0:
-            begun = state.filter(~pl.col("reason").is_in(_SILENT).fill_null(False))
+            # One whose process died as it ran is no silent one: it might have published.
+            ended = _looked_up(flow.instances, "end", "instance_0").is_not_null()
+            begun = state.filter(~(ended & pl.col("reason").is_in(_SILENT).fill_null(False)))
             silent, state = state.height - begun.height, begun
     frame = _described(flow, chain, state)
     hops = pl.concat(_hop(flow, chain, frame, hop) for hop in range(len(path)))
@@ -149,7 +151,7 @@ def _publish_by_sibling(
     """
     publication, sibling = f"publication_{hop}", f"sibling_{hop}"
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
-    of_node = (pl.col("pid") == callback.pid) & (pl.col("node") == callback.node)
+    of_node = pl.col("pid").is_in(callback.processes) & (pl.col("node") == callback.node)
     here = flow.publications.filter((pl.col("topic") == topic) & of_node)
     began = pl.coalesce(_looked_up(flow.instances, "start", "instance"), "time")
     here = here.select("publisher", "callback_id", "time", later="publication", began=began)
@@ -196,6 +198,9 @@ def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataF
     instance, publication = pl.col(f"instance_{hop}"), pl.col(f"publication_{hop}")
     stuck = instance.is_not_null() & publication.is_null()
     ended = _looked_up(flow.instances, "end", f"instance_{hop}").is_not_null()
+    if flow.followed.height:  # processes that were started again, as which nothing runs any more
+        gone = flow.followed.filter(pl.col("pid") != pl.col("last_pid"))["pid"].unique()
+        ended |= _looked_up(flow.instances, "pid", f"instance_{hop}").is_in(gone.implode())
     why = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
     if "gate_release" in flow.events:
         withheld = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances)
@@ -215,7 +220,9 @@ def _unless_active(
 ) -> pl.DataFrame:
     """Say so of traversals that stopped at this hop because its lifecycle node was not active: in
     the node, also where its subscription did not even exist."""
-    changes = flow.objects.activity.filter(pid=callback.pid, node=callback.node)
+    changes = flow.objects.activity.filter(
+        pl.col("pid").is_in(callback.processes), node=callback.node
+    )
     stopped = pl.col("reason").is_in(["not published", "lost", "not taken", "not executed"])
     stopped &= pl.col("broken_hop") == hop
     if changes.is_empty() or state.filter(stopped).is_empty():

@@ -29,7 +29,6 @@ from chainshaper.analysis import (
     find_chain,
     graph_of,
     traverse,
-    with_restarts,
 )
 from chainshaper.analysis.disturbance import Due, with_punctuality
 from chainshaper.analysis.latency import (
@@ -330,9 +329,8 @@ class Watch:
         over = now - self.longest_ns
         since = now - 2 * self.longest_ns - (over - self._over_ns)
         tables = self._tables(since)
-        flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
-        if ended := self._ended():
-            flow = with_restarts(flow, ended)
+        objects, ended = self._objects(tables, since), self._ended()
+        flow = data_flow(tables, self._clock_offset_ns, objects, ended=ended)
         moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
         # Where publications carry no stamp, the clock's offset says which one was taken.
         stampless = flow.publications["source_timestamp"].null_count() > 0
