@@ -110,8 +110,9 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
 
 
 def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
-    """Callback statistics as plain data: response and execution times in ns."""
-    columns = ("node", "kind", "topic", "period_ns", "pid", "tids", "count")
+    """Callback statistics as plain data: response and execution times in ns; ``pid`` is the last
+    of ``pids``, the processes of a node that was started again."""
+    columns = ("node", "kind", "topic", "period_ns", "pid", "pids", "tids", "count")
     return statistics.select(*columns, "response_ns", "execution_ns").to_dicts()
 
 
@@ -155,7 +156,7 @@ def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
     return {
         "chain": chain.spec,
         "nodes": [callback.node for callback in path],
-        "callbacks": [callback.label for callback in path],
+        "callbacks": [graph.label(callback) for callback in path],
         "topics": list(chain.topics),
     }
 

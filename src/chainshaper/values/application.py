@@ -115,6 +115,7 @@ class ApplicationGraph:
     def node_text(self, callback: Callback) -> str:
         """The callback's node as a way point: ``/talker``, of two at once ``/talker@4711``."""
         namesakes = {one.pid for one in self.callbacks if one.node == callback.node}
+        namesakes |= {one.pid for one in self.nodes if one.name == callback.node}
         return f"{callback.node}@{callback.pid}" if len(namesakes) > 1 else callback.node
 
     def path(self, chain: "Chain") -> list[Callback]:

@@ -272,7 +272,7 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
             "hop": range(len(path)),
             "callback_id": analysis.chain.callbacks,
             "node": [callback.node for callback in path],
-            "callback": [callback.label for callback in path],
+            "callback": [analysis.graph.label(callback) for callback in path],
             "topic": analysis.chain.topics,
         },
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
