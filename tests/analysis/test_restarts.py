@@ -13,11 +13,12 @@ import pytest
 from command_line import called
 from ctf_writing import write_lttng_trace
 from reference_traces import DATA
-from story import Story
+from story import OFFSET, Story
 
 from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_of
 from chainshaper.analysis.chains import SeveralPathsError
 from chainshaper.values.errors import InputError
+from chainshaper.values.recording import RecordingInfo, write_recording
 
 MS = 1_000_000
 CHAIN = "/image../objects"
@@ -203,3 +204,58 @@ def test_paths_that_no_way_point_tells_apart_are_named_by_their_function() -> No
         story.runs(timer, 10 + place * 10, 18 + place * 10, writes=((topic, 12 + place * 10),))
     with pytest.raises(InputError, match=r"by Talker::fast of /talker"):
         find_chain(graph_of(data_flow(story.tables())), "/chatter")
+
+
+def shaped(killed: int = 10, back: int = 14, cycles: int = 20) -> Story:
+    """/source → /out_tmp → shaping node (process 300, killed in a cycle; 400 once it is back) → /out.
+
+    Its standby (500) has each message, too, and publishes at once what the node does not: 3 ms
+    behind the cycle's start, where the shaping node does it 40 ms behind it.
+    """
+    story = Story()
+    source, raw = story.source("/source", 100, "/out_tmp", 50 * MS)
+    gate, out = story.relay("/chainshaper_out", 300, "/out_tmp", "/out")
+    standby, beside = story.relay("/chainshaper_out_standby", 500, "/out_tmp", "/out")
+    sink = story.subscription(story.node("/sink", 600), "/out")
+    for cycle in range(cycles):
+        begin = (100 + 50 * cycle) * MS
+        sent = begin + MS
+        story.runs(source, begin, begin + 2 * MS, writes=((raw, sent),))
+        dead = killed <= cycle < back
+        left = begin + (3 if dead else 40) * MS
+        writes = ((beside, left),) if dead else ()
+        story.runs(standby, begin + 2 * MS, begin + 4 * MS, reads=sent, writes=writes)
+        if dead:
+            came = begin + 2 * MS
+            story.gate(standby, sent, came, came, overrun="bypass", origin=came)
+            if cycle == killed:
+                story.runs(gate, begin + 2 * MS, None, reads=sent)
+        else:
+            if cycle == back:
+                node = story.node("/chainshaper_out", 400, begin)
+                gate = story.subscription(node, "/out_tmp", begin)
+                out = story.publisher(node, "/out", begin)
+            writes = ((out, left),)
+            story.runs(gate, begin + 2 * MS, left + MS, reads=sent, writes=writes)
+            story.gate(gate, sent, begin + 2 * MS, left, origin=begin)
+        story.runs(sink, left + MS, left + 2 * MS, reads=left)
+    return story
+
+
+def test_a_shaping_node_that_was_killed_and_came_back_is_one_chain_and_its_standby_publishes_for_it(
+    tmp_path: Path,
+) -> None:
+    found = analyse_latency(shaped().tables(), "/out_tmp../out")
+    wanted = [3 if 10 <= cycle < 14 else 40 for cycle in range(20)]
+    assert found.traversals["latency_ns"].to_list() == [MS * one for one in wanted]
+    assert found.traversals["late"].to_list() == [False] * 20, "what went around was early"
+    assert found.traversals["reception_ns"].null_count() == 0
+    assert found.incomplete == {}
+    gates = [one.node for one in found.graph.path(found.chain)]
+    assert gates == ["/source", "/chainshaper_out"]
+    info = RecordingInfo(source="lttng", clock_offset_ns=OFFSET)
+    file = str(write_recording(tmp_path / "recording", shaped().tables(), info).path)
+    latency = json.loads(run("latency", file, "--chain", "/out_tmp../out", "--json"))
+    assert (latency["count"], latency["late"], latency["overrun_outcomes"]) == (20, 0, {})
+    assert latency["overruns_by_policy"] == {"bypass": 4}
+    run("report", file, "--chain", "/out_tmp../out", "-o", str(tmp_path / "r.html"))

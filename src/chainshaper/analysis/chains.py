@@ -107,7 +107,7 @@ class ChainEnumeration:
 
 def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     """The one chain of ``graph`` that ``spec`` means; of a shaping node that a standby has stood in
-    for, it is the path by that node.
+    for, it is the path by that node, and traversals go on through the standby where that published.
 
     Raises InputError: a topic or node that does not exist, no path, or only a cyclic one.
     SeveralPathsError: several.

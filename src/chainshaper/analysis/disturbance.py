@@ -79,6 +79,8 @@ def with_punctuality(
     hops, chain = traversals.hops, traversals.chain
     releases = gated_hops(flow.events, flow.objects, hops, 0 if due is None else due.cycles)
     decided = releases.filter(pl.col("hop") == len(chain.callbacks) - 1).drop("hop")
+    # A standby publishes at once what went around the gate: no slot was chosen for it.
+    decided = decided.filter(pl.col("overrun").ne_missing("bypass"))
     frame = traversals.frame.join(decided, on="traversal", how="left", maintain_order="left")
     start, end, counted_from = pl.col("start"), pl.col("end"), pl.col("origin")
     # The period of the timer that starts the chain stands for the cycle of a plan.

@@ -16,11 +16,15 @@ away, and ``notes`` says that L is a lower bound.
 **One row per data flow.** An instance that publishes a topic twice makes two traversals, with
 the same start; two messages that go into one publication are two traversals with the same end.
 
+**A standby.** What a shaping node's standby published for it, while it was not there, is the
+chain's output: the traversal goes on with the standby's instance.
+
 **Silent instances.** An instance of the first callback that ended and published nothing on the
 chain's first topic begins no traversal: callbacks may publish on a condition. Further down, where
 data had arrived, an instance that publishes nothing leaves its traversal incomplete.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,6 +35,7 @@ from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_
 from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
 from chainshaper.analysis.messages import discarded_instances, overwritten_in, why_not_sent
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
+from chainshaper.values.plan_choices import STANDBY
 
 REASONS: dict[str, str] = {
     "lost": "published, but never taken, though a later message of the topic was",
@@ -64,7 +69,8 @@ class Traversals:
     topic where an incomplete one stopped) and ``reason`` (a key of :data:`REASONS`).
 
     ``hops`` has one row per traversal and callback reached, sorted by hop: ``traversal``,
-    ``hop`` (from 0), ``callback_id``, ``topic`` (that it publishes), ``instance``, the times
+    ``hop`` (from 0), ``callback_id`` (of a standby where that published for its shaping node),
+    ``topic`` (that it publishes), ``instance``, the times
     ``take``, ``start``, ``publish`` and ``end`` (of the instance), ``source_timestamp`` (of the
     message it took), ``communication_ns`` (previous publication to start: transport and waiting),
     ``computation_ns`` (start to publication), and ``via``: ``instance`` when the instance itself
@@ -94,9 +100,10 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
     state = _begun(flow, path[0])
     silent, notes = 0, list[str]()
     for hop, (callback, topic) in enumerate(zip(path, chain.topics, strict=True)):
+        standby = _standby(graph, callback, topic)
         if hop:
-            state = _take(flow, state, hop, callback)
-        state = _publish(flow, state, hop, callback, topic)
+            state = _take(flow, state, hop, callback, standby, topic)
+        state = _publish(flow, state, hop, [callback.id, *standby], topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             state, note = _publish_by_sibling(flow, state, hop, callback, topic)
             notes += note
@@ -125,11 +132,22 @@ def _begun(flow: DataFlow, first: Callback) -> pl.DataFrame:
     )
 
 
+def _standby(graph: ApplicationGraph, callback: Callback, topic: str) -> list[int]:
+    """The callback that publishes the topic while this one, a shaping node's, is not there."""
+    return [
+        one.id
+        for one in graph.callbacks
+        if one.node == callback.node + STANDBY
+        and one.trigger == callback.trigger
+        and topic in one.publishes
+    ]
+
+
 def _publish(
-    flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback, topic: str
+    flow: DataFlow, state: pl.DataFrame, hop: int, callbacks: Sequence[int], topic: str
 ) -> pl.DataFrame:
     """Add the publications of the hop's topic inside each traversal's instance."""
-    own = (pl.col("callback_id") == callback.id) & (pl.col("topic") == topic)
+    own = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
     inside = flow.publications.filter(own & pl.col("instance").is_not_null())
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
@@ -237,14 +255,29 @@ def _unless_active(
     return state.with_columns(reason=pl.when(stopped & ~active).then(idle).otherwise("reason"))
 
 
-def _take(flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback) -> pl.DataFrame:
-    """Add the instance of ``callback`` that took each traversal's latest publication."""
-    own = (pl.col("callback_id") == callback.id) & pl.col("publication").is_not_null()
-    taken = flow.takes.filter(own).select("publication", "take", "instance")
+def _take(
+    flow: DataFlow,
+    state: pl.DataFrame,
+    hop: int,
+    callback: Callback,
+    standby: Sequence[int],
+    topic: str,
+) -> pl.DataFrame:
+    """Add the instance of ``callback`` that took each traversal's latest publication, or that of
+    its ``standby`` which published for it."""
+    taken = flow.takes.filter(pl.col("publication").is_not_null())
+    own = taken.filter(pl.col("callback_id") == callback.id)
+    own = own.select("publication", "take", "instance")
     # Should a message have been taken twice, the take that led to an execution is followed, of
     # several the first: what is laid out last stays.
     executed = pl.col("instance").is_not_null()
-    taken = pl.concat([taken.filter(~executed).reverse(), taken.filter(executed).reverse()])
+    layers = [own.filter(~executed).reverse(), own.filter(executed).reverse()]
+    if standby:
+        published = flow.publications.filter(pl.col("topic") == topic)["instance"].drop_nulls()
+        passed_on = pl.col("instance").is_in(published.implode())
+        for_it = taken.filter(pl.col("callback_id").is_in(standby)).select(own.columns)
+        layers += [for_it.filter(passed_on).reverse(), own.filter(passed_on).reverse()]
+    taken = pl.concat(layers)
     before, height = pl.col(f"publication_{hop - 1}"), flow.publications.height
     laid_out = {name: by_number(taken, "publication", name, height) for name in taken.columns[1:]}
     state = state.with_columns(
@@ -306,7 +339,7 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
     reached = frame.filter(pl.col(instance).is_not_null()).select(
         "traversal",
         hop=pl.lit(hop, dtype=pl.UInt8),
-        callback_id=pl.lit(chain.callbacks[hop], dtype=pl.UInt32),
+        callback_id=_looked_up(flow.instances, "callback_id", instance),
         topic=pl.lit(chain.topics[hop], dtype=pl.Enum(list(chain.topics))),
         instance=instance,
         take=_looked_up(flow.takes, "time", take),

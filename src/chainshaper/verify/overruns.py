@@ -109,8 +109,11 @@ class Outcome:
 
 
 def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outcome]:
-    """What became of the outputs that overran, per policy that was applied to them."""
+    """What became of the outputs that overran, per policy that was applied to them; those that a
+    standby dealt with did not overrun.
+    """
     decided = analysis.decided.select("traversal", "overrun")
+    decided = decided.filter(~pl.col("overrun").is_in([*_WITHOUT_NODE]).fill_null(False))
     cycles = analysis.traversals.join(decided, on="traversal", how="left", maintain_order="left")
     missed = pl.col("late").fill_null(False) | (pl.col("reason") == "discarded").fill_null(False)
     policy = pl.col("overrun")
