@@ -15,6 +15,9 @@ from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_o
 from chainshaper.analysis.traversals import Traversals
 
 
+PARTS = ["communication_ns", "computation_ns", "waiting_ns"]
+
+
 @dataclass
 class Relay:
     """/source (timer, process 1) → /t1 → /relay (process 2) → /t2 → /sink (process 3)."""
@@ -65,10 +68,10 @@ def test_a_message_goes_through(spec: str) -> None:
     assert found.frame.select("start", "end", "latency_ns", "complete").rows() == [
         (10, 30, 20, True)
     ]
-    columns = ["hop", "take", "start", "publish", "end", "communication_ns", "computation_ns"]
+    columns = ["hop", "take", "start", "publish", "end", *PARTS]
     assert found.hops.select(columns).rows() == [
-        (0, None, 10, 12, 13, None, 2),
-        (1, 19, 20, 30, 31, 8, 10),
+        (0, None, 10, 12, 13, None, 2, 0),
+        (1, 19, 20, 30, 31, 8, 10, 0),
     ]
 
 
@@ -298,7 +301,7 @@ def test_traversals_agree_with_following_each_message_by_hand(cycles: list[Cycle
     assert sorted(complete.select("start", "end").iter_rows()) == sorted(expected)
     assert found.frame.height - complete.height == incomplete
     assert found.silent == silent
-    parts = pl.col("communication_ns").sum() + pl.col("computation_ns").sum()
+    parts = pl.sum_horizontal(pl.col(PARTS).sum())
     joined = complete.join(found.hops.group_by("traversal").agg(total=parts), on="traversal")
     assert joined["total"].to_list() == joined["latency_ns"].to_list()
 
@@ -398,6 +401,37 @@ def test_a_synchronised_message_leaves_with_the_input_that_completes_the_set(
     if (told, spec) == (RIGHT_LAST, LEFT):
         assert found.hops.filter(hop=1)["via"].to_list() == ["sibling", "sibling"]
         assert found.notes == ()
+
+
+def test_waiting_for_the_other_input_is_no_computation() -> None:
+    """The right input comes 100 behind the left one; each callback computes for 3."""
+    run = Fusion(symbol=MESSAGE_FILTER)
+    for begin in (1_000, 1_300):
+        for side, start in (("left", begin), ("right", begin + 100)):
+            timer, points = run.timers[side]
+            run.story.runs(timer, start, start + 10, writes=((points, start + 8),))
+        left, right = (run.inputs[side] for side in ("left", "right"))
+        run.story.runs(left, begin + 10, begin + 13, reads=begin + 8)
+        done = ((run.fused, begin + 112),)
+        run.story.runs(right, begin + 110, begin + 113, reads=begin + 108, writes=done)
+    for spec, fused in ((LEFT, (2, 5, 97)), (RIGHT, (2, 2, 0))):
+        found = traversals(run.story, spec)
+        hops = found.hops.filter(pl.col("hop") == 1).select(PARTS)
+        assert hops.rows() == [fused, fused], "3 of one callback and 2 of the other"
+        assert found.hops.filter(pl.col("hop") == 0).select(PARTS).rows() == [(None, 8, 0)] * 2
+
+
+@pytest.mark.parametrize("came", [30, 25])
+def test_what_a_gate_holds_back_waits(came: int) -> None:
+    """Of 45 between start and publication the gate held the message for 33, from its arrival."""
+    story = Story()
+    timer, t1 = story.source("/source", 1, "/tmp")
+    hold, out = story.relay("/gate", 2, "/tmp", "/t1")
+    story.runs(timer, 0, 20, writes=((t1, 10),))
+    story.runs(hold, 25, 75, reads=10, writes=((out, 70),))
+    story.gate(hold, 10, came, 63, origin=0)
+    found = traversals(story, "/tmp../t1")
+    assert found.hops.select(PARTS).rows() == [(None, 10, 0), (15, 45 - (63 - came), 63 - came)]
 
 
 def test_outputs_without_a_new_input_give_a_holding_synchroniser_away() -> None:

@@ -8,6 +8,8 @@ import pytest
 from command_line import called, json_of, refused
 from reference_traces import CHAINS, TRACES, reference_folder, reference_trace
 
+from chainshaper.verify.measure import PARTS
+
 SYSTEMS = {
     "jazzy_chain_cyclonedds": ("jazzy", "rmw_cyclonedds_cpp"),
     "jazzy_chain_fastrtps_async": ("jazzy", "rmw_fastrtps_cpp"),
@@ -75,11 +77,9 @@ def test_latency_of_every_traversal_and_the_same_once_converted(
     assert found["mean_ns"] == round(mean)
     assert found["lost"] == NO_LOSS
     assert (found["disturbed"], found["stalls_watched"]) == (0, False)
-    shares = found["communication_share"] + found["computation_share"]
-    assert shares == pytest.approx(1.0), "communication and computation are the whole latency"
-    parts = [
-        hop[f"{part}_ns"] for hop in found["hops"] for part in ("communication", "computation")
-    ]
+    shares = sum(found[f"{part}_share"] for part in PARTS)
+    assert shares == pytest.approx(1.0), "the parts are the whole latency"
+    parts = [hop[f"{part}_ns"] for hop in found["hops"] for part in PARTS]
     assert sum(part["mean"] for part in parts if part) == pytest.approx(mean, abs=1)
 
     recording = tmp_path / "recording"

@@ -33,7 +33,12 @@ import polars as pl
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
 from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
-from chainshaper.analysis.messages import discarded_instances, overwritten_in, why_not_sent
+from chainshaper.analysis.messages import (
+    discarded_instances,
+    gated_hops,
+    overwritten_in,
+    why_not_sent,
+)
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
 from chainshaper.values.plan_choices import STANDBY
 
@@ -73,9 +78,11 @@ class Traversals:
     ``topic`` (that it publishes), ``instance``, the times
     ``take``, ``start``, ``publish`` and ``end`` (of the instance), ``source_timestamp`` (of the
     message it took), ``communication_ns`` (previous publication to start: transport and waiting),
-    ``computation_ns`` (start to publication), and ``via``: ``instance`` when the instance itself
-    published, ``sibling`` when another callback of its node did. Over a complete traversal the two
-    parts add up to the latency.
+    ``computation_ns`` (start to publication, without the next), ``waiting_ns`` (in the node: from
+    the end of the instance until another callback of the node began, which published for it; in a
+    gate, from the arrival until it let go; for a publisher's thread, until that sent it), and ``via``: ``instance`` when the instance itself
+    published, ``sibling`` when another callback of its node did. Over a complete traversal the
+    three parts add up to the latency.
 
     ``silent`` counts instances of the first callback that published nothing.
     """
@@ -116,6 +123,7 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
             silent, state = state.height - begun.height, begun
     frame = _described(flow, chain, state)
     hops = pl.concat(_hop(flow, chain, frame, hop) for hop in range(len(path)))
+    hops = _without_holds(flow, hops)
     return Traversals(chain, frame.select(_SUMMARY), hops, silent, tuple(notes))
 
 
@@ -217,8 +225,8 @@ def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataF
     stuck = instance.is_not_null() & publication.is_null()
     ended = _looked_up(flow.instances, "end", f"instance_{hop}").is_not_null()
     if flow.followed.height:  # processes that were started again, as which nothing runs any more
-        gone = flow.followed.filter(pl.col("pid") != pl.col("last_pid"))["pid"].unique()
-        ended |= _looked_up(flow.instances, "pid", f"instance_{hop}").is_in(gone.implode())
+        followed = flow.followed.filter(pl.col("pid") != pl.col("last_pid"))["pid"].unique()
+        ended |= _looked_up(flow.instances, "pid", f"instance_{hop}").is_in(followed.implode())
     why = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
     if "gate_release" in flow.events:
         withheld = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances)
@@ -336,6 +344,15 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
     instance, take = f"instance_{hop}", f"take_{hop}"
     sent = _published_at(flow, hop - 1, chain) if hop else pl.lit(None, dtype=pl.Int64)
     via = pl.when(f"sibling_{hop}").then(pl.lit("sibling")).otherwise(pl.lit("instance"))
+    start = _looked_up(flow.instances, "start", instance)
+    done = pl.coalesce(_looked_up(flow.instances, "end", instance), start)
+    # What a thread of the node's publishes, without a callback, it may have computed meanwhile.
+    publisher = _looked_up(flow.publications, "instance", f"publication_{hop}")
+    began = pl.lit(flow.instances["start"]).gather(publisher)
+    waiting = pl.when(f"sibling_{hop}").then((began - done).clip(lower_bound=0)).fill_null(0)
+    publish = _published_at(flow, hop, chain)
+    handed_over = _looked_up(flow.publications, "time", f"publication_{hop}")
+    waiting += (publish - handed_over).clip(lower_bound=0).fill_null(0)
     reached = frame.filter(pl.col(instance).is_not_null()).select(
         "traversal",
         hop=pl.lit(hop, dtype=pl.UInt8),
@@ -343,18 +360,38 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
         topic=pl.lit(chain.topics[hop], dtype=pl.Enum(list(chain.topics))),
         instance=instance,
         take=_looked_up(flow.takes, "time", take),
-        start=_looked_up(flow.instances, "start", instance),
-        publish=_published_at(flow, hop, chain),
+        start=start,
+        publish=publish,
         end=_looked_up(flow.instances, "end", instance),
         source_timestamp=_looked_up(flow.takes, "source_timestamp", take),
         communication_ns=sent,
+        waiting_ns=waiting,
         via=via.cast(_VIA),
     )
+    published = pl.col("publish").is_not_null()
     return reached.with_columns(
         communication_ns=pl.col("start") - pl.col("communication_ns"),
-        computation_ns=pl.col("publish") - pl.col("start"),
-        via=pl.when(pl.col("publish").is_not_null()).then("via"),
+        computation_ns=pl.col("publish") - pl.col("start") - pl.col("waiting_ns"),
+        waiting_ns=pl.when(published).then("waiting_ns"),
+        via=pl.when(published).then("via"),
     )
+
+
+def _without_holds(flow: DataFlow, hops: pl.DataFrame) -> pl.DataFrame:
+    """Hops in which what a gate held a message back is waiting, not computation."""
+    if "gate_release" not in flow.events:
+        return hops
+    gated = gated_hops(flow.events, flow.objects, hops).select(
+        "traversal", "hop", "arrival", "let_go"
+    )
+    rows = hops.join(gated, on=["traversal", "hop"], how="left", maintain_order="left")
+    until = pl.min_horizontal("let_go", "publish")
+    since = pl.max_horizontal("arrival", "start")
+    between = pl.when(pl.col("let_go").is_not_null()).then(until - since)
+    held = pl.min_horizontal(between.clip(lower_bound=0).fill_null(0), "computation_ns")
+    return rows.with_columns(
+        computation_ns=pl.col("computation_ns") - held, waiting_ns=pl.col("waiting_ns") + held
+    ).select(hops.columns)
 
 
 def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:

@@ -44,7 +44,7 @@ from chainshaper.values.recording import (
     event_counts,
     lost_text,
 )
-from chainshaper.verify.measure import Measurement
+from chainshaper.verify.measure import PARTS, Measurement
 
 if TYPE_CHECKING:  # only their verbs import them
     from chainshaper.verify.budgets import Judged
@@ -495,9 +495,9 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             table.add(span, own.count, *times, own.late, own.incomplete)
         tables.append(table)
         if one.hops:
-            hops = ResultTable("", [*words("node", "topic"), *figures("waits", "computes")])
+            hops = ResultTable("", [*words("node", "topic"), *figures(*PARTS)])
             for hop in one.hops:
-                hops.add(hop.node, hop.topic, ms(hop.communication_ns), ms(hop.computation_ns))
+                hops.add(hop.node, hop.topic, *(ms(getattr(hop, f"{part}_ns")) for part in PARTS))
             tables.append(hops)
     lost = f"; {seen.lost} events lost" if seen.lost else ""
     if unclear := sum(one.counted["unclear"] for one in seen.chains):

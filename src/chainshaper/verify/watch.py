@@ -73,14 +73,15 @@ _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave 
 @dataclass(frozen=True)
 class Hop:
     """A callback of the chain: its mean shares of the latency over the last minute (ns), and in
-    ``longest_ns`` the longest communication and computation.
+    ``longest_ns`` the longest of each, in the order of :data:`~.measure.PARTS`.
     """
 
     node: str
     topic: str
     communication_ns: float
     computation_ns: float
-    longest_ns: tuple[int, int]
+    waiting_ns: float
+    longest_ns: tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
@@ -192,7 +193,7 @@ class _Chain:
         self.counted["late"] += int(traversals["late"].sum() or 0)
         own = hops.join(traversals.filter("complete"), on="traversal", how="semi")
         if own.height:
-            shares = pl.col("communication_ns", "computation_ns")
+            shares = pl.col([f"{part}_ns" for part in PARTS])
             most = shares.max().name.prefix("longest_")
             figures = own.group_by("hop").agg(shares.sum(), most, count=pl.len())
             self.hops.append((now_ns, figures))
@@ -487,10 +488,11 @@ def _hops(one: _Chain) -> Iterator[Hop]:
         return
     figures = pl.concat([frame for _, frame in one.hops]).group_by("hop")
     sums = figures.agg(pl.exclude("^longest_.*$").sum(), pl.col("^longest_.*$").max()).sort("hop")
-    for number, communication, computation, count, *longest in sums.iter_rows():
-        node, topic = one.names[number]
-        most = (longest[0], longest[1])
-        yield Hop(node, topic, communication / count, computation / count, most)
+    for row in sums.iter_rows(named=True):
+        communication, computation, waiting = (row[f"{part}_ns"] / row["count"] for part in PARTS)
+        longest = tuple(row[f"longest_{part}_ns"] for part in PARTS)
+        node, topic = one.names[row["hop"]]
+        yield Hop(node, topic, communication, computation, waiting, longest)
 
 
 def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[CallbackNow]:
@@ -578,8 +580,7 @@ def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
                     yield "chain.latency", ns / SECOND, {**chain, "span": span, "statistic": which}
         for hop in one.hops:
             about = {**chain, "node": hop.node, "topic": hop.topic}
-            means = (hop.communication_ns, hop.computation_ns)
-            for part, mean in zip(PARTS, means, strict=True):
-                yield "hop.time", mean / SECOND, {**about, "part": part}
+            for part in PARTS:
+                yield "hop.time", getattr(hop, f"{part}_ns") / SECOND, {**about, "part": part}
         for outcome, count in one.counted.items():
             yield "chain.cycles", count, {**chain, "outcome": outcome}
