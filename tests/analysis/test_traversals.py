@@ -13,6 +13,7 @@ from test_messages import hand_over, intra_process, receive
 
 from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_of, traverse
 from chainshaper.analysis.traversals import Traversals
+from chainshaper.verify.budgets import _missing, _under_way_from
 
 
 PARTS = ["communication_ns", "computation_ns", "waiting_ns"]
@@ -230,6 +231,68 @@ def test_messages_stored_for_a_timer() -> None:
         story.runs(store, cycle + 20, cycle + 22, reads=cycle + 12)
         story.runs(cyclic, cycle + 45, cycle + 51, writes=((out, cycle + 50),))
     assert spans(traversals(story, "/t1../out")) == [(10, 50), (110, 150)]
+
+
+def stored_twice(cycles: int = 10) -> Story:
+    """A camera every 50, whose messages are stored; a timer every 100, which publishes at 84."""
+    story = Story()
+    camera, image = story.source("/camera", 1, "/image", 50)
+    node = story.node("/planner", 2)
+    store, timer = story.subscription(node, "/image"), story.timer(node, period=100)
+    out = story.publisher(node, "/plan")
+    for begin in range(1_000, 1_000 + 100 * cycles, 100):
+        for sent in (begin + 2, begin + 52):
+            story.runs(camera, sent - 2, sent + 2, writes=((image, sent),))
+            story.runs(store, sent + 5, sent + 8, reads=sent)
+        story.runs(timer, begin + 80, begin + 85, writes=((out, begin + 84),))
+    return story
+
+
+def test_of_several_messages_stored_for_a_timer_the_newest_counts() -> None:
+    found = analyse_latency(stored_twice().tables(), "/image../plan")
+    assert found.traversals["latency_ns"].to_list() == [None, 34] * 10, "not 34 and 84 in turns"
+    assert found.incomplete == {"not used": 10}
+    assert found.traversals["broken_at"].to_list() == ["/plan", None] * 10
+    counted = found.statistics.count, found.statistics.incomplete, found.silent
+    assert counted == (10, 10, 0), "none disappears"
+    last = found.hops.filter(pl.col("hop") == 1).drop_nulls("publish")
+    assert last.select(PARTS).rows() == [(5, 3 + 4, 20)] * 10
+
+
+def test_a_message_that_was_not_used_breaks_no_budget() -> None:
+    story = stored_twice()
+    flow = data_flow(story.tables())
+    found = analyse_latency(flow, "/image../plan")
+    assert _missing(found.traversals, _under_way_from(flow, found)) == 0
+
+
+def two_lefts(symbol: str) -> Story:
+    """Two messages of the left input in each set, 82 and 42 before the output."""
+    run = Fusion(symbol)
+    for begin in (1_000, 1_300):
+        left, points = run.timers["left"]
+        for start in (begin, begin + 40):
+            run.story.runs(left, start, start + 10, writes=((points, start + 8),))
+            run.story.runs(run.inputs["left"], start + 12, start + 15, reads=start + 8)
+        right, points = run.timers["right"]
+        run.story.runs(right, begin + 60, begin + 70, writes=((points, begin + 68),))
+        done = ((run.fused, begin + 82),)
+        run.story.runs(run.inputs["right"], begin + 80, begin + 83, reads=begin + 68, writes=done)
+    return run.story
+
+
+def test_a_synchroniser_of_the_application_s_own_has_the_newest_input() -> None:
+    found = traversals(two_lefts("Fusion::left(Cloud)"), LEFT)
+    assert found.frame["latency_ns"].to_list() == [None, 42] * 2
+    assert found.notes == ()
+
+
+def test_which_message_a_queue_had_in_its_set_no_event_says() -> None:
+    found = traversals(two_lefts(MESSAGE_FILTER), LEFT)
+    assert found.frame["latency_ns"].to_list() == [82, 42] * 2
+    assert [note.partition(":")[0] for note in found.notes] == [
+        "2 messages on /left/points count with the same publication on /fused as another one"
+    ]
 
 
 def test_the_whole_analysis_with_the_reception_of_a_subscriber() -> None:

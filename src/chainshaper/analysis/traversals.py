@@ -13,8 +13,14 @@ complete it. For message_filters that is the soonest set that the message can be
 approximate-time synchroniser may hold messages back; outputs into which no new input went give that
 away, and ``notes`` says that L is a lower bound.
 
+**The newest message counts.** Of several messages that a node stored for one publication, of a
+timer or of a synchroniser of its own, the newest is taken to be in it, as in a variable that is
+overwritten: L is the age of what was published. The others are incomplete, "not used"; no output is
+missing for them. message_filters has queues instead: there each message counts, also where several
+came before one publication, of which only one can have been in it; ``notes`` says so.
+
 **One row per data flow.** An instance that publishes a topic twice makes two traversals, with
-the same start; two messages that go into one publication are two traversals with the same end.
+the same start.
 
 **A standby.** What a shaping node's standby published for it, while it was not there, is the
 chain's output: the traversal goes on with the standby's instance.
@@ -48,6 +54,7 @@ REASONS: dict[str, str] = {
     "not taken": "published, but not taken by the time the recording ended",
     "not executed": "taken, but no callback instance got it",
     "not published": "its callback instance, or its process, ended without publishing",
+    "not used": "stored for a timer or a synchroniser of its node, which used a newer message",
     "inactive": "its node is a lifecycle node, which was not active then",
     "discarded": "withheld on purpose: it had overrun its slot or outlived its lifespan, or newer "
     "messages had filled its asynchronous publisher's history",
@@ -58,8 +65,11 @@ REASONS: dict[str, str] = {
 }
 """Why a traversal is incomplete."""
 
+OWES_NO_OUTPUT = ("not used", "inactive")
+"""Reasons for which no output is missing."""
+
 _SILENT = ["not published", "inactive"]
-_IN_NODE = [*_SILENT, "discarded", "not sent", "still running"]
+_IN_NODE = [*_SILENT, "not used", "discarded", "not sent", "still running"]
 _REASON = pl.Enum(list(REASONS))
 _VIA = pl.Enum(["instance", "sibling"])
 
@@ -113,6 +123,8 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
         state = _publish(flow, state, hop, [callback.id, *standby], topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             state, note = _publish_by_sibling(flow, state, hop, callback, topic)
+            if _keeps_newest(graph, callback, topic):
+                state = _newest_alone(state, hop)
             notes += note
         state = _unless_published(flow, state, hop)
         state = _unless_active(flow, state, hop, callback)
@@ -173,7 +185,7 @@ def _publish_by_sibling(
     """Fill in what the node's first instance after this one's start publishes.
 
     A node that was created anew in between knows nothing of the messages of the one before it.
-    Also returns a note if outputs of a synchroniser got no input that came since the one before.
+    Also returns notes where it is not clear which input an output of message_filters got.
     """
     publication, sibling = f"publication_{hop}", f"sibling_{hop}"
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
@@ -203,7 +215,38 @@ def _publish_by_sibling(
         f"{callback.topic}: {callback.node} holds messages back or uses old ones again, for how "
         "long the events do not show; latencies through it are lower bounds."
     )
-    return state, [note] if missed > 0 else []
+    if missed > 0:
+        return state, [note]
+    shared = reached.len() - reached.n_unique()
+    note = (
+        f"{shared} messages on {callback.topic} count with the same publication on {topic} as "
+        f"another one: {callback.node} has one of them in it, and no event says which."
+    )
+    return state, [note] if shared else []
+
+
+def _keeps_newest(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
+    """Whether a node that stores what the callback reads has the newest message only."""
+    if callback.kind == "service":
+        return False  # each goal of an action has feedback of its own
+    by_timer = any(
+        one.kind == "timer" and topic in one.publishes
+        for one in graph.callbacks
+        if (one.node, one.pid) == (callback.node, callback.pid)
+    )
+    return by_timer or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER)
+
+
+def _newest_alone(state: pl.DataFrame, hop: int) -> pl.DataFrame:
+    """The state in which of several messages that went into one publication the newest did alone.
+
+    A node that stores messages has the newest when it publishes: those before it are not used.
+    """
+    instance, publication = f"instance_{hop}", f"publication_{hop}"
+    newest = pl.col(instance).max().over(publication)
+    older = (pl.col(publication).is_not_null() & (pl.col(instance) < newest)).fill_null(False)
+    state = _broken(state, older, hop, pl.lit("not used"))
+    return state.with_columns(pl.when(~older).then(publication).alias(publication))
 
 
 def _begun_with_last_input(here: pl.DataFrame, stored: pl.Series, callback: int) -> pl.DataFrame:

@@ -161,7 +161,7 @@ def _profile_of(
         every_step_ns=steps[every["traversal"].to_numpy()],
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=analysis.statistics.incomplete,
+        incomplete=analysis.statistics.incomplete - analysis.incomplete.get("not used", 0),
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),

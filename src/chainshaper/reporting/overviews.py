@@ -502,6 +502,8 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
     lost = f"; {seen.lost} events lost" if seen.lost else ""
     if unclear := sum(one.counted["unclear"] for one in seen.chains):
         lost += f"; {unclear} cycles unclear: the clock was set"
+    if unused := sum(one.counted["not_used"] for one in seen.chains):
+        lost += f"; {unused} messages not used: newer ones were stored"
     tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
     return tables
 

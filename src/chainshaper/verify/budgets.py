@@ -31,6 +31,7 @@ from chainshaper.analysis.latency import (
     latency_statistics,
     longest_times,
 )
+from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.durations import duration_text
@@ -320,11 +321,11 @@ def _under_way_from(flow: DataFlow, analysis: LatencyAnalysis) -> int:
 
 def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
     """The share of outputs that were late or never came; those are not missing that were under way
-    at the end, or of lifecycle nodes that were not active.
+    at the end, or owed for nothing (:data:`~.traversals.OWES_NO_OUTPUT`).
     """
     over = traversals.filter(
         pl.col("complete") | (pl.col("start") <= under_way_from_ns),
-        pl.col("reason").ne_missing("inactive"),
+        ~pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False),
     )
     if not over.height:
         return None

@@ -38,6 +38,7 @@ from chainshaper.analysis.latency import (
     longest_times,
 )
 from chainshaper.analysis.objects import Objects, resolve_objects
+from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.gate.decision import clock_offset
 from chainshaper.planning import ApplicationPlan
 from chainshaper.planning.plan_file import plan_values
@@ -103,8 +104,9 @@ class ChainNow:
     left within each of the plan's slots, over the hour (empty: without a plan), ``early`` those
     before the first slot; ``promised_ns`` is the end of the last slot, which is ``moved_ns`` behind
     the plan's; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
-    ``incomplete``, and ``unclear``, whose messages no event before Iron tells apart while
-    CLOCK_REALTIME is set. ``problem`` says why nothing goes through the chain.
+    ``incomplete``, ``unclear``, whose messages no event before Iron tells apart while
+    CLOCK_REALTIME is set, and ``not_used``: older than the message that the chain's timer or
+    synchroniser used, so no output is missing. ``problem`` says why nothing goes through the chain.
     """
 
     chain: str
@@ -177,7 +179,7 @@ class _Chain:
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
     first: Callback | None = None  # where cycles began when the chain was seen last
     counted: Counter[str] = field(
-        default_factory=lambda: Counter(complete=0, late=0, incomplete=0, unclear=0)
+        default_factory=lambda: Counter(complete=0, late=0, incomplete=0, unclear=0, not_used=0)
     )
     problem: str | None = None
 
@@ -342,8 +344,11 @@ class Watch:
             _forget(one.hops, now - SPANS["minute"])
             if (found := self._judged(one, flow, graph)) is not None:
                 judged, hops = found
-                # A lifecycle node that is not active owes no output.
-                new = judged.filter(within, pl.col("reason").ne_missing("inactive"))
+                begun = judged.filter(within)
+                # A lifecycle node that is not active owes no output, nor does an older message.
+                idle = pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False)
+                new = begun.filter(~idle)
+                one.counted["not_used"] += begun.filter(reason="not used").height
                 new = new.with_columns(pl.col("place_ns") - moved.get(one.output, 0))
                 one.take_over(clear := new.filter(pl.col("start") > clear_ns), hops, now)
                 one.counted["unclear"] += new.height - clear.height
