@@ -129,9 +129,7 @@ def test_who_watches_knows_which_processes_run() -> None:
 
 
 @pytest.mark.parametrize("of", ["hand-made", "field"])
-def test_every_verb_that_takes_a_chain_measures_across_a_restart(
-    tmp_path: Path, of: str
-) -> None:
+def test_every_verb_that_takes_a_chain_measures_across_a_restart(tmp_path: Path, of: str) -> None:
     folder = DATA / "field/respawned_node/respawn"
     if of == "field" and not folder.is_dir():
         pytest.skip(f"the field's traces are not here ({folder})")
@@ -207,7 +205,7 @@ def test_paths_that_no_way_point_tells_apart_are_named_by_their_function() -> No
 
 
 def shaped(killed: int = 10, back: int = 14, cycles: int = 20) -> Story:
-    """/source → /out_tmp → shaping node (process 300, killed in a cycle; 400 once it is back) → /out.
+    """/source → /out_tmp → shaping node (process 300, killed in a cycle; then 400) → /out.
 
     Its standby (500) has each message, too, and publishes at once what the node does not: 3 ms
     behind the cycle's start, where the shaping node does it 40 ms behind it.

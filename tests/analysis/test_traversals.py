@@ -15,7 +15,6 @@ from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_o
 from chainshaper.analysis.traversals import Traversals
 from chainshaper.verify.budgets import _missing, _under_way_from
 
-
 PARTS = ["communication_ns", "computation_ns", "waiting_ns"]
 
 

@@ -243,7 +243,7 @@ def analyse_latency(
     received = reception(flow, found, graph)
     sent, arrived = judged["end"].fill_null(0), received["received"].fill_null(-1)
     on_its_way = pl.Series(stalled_after(flow, sent.to_numpy(), arrived.to_numpy()))
-    frame = judged.drop("origin", "computed_at").with_columns(
+    frame = judged.drop("origin", "computed_at", "expected_at").with_columns(
         *(received["received"], received["reception_ns"]),
         disturbed=hit,
         reception_disturbed=hit | on_its_way,

@@ -72,9 +72,9 @@ def _spans(tables: events.EventTables, pids: Collection[int]) -> dict[int, tuple
         if not {"pid", "time"} <= {*table.columns}:
             continue
         own = table.lazy().filter(pl.col("pid").is_in(list(pids))).group_by("pid")
-        for pid, first, last in own.agg(
-            first=pl.col("time").min(), last=pl.col("time").max()
-        ).collect().iter_rows():
+        for pid, first, last in (
+            own.agg(first=pl.col("time").min(), last=pl.col("time").max()).collect().iter_rows()
+        ):
             before = spans.get(pid, (first, last))
             spans[pid] = min(first, before[0]), max(last, before[1])
     return spans

@@ -90,9 +90,9 @@ class Traversals:
     message it took), ``communication_ns`` (previous publication to start: transport and waiting),
     ``computation_ns`` (start to publication, without the next), ``waiting_ns`` (in the node: from
     the end of the instance until another callback of the node began, which published for it; in a
-    gate, from the arrival until it let go; for a publisher's thread, until that sent it), and ``via``: ``instance`` when the instance itself
-    published, ``sibling`` when another callback of its node did. Over a complete traversal the
-    three parts add up to the latency.
+    gate, from the arrival until it let go; for a publisher's thread, until that sent it), and
+    ``via``: ``instance`` when the instance itself published, ``sibling`` when another callback of
+    its node did. Over a complete traversal the three parts add up to the latency.
 
     ``silent`` counts instances of the first callback that published nothing.
     """
@@ -119,7 +119,7 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
     for hop, (callback, topic) in enumerate(zip(path, chain.topics, strict=True)):
         standby = _standby(graph, callback, topic)
         if hop:
-            state = _take(flow, state, hop, callback, standby, topic)
+            state = _take(flow, state, hop, callback, standby=standby, topic=topic)
         state = _publish(flow, state, hop, [callback.id, *standby], topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             state, note = _publish_by_sibling(flow, state, hop, callback, topic)
@@ -311,6 +311,7 @@ def _take(
     state: pl.DataFrame,
     hop: int,
     callback: Callback,
+    *,
     standby: Sequence[int],
     topic: str,
 ) -> pl.DataFrame:

@@ -4,9 +4,9 @@
 *communication* is the time from the publication before it to its own start: transport, and waiting
 for its executor. Its *computation* is the time from its start to its publication: execution and
 pre-emption; without its *waiting*: for another callback of the node that publishes for it (a
-synchroniser that waits for its other input, a timer that publishes what was stored for it), or in
-a gate for its slot, for the thread of an asynchronous publisher. Over a complete traversal the three add up to the latency, so mean shares add
-up to one.
+synchroniser that waits for its other input, a timer that publishes what was stored for it), in a
+gate for its slot, or for the thread of an asynchronous publisher. Over a complete traversal the
+three add up to the latency, so mean shares add up to one.
 """
 
 from collections.abc import Callable, Sequence
