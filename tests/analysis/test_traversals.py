@@ -3,17 +3,26 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from story import Callback, Node, Publisher, Story
+from story import OFFSET, Callback, Node, Publisher, Story
 from test_messages import hand_over, intra_process, receive
 
 from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_of, traverse
 from chainshaper.analysis.traversals import Traversals
-from chainshaper.verify.budgets import _missing, _under_way_from
+from chainshaper.reporting.latency import breakdown_json, breakdown_table
+from chainshaper.values.recording import RecordingInfo, write_recording
+from chainshaper.verify.budgets import (
+    LEAST_MISSING,
+    Budget,
+    ChainBudget,
+    check_budget,
+    propose_budget,
+)
 
 PARTS = ["communication_ns", "computation_ns", "waiting_ns"]
 
@@ -232,18 +241,19 @@ def test_messages_stored_for_a_timer() -> None:
     assert spans(traversals(story, "/t1../out")) == [(10, 50), (110, 150)]
 
 
-def stored_twice(cycles: int = 10) -> Story:
+def stored_twice(cycles: int = 10, unit: int = 1) -> Story:
     """A camera every 50, whose messages are stored; a timer every 100, which publishes at 84."""
     story = Story()
-    camera, image = story.source("/camera", 1, "/image", 50)
+    camera, image = story.source("/camera", 1, "/image", 50 * unit)
     node = story.node("/planner", 2)
-    store, timer = story.subscription(node, "/image"), story.timer(node, period=100)
+    store, timer = story.subscription(node, "/image"), story.timer(node, period=100 * unit)
     out = story.publisher(node, "/plan")
-    for begin in range(1_000, 1_000 + 100 * cycles, 100):
-        for sent in (begin + 2, begin + 52):
-            story.runs(camera, sent - 2, sent + 2, writes=((image, sent),))
-            story.runs(store, sent + 5, sent + 8, reads=sent)
-        story.runs(timer, begin + 80, begin + 85, writes=((out, begin + 84),))
+    for begin in range(1_000 * unit, (1_000 + 100 * cycles) * unit, 100 * unit):
+        for sent in (begin + 2 * unit, begin + 52 * unit):
+            story.runs(camera, sent - 2 * unit, sent + 2 * unit, writes=((image, sent),))
+            story.runs(store, sent + 5 * unit, sent + 8 * unit, reads=sent)
+        done = ((out, begin + 84 * unit),)
+        story.runs(timer, begin + 80 * unit, begin + 85 * unit, writes=done)
     return story
 
 
@@ -258,11 +268,29 @@ def test_of_several_messages_stored_for_a_timer_the_newest_counts() -> None:
     assert last.select(PARTS).rows() == [(5, 3 + 4, 20)] * 10
 
 
-def test_a_message_that_was_not_used_breaks_no_budget() -> None:
-    story = stored_twice()
-    flow = data_flow(story.tables())
-    found = analyse_latency(flow, "/image../plan")
-    assert _missing(found.traversals, _under_way_from(flow, found)) == 0
+def test_what_waited_and_what_was_not_used_in_budget_table_and_page(tmp_path: Path) -> None:
+    ms = 1_000_000
+    info = RecordingInfo(source="lttng", clock_offset_ns=OFFSET)
+    recording = write_recording(tmp_path / "recording", stored_twice(unit=ms).tables(), info)
+    (chain,) = propose_budget(recording, ["/image../plan"]).chains
+    assert (chain.missing, chain.hops[0].waiting_ns) == (LEAST_MISSING, None)
+    limits = (chain.hops[1].computation_ns, chain.hops[1].waiting_ns)
+    assert limits == pytest.approx((7.7 * ms, 22 * ms), rel=0.01)
+    shorter = chain.hops[1].model_copy(update={"waiting_ns": 19 * ms})
+    budget = Budget(chains=(chain.model_copy(update={"hops": (shorter,)}),))
+    (broken,) = [one for one in check_budget(recording, budget) if not one.met]
+    assert (broken.what, broken.found) == ("waiting of /plan", 20 * ms)
+    budget = Budget(chains=(ChainBudget(chain="/image../plan", maximum_ns=ms),))
+    (broken,) = check_budget(recording, budget)
+    assert broken.because == "its longest hop is /planner (20ms of waiting on average to /plan)"
+    analysis = analyse_latency(recording, "/image../plan")
+    titles = [column.title for column in breakdown_table(analysis).columns]
+    assert "waiting\nmax" in titles
+    values = breakdown_json(analysis)
+    assert (values["hops"][1]["waiting_ns"]["max"], round(values["waiting_share"], 3)) == (
+        20 * ms,
+        round(20 / 34, 3),
+    )
 
 
 def two_lefts(symbol: str) -> Story:

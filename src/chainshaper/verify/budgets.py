@@ -383,9 +383,15 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
         return f"from {worst.text.partition(': ')[2]}"
     if not parts["count"].sum():
         return None
-    longest = parts.sort("computation_share", descending=True, nulls_last=True).row(0, named=True)
-    mean = duration_text(round(longest["computation_ns"]["mean"]))
-    return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
+    means = [
+        (row[f"{part}_ns"]["mean"], part, row)
+        for row in parts.iter_rows(named=True)
+        for part in ("computation", "waiting")
+        if row[f"{part}_ns"] is not None
+    ]
+    mean, part, longest = max(means, key=lambda one: one[0])
+    took = f"{duration_text(round(mean))} of {part} on average"
+    return f"its longest hop is {longest['node']} ({took} to {longest['topic']})"
 
 
 def junit_report(judged: "Sequence[Judged | Compared]") -> str:
