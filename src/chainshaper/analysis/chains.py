@@ -190,14 +190,19 @@ def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], comp
     for chain, path, names in zip(shown, paths, passed, strict=True):
         others = {name for other in passed if other is not names for name in other}
         own = next((name for name in names if name not in others), None)
-        remedy = f"  (only this one passes {own})" if own else _without_way_point(path, paths)
+        points = tuple(_way_points(graph, chain))
+        remedy = f"  (only this one passes {own})"
+        if own is None:
+            remedy = f"  (write {'..'.join(points)})"
+            if points == chain.topics:
+                remedy = _without_way_point(path, paths)
         way = " → ".join((graph.label(path[0]), *chain.topics))
         lines.append(f"  {way}{remedy}")
     return "\n".join(lines)
 
 
 def _without_way_point(path: Sequence[Callback], paths: Sequence[Sequence[Callback]]) -> str:
-    """Which callback sets a path apart that no way point alone does."""
+    """Which callback sets a path apart that no way point does."""
     others = {callback.id for one in paths if one is not path for callback in one}
     apart = next((one for one in path if one.id not in others), None)
     if apart is None:
