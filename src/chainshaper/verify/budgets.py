@@ -32,6 +32,7 @@ from chainshaper.analysis.latency import (
     latency_statistics,
     longest_times,
 )
+from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.durations import duration_text
@@ -79,6 +80,7 @@ class HopBudget(Part):
     topic: str
     communication_ns: PositiveDuration | None = None
     computation_ns: PositiveDuration | None = None
+    waiting_ns: PositiveDuration | None = None
 
 
 class ChainBudget(Part):
@@ -180,8 +182,8 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
         wanted: tuple[Percentile, ...] = ("50", "99")
         percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}
         hops = tuple(
-            HopBudget(topic=topic, communication_ns=limit(waits), computation_ns=limit(computes))
-            for topic, (waits, computes) in _longest_parts(hop_breakdown(analysis)).items()
+            HopBudget(topic=topic, **{f"{part}_ns": limit(most) for part, most in parts.items()})
+            for topic, parts in _longest_parts(hop_breakdown(analysis)).items()
         )
         missing = _missing(analysis.traversals, _under_way_from(flow, analysis)) or 0.0
         of_chains.append(
@@ -277,7 +279,8 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
             why = None if minute.count else "no cycle was complete"
             limits = _chain_limits(chain, minute, missing)
             found += [Judged("now", chain.chain, *one, because=why) for one in limits]
-            found += _judged_hops("now", chain, {one.topic: one.longest_ns for one in now.hops})
+            longest = {one.topic: dict(zip(PARTS, one.longest_ns, strict=True)) for one in now.hops}
+            found += _judged_hops("now", chain, longest)
     times = {(one.node, one.starts): one.longest_ns for one in seen.callbacks}
     running = [one for one in budget.callbacks if (one.node, one.starts) in times]
     found += _judged_callbacks("now", running, times)
@@ -321,11 +324,11 @@ def _under_way_from(flow: DataFlow, analysis: LatencyAnalysis) -> int:
 
 def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
     """The share of outputs that were late or never came; those are not missing that were under way
-    at the end, or of lifecycle nodes that were not active.
+    at the end, or owed for nothing (:data:`~.traversals.OWES_NO_OUTPUT`).
     """
     over = traversals.filter(
         pl.col("complete") | (pl.col("start") <= under_way_from_ns),
-        pl.col("reason").ne_missing("inactive"),
+        ~pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False),
     )
     if not over.height:
         return None
@@ -333,20 +336,22 @@ def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
     return float(gone) / over.height
 
 
-def _longest_parts(parts: pl.DataFrame) -> dict[str, Longest]:
-    """The longest communication and computation of each hop, by its topic."""
+def _longest_parts(parts: pl.DataFrame) -> dict[str, dict[str, float | None]]:
+    """The longest communication, computation and waiting of each hop, by its topic."""
     most = (pl.col(f"{part}_ns").struct.field("max").alias(part) for part in PARTS)
-    rows = parts.select("topic", *most).iter_rows()
-    return {topic: (waits, computes) for topic, waits, computes in rows}
+    rows = parts.select("topic", *most).iter_rows(named=True)
+    return {row["topic"]: {part: row[part] for part in PARTS} for row in rows}
 
 
-def _judged_hops(name: str, chain: ChainBudget, longest: Mapping[str, Longest]) -> Iterator[Judged]:
-    """The limits of hops; ``longest`` are communication and computation by topic."""
+def _judged_hops(
+    name: str, chain: ChainBudget, longest: Mapping[str, Mapping[str, float | None]]
+) -> Iterator[Judged]:
+    """The limits of hops; ``longest`` are the parts of each by its topic."""
     for hop in chain.hops:
-        limits = zip(PARTS, (hop.communication_ns, hop.computation_ns), strict=True)
-        named = {f"{part} of {hop.topic}": limit for part, limit in limits}
-        why = "the chain has no such hop here"
-        yield from _judged(name, chain.chain, named, longest.get(hop.topic), why)
+        named = {f"{part} of {hop.topic}": getattr(hop, f"{part}_ns") for part in PARTS}
+        times = longest.get(hop.topic)
+        found = None if times is None else tuple(times[part] for part in PARTS)
+        yield from _judged(name, chain.chain, named, found, "the chain has no such hop here")
 
 
 def _judged_callbacks(
@@ -361,10 +366,14 @@ def _judged_callbacks(
 
 
 def _judged(
-    name: str, where: str, limits: Mapping[str, int | None], times: Longest | None, why: str
+    name: str,
+    where: str,
+    limits: Mapping[str, int | None],
+    times: Sequence[float | None] | None,
+    why: str,
 ) -> Iterator[Judged]:
-    """Those of two limits that there are, beside the times; ``why`` one of these is not known."""
-    for (what, limit), most in zip(limits.items(), times or (None, None), strict=True):
+    """Those of the limits that there are, beside the times; ``why`` one of these is not known."""
+    for (what, limit), most in zip(limits.items(), times or [None] * len(limits), strict=True):
         if limit is not None:
             yield Judged(name, where, what, limit, most, because=why if most is None else None)
 
@@ -377,9 +386,15 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
         return f"from {worst.text.partition(': ')[2]}"
     if not parts["count"].sum():
         return None
-    longest = parts.sort("computation_share", descending=True, nulls_last=True).row(0, named=True)
-    mean = duration_text(round(longest["computation_ns"]["mean"]))
-    return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
+    means = [
+        (row[f"{part}_ns"]["mean"], part, row)
+        for row in parts.iter_rows(named=True)
+        for part in ("computation", "waiting")
+        if row[f"{part}_ns"] is not None
+    ]
+    mean, part, longest = max(means, key=lambda one: one[0])
+    took = f"{duration_text(round(mean))} of {part} on average"
+    return f"its longest hop is {longest['node']} ({took} to {longest['topic']})"
 
 
 def junit_report(judged: "Sequence[Judged | Compared]") -> str:

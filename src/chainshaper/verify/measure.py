@@ -2,9 +2,11 @@
 
 :func:`hop_breakdown` says where the latency goes. A hop is a callback of the chain. Its
 *communication* is the time from the publication before it to its own start: transport, and waiting
-for its executor. Its *computation* is the time from its start to its publication: execution,
-pre-emption, and waiting for another callback of the node that publishes for it (a synchroniser).
-Over a complete traversal the two add up to the latency, so mean shares add up to one.
+for its executor. Its *computation* is the time from its start to its publication: execution and
+pre-emption; without its *waiting*: for another callback of the node that publishes for it (a
+synchroniser that waits for its other input, a timer that publishes what was stored for it), in a
+gate for its slot, or for the thread of an asynchronous publisher. Over a complete traversal the
+three add up to the latency, so mean shares add up to one.
 """
 
 from collections.abc import Callable, Sequence
@@ -262,15 +264,15 @@ def compare_chains(
     return tuple(Comparison(own[0].analysis.chain.spec, own) for own in zip(*columns, strict=True))
 
 
-PARTS = ("communication", "computation")
+PARTS = ("communication", "computation", "waiting")
 
 
 def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
-    """Communication and computation of every hop of a chain, over its complete traversals.
+    """Communication, computation and waiting of every hop of a chain, over complete traversals.
 
     One row per hop: ``hop`` (from 0), ``callback_id``, ``node``, ``callback`` (a short text),
     ``topic`` (that it publishes), ``count``, ``by_sibling`` (how often another callback of the
-    node published for it), and for both parts ``…_ns``, a struct ``{min, mean, max}`` in ns (null
+    node published for it), and for all parts ``…_ns``, a struct ``{min, mean, max}`` in ns (null
     without traversals, and for the first hop's communication), and ``…_share`` of the mean latency.
     """
     path = analysis.graph.path(analysis.chain)
@@ -288,7 +290,7 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
             "hop": range(len(path)),
             "callback_id": analysis.chain.callbacks,
             "node": [callback.node for callback in path],
-            "callback": [callback.label for callback in path],
+            "callback": [analysis.graph.label(callback) for callback in path],
             "topic": analysis.chain.topics,
         },
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},
