@@ -31,6 +31,7 @@ from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.traversals import Traversals
 from chainshaper.gate.decision import STALL_NS
 from chainshaper.values import events
+from chainshaper.values.application import Chain
 
 WAKE_UP_NS = 250_000
 
@@ -81,11 +82,9 @@ def with_punctuality(
     decided = releases.filter(pl.col("hop") == len(chain.callbacks) - 1).drop("hop")
     frame = traversals.frame.join(decided, on="traversal", how="left", maintain_order="left")
     start, end, counted_from = pl.col("start"), pl.col("end"), pl.col("origin")
-    # The period of the timer that starts the chain stands for the cycle of a plan.
-    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
-    period: int | None = first["period_ns"].max()  # type: ignore[assignment]
-    cycle_ns = period if due is None else due.cycle_ns
-    limit = pl.lit(cycle_ns if due is None else (due.cycles + 1) * due.cycle_ns, dtype=pl.Int64)
+    within = due_within(flow, chain, due)
+    cycle_ns = within if due is None else due.cycle_ns
+    limit = pl.lit(within, dtype=pl.Int64)
     began = start
     if due is not None and due.from_cycle:
         began = start - pl.lit(lateness_in_cycle(frame["start"], due.cycle_ns))
@@ -105,6 +104,18 @@ def with_punctuality(
         origin="origin",
         computed_at=pl.coalesce("arrival", "end"),
     ), releases
+
+
+def due_within(flow: DataFlow, chain: Chain, due: Due | None) -> int | None:
+    """How long after its beginning an output is late whatever the slots are (ns; None: not known).
+
+    The period of the timer that starts the chain stands for the cycle of a plan.
+    """
+    if due is not None:
+        return (due.cycles + 1) * due.cycle_ns
+    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
+    period: int | None = first["period_ns"].max()  # type: ignore[assignment]
+    return period
 
 
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:

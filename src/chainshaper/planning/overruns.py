@@ -369,8 +369,8 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         yield f"{said} latencies, which may be the longest, are not in the plan."
     if margin.confidence_interval_ns:
         low, high = map(duration_text, margin.confidence_interval_ns)
-        epsilon = duration_text(margin.epsilon_ns)
-        yield f"the margin {epsilon} is an estimate, 95 % confidence between {low} and {high}."
+        said = f"the margin {high} is the upper end of an estimate from the tail of the latencies"
+        yield f"{said}, which lies between {low} and that."
     if NEARLY_FULL * cycle < last <= cycle:
         said = f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}"
         yield f"{said}: an execution a little longer than any measured delays the next one."

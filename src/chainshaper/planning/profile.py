@@ -97,6 +97,7 @@ class Profile:
     output_depth: int | None = None
     recording: str | None = None
     incomplete: int = 0
+    unpublished: int = 0
     disturbed: int = 0
     realtime: bool | None = None
     longest_stall_ns: int | None = None
