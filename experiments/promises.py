@@ -5,8 +5,9 @@
 From each sample a plan is made, by default and for a share of late outputs that is asked for. Its
 promise holds if that share of all cycles to come, at most, is late: the distribution is known, so
 what lies behind the slot's start is computed, not sampled. The way to the shaping node takes 0.2 ms
-of it. The longest 5 % of the cycles count as disturbed by the machine. A plan that the sample does not allow is refused, and counted apart. Cells: plans whose
-promise holds, of all that were made, and how many samples were refused.
+of it. The longest 5 % of the cycles count as disturbed by the machine. A plan that the sample does
+not allow is refused, and counted apart. Cells: plans whose promise holds, of all that were made,
+and how many samples were refused.
 """
 
 import argparse
@@ -104,9 +105,7 @@ DISTRIBUTIONS = {
     "slow stretches (4 cycles)": Distribution(
         slow_stretches,
         lambda ms: float(
-            _mixed(
-                SLOW, stats.gamma.sf(ms - SLOWER_MS, 9, scale=2), stats.gamma.sf(ms, 9, scale=2)
-            )
+            _mixed(SLOW, stats.gamma.sf(ms - SLOWER_MS, 9, scale=2), stats.gamma.sf(ms, 9, scale=2))
         ),
     ),
 }

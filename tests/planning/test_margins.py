@@ -240,7 +240,7 @@ def test_a_percentile_holds_also_where_the_machine_disturbed_every_cycle() -> No
 
 
 def test_more_cycles_than_measured_cannot_be_promised() -> None:
-    with pytest.raises(OperationError, match=r"302 cycles are too few .* Measure 1000 cycles, .* or 2995 "):
+    with pytest.raises(OperationError, match=r"302 cycles are too few .* or 2995 "):
         _planned(list(np.linspace(40, 60, 302)), disturbed=0, overrun_probability=0.001)
     with pytest.raises(InputError, match="between 0 and 1"):
         _planned([40, 50], disturbed=0, overrun_probability=1.5)

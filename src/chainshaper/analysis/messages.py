@@ -409,9 +409,9 @@ def gated_hops(
     """What gates decided about the messages of a chain: one row per hop whose callback is a gate.
 
     ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode,
-    dropped, moved_ns`` of `gate_release`, sorted; ``let_go`` is when it did. Several messages may have the
-    same source timestamp (writers stamp in microseconds, a simulated clock stands still): then
-    the decision is meant whose ``arrival`` is nearest to the start of the callback.
+    dropped, moved_ns`` of `gate_release`, sorted; ``let_go`` is when it did. Several messages may
+    have the same source timestamp (writers stamp in microseconds, a simulated clock stands still):
+    then the decision is meant whose ``arrival`` is nearest to the start of the callback.
     """
     key = ["callback_id", "source_timestamp"]
     decided = with_overrun(gate_decisions(tables, objects), due_cycles).with_columns(let_go="time")

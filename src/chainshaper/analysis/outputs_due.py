@@ -3,15 +3,15 @@
 An output is due for every traversal, but for
 
 * one that was under way as the recording, or the plan's time in force, ended: it was to be out
-  later than that. As an application ends, its nodes do so one by one, so the last tenth of what was
-  recorded, 3 s at most, does not count for traversals without an end;
+  later than that;
 * one of a lifecycle node that was not active;
 * one that a gate replaced by another of its cycle, or let another go first, as its plan has it
   (``messages``).
 
 With a plan an output is due in each cycle, also in one in which the chain did not begin: a timer
-that skipped its expiry, a node that died. How often a chain did not begin shows where its beginnings
-fall behind by whole cycles and stay there.
+that skipped its expiry, a node that died. How often a chain did not begin shows where its
+beginnings fall behind by whole cycles and stay there. As an application ends, its nodes do so one
+by one: beginnings are not missed in the last tenth of a recording, 3 s at most.
 """
 
 import numpy as np
@@ -40,8 +40,9 @@ def with_outputs_due(
     ``limit_ns`` is how long after its beginning an output is to be out (None: as long as the
     longest took), ``until_ns`` when the plan was released (None: not before the recording ended).
     """
-    ended = _ended(flow, until_ns)
-    limit = frame["latency_ns"].max() or 0 if limit_ns is None else limit_ns
+    ended = int(flow.instances["start"].max() or 0) if until_ns is None else until_ns  # type: ignore[arg-type]
+    longest = frame["latency_ns"].max() or 0
+    limit = longest if limit_ns is None else limit_ns
     replaced = releases.filter(pl.col("dropped").is_in(_AS_PLANNED))["traversal"]
     reason = pl.col("reason").cast(pl.String)
     expected = (reason == "discarded") | (pl.col("start") + limit <= ended)
@@ -50,8 +51,8 @@ def with_outputs_due(
     return frame.with_columns(was_due=(due & ~as_planned).fill_null(False))
 
 
-def _ended(flow: DataFlow, until_ns: int | None) -> int:
-    """Until when what was due had to be there."""
+def _running_until(flow: DataFlow, until_ns: int | None) -> int:
+    """Until when every node of an application ran, as far as none ended by itself."""
     if until_ns is not None:
         return until_ns
     times = flow.instances["start"]
@@ -77,7 +78,7 @@ def not_begun(
         return 0
     behind = own.to_numpy() - np.arange(len(own)) * due.cycle_ns
     skipped = int(_stays_behind(behind, due.cycle_ns).sum())
-    quiet = _ended(flow, until_ns) - int(own[-1]) - due.cycles * due.cycle_ns
+    quiet = _running_until(flow, until_ns) - int(own[-1]) - due.cycles * due.cycle_ns
     return skipped + max(0, round(quiet / due.cycle_ns - 1))
 
 

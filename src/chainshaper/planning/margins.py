@@ -10,8 +10,8 @@ much as n / d independent ones do, where d = 1 + 2 Σ ρ_h is the variance of th
 cycles beside that of independent ones (ρ_h: the correlation at h cycles' distance). All of the
 above holds with that number in place of n.
 
-**Beyond the sample** (:func:`fit_tail`) the excesses of latencies over a high threshold u follow, in
-the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan). With ζ the share of
+**Beyond the sample** (:func:`fit_tail`) the excesses of latencies over a high threshold u follow,
+in the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan). With ζ the share of
 latencies above u, ξ the shape and σ the scale, the latency exceeded with probability p is
 
     x_p = u + σ/ξ · ((ζ/p)^ξ − 1).
@@ -202,7 +202,7 @@ def independent_cycles(latencies_ns: _Latencies) -> int:
 def _more_than(count: int, mean: float) -> float:
     """The probability that a Poisson variable of this ``mean`` is ``count`` or more."""
     term = math.exp(count * math.log(mean) - mean - math.lgamma(count + 1))
-    total, number = 0.0, count
+    total, number = 0.0, float(count)
     while term > 1e-12 * total or number < mean:
         total += term
         number += 1
@@ -220,7 +220,15 @@ def late_share(every_latency_ns: _Latencies, latency_ns: int, independent: int =
     size = every_latency_ns.size
     beyond = int(np.count_nonzero(every_latency_ns > latency_ns))
     trials = independent or size
-    hits = math.ceil(beyond * trials / size)
+    return most_probable(math.ceil(beyond * trials / size), trials)
+
+
+def most_probable(hits: int, trials: int) -> float:
+    """The probability of a hit, at most, with 95 % confidence, where so many trials had ``hits``.
+
+    >>> round(most_probable(0, 299), 4)
+    0.01
+    """
     if hits >= trials:
         return 1.0
     # P(Bin(n, p) ≤ hits) falls with p: where it is 5 %. Terms far below the last are none.
@@ -233,6 +241,16 @@ def late_share(every_latency_ns: _Latencies, latency_ns: int, independent: int =
         terms = ways + few * math.log(share) + (trials - few) * math.log1p(-share)
         low, high = (share, high) if np.exp(terms).sum() > 1 - CONFIDENCE else (low, share)
     return high
+
+
+def covering_rank(independent: int, overrun_probability: float) -> int:
+    """Which longest latency covers all cycles but a share: the largest k of
+    :func:`covered_latency`.
+
+    >>> covering_rank(299, 0.01), covering_rank(473, 0.01)
+    (1, 2)
+    """
+    return max(1, _by_chance(independent, overrun_probability, CONFIDENCE))
 
 
 def covered_latency(
@@ -251,8 +269,7 @@ def covered_latency(
         (299, 599)
     """
     ordered = np.sort(latencies_ns)
-    trials = independent or ordered.size
-    covered = ordered[-max(1, _by_chance(trials, overrun_probability, CONFIDENCE))]
+    covered = ordered[-covering_rank(independent or ordered.size, overrun_probability)]
     if latest_ns is not None and covered > latest_ns:
         covered = ordered[ordered <= latest_ns].max(initial=0)
     return int(covered)
@@ -342,9 +359,7 @@ def _refuse_too_few(latencies: _Latencies, probability: float) -> None:
             f" measure {needed} cycles, or give the margin (--epsilon)"
         )
     if size < FEWEST_CYCLES or size * FARTHEST * probability < 1:
-        raise OperationError(
-            f"{size} cycles are too few for {asked}. {_remedy(size, probability)}"
-        )
+        raise OperationError(f"{size} cycles are too few for {asked}. {_remedy(size, probability)}")
 
 
 def _remedy(size: int, probability: float) -> str:
@@ -445,7 +460,7 @@ def _halves_alike(latencies: _Latencies) -> float:
     if scaled < 0.2:  # the series converges slowly there, and to one
         return 1.0
     terms = (2 * (-1) ** (k - 1) * math.exp(-2 * (k * scaled) ** 2) for k in range(1, 101))
-    return min(1.0, max(0.0, sum(terms)))
+    return float(np.clip(sum(terms), 0.0, 1.0))
 
 
 def _no_trend(latencies: _Latencies) -> float:

@@ -91,7 +91,8 @@ class Evidence(Part):
 
     They are of undisturbed cycles, or of all, where the machine disturbed all but one at most
     (``all_disturbed``). ``max_of_all_ns`` is of all, ``incomplete`` counts traversals without an
-    end, of which the application had ``unpublished`` ones end by itself, ``utilisation`` is the share of its core that the chain takes, ``interference_ns`` the part
+    end, ``unpublished`` those of them that the application ended without a publication,
+    ``utilisation`` is the share of its core that the chain takes, ``interference_ns`` the part
     of the average and the longest latency that is for others
     (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's asynchronous
     publisher, ``longest_publication_ns`` of its synchronous one; ``publish_slot`` says where Δ is

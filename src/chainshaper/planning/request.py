@@ -435,6 +435,11 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
     # Of the latencies themselves: what the least margin adds is the way to the shaping node, and
     # how many cycles end within it is an accident of the sample.
     late = margins.late_share(every, longest + stalls, independent)
+    if covers and np.array_equal(covered, every):
+        # Which of the longest it is was fixed before they were seen, however many are equal to it.
+        rank = margins.covering_rank(independent, margins.OVERRUN_PROBABILITY)
+        if longest + stalls == np.sort(every)[-rank]:
+            late = margins.most_probable(rank - 1, independent)
     if probability is not None and late > probability:
         reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
         remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"

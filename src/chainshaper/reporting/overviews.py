@@ -16,7 +16,7 @@ from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
 from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
-from chainshaper.reporting.latency import expected_text
+from chainshaper.reporting.latency import expected_jitter_text
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
@@ -367,7 +367,7 @@ def plan_table(plan: Plan) -> ResultTable:
             threads.append(f"{thread.node} ({what})" if what else thread.node)
         table.add(one.name, one.core, one.priority, slots_ms(*one.slots), ", ".join(threads))
     offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
-    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_text(plan)}"
+    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_jitter_text(plan)}"
     return table
 
 

@@ -15,17 +15,16 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 from xml.etree import ElementTree
 
 import polars as pl
 import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
-from chainshaper.analysis import DataFlow, data_flow
+from chainshaper.analysis import data_flow
 from chainshaper.analysis.latency import (
     PERCENTILES,
-    LatencyAnalysis,
     LatencyStatistics,
     Longest,
     latency_statistics,

@@ -70,9 +70,9 @@ class JudgedFigure:
 class BandHeld:
     """One latency band, over undisturbed cycles whose output came in the cycle it was due.
 
-    ``inside`` counts outputs that left while the slot was open. ``jitter_at_most_ns`` is what a band
-    beside others promises (None: nothing). With modes it is that of ``mode``:
-    ``late`` counts the mode's outputs behind its slot, the shares are those of its others.
+    ``inside`` counts outputs that left while the slot was open. ``jitter_at_most_ns`` is what a
+    band beside others promises (None: nothing). With modes it is that of ``mode``: ``late`` counts
+    the mode's outputs behind its slot, the shares are those of its others.
     """
 
     slot_start_ns: int
