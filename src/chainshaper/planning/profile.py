@@ -182,10 +182,9 @@ def other_beginnings(profile: Profile) -> str | None:
     if not own or not (others := [node for node in begin if node not in own]):
         return None
     return (
-        f"{profile.name} waits for what {' and '.join(others)} begin{'s' * (len(others) == 1)}, at"
-        f" another time beside {profile.nodes[0]} after every start of the application unless they"
-        " are started together, and its latency is another then: measure it after other starts too,"
-        " or let slots follow (--adapt)"
+        f"{profile.name} waits for {' and '.join(others)}: beside {profile.nodes[0]} these start at"
+        " a new offset at each launch, which changes the latency. Record several launches, or use"
+        " --adapt"
     )
 
 

@@ -122,7 +122,8 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         if measurement.prediction is not None:
             entry["prediction"] = prediction_json(measurement.prediction)
         entries.append(entry)
-    return {"format": JSON_FORMAT, "chain": comparison.chain, "recordings": entries}
+    about = {"format": JSON_FORMAT, "chain": comparison.chain, "remark": comparison.remark}
+    return {**about, "recordings": entries}
 
 
 def comparisons_json(comparisons: Sequence[Comparison]) -> dict[str, Any]:
@@ -147,7 +148,9 @@ def latency_table(measurement: Measurement) -> ResultTable:
         columns = dict([*columns.items()][::2])
     title = f"End-to-end latency of {analysis.chain.spec} [ms]"
     table = ResultTable(title, [*words(""), *figures(*columns)], measurement.left_out.text)
-    for title, cells in _rows([*columns.values()]).items():
+    for name, cells in _rows([*columns.values()]).items():
+        # Without a plan no output is due at any time: its period is what there is to compare with.
+        title = "longer than the period" if name == LATE[0] and measurement.plan is None else name
         table.add(title, *cells, detail=title in ("median", "99th percentile"))
     return table
 
@@ -210,6 +213,8 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
     remarks = [
         f"{m.recording.path.name}: {m.left_out.text}" for m in measurements if m.left_out.text
     ]
+    if comparison.remark:
+        remarks.append(comparison.remark)
     planned = [m.plan for m in measurements if m.plan is not None]
     if planned:
         remarks.append(

@@ -268,7 +268,7 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
         if stopped and chain.missing is not None and now.counted["complete"]:
             found.append(Judged("now", chain.chain, "missing", chain.missing, 1.0, because=stopped))
             chain = chain.model_copy(update={"missing": None})  # noqa: PLW2901
-        missing = OutputsDue.of(minute).share
+        missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).share
         if missing is not None:
             why = None if minute.count else "no cycle was complete"
             limits = _chain_limits(chain, minute, missing)

@@ -13,11 +13,12 @@ from dataclasses import dataclass, field
 
 import polars as pl
 
-from chainshaper.analysis import LatencyAnalysis, LatencyStatistics
+from chainshaper.analysis import LatencyAnalysis
 from chainshaper.planning import Plan
+from chainshaper.planning.plan import Evidence
 
 STANDARD_ERRORS = 3  # beyond so many, a figure is not what was predicted
-NOT_PUBLISHED, NOT_BEGUN = "not published", "not begun"
+NOT_PUBLISHED, NOT_BEGUN, NEVER_CAME = "not published", "not begun", "never came"
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,14 @@ class OutputsDue:
     promised: float | None = None
 
     @classmethod
-    def of(cls, statistics: LatencyStatistics, promised: float | None = None) -> "OutputsDue":
-        """What statistics alone say of it, which have no reasons."""
-        gone = statistics.incomplete
-        absent = {"that never came": gone} if gone else {}
-        return cls(statistics.count + gone, statistics.late, absent, promised=promised)
+    def of(
+        cls, count: int, late: int | None, incomplete: int, plan: Plan | None = None
+    ) -> "OutputsDue":
+        """Of so many outputs that came, and so many that did not, for no known reason."""
+        absent, due, usual = {NEVER_CAME: incomplete} if incomplete else {}, count + incomplete, 0
+        if plan is not None:
+            usual = _usual(plan.evidence, plan.evidence.incomplete, due, incomplete)
+        return cls(due, late, absent, usual, None if plan is None else promised_by(plan))
 
     @property
     def missed(self) -> int:
@@ -70,11 +74,10 @@ class OutputsDue:
     @property
     def text(self) -> str:
         """``875 of 1000 outputs missed (875 discarded)``, ``0 of 320 outputs late``."""
-        absent = {reason: count for reason, count in self.absent.items() if count}
-        if not absent:
+        if not self.absent:
             return f"{self.late or 0} of {self.due} outputs late"
         parts = [f"{self.late} late"] if self.late else []
-        parts += [f"{count} {reason}" for reason, count in absent.items()]
+        parts += [f"{count} {reason}" for reason, count in self.absent.items()]
         usual = f", {self.usual} of these as before the plan" if self.usual else ""
         return f"{self.missed} of {self.due} outputs missed ({', '.join(parts)}{usual})"
 
@@ -83,6 +86,17 @@ def _by_chance(count: int, share: float) -> int:
     """How many of so many may be hit where this share is, as far as chance goes."""
     mean = count * share
     return math.floor(mean + STANDARD_ERRORS * math.sqrt(mean))
+
+
+def promised_by(plan: Plan) -> float:
+    """The share of outputs that a plan says may be missed, at most."""
+    return plan.margin.overrun_probability or 0.0
+
+
+def _usual(evidence: Evidence, before: int, due: int, absent: int) -> int:
+    """How many of the ``absent`` are so as often as ``before``, in what was planned from."""
+    planned_from = evidence.samples + evidence.disturbed + evidence.incomplete
+    return min(absent, _by_chance(due, before / planned_from)) if before else 0
 
 
 def outputs_due(analysis: LatencyAnalysis, plan: Plan | None = None) -> OutputsDue:
@@ -102,18 +116,14 @@ def _counted(traversals: pl.DataFrame, not_begun: int, plan: Plan | None) -> Out
     if not_begun:
         absent[NOT_BEGUN] = not_begun
     known = due["late"].count() or not due.filter("complete").height
-    count, usual, promised = due.height + not_begun, 0, None
+    count, usual = due.height + not_begun, 0
     if plan is not None:
-        promised = plan.margin.overrun_probability or 0.0
-        evidence = plan.evidence
-        planned_from = evidence.samples + evidence.disturbed + evidence.incomplete
-        if evidence.unpublished:
-            as_often = _by_chance(count, evidence.unpublished / planned_from)
-            usual = min(absent[NOT_PUBLISHED], as_often)
+        before = plan.evidence.unpublished
+        usual = _usual(plan.evidence, before, count, absent[NOT_PUBLISHED])
     return OutputsDue(
         due=count,
         late=int(due["late"].sum() or 0) if known else None,
-        absent=dict(absent),
+        absent={reason: number for reason, number in absent.items() if number},
         usual=usual,
-        promised=promised,
+        promised=None if plan is None else promised_by(plan),
     )
