@@ -26,7 +26,7 @@ from chainshaper.planning.margins import HOP_NS
 from chainshaper.values.errors import OperationError
 
 MS, CYCLE_MS = 1_000_000, 10_000  # so long that it refuses no plan
-SIZES = (400, 1_000, 3_000, 10_000)
+SIZES = (400, 1_000, 4_000, 10_000)
 SHARES = (None, 1e-3, 1e-4)
 """Late outputs that are asked for; None: the default, whose promise is what the plan says."""
 CALM = 0.95  # so far the latencies are of cycles that the machine did not disturb

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from bare_plans import MS
 from numpy.typing import NDArray
+from promises import held_of
 from scipy import stats
 
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain, plan_shaping, plan_warnings
@@ -101,6 +102,32 @@ def test_what_a_sample_cannot_say_is_refused_with_how_many_cycles_could() -> Non
         " for 0.001497 or more, which 2000 cycles show"
     )
     assert derive_margin(latencies, 0.001497).source == "measured"
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "share", "repeats"),
+    [
+        ("exponential", 1_000, None, 60),
+        ("exponential, in whole ms", 4_000, 1e-3, 60),
+        ("lognormal (σ 0.4)", 1_000, 1e-3, 25),
+        ("beta (2, 5)", 4_000, 1e-4, 15),
+        ("slow stretches (4 cycles)", 1_000, None, 40),
+        ("autoregressive (0.7)", 400, None, 40),
+    ],
+)
+def test_the_promise_holds_in_95_of_100_plans(
+    name: str, size: int, share: float | None, repeats: int
+) -> None:
+    """A part of `experiments/promises.py`, with other samples: as far as chance goes."""
+    held, made = held_of(name, size, share, repeats, seed=1)
+    assert made > 0.8 * repeats
+    assert made - held <= stats.binom.ppf(0.999, made, 0.05)
+
+
+def test_what_depends_on_the_cycles_before_is_refused_for_a_rare_share() -> None:
+    for name in ("autoregressive (0.7)", "slow stretches (4 cycles)"):
+        assert held_of(name, 1_000, 1e-3, 20) == (0, 0)
+    assert held_of("Pareto (α 3)", 400, 1e-3, 20) == (0, 0), "too few for a tail"
 
 
 def test_clusters_of_long_cycles_count_as_few() -> None:

@@ -160,7 +160,8 @@ def test_the_verdict_has_the_bound_that_it_judges_by(tmp_path: Path) -> None:
         said.append(_text(measure_latency(shaped)))
     assert "promise met: jitter 0.000 ms, at most 1.000 ms; 0 of 400 outputs late" in said[0]
     assert re.search(
-        r"promise met: jitter within bands [01]\.\d+, [01]\.\d+, 0\.000 ms, at most 1\.100 ms; ", said[1]
+        r"promise met: jitter within bands [01]\.\d+, [01]\.\d+, 0\.000 ms, at most 1\.100 ms; ",
+        said[1],
     )
 
 

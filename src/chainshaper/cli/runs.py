@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 STDERR = 2
 PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
-MOST_JUDGED = 1_000_000  # simulated cycles, which are read again for that
+MOST_JUDGED = 100_000  # simulated cycles, which are read again for that: more take memory
 MOST_RECORDED = 100  # by `watch --budget` itself: a limit that breaks for weeks fills no disk
 
 COMMAND: list[str] | None = opt.argument(
