@@ -344,9 +344,9 @@ def _changed(model: type[_Model], data: Any, changes: Values, without: str = "")
 
 def _refuse_unknown_node(name: str, described: Mapping[str, Any]) -> None:
     """Refuse a path to a node that the description has not: it would be added, with one value."""
-    first, _, rest = name.partition(".")
-    node, known = rest.partition(".")[0], [*described.get("nodes", {})]
-    if first == "nodes" and node not in (*known, INTERFERENCE):
+    (first, *within), known = name.split("."), [*described.get("nodes", {})]
+    node = within[0] if within else ""
+    if first == "nodes" and within[1:] and node not in (*known, INTERFERENCE):
         near = difflib.get_close_matches(node, known, n=1)
         meant = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
         raise InputError(f"axis {name}: the application has no node {node!r}; {meant}")

@@ -181,10 +181,10 @@ def other_beginnings(profile: Profile) -> str | None:
     own = {one.node for one in profile.callbacks if (one.node, one.publishes) == first}
     if not own or not (others := [node for node in begin if node not in own]):
         return None
+    begin_apart = ", ".join((profile.nodes[0], *others[:-1]))
     return (
-        f"{profile.name} waits for {' and '.join(others)}: beside {profile.nodes[0]} these start at"
-        " a new offset at each launch, which changes the latency. Record several launches, or use"
-        " --adapt"
+        f"{begin_apart} and {others[-1]} start at a new offset to each other at each launch, which"
+        f" changes the latency of {profile.name}. Record several launches, or use --adapt"
     )
 
 

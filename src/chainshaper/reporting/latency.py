@@ -34,6 +34,7 @@ from chainshaper.verify.overruns import (
     overruns_text,
 )
 from chainshaper.verify.predictions import JudgedFigure, JudgedPrediction, jitter_within_band
+from chainshaper.verify.promises import outputs_due
 
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows that say what happened to cycles that are called disturbed."""
@@ -324,12 +325,14 @@ def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ())
     """One row per chain of an application, each recording's figures of undisturbed cycles."""
     names = names or [one.recording.path.name for one in comparisons[0].measurements]
     fields = {"jitter": "jitter_ns", "average": "mean_ns", "maximum": "max_ns"}
-    titles = [f"{title}\n{name}" for title in (*fields, "late of all") for name in names]
+    titles = [f"{title}\n{name}" for title in (*fields, "missed of all") for name in names]
     table = ResultTable("At publication [ms]", [*words("chain"), *figures(*titles)])
     for chain in comparisons:
         found = [one.analysis for one in chain.measurements]
         times = (getattr(one.undisturbed, field) for field in fields.values() for one in found)
-        table.add(chain.chain, *map(ms, times), *(one.statistics.late for one in found))
+        outputs = (outputs_due(one.analysis, one.plan) for one in chain.measurements)
+        missed = (ABSENT if one.late is None and not one.missed else one.missed for one in outputs)
+        table.add(chain.chain, *map(ms, times), *missed)
     return table
 
 
