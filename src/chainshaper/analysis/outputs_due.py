@@ -8,10 +8,10 @@ An output is due for every traversal, but for
 * one that a gate replaced by another of its cycle, or let another go first, as its plan has it
   (``messages``).
 
-With a plan an output is due in each cycle, also in one in which the chain did not begin: a timer
-that skipped its expiry, a node that died. How often a chain did not begin shows where its
-beginnings fall behind by whole cycles and stay there. As an application ends, its nodes do so one
-by one: beginnings are not missed in the last tenth of a recording, 3 s at most.
+With a plan an output of a chain that a timer begins is due in each cycle, also in one in which it
+did not begin: a timer that skipped its expiry, a node that died. How often a chain did not begin
+shows where its beginnings fall behind by whole cycles and stay there. As an application ends, its
+nodes do so one by one: beginnings are not missed in the last tenth of a recording, 3 s at most.
 """
 
 import numpy as np
@@ -66,10 +66,14 @@ def not_begun(
     due: Due,
     between: tuple[int, int | None] | None,
 ) -> int:
-    """In how many cycles of a plan a chain did not begin, after it first had.
+    """In how many cycles of a plan a chain that a timer begins did not begin, after it first had.
 
-    Cycles in which its first callback ran and published nothing are not among them.
+    Cycles in which its first callback ran and published nothing are not among them. Where a message
+    begins the chain nothing was due without one.
     """
+    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
+    if first["period_ns"].max() is None:
+        return 0
     own = flow.instances.filter(pl.col("callback_id") == chain.callbacks[0])["start"].sort()
     since_ns, until_ns = between or (0, None)
     own = own.filter(own >= since_ns)

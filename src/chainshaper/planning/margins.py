@@ -61,6 +61,7 @@ FARTHEST = 10  # times as rare as one cycle of the sample: so far a tail is foll
 SIGNIFICANCE = 0.01  # below it, an unchanging system is given up
 GOODNESS = 0.10  # the fit's own test must not come near rejection
 CONFIDENCE = 0.95
+WELL_COVERED = 0.99  # confidence of a smaller share of late outputs than was asked for
 OF_TAIL = 0.99  # of the bound on a tail: what the fit itself may be wrong by comes on top
 BOOTSTRAPS = 499
 # Long cycles are the longest such parts of all; they are counted together so many cycles apart.
@@ -223,7 +224,7 @@ def late_share(every_latency_ns: _Latencies, latency_ns: int, independent: int =
     return most_probable(math.ceil(beyond * trials / size), trials)
 
 
-def most_probable(hits: int, trials: int) -> float:
+def most_probable(hits: int, trials: int, confidence: float = CONFIDENCE) -> float:
     """The probability of a hit, at most, with 95 % confidence, where so many trials had ``hits``.
 
     >>> round(most_probable(0, 299), 4)
@@ -231,7 +232,7 @@ def most_probable(hits: int, trials: int) -> float:
     """
     if hits >= trials:
         return 1.0
-    # P(Bin(n, p) ≤ hits) falls with p: where it is 5 %. Terms far below the last are none.
+    # P(Bin(n, p) ≤ hits) falls with p, to what is not confident. Far below the last, terms are 0.
     low, high = hits / trials, 1.0
     logarithms = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, trials + 1)))])
     few = np.arange(max(0, hits - 40 * math.isqrt(trials) - 40), hits + 1)
@@ -239,7 +240,7 @@ def most_probable(hits: int, trials: int) -> float:
     for _ in range(60):
         share = (low + high) / 2
         terms = ways + few * math.log(share) + (trials - few) * math.log1p(-share)
-        low, high = (share, high) if np.exp(terms).sum() > 1 - CONFIDENCE else (low, share)
+        low, high = (share, high) if np.exp(terms).sum() > 1 - confidence else (low, share)
     return high
 
 

@@ -435,11 +435,14 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
     # Of the latencies themselves: what the least margin adds is the way to the shaping node, and
     # how many cycles end within it is an accident of the sample.
     late = margins.late_share(every, longest + stalls, independent)
-    if covers and np.array_equal(covered, every):
-        # Which of the longest it is was fixed before they were seen, however many are equal to it.
-        rank = margins.covering_rank(independent, margins.OVERRUN_PROBABILITY)
-        if longest + stalls == np.sort(every)[-rank]:
-            late = margins.most_probable(rank - 1, independent)
+    usual = margins.OVERRUN_PROBABILITY
+    if covers and covered is every and independent >= margins.cycles_needed(usual):
+        # Which of the longest covers the usual share was fixed before they were seen.
+        rank = margins.covering_rank(independent, usual)
+        if longest + stalls >= np.sort(every)[-rank]:
+            fewer = int(np.count_nonzero(every > longest)) if stalls == 0 else rank - 1
+            surely = margins.most_probable(fewer, independent, margins.WELL_COVERED)
+            late = min(usual, surely)
     if probability is not None and late > probability:
         reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
         remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"
