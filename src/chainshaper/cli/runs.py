@@ -295,7 +295,7 @@ def watch(
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
         "--environment",
-        "Print the variable that puts the library in front of ROS 2; no more.",
+        "Print the export line that enables watching, and exit.",
         False,
     ),
     json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),
