@@ -38,6 +38,7 @@ from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement
+from chainshaper.verify.promises import OutputsDue
 
 
 class _Reader(HTMLParser):
@@ -217,13 +218,13 @@ def test_the_headline_says_as_predicted_only_of_what_was_judged_and_broke_no_pro
     figures = ("mean", "max", "jitter")
     said = "Jitter 0.000 ms (known); average 30.020 ms (known)"
     for changes, verdict in (
-        ({}, "as predicted, 0 of 3 late"),
+        ({}, "as predicted, 0 of 3 outputs late"),
         (
             {name: replace(getattr(judged, name), holds=None) for name in figures},
-            "not judged, 0 of 3 late",
+            "not judged, 0 of 3 outputs late",
         ),
         (
-            {"late_of_all": 12, "cycles": 320, "most_late": 0},
+            {"outputs": OutputsDue(320, 12, promised=0.0)},
             "differs from the prediction: 12 of 320 outputs late, none expected",
         ),
     ):

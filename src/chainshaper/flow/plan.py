@@ -35,6 +35,7 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import PARTS, chain_of, longest_stall, opened
+from chainshaper.verify.promises import NOT_PUBLISHED
 from chainshaper.workload.description import Application, node_name
 from chainshaper.workload.live import timing_of
 
@@ -167,6 +168,7 @@ def _profile_of(
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
         incomplete=analysis.statistics.incomplete - analysis.incomplete.get("not used", 0),
+        unpublished=analysis.incomplete.get(NOT_PUBLISHED, 0),
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),

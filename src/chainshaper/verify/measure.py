@@ -87,6 +87,11 @@ class Measurement:
     prediction: JudgedPrediction | None
     left_out: LeftOut
 
+    @property
+    def period_ns(self) -> int | None:
+        """The period of the timer that starts the chain; None: no timer does."""
+        return _period_of(self.analysis)
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -94,6 +99,17 @@ class Comparison:
 
     chain: str
     measurements: tuple[Measurement, ...]
+
+    @property
+    def remark(self) -> str | None:
+        """What makes its recordings hard to compare: other periods; None: nothing does."""
+        periods = {one.recording.path.name: one.period_ns for one in self.measurements}
+        if len({*periods.values()} - {None}) < 2:
+            return None
+        found = ", ".join(
+            f"every {duration_text(period)} in {name}" for name, period in periods.items() if period
+        )
+        return f"{self.chain} starts {found}: these are different applications"
 
 
 class SeveralChainsError(InputError):
@@ -179,6 +195,8 @@ def _measured(
         output = analysis.chain.topics[-1]
         own = None if joint is None else plan_of_chain(joint, output)
         planned_for = own is not None and own.chain.output in (None, output)
+        if own is not None and planned_for:
+            _refuse_other_period(own, analysis, recording)
         decided = gate_releases(recording, own, analysis)
         measurements.append(
             Measurement(
@@ -195,6 +213,22 @@ def _measured(
             )
         )
     return measurements
+
+
+def _period_of(analysis: LatencyAnalysis) -> int | None:
+    return analysis.graph.callbacks[analysis.chain.callbacks[0]].period_ns
+
+
+def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recording) -> None:
+    """Refuse to judge by a plan whose cycle is not the chain's period, or several of them (a source
+    may be faster than the cycle)."""
+    period = _period_of(analysis)
+    if period is not None and plan.cycle_ns % period:
+        raise InputError(
+            f"{recording.path}: {analysis.chain.spec} starts every {duration_text(period)} there,"
+            f" and the plan's cycle is {duration_text(plan.cycle_ns)}: name the plan that was in"
+            " force, or plan again"
+        )
 
 
 def _in_front(chain: str, plan: ApplicationPlan | None) -> str:
