@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 from chainshaper.linux.threads import find_thread, has_ended, open_process, read_proc, start_of
-from chainshaper.values.errors import OperationError, PlatformError
+from chainshaper.values.errors import OperationError, PlatformError, text_of
 
 _T = TypeVar("_T")
 
@@ -141,7 +141,7 @@ class Journal:
             content = self._remembered()
         except OSError as error:
             raise OperationError(f"{self.path} cannot be read: {error.strerror}") from error
-        return content.decode(errors="replace").split("\n")[:-1]
+        return text_of(content).split("\n")[:-1]
 
     def _remembered(self) -> bytes:
         if self.memory is None or self.memory.closed:
@@ -256,7 +256,7 @@ def discard_journal(journal: Journal) -> None:
 
 
 def boot_id() -> str:
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return text_of(read_proc("/proc/sys/kernel/random/boot_id")).strip()
 
 
 @contextlib.contextmanager

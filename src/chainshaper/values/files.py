@@ -67,6 +67,27 @@ def _is_own_group(gid: int, uid: int) -> bool:
     return own and {*group.gr_mem} <= {user.pw_name}
 
 
+_LONGEST_FILE = 512 << 20
+
+
+def open_regular(path: Path) -> int:
+    """Open a file that a process of others has named. Raises OSError: no ordinary one."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(f"{path} is no ordinary file")
+    return descriptor
+
+
+def read_regular(path: Path, longest: int = _LONGEST_FILE) -> bytes:
+    """The content of such a file. Raises OSError: also if it is longer."""
+    with os.fdopen(open_regular(path), "rb") as file:
+        content = file.read(longest + 1)
+    if len(content) > longest:
+        raise OSError(f"{path} has more than {longest} bytes")
+    return content
+
+
 def free_place(path: Path, taken: bool) -> Path:
     """The path, if it is not ``taken`` and its folder is there; asked before long work begins.
 

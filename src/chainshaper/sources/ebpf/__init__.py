@@ -27,12 +27,13 @@ from chainshaper.linux.processes import descendants, run_users, user_name, user_
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents, read_proc, read_stat, status_field
 from chainshaper.sources.ebpf import trace_points as tp
-from chainshaper.sources.ebpf.functions import callback_functions, open_regular
+from chainshaper.sources.ebpf.functions import callback_functions
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
 from chainshaper.sources.system import info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
+from chainshaper.values.files import open_regular
 from chainshaper.values.recording import RecordingInfo
 
 _ATTACHED = "__BPFTRACE_NOTIFY_PROBES_ATTACHED"

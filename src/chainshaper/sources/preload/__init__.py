@@ -42,7 +42,7 @@ from chainshaper.sources.ebpf.trace_points import (
 )
 from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.events import EventTables
 from chainshaper.values.files import own_cache, why_distrusted
 from chainshaper.values.recording import RecordingInfo
@@ -169,7 +169,7 @@ class TracedProcess:
             said = texts.setdefault(int(np.searchsorted(own, at)) - 1, {})
             said[place] = (said.get(place, b"") + records["values"][at, 1:].tobytes())[:length]
         return self._numbered(records[own]), {
-            number: {place: text.decode(errors="replace") for place, text in said.items()}
+            number: {place: text_of(text) for place, text in said.items()}
             for number, said in texts.items()
         }
 
@@ -263,9 +263,9 @@ def compile_library(
         )
     library = library.absolute()
     command, environment = [path, "-o", str(library), *words], tool_environment()
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
     if done.returncode:
-        last = "; ".join(done.stderr.splitlines()[-2:])
+        last = "; ".join(text_of(done.stderr).splitlines()[-2:])
         raise PlatformError(f"{path} cannot compile {library.name}: {last}; see `{path} -v`")
     return library
 
