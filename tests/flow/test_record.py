@@ -205,6 +205,9 @@ class BrokenTracer:
     def recording(self) -> tuple[EventTables, RecordingInfo]:
         raise self.error
 
+    def written(self) -> None:
+        raise AssertionError("nothing was")
+
 
 @pytest.mark.parametrize("error", [OperationError("it cannot be read"), MemoryError()])
 def test_a_trace_is_kept_and_named_whatever_reading_it_ends_with(

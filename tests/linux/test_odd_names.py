@@ -1,4 +1,4 @@
-"""Whatever others call programs, files, groups and mount points: it is read, and misleads nobody."""
+"""Whatever others call programs, files, groups and mount points: it is read, and misleads none."""
 
 import json
 import mmap
@@ -24,7 +24,9 @@ CLI = [sys.executable, "-m", "chainshaper"]
 def test_bytes_that_are_no_text_are_shown_as_bytes() -> None:
     assert text_of(b"m\xfc\xc3\xa4\xc3") == "m\\xfcä\\xc3"
     assert shown(os.fsdecode(b"/mnt/\xfc")) == "/mnt/\\xfc"
-    assert storable({"\udcfc": ["ä\ud800", 1, ("b", None)]}) == {"\\xfc": ["ä\\ud800", 1, ["b", None]]}
+    assert storable({"\udcfc": ["ä\ud800", 1, ("b", None)]}) == {
+        "\\xfc": ["ä\\ud800", 1, ["b", None]]
+    }
 
 
 @BY_NAME
@@ -102,7 +104,8 @@ def beneath_odd_mounts(folder: Path, *command: str) -> "subprocess.CompletedProc
 
 @needs_root
 @pytest.mark.parametrize(
-    "verb", [("status",), ("status", "--json"), ("release",), ("threads",), ("doctor", "--watch", "10ms")],
+    "verb",
+    [("status",), ("status", "--json"), ("release",), ("threads",), ("doctor", "--watch", "10ms")],
 )
 def test_verbs_go_on_beneath_mount_points_programs_and_groups_of_any_name(
     verb: tuple[str, ...], tmp_path: Path
@@ -128,7 +131,7 @@ def test_the_hierarchy_is_found_at_a_mount_point_of_any_name(tmp_path: Path) -> 
     program = f'set -e; mount -t cgroup2 none "$0"; umount {cgroups.mount_point()}; exec "$@"'
     words = ["unshare", "--mount", "bash", "-c", program, str(folder), sys.executable, "-c", ask]
     done = subprocess.run(words, capture_output=True, check=True)
-    assert done.stdout.decode().strip() == f"{ascii(os.fsencode(folder))} True"
+    assert done.stdout.decode().strip() == f"{os.fsencode(folder)!a} True"
 
 
 def test_threads_are_listed_by_the_bytes_of_their_names(tmp_path: Path) -> None:

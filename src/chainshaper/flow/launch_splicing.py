@@ -25,6 +25,7 @@ from chainshaper.splicing import spliced_launch as launching
 from chainshaper.splicing.application import nothing_to_splice
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.files import write_whole
 from chainshaper.values.plan_choices import STANDBY, Fallback, NodeKind
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
@@ -132,7 +133,7 @@ def splice_launch_files(
         if not any(blocks):
             return made, {}
         into.mkdir(parents=True, exist_ok=True)
-        (into / "gates").write_text("".join(blocks), encoding="utf-8")
+        write_whole(into / "gates", ["".join(blocks).encode()])
         return made, {
             "LD_PRELOAD": str(ours.gate_library()),
             ours.GATES: str(folder / launching.NODES / "gates"),
@@ -242,7 +243,7 @@ def _spliced(
     with place as partial:
         made, environment = written(Path(partial, launching.NODES))
         text = launching.launch_text(words, made, redirects, environment)
-        Path(partial, name).write_text(text, encoding="utf-8")
+        write_whole(Path(partial, name), [text.encode()])
     found = [] if dry is None else _tried(words, redirects, dry)
     diff = difflib.unified_diff([], text.splitlines(keepends=True), "/dev/null", str(copy))
     strange = [file for file in files if not executable and str(file) not in words]

@@ -41,7 +41,7 @@ from chainshaper.values import events
 from chainshaper.values import recording as recordings
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
-from chainshaper.values.files import open_to_all
+from chainshaper.values.files import open_to_all, rename_output
 from chainshaper.values.recording import EndpointInfo, Recording, ThreadInfo
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
@@ -144,12 +144,13 @@ def record_command(
             _trace(run, scheduling, command_stdout, stalls=watch_stalls)
             progress(1.0, "reading the events")
             recording = _written(output, run, chain, plan)
+            run.tracer.written()
         except BaseException as error:  # the trace may be of hours: nothing costs it
             if not run.ended_ns:
                 raise
             said = "".join(f"; {note.rstrip('.')}" for note in run.notes)
             if any(folder.iterdir()):
-                left = folder.rename(output.with_name(folder.name.lstrip(".")))
+                left = rename_output(folder, output.with_name(folder.name.lstrip(".")))
                 said += f"; what was traced stays in {left}"
             if isinstance(error, ChainshaperError):
                 raise OperationError(f"{error}{said}") from error
@@ -157,7 +158,7 @@ def record_command(
             raise
         if any(folder.iterdir()):
             open_to_all(folder)
-            folder.rename(recording.path / TRACE_FOLDER)
+            rename_output(folder, recording.path / TRACE_FOLDER)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return Recorded(recording, run.exit_code)

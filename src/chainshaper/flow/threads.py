@@ -5,6 +5,7 @@ say which nodes a process has, the callbacks that ran which threads execute.
 """
 
 import math
+import os
 import platform
 import re
 import time
@@ -171,7 +172,9 @@ def _follows_clock(pid: int) -> bool:
     for option, file in pairwise(words):
         if option == "--params-file":  # as `ros2 launch` writes one for each node
             with suppress(OSError):
-                texts.append(text_of(read_regular(Path(f"/proc/{pid}/cwd", file), _LONGEST_SETTINGS)))
+                texts.append(
+                    text_of(read_regular(Path(f"/proc/{pid}/cwd", file), _LONGEST_SETTINGS))
+                )
     return any(re.search(r"\buse_sim_time\W+true\b", one, re.IGNORECASE) for one in texts)
 
 
