@@ -404,6 +404,8 @@ class _Run:
                 drifts = self.drifts = self.drift_watches()
                 following, sent, said = self.follow(servers, drifts), dict[int, int](), list[str]()
             is_over = self.command_ended or self.stop.is_set()
+            for failure in {one.failure for one in drifts} - {None}:
+                self.note(f"whether cycles begin elsewhere by now is not known any more: {failure}")
             followed_ns = next(following)
             seen = {k: ns for k, one in enumerate(drifts) if (ns := one.surely_ns) is not None}
             for k, ns in seen.items():

@@ -396,7 +396,16 @@ class ScxServers(BackEnd):
             raise OperationError(f"thread {tid} gets no server: {error.strerror}") from error
 
     def _watch(self) -> None:
-        """Fail open when a kicker stops: an idle core would never notice by itself."""
+        """Fail open when a kicker stops, or watching does: an idle core would never notice."""
+        try:
+            self._watch_kickers()
+        except Exception as error:  # a thread that ends in silence watches no more
+            with self._lock:
+                why = f"watching the kickers has failed ({type(error).__name__}: {error})"
+                self._failure = self._failure or f"{why}; {_FREELY}"
+                self._end()
+
+    def _watch_kickers(self) -> None:
         while not self._released.wait(_WATCH_S):
             with self._lock:
                 for core, kicker in self._kickers.items():

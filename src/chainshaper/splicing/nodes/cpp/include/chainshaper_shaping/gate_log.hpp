@@ -5,6 +5,8 @@
 
 #include <pthread.h>
 #include <sched.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 #include <cstdio>
 #include <cstring>
@@ -92,9 +94,15 @@ private:
   // Adds whole lines only; what cannot be written is missing. A file that would have more than half
   // of `most_bytes_` becomes `….1`; one that has been removed is made anew. Whether it is there.
   bool append(const std::string & lines) {
-    const int file =
-        open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK, 0644);
+    const int flags = O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK | O_NOFOLLOW;
+    const int file = open(path_.c_str(), flags, 0644);
     if (file < 0) return false;
+    struct stat state{};
+    if (fstat(file, &state) != 0 || state.st_nlink > 1 || state.st_uid != geteuid()) {
+      close(file);  // somebody else's was put in its place
+      errno = EPERM;
+      return false;
+    }
     const std::int64_t before = lseek(file, 0, SEEK_END);
     const auto header = static_cast<std::int64_t>(std::strlen(schema::log_header));
     if (before > header && before + static_cast<std::int64_t>(lines.size()) > most_bytes_ / 2 &&
