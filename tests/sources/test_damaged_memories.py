@@ -30,7 +30,7 @@ from chainshaper.sources.preload import (
 from chainshaper.values.errors import InputError, text_of
 from chainshaper.values.recording import Recording, open_recording, write_recording
 
-COUNT = int(os.environ.get("CHAINSHAPER_DAMAGED_MEMORIES", "150"))
+COUNT = int(os.environ.get("CHAINSHAPER_DAMAGED_MEMORIES", "100"))
 RINGS, RING_RECORDS, OBJECT_RECORDS = 2, 8, 12
 NUMBERS = {name: number for number, name in enumerate(event_names(), preload._FIRST_EVENT)}
 ADD_SEALS, SHRINK = 1033, 2

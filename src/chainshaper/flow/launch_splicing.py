@@ -24,7 +24,7 @@ from chainshaper.splicing import shaping_process as ours
 from chainshaper.splicing import spliced_launch as launching
 from chainshaper.splicing.application import nothing_to_splice
 from chainshaper.splicing.redirection import Redirect
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError, storable
 from chainshaper.values.files import write_whole
 from chainshaper.values.plan_choices import STANDBY, Fallback, NodeKind
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
@@ -97,6 +97,12 @@ def splice_launch_files(
     if without := [chain for chain in joint.chains if chain.shaping_node is None]:
         raise nothing_to_splice(without[0])
     folder = launching.usable(Path(output))
+    for path in (folder, *launch_files):
+        if storable(str(path)) != str(path):
+            raise InputError(
+                f"{path}: the files that are written for ROS 2 name it, and hold names in UTF-8"
+                " only: rename it"
+            )
     known = _endpoints(recording, "publisher")
     every = [
         (chain, one, _publisher(chain, one, known))
