@@ -19,6 +19,7 @@ from processes import wait_for
 from chainshaper import open_recording
 from chainshaper.flow import record
 from chainshaper.values import events
+from chainshaper.values import recording as recording_module
 from chainshaper.values.errors import OperationError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
@@ -305,7 +306,7 @@ def test_what_was_traced_is_removed_when_the_tables_are_there(
     def full(*_: object) -> None:
         raise OperationError("the disk is full")
 
-    monkeypatch.setattr(record.recordings, "write_recording", full)
+    monkeypatch.setattr(recording_module, "write_recording", full)
     with pytest.raises(OperationError, match="the disk is full; what was traced stays in "):
         record.record_command(tmp_path / "lost", ["true"])
     (left,) = (one for one in tmp_path.iterdir() if one.name != "rec")

@@ -300,12 +300,12 @@ def _written(
         found = partial(with_found_nodes, tables, info, run.endpoints, run.processes)
         tables, info = _beside_events(run, "nodes", found, (tables, info))
     recording = Recording(output, info, tables)
-    threads = _beside_events(
-        run, "threads", partial(_recorded_threads, run.processes, recording), ()
-    )
-    endpoints = _beside_events(
-        run, "endpoints", partial(_known_endpoints, tables, run.endpoints), ()
-    )
+    threads: tuple[ThreadInfo, ...] = ()
+    endpoints: tuple[EndpointInfo, ...] = ()
+    ask_threads = partial(_recorded_threads, run.processes, recording)
+    threads = _beside_events(run, "threads", ask_threads, threads)
+    ask_endpoints = partial(_known_endpoints, tables, run.endpoints)
+    endpoints = _beside_events(run, "endpoints", ask_endpoints, endpoints)
     notes = [*info.notes, *run.notes, *filter(None, [run.strangers])]
     if run.no_qos_because is not None:
         notes.append(f"types and QoS of topics could not be asked for: {run.no_qos_because}.")

@@ -149,7 +149,11 @@ class TracedProcess:
     @property
     def dropped(self) -> int:
         """Events for which the process itself had no room."""
-        return int(self.header["dropped"][0])
+        dropped = int(self.header["dropped"][0])
+        if dropped >= _MOST_WRITTEN:
+            self._damaged(f"it says that it had no room for {dropped} events")
+            return 1
+        return dropped
 
     def new_records(self) -> list[NDArray[Any]]:
         """What came into the rings since the last time, each ring's in the order of writing."""
