@@ -40,6 +40,18 @@ EXTREMES = (
 )
 
 
+@pytest.fixture
+def small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Memories of few records: those of the library have a million."""
+    of_objects = preload._HEADER.itemsize + RINGS * preload._RING.itemsize
+    of_records = of_objects + OBJECT_RECORDS * RECORD.itemsize
+    sizes = {"_RINGS": RINGS, "_RING_RECORDS": RING_RECORDS, "_OBJECT_RECORDS": OBJECT_RECORDS}
+    sizes |= {"_OF_OBJECTS": of_objects, "_OF_RECORDS": of_records}
+    sizes["_SIZE"] = of_records + RINGS * RING_RECORDS * RECORD.itemsize
+    for name, size in sizes.items():
+        monkeypatch.setattr(preload, name, size)
+
+
 def records(count: int, event: str, pid: int) -> NDArray[Any]:
     found = np.zeros(count, RECORD)
     found["time"] = time.monotonic_ns() - 1_000_000 + np.arange(count)
@@ -116,6 +128,7 @@ def recorded(tracer: PreloadTracer, path: Path) -> Recording:
     return recording
 
 
+@pytest.mark.usefixtures("small")
 def test_memories_of_any_content_cost_no_other_process_an_event(tmp_path: Path) -> None:
     chance, damaged, refused = random.Random(29), 0, 0
     for number in range(COUNT):
@@ -155,6 +168,7 @@ BAD = {
 }
 
 
+@pytest.mark.usefixtures("small")
 @pytest.mark.parametrize(("field", "value"), [(f, v) for f, values in BAD.items() for v in values])
 def test_what_stands_before_a_bad_record_is_there_and_what_follows_is_counted(
     tmp_path: Path, field: str, value: int
@@ -173,6 +187,7 @@ def test_what_stands_before_a_bad_record_is_there_and_what_follows_is_counted(
     assert note.startswith("process 7 (unknown): from where it has a record of event ")
 
 
+@pytest.mark.usefixtures("small")
 def test_texts_of_an_event_that_was_not_finished_are_no_other_events(tmp_path: Path) -> None:
     """A process was killed while it wrote: the texts are there, the event's number is not."""
     memory = whole_memory(7)
@@ -188,6 +203,7 @@ def test_texts_of_an_event_that_was_not_finished_are_no_other_events(tmp_path: P
     assert nodes["node_name"].to_list() == ["node"]
 
 
+@pytest.mark.usefixtures("small")
 def test_a_reader_that_ends_says_why_and_what_there_was_is_recorded(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
