@@ -46,6 +46,7 @@ from chainshaper.planning import Plan, PlanRequest, plan_application
 from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
+from chainshaper.verify.promises import outputs_due, promised_by
 
 MS = 1_000_000
 HARMONIC_MS = ((20, 40, 80), (25, 50, 100), (50, 100, 200), (100,))
@@ -207,16 +208,14 @@ def outcome(shaped: Recording, flow: DataFlow, plan: Plan) -> dict[str, Any]:
     from scipy.stats import binom
 
     measured = measure_latency(shaped, plan.chain.spec, flow=flow)
-    figures = measured.analysis.statistics
-    every = figures.count + figures.incomplete
-    promised = plan.margin.overrun_probability or 0.0
-    late = (figures.late or 0) + figures.incomplete
-    likely = float(binom.sf(late - 1, every, promised)) if late else 1.0
+    outputs, promised = outputs_due(measured.analysis, plan), promised_by(plan)
+    missed = outputs.missed
+    likely = float(binom.sf(missed - 1, outputs.due, promised)) if missed else 1.0
     found = {
         "chain": plan.chain.spec,
-        "cycles": every,
-        "late": figures.late,
-        "never": figures.incomplete,
+        "cycles": outputs.due,
+        "late": outputs.late,
+        "never": sum(outputs.absent.values()),
         "promised": promised,
         "likely": likely,
     }

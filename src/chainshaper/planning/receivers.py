@@ -63,7 +63,7 @@ def _placed(
         if _reaches_next_cycle(plan, time_ns + one.longest_ns):
             # They delay the next instance by so much, for which the margin is there.
             longest_ns = profile.longest_ns + margin.epsilon_ns - time_ns
-            late = margins.late_share(profile.every, longest_ns)
+            late = margins.late_share(profile.every, longest_ns, margin.independent_cycles or 0)
             worse = max(late, margin.overrun_probability or 0.0)
             margin = margin.model_copy(update={"overrun_probability": worse})
         waits_ns += GATE_TAKES_NS
