@@ -95,6 +95,7 @@ class Profile:
     :data:`UNKNOWN` where that varies.
     ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
     are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
+    ``others_ns`` is for how long gates of other chains may have its cores in a cycle,
     ``interfering`` what else the chain's threads run, ``contradictions`` what in the recording's
     events contradicts itself about its callbacks, in words; ``reception`` is None where nothing
     says how the output is received. The rest is :class:`~chainshaper.planning.plan.Evidence`, and
@@ -136,6 +137,7 @@ class Profile:
     longest_stall_ns: int | None = None
     utilisation: float | None = None
     interference_ns: int | None = None
+    others_ns: int = 0
     longest_send_ns: int | None = None
     longest_publication_ns: int | None = None
     asynchronous: bool | None = None
@@ -316,10 +318,15 @@ def with_interference(
     ``groups`` are the places of chains that begin together. With ``at_once`` groups do not take
     turns: those of a shorter period run at a better priority, and, with ``shifting``, one may have
     to wait before it takes its stamp, from which its slots count. Where every callback has slots of
-    its own nothing is added.
+    its own nothing is added to the latency: ``others_ns`` is what each slot has to have room for.
     """
-    if len(profiles) == 1 or wishes.policy in PER_CALLBACK:
+    if len(profiles) == 1:
         return list(profiles)
+    if wishes.policy in PER_CALLBACK:
+        return [
+            replace(one, others_ns=_of_gates_beside(k, profiles, wishes))
+            for k, one in enumerate(profiles)
+        ]
     undelayed = [alone(profile) for profile in profiles]
     delays = [0] * len(profiles)
     for _ in range(MOST_ROUNDS):
@@ -329,6 +336,19 @@ def with_interference(
             break
     measured = (profile.latencies_ns for profile in profiles)
     return list(map(_later, undelayed, delays, measured))
+
+
+def _of_gates_beside(k: int, profiles: Sequence[Profile], wishes: Wishes) -> int:
+    """For how long the gates of other chains may have the cores of a chain in one of its cycles."""
+    if wishes.policy in UNSHAPED or wishes.publication == "asynchronous":
+        return 0
+    own, cores = profiles[k], {*profiles[k].core_of.values()}
+    return sum(
+        (1 + -(-own.period_ns // one.period_ns)) * one.cost_ns
+        for place, other in enumerate(profiles)
+        if place != k and other.core_of.get(other.last or "") in cores
+        for one in _of_gate(other, wishes, 0, False)
+    )
 
 
 def _delays(

@@ -20,6 +20,7 @@ from dataclasses import replace
 from chainshaper.planning import margins
 from chainshaper.planning.offsets import LEAD_NS
 from chainshaper.planning.plan import (
+    PER_CALLBACK,
     Plan,
     Prediction,
     ReceiverPlace,
@@ -36,14 +37,41 @@ def without_reception(profile: Profile) -> Profile:
     return replace(profile, reception=None)
 
 
+def without_places(plan: Plan) -> Plan:
+    """The plan with no place for those that receive its output."""
+    node = plan.shaping_node
+    if node is None or node.receivers_at is None:
+        return plan
+    return revised(
+        plan,
+        shaping_node=node.model_copy(update={"receivers_at": None}),
+        predicted=plan.predicted.model_copy(update={"receivers": None}),
+    )
+
+
+def has_places(plan: Plan) -> bool:
+    """Whether a plan has a place for those that receive its output."""
+    return plan.shaping_node is not None and plan.shaping_node.receivers_at is not None
+
+
 def with_receivers_placed(plans: Sequence[Plan], profiles: Sequence[Profile]) -> list[Plan]:
     """The plans with a place for those that receive their outputs, where there is room for it."""
+    plans = list(map(without_places, plans))
     running = {thread.node for one in plans for server in one.servers for thread in server.threads}
     busy = {one.core for plan in plans for one in plan.servers if not one.best_effort}
     nodes = [node for plan in plans for node in shaping_nodes(plan)]
+    shared = [
+        {one.core for other in plans if other is not plan for one in other.servers}
+        for plan in plans
+    ]
     return [
         _placed(plan, profile, running, busy, nodes)
-        for plan, profile in zip(plans, profiles, strict=True)
+        if plan.policy not in PER_CALLBACK
+        or plan.shaping_node is None
+        # What has the core in slots of other chains' callbacks is not in these.
+        or plan.shaping_node.core not in theirs
+        else plan
+        for plan, profile, theirs in zip(plans, profiles, shared, strict=True)
     ]
 
 
@@ -102,7 +130,7 @@ def _has_room(plan: Plan, profile: Profile, time_ns: int) -> bool:
     node, period = plan.shaping_node, plan.chain.period_ns
     work_ns = time_ns + (0 if node is None else node_work_ns(plan, node))
     if plan.policy == "let-per-chain":
-        return profile.longest_ns + work_ns < period
+        return plan.evidence.max_latency_ns + work_ns < period
     if plan.policy == "let-per-callback":
         nodes = len(shaping_nodes(plan))
         took_ns = sum(one.max_response_ns for one in profile.callbacks)

@@ -530,9 +530,9 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
             every = profile.every_graph_step_ns if with_branches else profile.every_step_ns
             steps = every[_work(profile, every).finished_ns[:, -1] <= profile.longest_ns]
         work, cores = _work(profile, steps), request.cores
-        one, room_ns = profile.reception, 0
+        one, room_ns = profile.reception, profile.others_ns
         if one is not None and one.core in (None, *(cores or profile.core_of.values())):
-            room_ns = one.time_ns + one.beside_ns
+            room_ns += one.time_ns + one.beside_ns
         return pipelined(plan, work, profile.core_of, cores, room_ns=room_ns)
     if request.policy == "server-per-callback":
         margin_ns = plan.margin.epsilon_ns

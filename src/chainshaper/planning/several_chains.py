@@ -27,7 +27,11 @@ from chainshaper.planning.plan import (
     with_slots,
 )
 from chainshaper.planning.profile import Profile, with_interference
-from chainshaper.planning.receivers import with_receivers_placed, without_reception
+from chainshaper.planning.receivers import (
+    has_places,
+    with_receivers_placed,
+    without_reception,
+)
 from chainshaper.planning.request import (
     PlanRequest,
     best_effort_cores,
@@ -154,7 +158,10 @@ def _planned(
     placed, remarks = place_chains(
         plans(at_once=False), together=groups, time_limit_s=time_limit_s, at_once=at_once
     )
-    placed = tuple(with_receivers_placed(placed, profiles))
+    # What has no place in the chain's plan alone has none beside others.
+    pairs = zip(placed, profiles, strict=True)
+    placed_for = [one if has_places(plan) else without_reception(one) for plan, one in pairs]
+    placed = tuple(with_receivers_placed(placed, placed_for))
     return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 
 
