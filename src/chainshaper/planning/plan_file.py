@@ -90,6 +90,8 @@ def _yaml_values(plan: Plan) -> dict[str, Any]:
         server["threads"] = [_OnOneLine(thread) for thread in threads]
         if not server["best_effort"]:
             del server["best_effort"]
+    if "receivers" in values["predicted"]:
+        del values["predicted"]["receivers"]["shares"]  # of no bands
     if "modes" in values:
         values["modes"]["bands"] = _OnOneLine(values["modes"]["bands"])
     return values

@@ -18,7 +18,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from chainshaper.planning import margins
-from chainshaper.planning.offsets import LEAD_NS
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
@@ -119,10 +118,8 @@ def node_work_ns(plan: Plan, node: ShapingNode) -> int:
 
 
 def _reaches_next_cycle(plan: Plan, after_ns: int) -> bool:
-    """Whether what follows the last output for so long reaches the next instance, whose timer may
-    expire somewhat before its cycle starts.
-    """
-    return plan.predicted.max_ns % plan.cycle_ns + after_ns > plan.cycle_ns - LEAD_NS
+    """Whether what follows the last output for so long reaches the next instance of its chain."""
+    return plan.predicted.max_ns % plan.cycle_ns + after_ns > plan.cycle_ns
 
 
 def _has_room(plan: Plan, profile: Profile, time_ns: int) -> bool:

@@ -262,6 +262,9 @@ def verdict(one: Measurement) -> tuple[bool | None, str]:
     if judged.mean.measured_ns is None:
         return None, f"{name}: no undisturbed cycle to judge the promise by{aside}"
     met = f"{name}: promise met: {judged.jitter_text}; {judged.outputs.text}"
+    if (received := judged.receivers) is not None:
+        met += f"; received with jitter {ms(received.jitter_ns)} ms, at most"
+        met += f" {milliseconds(received.predicted_jitter_ns)} ms"
     return True, f"{met} ({expected_text(one.plan)}){aside}"
 
 
