@@ -92,8 +92,10 @@ def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     if out.present(json, overviews.callback_rows(found), overviews.callback_table(found)):
         out.show_line(out.lost_events(recording))
         out.notes((*recording.info.notes, *flow.notes))
-    elif any(recording.info.lost.values()):  # the array has no place for it
-        out.notes([out.lost_events(recording)])
+    else:  # the array has no place for them
+        out.notes(one.note for one in flow.contradictions)
+        if any(recording.info.lost.values()):
+            out.notes([out.lost_events(recording)])
 
 
 def chains(
