@@ -78,8 +78,8 @@ REFUSED = {
     ),
     "its executor waited": (
         waits_inside,
-        "1 instances of the subscription callback of /detector for /image seemed to last on"
-        " although its executor looked for other work, the first at 1.502000 s",
+        "1 instances of the subscription callback of /detector for /image seem to last on"
+        " although their thread looked for other work, or did some, the first at 1.502000 s",
     ),
     "inside itself": (
         inside_itself,
@@ -89,8 +89,12 @@ REFUSED = {
 }
 
 
-def trace(folder: Path, story: Story) -> Path:
-    return write_lttng_trace(folder / "trace", story.tables(), clock_offset_ns=OFFSET)
+def trace(folder: Path, story: Story, lost: int = 1) -> Path:
+    """As LTTng writes it, which says that events were lost."""
+    tables = story.tables()
+    return write_lttng_trace(
+        folder / "trace", tables, clock_offset_ns=OFFSET, discarded_events=lost
+    )
 
 
 @pytest.mark.parametrize(("executes", "note"), REFUSED.values(), ids=REFUSED)
@@ -114,6 +118,14 @@ def test_a_trace_without_contradictions_has_no_note(tmp_path: Path) -> None:
     folder = trace(tmp_path, story)
     plan = json_of("plan", folder, "--chain", "/image../objects")
     assert plan["cycle_ns"] == 50 * MS
+
+
+def test_where_nothing_was_lost_a_callback_spins_an_executor_itself(tmp_path: Path) -> None:
+    folder = trace(tmp_path, chain(executes=waits_inside), lost=0)
+    found = json_of("latency", folder, "--chain", "/image../objects")
+    assert any("it spins an executor itself now and then" in one for one in found["notes"])
+    plan = json_of("plan", folder, "--chain", "/image../objects")
+    assert plan["predicted"]["max_ns"] >= 41 * MS
 
 
 @pytest.mark.parametrize("every", [25, 40, 100])

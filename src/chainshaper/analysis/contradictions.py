@@ -9,7 +9,8 @@
 * **A timer's callback starts at another period than declared**: the period that its starts show
   counts; where they are not regular, a plan is refused.
 * **A callback spans its executor's next take, or its search for work**: its end is left out; where
-  only the search for work says so, a plan is refused.
+  only the search for work says so, a plan is refused. Where no event was lost, it spins an executor
+  itself.
 * **A callback ran inside itself in one thread**: the outer instances have no end. A plan is
   refused.
 * **Events lie behind the end of their packet**: the decoder drops them, and the recording's own
@@ -180,21 +181,27 @@ def _of_another_period(one: OtherPeriod) -> Contradiction:
 
 
 def _longer_than_they_ran(nodes: pl.DataFrame, ends: LostEnds) -> Iterator[Contradiction]:
-    proofs = (
-        (ends.by_take, "its thread took the next message for it", False),
-        (ends.by_wait, "its executor looked for other work", True),
+    lost = "their ends and the starts after them were lost, so they have no end"
+    doubt = "or it spins an executor itself now and then, and they are longer: record again without"
+    counted = (
+        "it spins an executor itself now and then, or losses were not counted; they count as so"
     )
-    for numbers, proof, refused in proofs:
+    proofs = (
+        (ends.by_take, "took the next message for it, or executed it again", lost, False),
+        (
+            ends.by_wait,
+            "looked for other work, or did some",
+            f"{counted} so long" if ends.complete else f"{lost} here, {doubt} losses",
+            not ends.complete,
+        ),
+    )
+    for numbers, proof, said, refused in proofs:
         rows = ends.instances.filter(pl.col("instance").is_in(numbers.implode()))
         for number, about, own in _by_callback(rows, nodes):
-            remedy = ": their ends and the starts after them were lost, so they have no end"
-            if refused:
-                remedy += " here, or it spins an executor itself now and then, and they are longer"
-                remedy += ": record again without losses"
             yield Contradiction(
                 frozenset({number}),
-                f"{own.height} instances of {about} seemed to last on although {proof}, the first"
-                f" {clock_text(own['start'][0])} in thread {own['tid'][0]}{remedy}.",
+                f"{own.height} instances of {about} seem to last on although their thread {proof},"
+                f" the first {clock_text(own['start'][0])} in thread {own['tid'][0]}: {said}.",
                 refused,
             )
 

@@ -40,6 +40,7 @@ from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objec
 from chainshaper.analysis.unseen_takes import with_unseen_takes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
+from chainshaper.values.recording import Recording
 
 _ACTION = "/_action/"
 
@@ -74,13 +75,24 @@ class DataFlow:
     untold: frozenset[int] = frozenset()
 
 
+def recorded_flow(recording: Recording) -> DataFlow:
+    """Resolve a recording's events, with what it knows of the clocks and of lost events."""
+    info = recording.info
+    return data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
+
+
 def data_flow(
-    tables: events.EventTables, clock_offset_ns: int = 0, objects: Objects | None = None
+    tables: events.EventTables,
+    clock_offset_ns: int = 0,
+    objects: Objects | None = None,
+    *,
+    complete: bool = False,
 ) -> DataFlow:
     """Resolve a recording's events.
 
     ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
-    ``objects`` are the tables' own, where they have been resolved already.
+    ``objects`` are the tables' own, where they have been resolved already. ``complete``: it is
+    known that no event was lost.
     """
     objects = objects or resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
@@ -90,7 +102,7 @@ def data_flow(
         published = publications(tables, objects, sent)
         taken, followed = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
-    ends = without_disproved_ends(tables, instances, taken)
+    ends = without_disproved_ends(tables, instances, taken, objects.callbacks, complete=complete)
     instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
@@ -140,8 +152,8 @@ def _notes(
     if missing := both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum():
         yield (
             f"{missing} messages were taken without an event of rmw (from Lyrical on"
-            " rmw_fastrtps_cpp has none for messages with a field uint8[]): chains cannot be"
-            " followed through them. `record --source preload` sees them."
+            " rmw_fastrtps_cpp has none for messages with a field uint8[]): chains are followed"
+            " through them only where a note says so. `record --source preload` sees them."
         )
 
 

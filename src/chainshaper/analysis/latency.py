@@ -1,7 +1,7 @@
 """The end-to-end latencies of one chain in a recording, figures about them and about callbacks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -10,7 +10,7 @@ import polars as pl
 
 from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.disturbance import Due, disturbed, stalled_after, with_punctuality
-from chainshaper.analysis.flow import DataFlow, data_flow, timer_calls
+from chainshaper.analysis.flow import DataFlow, data_flow, recorded_flow, timer_calls
 from chainshaper.analysis.graph import graph_of
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
@@ -224,9 +224,11 @@ def analyse_latency(
     """
     notes: tuple[str, ...] = ()
     if isinstance(source, Recording):
-        notes, info = source.info.notes, source.info
-        clock_offset_ns = info.clock_offset_ns if clock_offset_ns is None else clock_offset_ns
-        source = source.events
+        notes = source.info.notes
+        if clock_offset_ns is not None:
+            info = source.info.model_copy(update={"clock_offset_ns": clock_offset_ns})
+            source = replace(source, info=info)
+        source = recorded_flow(source)
     flow = source if isinstance(source, DataFlow) else data_flow(source, clock_offset_ns or 0)
     graph = graph_of(flow)
     if isinstance(chain, str):

@@ -16,9 +16,9 @@ import polars as pl
 from chainshaper.analysis import (
     LatencyAnalysis,
     analyse_latency,
-    data_flow,
     enumerate_chains,
     graph_of,
+    recorded_flow,
 )
 from chainshaper.analysis.flow import DataFlow, left_when_taken
 from chainshaper.analysis.latency import summary
@@ -102,7 +102,7 @@ def chain_of(recording: Recording, chain: str | None) -> str:
     named = chain or recording.info.chain
     if named is not None:
         return named
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     found = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
     known = " or ".join(f"--chain {one.spec}" for one in found.chains)
     more = "" if found.complete else ", or others (`chainshaper chains`)"
@@ -148,7 +148,7 @@ def _measured(
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for one in joint.chains for due in due_of(one)]
     spell, left_out = _in_force(recording)
-    flow = flow or data_flow(recording.events, info.clock_offset_ns)
+    flow = flow or recorded_flow(recording)
     if gated := [one for one in joint.chains if any(publisher_servers(one))] if joint else []:
         flow = left_when_taken(flow, [one.chain.output for one in gated])
     if spell is not None:
