@@ -62,10 +62,11 @@ def profile_chains(
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
     ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
-    names. All times but ``every_latency_ns`` are over cycles that the machine did not disturb (of
-    fewer than two: over all). Of ``modes``, each has a profile of its own: of its recording or file
-    of latencies in ``mode_recordings``, or of the cycles that began in it, by the description of
-    what ran. What happened before ``since_ns`` or from ``until_ns`` on is left out.
+    names, or the only one in it. All times but ``every_latency_ns`` are over cycles that the
+    machine did not disturb (of fewer than two: over all). Of ``modes``, each has a profile of its
+    own: of its recording or file of latencies in ``mode_recordings``, or of the cycles that began
+    in it, by the description of what ran. What happened before ``since_ns`` or from ``until_ns`` on
+    is left out.
 
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
@@ -77,7 +78,7 @@ def profile_chains(
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
     flow = recorded_flow(recording)
-    analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
+    analyses = [analyse_latency(flow, chain_of(recording, chain, flow)) for chain in chains]
     stages = [graph_stages(one.graph, one.chain) for one in analyses]
     planned = {number for own in stages for stage in own for number in stage.members}
     chained = {number for one in analyses for number in one.chain.callbacks}

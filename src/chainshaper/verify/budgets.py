@@ -165,14 +165,15 @@ def save_budget(budget: Budget, path: str | Path) -> Path:
 def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float = ROOM) -> Budget:
     """What was measured, and ``room`` beyond it, as limits for chains, hops and callbacks.
 
-    Without ``chains``, of the chain that the recording names. Raises InputError: no such chain.
+    Without ``chains``, of the chain that it names, or the only one in it. Raises InputError: no
+    such chain.
     """
 
     def limit(ns: float | None) -> int | None:
         return None if ns is None else -int(-ns * (1 + room) // GRAIN_NS) * GRAIN_NS or None
 
     of_chains, flow = [], recorded_flow(recording)
-    for chain in chains or [chain_of(recording, None)]:
+    for chain in chains or [chain_of(recording, None, flow)]:
         analysis = measure_latency(recording, chain, flow=flow).analysis
         refuse_contradicted(flow.contradictions, analysis.chain.callbacks, recording.path)
         figures = analysis.statistics

@@ -94,22 +94,36 @@ class Comparison:
     measurements: tuple[Measurement, ...]
 
 
-def chain_of(recording: Recording, chain: str | None) -> str:
-    """The chain that was asked for, or the one that the recording itself names.
+class SeveralChainsError(InputError):
+    """No chain was named, and the recording has several, or none."""
 
-    Raises InputError: neither names one.
+
+def chain_of(recording: Recording, chain: str | None, flow: DataFlow | None = None) -> str:
+    """The chain that was asked for, that the recording itself names, or the only one in it.
+
+    ``flow`` is the recording's data flow, where that has been resolved already. Raises
+    SeveralChainsError: none was asked for or named, and it has several, or none.
     """
     named = chain or recording.info.chain
     if named is not None:
         return named
-    flow = recorded_flow(recording)
+    flow = flow or recorded_flow(recording)
     found = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
+    if found.complete and len(found.chains) == 1:
+        return found.chains[0].spec
     known = " or ".join(f"--chain {one.spec}" for one in found.chains)
     more = "" if found.complete else ", or others (`chainshaper chains`)"
-    raise InputError(
+    raise SeveralChainsError(
         f"{recording.path} names no chain of interest: "
         + (f"add {known}{more}" if known else "and no chain is in it, see `chainshaper graph`")
     )
+
+
+def taken_chain(recording: Recording, chain: str | None, spec: str) -> tuple[str, ...]:
+    """A note that ``spec`` was taken since it is the only chain; none where one was named."""
+    if chain is not None or recording.info.chain is not None:
+        return ()
+    return (f"no --chain was given: {spec} is the only chain in {recording.path}.",)
 
 
 def measure_latency(
@@ -155,9 +169,11 @@ def _measured(
         recording = replace(recording, events=events.happened(recording.events, *spell))
     measurements = []
     for chain in chains:
-        begun = _in_front(chain_of(recording, chain), joint)
+        spec = chain_of(recording, chain, flow)
+        begun = _in_front(spec, joint)
         found = analyse_latency(flow, begun, due=due, between=spell)
-        analysis = replace(found, notes=(*info.notes, *found.notes))
+        notes = (*taken_chain(recording, chain, spec), *info.notes, *found.notes)
+        analysis = replace(found, notes=notes)
         output = analysis.chain.topics[-1]
         own = None if joint is None else plan_of_chain(joint, output)
         planned_for = own is not None and own.chain.output in (None, output)
