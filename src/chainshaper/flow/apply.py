@@ -116,7 +116,7 @@ def apply_plan(
     recorded, unread = threads.recorded_in(recordings, unread)
     cores, stop = {server.core for server in given.servers}, stop or threading.Event()
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
-    run = _Run(given, given, choice, journal, recorded, unread, taken, stop)
+    run = _Run(given, given, choice, journal, recorded, taken, stop, unread)
     try:
         run.guardians = Guardians(journal)
         if command:
@@ -159,9 +159,9 @@ class _Run:
     choice: Choice
     journal: Journal
     recorded: tuple[allocation.RecordedProcess, ...]
-    unread: tuple[str, ...]  # recordings that say nothing of this machine, or cannot be read
     users: frozenset[int]
     stop: threading.Event
+    unread: tuple[str, ...] = ()  # recordings that say nothing of this machine, or cannot be read
     guardians: Guardians | None = None
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
