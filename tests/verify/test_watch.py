@@ -483,7 +483,9 @@ def test_wrong_use_and_the_environment(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     said = called("watch", "--environment")
     assert said.code == 0
-    library = Path(said.out.removeprefix("export LD_PRELOAD=").strip())
+    loaded, options = said.out.splitlines()
+    assert options == "export ASAN_OPTIONS=verify_asan_link_order=0"
+    library = Path(loaded.removeprefix("export LD_PRELOAD="))
     assert library.is_file()
     brought = Path(preload.__file__).with_name(library.name)  # by a wheel, which has it compiled
     assert library == brought if brought.is_file() else library.is_relative_to(tmp_path)

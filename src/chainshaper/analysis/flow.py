@@ -25,6 +25,8 @@ from dataclasses import dataclass, replace
 
 import polars as pl
 
+from chainshaper.analysis.contradictions import Contradiction, contradictions
+from chainshaper.analysis.lost_ends import LOOKS, without_disproved_ends
 from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
 from chainshaper.analysis.messages import (
     link_takes,
@@ -35,11 +37,11 @@ from chainshaper.analysis.messages import (
     with_departures,
 )
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objects
+from chainshaper.analysis.unseen_takes import with_unseen_takes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 
 _ACTION = "/_action/"
-_LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
 
 
 @dataclass(frozen=True)
@@ -47,8 +49,10 @@ class DataFlow:
     """A recording, resolved.
 
     * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`.
-    * ``instances``: see :func:`callback_instances`, with those that no event shows added. An
-      instance's number is its row.
+    * ``instances``: see :func:`callback_instances`, with those that no event shows added, and
+      without the ends that other events disprove (:mod:`~chainshaper.analysis.lost_ends`: then,
+      and where an end was lost, ``until`` is when it had ended at the latest, null if not known).
+      An instance's number is its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
       ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),
       and when it was ``sent`` (null: it never was).
@@ -56,6 +60,8 @@ class DataFlow:
       was read and the ``instance`` that got the message (null: none did).
     * ``events``: the tables all this came from.
     * ``notes``: what cannot be known, in plain words.
+    * ``contradictions``: what in the events contradicts itself; their notes are in ``notes``.
+    * ``untold``: subscriptions' callbacks that ran without any event of a take.
     """
 
     objects: Objects
@@ -64,6 +70,8 @@ class DataFlow:
     takes: pl.DataFrame
     events: events.EventTables
     notes: tuple[str, ...]
+    contradictions: tuple[Contradiction, ...] = ()
+    untold: frozenset[int] = frozenset()
 
 
 def data_flow(
@@ -80,10 +88,13 @@ def data_flow(
         sent, received = service_calls(tables, objects, clock_offset_ns)
         taken = takes(tables, objects, received)
         published = publications(tables, objects, sent)
-        taken = link_takes(tables, taken, published, clock_offset_ns)
+        taken, followed = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
+    ends = without_disproved_ends(tables, instances, taken)
+    instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
+    taken, unseen = with_unseen_takes(taken, instances, published, objects)
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
         published = _begun_outside(published, instances)
@@ -91,11 +102,24 @@ def data_flow(
         published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
-    notes = (*objects.notes, *_notes(tables, instances))
-    return DataFlow(objects, instances, published, taken, tables, notes)
+    seen = contradictions(
+        tables=tables,
+        objects=objects,
+        instances=instances,
+        published=published,
+        taken=taken,
+        ends=ends,
+        unseen=unseen,
+        stamped=followed,
+    )
+    notes = (*objects.notes, *_notes(tables, instances, taken), *(one.note for one in seen))
+    untold = frozenset(one.callback_id for one in unseen)
+    return DataFlow(objects, instances, published, taken, tables, notes, seen, untold)
 
 
-def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]:
+def _notes(
+    tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame
+) -> Iterator[str]:
     """What cannot be known of instances and messages, in plain words."""
     if "sched_switch" in tables and instances.height and not instances["execution_ns"].count():
         yield (
@@ -103,7 +127,7 @@ def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]
             "container threads have other numbers): execution times cannot be known."
         )
     within = int(instances["intra_process"].sum())
-    if within and not events.table(tables, "rclcpp_ring_buffer_dequeue").height:
+    if within and not taken["intra_process"].any():
         yield (
             f"{within} callback instances got their message within their process, of which no "
             "other event tells (before Iron, or not enabled): chains cannot be followed through "
@@ -263,7 +287,7 @@ def _with_assumed_readers(
         return instances, taken.with_columns(assumed_instance=pl.lit(None, dtype=pl.UInt32))
     if assumed["by_executor"].any():
         looks = pl.concat(
-            events.table(tables, name).select("pid", "tid", end="time") for name in _LOOKS
+            events.table(tables, name).select("pid", "tid", end="time") for name in LOOKS
         )
         assumed = first_after(assumed, looks.sort("end"), ["pid", "tid"], "start", "end")
         end = pl.when("by_executor").then("end")
@@ -313,7 +337,8 @@ def _published_in(
 ) -> pl.DataFrame:
     """Add ``instance`` and ``callback_id``: the innermost instance running on the thread then.
 
-    An instance without an end is taken to run until the thread's next instance. A publication in
+    An instance without an end is taken to run until the thread's next instance, or until its thread
+    looked for other work. A publication in
     the nanosecond in which one instance ends and the next begins is the first one's. Where a
     callback runs others inside itself (it spins an executor), what it publishes after them is its
     own: the search is repeated among the instances that contain others, per level of nesting.
@@ -323,7 +348,8 @@ def _published_in(
     running = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
     running = running.drop("execution_ns", "intra_process")
     key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
-    inside = (pl.col("end").is_null() | (pl.col("time") <= pl.col("end"))) & (
+    over = pl.coalesce("end", "until")
+    inside = (over.is_null() | (pl.col("time") <= over)) & (
         ~pl.col("assumed") | (pl.col("owner") == pl.col("node"))
     )
     rest, found, strictly = published.select("publication", "time", *key, "node"), [], True

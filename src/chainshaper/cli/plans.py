@@ -67,7 +67,7 @@ def plan(
     profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], how)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     doubts = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
-    doubts += [doubt for one in profiles for doubt in doubts_about(one)]
+    doubts += dict.fromkeys(doubt for one in profiles for doubt in doubts_about(one))
     doubts += [
         f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
         for core in sorted({*(request.cores or ())} - {*available_cores()})

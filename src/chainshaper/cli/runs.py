@@ -298,13 +298,14 @@ def watch(
     from chainshaper.linux import own_processes
     from chainshaper.linux.processes import run_users
     from chainshaper.reporting.overviews import watch_tables
-    from chainshaper.sources.preload import installed_library, preloading
+    from chainshaper.sources.preload import in_front, installed_library
     from chainshaper.values.recording import refuse_existing
     from chainshaper.verify.budgets import Budget, load_budget
     from chainshaper.verify.watch import Watch, exporting
 
     if environment:
-        out.show_line(f"export LD_PRELOAD={shlex.quote(preloading(installed_library()))}")
+        for name, value in in_front(installed_library()).items():
+            out.show_line(f"export {name}={shlex.quote(value)}")
         return
     known = opt.plan_in_force(plan)
     specs = () if known is None else (one.chain.spec for one in known.chains)
@@ -321,7 +322,7 @@ def watch(
     with out.stop_on_signals() as stop, ExitStack() as until:
         started = None
         if command:
-            variables = {"LD_PRELOAD": preloading(installed_library())}
+            variables = in_front(installed_library())
             started = own_processes.start_command(command, variables, STDERR)
             until.callback(own_processes.end_command, started)
         show = until.enter_context(out.live())

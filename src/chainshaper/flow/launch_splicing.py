@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from chainshaper.gate.decision import Rule
 from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
 from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
+from chainshaper.sources.preload import ANY_ORDER, SANITIZER
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
 from chainshaper.splicing import shaping_process as ours
@@ -135,6 +136,7 @@ def splice_launch_files(
         (into / "gates").write_text("".join(blocks), encoding="utf-8")
         return made, {
             "LD_PRELOAD": str(ours.gate_library()),
+            SANITIZER: ANY_ORDER,
             ours.GATES: str(folder / launching.NODES / "gates"),
         }
 

@@ -70,7 +70,8 @@ class Profile:
     ``every_step_ns`` are what each callback of the chain took, a row per latency.
     ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
     are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
-    ``interfering`` what else the chain's threads run. The rest is
+    ``interfering`` what else the chain's threads run, ``contradictions`` what in the recording's
+    events contradicts itself about its callbacks, in words. The rest is
     :class:`~chainshaper.planning.plan.Evidence`, and :class:`~.plan.ChainOfPlan`.
     """
 
@@ -108,6 +109,7 @@ class Profile:
     intra_process: Literal[True] | None = None
     simulated: tuple[str, ...] = ()
     interfering: tuple[Interfering, ...] = ()
+    contradictions: tuple[str, ...] = ()
     lost_events: int | None = None
     all_disturbed: bool | None = None
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
@@ -169,8 +171,10 @@ def up_to(profile: Profile, percentile: float) -> Profile:
 
 
 def doubts_about(profile: Profile) -> list[str]:
-    """What else than the chain decides its latencies, one sentence each."""
-    return [*filter(None, (other_beginnings(profile), interfering_callback(profile)))]
+    """What else than the chain decides its latencies, and what in the evidence contradicts itself,
+    one sentence each."""
+    doubts = (other_beginnings(profile), interfering_callback(profile), *profile.contradictions)
+    return [*filter(None, doubts)]
 
 
 def other_beginnings(profile: Profile) -> str | None:

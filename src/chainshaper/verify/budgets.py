@@ -23,6 +23,7 @@ import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
 from chainshaper.analysis import DataFlow, data_flow
+from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.latency import (
     PERCENTILES,
     LatencyAnalysis,
@@ -173,6 +174,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
     of_chains, flow = [], data_flow(recording.events, recording.info.clock_offset_ns)
     for chain in chains or [chain_of(recording, None)]:
         analysis = measure_latency(recording, chain, flow=flow).analysis
+        refuse_contradicted(flow.contradictions, analysis.chain.callbacks, recording.path)
         figures = analysis.statistics
         wanted: tuple[Percentile, ...] = ("50", "99")
         percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}

@@ -333,7 +333,10 @@ class Watch:
         flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
         if ended := self._ended():
             flow = with_restarts(flow, ended)
-        moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
+        moved = dict[str, int]()
+        if self.plan:  # a page of another user says nothing of the outputs that are watched
+            watched = (output for output in find_outputs() if output.user in self.users)
+            moved = {output.topic: output.moved_ns for output in watched}
         # Where publications carry no stamp, the clock's offset says which one was taken.
         stampless = flow.publications["source_timestamp"].null_count() > 0
         clear_ns = self._stepped_ns if stampless else 0

@@ -15,6 +15,7 @@ import re
 import secrets
 import shutil
 import socket
+import stat
 import struct
 import subprocess
 import tempfile
@@ -67,7 +68,10 @@ _RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
 _MAGIC, _FORMAT = 0x63687368, 2
 _TEXT, _LIBRARY, _FIRST_EVENT = 1, 2, 3
 _TEXT_BYTES, _PLACES = 40, 16
-_LARGEST = 1 << 30
+_RINGS, _RING_RECORDS, _OBJECT_RECORDS = 64, 1 << 14, 1 << 15  # of this format, no others
+_OF_OBJECTS = _HEADER.itemsize + _RINGS * _RING.itemsize
+_OF_RECORDS = _OF_OBJECTS + _OBJECT_RECORDS * RECORD.itemsize
+_SIZE = _OF_RECORDS + _RINGS * _RING_RECORDS * RECORD.itemsize
 _F_GET_SEALS, _F_SEAL_SHRINK = 1034, 2  # linux/fcntl.h
 _THREAD_TIME = 2  # the value of callback_start and callback_end that is no argument
 _CALL: dict[str, tuple[int, Literal["number", "gid"]]] = {  # where the values of a CALL are
@@ -96,26 +100,27 @@ class TracedProcess:
     """
 
     def __init__(self, descriptor: int, pid: int = 0) -> None:
-        size, seals = os.fstat(descriptor).st_size, 0
+        seals = 0
         with suppress(OSError):  # no memfd
             seals = fcntl.fcntl(descriptor, _F_GET_SEALS)
-        if not seals & _F_SEAL_SHRINK or not _HEADER.itemsize <= size <= _LARGEST:
+        size = os.fstat(descriptor).st_size
+        if not seals & _F_SEAL_SHRINK or size < _HEADER.itemsize:
             raise InputError("what was sent is no memory of a traced process")
+        header = np.frombuffer(os.pread(descriptor, _HEADER.itemsize, 0), _HEADER)
+        magic, form, self.inner_pid, *counts = header[0].tolist()[: len(_COUNTS)]
+        # Whatever a process says, no more is read than a memory of this version has.
+        known = [_RINGS, _RING_RECORDS, _OBJECT_RECORDS]
+        if (magic, form, counts) != (_MAGIC, _FORMAT, known) or size != _SIZE:
+            raise InputError("what was sent is the memory of another version of chainshaper")
         memory = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
         self.header: NDArray[Any] = np.frombuffer(memory, _HEADER, 1)
-        magic, form, self.inner_pid, rings, records, objects, *_ = self.header[0].tolist()
-        of_objects = _HEADER.itemsize + rings * _RING.itemsize
-        of_records = of_objects + objects * RECORD.itemsize
-        is_short = not records or size < of_records + rings * records * RECORD.itemsize
-        if (magic, form) != (_MAGIC, _FORMAT) or is_short:
-            raise InputError("what was sent is the memory of another version of chainshaper")
         self.pid = pid or self.inner_pid
         self._tids: dict[int, int] = {}
-        self._rings = np.frombuffer(memory, _RING, rings, _HEADER.itemsize)
-        self._objects = np.frombuffer(memory, RECORD, objects, of_objects)
-        self._records = np.frombuffer(memory, RECORD, rings * records, of_records)
-        self._records = self._records.reshape(rings, records)
-        self._read = np.zeros(rings, np.uint64)
+        self._rings = np.frombuffer(memory, _RING, _RINGS, _HEADER.itemsize)
+        self._objects = np.frombuffer(memory, RECORD, _OBJECT_RECORDS, _OF_OBJECTS)
+        records = np.frombuffer(memory, RECORD, _RINGS * _RING_RECORDS, _OF_RECORDS)
+        self._records = records.reshape(_RINGS, _RING_RECORDS)
+        self._read = np.zeros(_RINGS, np.uint64)
         self.lost = 0
 
     @property
@@ -311,11 +316,25 @@ def preloading(library: Path) -> str:
     return ":".join([str(library), *(one for one in before if one and one != str(library))])
 
 
+SANITIZER, ANY_ORDER = "ASAN_OPTIONS", "verify_asan_link_order=0"
+"""A node built with AddressSanitizer refuses to start behind any library in `LD_PRELOAD`, unless
+this variable tells it not to look at the order of libraries. The last word of it counts."""
+
+
+def in_front(library: Path) -> dict[str, str]:
+    """The variables that put a library in front of ROS 2 in all that is started with them.
+
+    Raises PlatformError: as :func:`preloading`.
+    """
+    options = filter(None, [os.environ.get(SANITIZER, ""), ANY_ORDER])
+    return {"LD_PRELOAD": preloading(library), SANITIZER: ":".join(options)}
+
+
 NO_PROCESS = (
     "no process of these users runs with the library in front: set what `chainshaper watch "
     "--environment` prints before the application is started, or name its user (--user)"
 )
-_MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
+_MEMORY = re.compile(rb"/memfd:chainshaper-trace\b")
 
 
 def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
@@ -325,14 +344,33 @@ def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[i
         with suppress(OSError):  # it has ended, or may not be looked into
             if Path(f"/proc/{pid}").stat().st_uid not in users:
                 continue
-            own = innermost_id(read_proc(f"/proc/{pid}/status"))
+            inner_pid = innermost_id(read_proc(f"/proc/{pid}/status"))
             for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-                if _MEMORY.match(str(descriptor.readlink())):
-                    with suppress(InputError), descriptor.open("rb") as file:
-                        memory = TracedProcess(file.fileno(), pid)
-                        if memory.inner_pid == own:  # else it is one that reads it, as we do
-                            yield pid, memory
-                            break
+                with suppress(OSError):  # it is closed meanwhile, or may not be opened
+                    memory = _memory_of(descriptor, pid)
+                    # Another process's memory is open in one that reads it, as we do.
+                    if memory is not None and memory.inner_pid == inner_pid:
+                        yield pid, memory
+                        break
+
+
+def _memory_of(descriptor: Path, pid: int) -> TracedProcess | None:
+    """The memory behind an open file of a process, in `/proc`; None: it is another kind of file.
+
+    Anything may have the name of a memory, and opening a pipe or a device may wait for ever or do
+    something: so the file is looked at before it is opened for reading. Raises OSError.
+    """
+    if not _MEMORY.match(os.fsencode(descriptor.readlink())):
+        return None
+    place = os.open(descriptor, os.O_PATH | os.O_CLOEXEC)
+    try:
+        if not stat.S_ISREG(os.fstat(place).st_mode):
+            return None
+        with Path(f"/proc/self/fd/{place}").open("rb") as file, suppress(InputError):
+            return TracedProcess(file.fileno(), pid)
+    finally:
+        os.close(place)
+    return None
 
 
 class PreloadTracer:
@@ -375,7 +413,7 @@ class PreloadTracer:
         self._socket.listen(128)
         self._socket.settimeout(_BETWEEN_LOOKS_S)
         self._reader.start()
-        return {"LD_PRELOAD": preloading(library), VARIABLE: name}
+        return {**in_front(library), VARIABLE: name}
 
     def failure(self) -> str | None:
         return self._failure
