@@ -267,10 +267,12 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
 def recording_of(
     named: Path | None, plan: "cs.ApplicationPlan | None" = None
 ) -> "cs.Recording | None":
-    """The recording that an option names, or else the plan's own, where that is still there."""
-    own = None if plan is None else plan.chains[0].evidence.recording
-    if named is None and own and Path(own).is_dir():
-        named = Path(own)
+    """The recording that an option names, or else the first of the plan's own that is still there,
+    whichever chain it was made for.
+    """
+    chains = () if plan is None else plan.chains
+    own = (Path(path) for one in chains if (path := one.evidence.recording) is not None)
+    named = named or next((path for path in own if path.is_dir()), None)
     return None if named is None else cs.open_source(named)
 
 
