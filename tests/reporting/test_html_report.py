@@ -38,6 +38,7 @@ from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement
+from chainshaper.verify.promises import OutputsDue
 
 
 class _Reader(HTMLParser):
@@ -131,9 +132,11 @@ def test_figures_of_a_run_known_by_hand(page: _Reader, section: str, row: list[s
 
 def test_hops_plan_and_notes_of_a_run_known_by_hand(page: _Reader) -> None:
     first, second, gate, _ = [row[1:] for row in page.rows["hops"][1:]]
-    assert first == ["3", "–", "–", "–", "–", "4.000", "4.000", "4.000", "13.3%"]
+    waited = ["0.000", "0.000", "0.000", "0.0%"]
+    assert first == ["3", "–", "–", "–", "–", "4.000", "4.000", "4.000", "13.3%", *waited]
     assert second[:5] == ["3", "1.000", "1.000", "1.000", "3.3%"]
-    assert gate[5:8] == ["14.020", "14.020", "14.020"]
+    assert gate[5:8] == ["0.000", "0.000", "0.000"], "the gate computes nothing,"
+    assert gate[9:12] == ["14.020", "14.020", "14.020"], "it waits for the slot"
     assert "shaping_node:" in "".join(page.text), "the plan as YAML"
     assert "known: the first 5 cycles warmed up" in page.text
     drawn = page.data["bars"]["slots-0"]
@@ -169,7 +172,7 @@ def test_every_figure_before_and_after_is_the_librarys(
             times = [getattr(one, field) for one in found]
             expected = ["–" if time is None else milliseconds(time) for time in times]
             assert rows[title] == expected, (place, kind, title)
-    hops = hop_breakdown(measurements[1].analysis).select("count", "computation_share")
+    hops = hop_breakdown(measurements[1].analysis).select("count", "waiting_share")
     shares = [(str(count), f"{share:.1%}") for count, share in hops.iter_rows()]
     assert [(row[1], row[-1]) for row in page.rows["hops"]][-len(shares) - 1 : -1] == shares
 
@@ -215,13 +218,13 @@ def test_the_headline_says_as_predicted_only_of_what_was_judged_and_broke_no_pro
     figures = ("mean", "max", "jitter")
     said = "Jitter 0.000 ms (known); average 30.020 ms (known)"
     for changes, judgement in (
-        ({}, "as predicted, 0 of 3 late"),
+        ({}, "as predicted, 0 of 3 outputs late"),
         (
             {name: replace(getattr(judged, name), holds=None) for name in figures},
-            "not judged, 0 of 3 late",
+            "not judged, 0 of 3 outputs late",
         ),
         (
-            {"late_of_all": 12, "cycles": 320, "most_late": 0},
+            {"outputs": OutputsDue(320, 12, promised=0.0)},
             "differs from the prediction: 12 of 320 outputs late, none expected",
         ),
     ):

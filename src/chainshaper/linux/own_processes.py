@@ -144,8 +144,7 @@ def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if _over(started):
             return
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(started.pid, number)
+        _signal_group(started, number)
         _await_end(started, patience_s)
 
 
@@ -198,6 +197,24 @@ def _await_end(
         if orphans_s is not None and started.poll() is not None:
             deadline, orphans_s = min(deadline, time.monotonic() + orphans_s), None
         time.sleep(_LOOK_S)
+
+
+def _signal_group(started: subprocess.Popen[bytes], number: int) -> None:
+    """Signal the command's process group, and no other that has its number by now."""
+    if started.returncode is None:  # it has not been waited for: the number is its own
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(started.pid, number)
+        return
+    stats = dict(all_stats())
+    if started.pid in stats:  # another's, so nothing is left of the group
+        return
+    for pid, (_, _, group, session, *others) in stats.items():
+        if int(group) == int(session) == started.pid:
+            pidfd = open_process(pid, int(others[15]))
+            if pidfd is not None:
+                with contextlib.suppress(OSError):  # it has ended, or is another user's
+                    signal.pidfd_send_signal(pidfd, number)
+                os.close(pidfd)
 
 
 def _over(started: subprocess.Popen[bytes]) -> bool:
