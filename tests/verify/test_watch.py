@@ -42,6 +42,7 @@ from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
 from chainshaper.verify.budgets import load_budget
 from chainshaper.verify.measure import PARTS, measure_latency
+from chainshaper.verify.promises import OutputsDue
 from chainshaper.verify.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 
 pytestmark = pytest.mark.waiting
@@ -401,7 +402,9 @@ def seen_with(figures: LatencyStatistics, at_ns: int = 0, hops: tuple[Hop, ...] 
     """A look at one chain, which has the same figures over all spans."""
     counted = {"complete": figures.count, "late": figures.late or 0, "incomplete": 0, "unclear": 0}
     spans = dict.fromkeys(SPANS, figures)
-    chain = ChainNow(CHAIN, spans, 20.0, hops, (), 0.0, None, 0, counted, problem=None)
+    outputs = OutputsDue.of(figures.count, figures.late, figures.incomplete)
+    about = {"problem": None, "outputs": outputs, "kept": outputs.kept}
+    chain = ChainNow(CHAIN, spans, 20.0, hops, (), 0.0, None, 0, counted, **about)  # type: ignore[arg-type]
     return Seen(at_ns, {1: "/first"}, 0, (chain,))
 
 

@@ -557,23 +557,58 @@ class _NamedPath(BaseModel):
     node_chain: tuple[_PathNode, ...] = Field(min_length=1)
 
 
+class _Publishes(BaseModel):
+    topic_name: str
+    callback_name: str | None = None
+    callback_names: tuple[str, ...] = ()
+
+
+class _Callback(BaseModel):
+    callback_name: str
+    topic_name: str | None = None
+
+
+class _Node(BaseModel):
+    node_name: str
+    callbacks: tuple[_Callback, ...] = ()
+    publishes: tuple[_Publishes, ...] = ()
+
+
+class _PathAlias(BaseModel):
+    path_name: str
+    callbacks: tuple[str, ...] = Field(min_length=1)
+
+
 class _Architecture(BaseModel):
     named_paths: tuple[_NamedPath, ...]
+
+
+class _ArchitectureOfGalactic(BaseModel):
+    path_name_aliases: tuple[_PathAlias, ...]
+    nodes: tuple[_Node, ...] = ()
 
 
 def load_named_paths(file: str | Path) -> dict[str, str]:
     """The named paths of a CARET architecture file: path name → chain as we write it.
 
     Each node of a path becomes a way point together with the topic it publishes. A last node that
-    publishes nothing ends the chain with the topic it subscribes to.
+    publishes nothing ends the chain with the topic it subscribes to. Galactic's files name the
+    paths ``path_name_aliases``, as callbacks.
 
-    Raises InputError: not readable, not YAML, no ``named_paths``, a path without nodes.
+    Raises InputError: not readable, not YAML, no named paths, a path without nodes, or with
+    callbacks that the file does not have.
     """
     path = Path(file)
     root = compose(read_text(path, "CARET's architecture file"), path)
     plain = PlainData(path, ours=False)
+    values = None if root is None else plain.of(root)
+    if isinstance(values, dict) and "named_paths" not in values and "path_name_aliases" in values:
+        try:
+            return _paths_of_callbacks(path, _ArchitectureOfGalactic.model_validate(values))
+        except ValidationError as error:
+            raise InputError(plain.problems(error, _ArchitectureOfGalactic)) from error
     try:
-        architecture = _Architecture.model_validate(None if root is None else plain.of(root))
+        architecture = _Architecture.model_validate(values)
     except ValidationError as error:
         raise InputError(
             f"{plain.problems(error, _Architecture)}; chains are read from the `named_paths` of a"
@@ -589,3 +624,46 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
             points.pop(-2)
         chains[named.path_name] = "..".join(point for point in points if point is not None)
     return chains
+
+
+def _paths_of_callbacks(file: Path, architecture: _ArchitectureOfGalactic) -> dict[str, str]:
+    """The chains of paths that name their callbacks, as ``/node/subscription_callback_0``.
+
+    A message leads from a callback to the next one of another node, so its topic is a way point;
+    within a node what passes is a variable, which the node's name stands for.
+    """
+    nodes = {node.node_name: node for node in architecture.nodes}
+    chains = {}
+    for alias in architecture.path_name_aliases:
+        points: list[str] = []
+        for number, unique_name in enumerate(alias.callbacks):
+            node_name, _, callback_name = unique_name.rpartition("/")
+            known = nodes[node_name].callbacks if node_name in nodes else ()
+            callback = next((c for c in known if c.callback_name == callback_name), None)
+            if callback is None:
+                where = f"{file}: path {alias.path_name!r}"
+                raise InputError(
+                    f"{where} names the callback {unique_name}, which no node in it has: correct"
+                    " one of the two"
+                )
+            if number and callback.topic_name is not None and node_name not in points:
+                points.append(callback.topic_name)
+            points.append(node_name)
+        published = _published(nodes[points[-1]], alias.callbacks[-1].rpartition("/")[2])
+        if published is not None:
+            points.append(published)
+        elif len(points) > 1 and not nodes[points[-1]].publishes:
+            points.pop()
+        chains[alias.path_name] = "..".join(dict.fromkeys(points))
+    return chains
+
+
+def _published(node: _Node, callback_name: str) -> str | None:
+    """The topic that a callback publishes; None where the file does not say which, or none."""
+    own = [
+        one.topic_name
+        for one in node.publishes
+        if callback_name in {one.callback_name, *one.callback_names}
+    ]
+    topics = own or [one.topic_name for one in node.publishes]
+    return topics[0] if len(topics) == 1 else None

@@ -28,11 +28,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.traversals import Traversals
 from chainshaper.gate.decision import STALL_NS
 from chainshaper.values import events
+from chainshaper.values.application import Chain
 
 WAKE_UP_NS = 250_000
 
@@ -86,11 +88,9 @@ def with_punctuality(
     decided = decided.filter(pl.col("overrun").ne_missing("bypass"))
     frame = traversals.frame.join(decided, on="traversal", how="left", maintain_order="left")
     start, end, counted_from = pl.col("start"), pl.col("end"), pl.col("origin")
-    # The period of the timer that starts the chain stands for the cycle of a plan.
-    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
-    period: int | None = first["period_ns"].max()  # type: ignore[assignment]
-    cycle_ns = period if due is None else due.cycle_ns
-    limit = pl.lit(cycle_ns if due is None else (due.cycles + 1) * due.cycle_ns, dtype=pl.Int64)
+    within = due_within(flow, chain, due)
+    cycle_ns = within if due is None else due.cycle_ns
+    limit = pl.lit(within, dtype=pl.Int64)
     began = start
     if due is not None and due.from_cycle:
         began = start - pl.lit(lateness_in_cycle(frame["start"], due.cycle_ns))
@@ -109,7 +109,7 @@ def with_punctuality(
         late=late.otherwise(place >= limit) & end.is_not_null(),
         origin="origin",
         computed_at=pl.coalesce("arrival", "end"),
-        expected_at=_expected(flow, traversals, period),
+        expected_at=_expected(flow, traversals, timer_period(flow, chain)),
     ), releases
 
 
@@ -147,6 +147,21 @@ def timer_due(starts: pl.Series, period_ns: int) -> pl.Series:
         due = before - late.shift(1) + period_ns
     frame = pl.DataFrame({"start": starts, "due": due})
     return frame.select(pl.min_horizontal("start", "due")).to_series()
+
+
+def due_within(flow: DataFlow, chain: Chain, due: Due | None) -> int | None:
+    """How long after its beginning an output is late whatever the slots are (ns; None: not known).
+
+    The period of the timer that starts the chain stands for the cycle of a plan.
+    """
+    return timer_period(flow, chain) if due is None else (due.cycles + 1) * due.cycle_ns
+
+
+def timer_period(flow: DataFlow, chain: Chain) -> int | None:
+    """The period of the timer that starts a chain, as its starts show it (ns; None: no timer)."""
+    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
+    declared: int | None = first["period_ns"].max()  # type: ignore[assignment]
+    return shown_periods(flow.contradictions).get(chain.callbacks[0], declared)
 
 
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:

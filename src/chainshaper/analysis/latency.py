@@ -9,9 +9,16 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.analysis.disturbance import Due, disturbed, stalled_after, with_punctuality
+from chainshaper.analysis.disturbance import (
+    Due,
+    disturbed,
+    due_within,
+    stalled_after,
+    with_punctuality,
+)
 from chainshaper.analysis.flow import DataFlow, data_flow, timer_calls
 from chainshaper.analysis.graph import graph_of
+from chainshaper.analysis.outputs_due import not_begun, with_outputs_due
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain, trigger_text
@@ -176,14 +183,16 @@ class LatencyAnalysis:
     """The end-to-end latency of one chain in one recording.
 
     ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with
-    ``place_ns``, ``due_at``, ``late`` (:func:`~.disturbance.with_punctuality`), ``disturbed``,
+    ``place_ns``, ``due_at``, ``late`` (:func:`~.disturbance.with_punctuality`), ``was_due``
+    (:func:`~.outputs_due.with_outputs_due`), ``disturbed``,
     ``received``, ``reception_ns`` (latency to the subscriber's `callback_start`) and
     ``reception_disturbed`` (also by a stall between the two), ``hops`` its frame of hops,
     ``releases`` what gates decided about them (:func:`~.messages.gated_hops`). ``statistics`` are
     over all complete traversals, ``undisturbed`` over those that the machine did not disturb;
     ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
     subscribes to the output). ``incomplete`` counts traversals without an end by reason, ``silent``
-    instances of the first callback that began none.
+    instances of the first callback that began none, ``not_begun`` cycles of a plan in which it did
+    not run at all.
     """
 
     chain: Chain
@@ -198,6 +207,7 @@ class LatencyAnalysis:
     incomplete: dict[str, int]
     silent: int
     notes: tuple[str, ...]
+    not_begun: int = 0
 
     @property
     def decided(self) -> pl.DataFrame:
@@ -248,6 +258,8 @@ def analyse_latency(
         disturbed=hit,
         reception_disturbed=hit | on_its_way,
     )
+    until = None if between is None else between[1]
+    frame = with_outputs_due(flow, frame, releases, due_within(flow, chain, own), until)
     hops = found.hops
     if between is not None:
         since_ns, until_ns = between
@@ -271,6 +283,7 @@ def analyse_latency(
         incomplete=dict(reasons.iter_rows()),
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),
+        not_begun=0 if own is None else not_begun(flow, chain, own, between),
     )
 
 

@@ -52,6 +52,8 @@ REASONS: dict[str, str] = {
     "lost": "published, but never taken, though a later message of the topic was",
     "overwritten": "published, but overwritten in a full intra-process ring buffer",
     "not taken": "published, but not taken by the time the recording ended",
+    "take not recorded": "published, but which of its subscriber's callback instances got it, no "
+    "event says: there are none of its takes",
     "not executed": "taken, but no callback instance got it",
     "not published": "its callback instance, or its process, ended without publishing",
     "not used": "stored for a timer or a synchroniser of its node, which used a newer message",
@@ -70,6 +72,7 @@ OWES_NO_OUTPUT = ("not used", "inactive")
 
 _SILENT = ["not published", "inactive"]
 _IN_NODE = [*_SILENT, "not used", "discarded", "not sent", "still running"]
+_WITHOUT_EFFECT = ["not published", "lost", "not taken", "take not recorded", "not executed"]
 _REASON = pl.Enum(list(REASONS))
 _VIA = pl.Enum(["instance", "sibling"])
 
@@ -292,7 +295,7 @@ def _unless_active(
     changes = flow.objects.activity.filter(
         pl.col("pid").is_in(callback.processes), node=callback.node
     )
-    stopped = pl.col("reason").is_in(["not published", "lost", "not taken", "not executed"])
+    stopped = pl.col("reason").is_in(_WITHOUT_EFFECT)
     stopped &= pl.col("broken_hop") == hop
     if changes.is_empty() or state.filter(stopped).is_empty():
         return state
@@ -338,6 +341,8 @@ def _take(
     latest = pl.lit(taken["publication"].max(), dtype=pl.UInt32)
     later = (before < latest).fill_null(False)  # they are numbered in order of time
     why = pl.when(later).then(pl.lit("lost")).otherwise(pl.lit("not taken"))
+    if callback.id in flow.untold:
+        why = pl.lit("take not recorded")
     if flow.publications["intra_time"].count():
         buffers = flow.objects.buffers
         overwritten = overwritten_in(flow.events, flow.publications, buffers, callback.id)

@@ -17,10 +17,11 @@ from chainshaper.analysis import (
     load_named_paths,
 )
 from chainshaper.analysis.chains import close_names
+from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.flow.plan import inputs_of
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.sources.lttng.trace import table_name
+from chainshaper.sources.lttng.sessions import table_name
 from chainshaper.values.application import INTERNAL_TOPICS
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
@@ -45,7 +46,10 @@ def list_chains(
 def named_chain(file: str | Path, name: str | None = None) -> str:
     """The chain that a CARET architecture file calls ``name``, which only one path needs not."""
     paths = load_named_paths(file)
-    known = ", ".join(paths) or "none"
+    known = ", ".join(paths)
+    if not paths:
+        remedy = "name a path in it (CARET's documentation says how), or leave out --chains"
+        raise InputError(f"{file}: no path is named in it: {remedy}")
     if name is None and len(paths) != 1:
         raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
     name = next(iter(paths)) if name is None else name
@@ -99,6 +103,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
     published = {topic for one in graph.callbacks for topic in one.publishes}
     nodes: dict[str, Any] = {}
+    periods = shown_periods(flow.contradictions)
     seen: set[int] = set()
     for one in graph.callbacks:
         ours = one.kind in ("timer", "subscription") and one.topic not in INTERNAL_TOPICS
@@ -114,7 +119,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
         if not taken.size or len(began) < 2:  # it hardly ran
             continue
         read = [graph.callbacks[number].topic for number in members]
-        period = one.period_ns or int(began.diff().median() or 0)
+        period = periods.get(one.id) or one.period_ns or int(began.diff().median() or 0)
         trigger: dict[str, Any] = {"timer": format_duration(round(period, -3))}
         if set(read) <= published:
             trigger = {"synchronises": read} if len(read) > 1 else {"subscription": read[0]}

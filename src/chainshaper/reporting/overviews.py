@@ -16,7 +16,7 @@ from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
 from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
-from chainshaper.reporting.latency import expected_text
+from chainshaper.reporting.latency import expected_jitter_text
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
@@ -61,7 +61,9 @@ SWEEP_FIGURES = {
     "band_jitter_ns": "jitter\nin a band",
     "late": "late",
     "incomplete": "no output",
+    "kept": "promise",
 }
+PROMISE = {True: "met", False: "broken", None: ABSENT}
 
 
 def contents_json(recording: Recording) -> dict[str, Any]:
@@ -367,8 +369,8 @@ def plan_table(plan: Plan) -> ResultTable:
             what = "publisher" if publishes else ", ".join(thread.callbacks)
             threads.append(f"{thread.node} ({what})" if what else thread.node)
         table.add(one.name, one.core, one.priority, slots_ms(*one.slots), ", ".join(threads))
-    offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
-    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_text(plan)}"
+    offset = f", offset {milliseconds(plan.offset_ns)}" if plan.offset_ns else ""
+    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_jitter_text(plan)}"
     return table
 
 
@@ -487,6 +489,10 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             if one.shares:
                 others = max(1.0 - one.early - sum(one.shares), 0.0)
                 title += f", before the first: {percent(one.early)}, outside: {percent(others)}"
+        if one.kept is not None:
+            met = "met" if one.kept else "broken"
+            title += f"; promise {met} over the hour: {one.outputs.text},"
+            title += f" {one.outputs.most_missed} at most"
         names = ("cycles", "min", "p50", "p99", "max", "jitter", "late", "incomplete")
         table = ResultTable(title, [*words("last [ms]"), *figures(*names)], one.problem)
         for span, own in one.spans.items():
@@ -551,6 +557,7 @@ def sweep_table(frame: pl.DataFrame) -> ResultTable:
     names = [name.removesuffix("_ns") for name in (*axes, *SWEEP_FIGURES.values())]
     table = ResultTable("Simulated end-to-end latency [ms]", figures(*names))
     for row in frame.head(MOST_ROWS).to_dicts():
+        row["kept"] = PROMISE[row["kept"]]
         found = [ms(row[n]) if n.endswith("_ns") else row[n] for n in SWEEP_FIGURES]
         if row["error"] is not None:
             found = ["failed", *([""] * (len(found) - 1))]

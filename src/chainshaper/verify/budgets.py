@@ -15,23 +15,22 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 from xml.etree import ElementTree
 
 import polars as pl
 import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
-from chainshaper.analysis import DataFlow, data_flow
+from chainshaper.analysis import data_flow
+from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.latency import (
     PERCENTILES,
-    LatencyAnalysis,
     LatencyStatistics,
     Longest,
     latency_statistics,
     longest_times,
 )
-from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.durations import duration_text
@@ -40,6 +39,7 @@ from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
 from chainshaper.verify.measure import PARTS, chain_of, hop_breakdown, measure_latency
+from chainshaper.verify.promises import OutputsDue, outputs_due, undisturbed_outputs_due
 
 if TYPE_CHECKING:
     from chainshaper.verify.slowdowns import Compared
@@ -166,15 +166,17 @@ def save_budget(budget: Budget, path: str | Path) -> Path:
 def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float = ROOM) -> Budget:
     """What was measured, and ``room`` beyond it, as limits for chains, hops and callbacks.
 
-    Without ``chains``, of the chain that the recording names. Raises InputError: no such chain.
+    Without ``chains``, of the chain that it names, or the only one in it. Raises InputError: no
+    such chain.
     """
 
     def limit(ns: float | None) -> int | None:
         return None if ns is None else -int(-ns * (1 + room) // GRAIN_NS) * GRAIN_NS or None
 
     of_chains, flow = [], data_flow(recording.events, recording.info.clock_offset_ns)
-    for chain in chains or [chain_of(recording, None)]:
+    for chain in chains or [chain_of(recording, None, flow)]:
         analysis = measure_latency(recording, chain, flow=flow).analysis
+        refuse_contradicted(flow.contradictions, analysis.chain.callbacks, recording.path)
         figures = analysis.statistics
         wanted: tuple[Percentile, ...] = ("50", "99")
         percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}
@@ -182,7 +184,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
             HopBudget(topic=topic, **{f"{part}_ns": limit(most) for part, most in parts.items()})
             for topic, parts in _longest_parts(hop_breakdown(analysis)).items()
         )
-        missing = _missing(analysis.traversals, _under_way_from(flow, analysis)) or 0.0
+        missing = outputs_due(analysis).share or 0.0
         of_chains.append(
             ChainBudget(
                 chain=chain,
@@ -218,9 +220,8 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))
         because = _from_where(hops, parts) or "no cycle was complete"
-        cycles, open_ns = analysis.traversals, _under_way_from(flow, analysis)
-        calm = _missing(cycles.filter(~pl.col("disturbed")), open_ns)
-        every = _chain_limits(chain, analysis.statistics, _missing(cycles, open_ns))
+        calm = undisturbed_outputs_due(analysis).share
+        every = _chain_limits(chain, analysis.statistics, outputs_due(analysis).share)
         undisturbed = _chain_limits(chain, analysis.undisturbed, calm)
         for limit, (_, _, at_rest) in zip(every, undisturbed, strict=True):
             one = Judged(name, chain.chain, *limit, at_rest)
@@ -271,8 +272,8 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
         if stopped and chain.missing is not None and now.counted["complete"]:
             found.append(Judged("now", chain.chain, "missing", chain.missing, 1.0, because=stopped))
             chain = chain.model_copy(update={"missing": None})  # noqa: PLW2901
-        if every := minute.count + minute.incomplete:
-            missing = ((minute.late or 0) + minute.incomplete) / every
+        missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).share
+        if missing is not None:
             why = None if minute.count else "no cycle was complete"
             limits = _chain_limits(chain, minute, missing)
             found += [Judged("now", chain.chain, *one, because=why) for one in limits]
@@ -311,26 +312,6 @@ def _chain_limits(
         yield "jitter", chain.jitter_ns, found.jitter_ns
     if chain.missing is not None:
         yield "missing", chain.missing, missing
-
-
-def _under_way_from(flow: DataFlow, analysis: LatencyAnalysis) -> int:
-    """Cycles that began behind this instant may have been under way as the recording ended."""
-    end: Any = flow.instances["start"].max() or 0
-    return int(end) - (analysis.statistics.max_ns or 0)
-
-
-def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
-    """The share of outputs that were late or never came; those are not missing that were under way
-    at the end, or owed for nothing (:data:`~.traversals.OWES_NO_OUTPUT`).
-    """
-    over = traversals.filter(
-        pl.col("complete") | (pl.col("start") <= under_way_from_ns),
-        ~pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False),
-    )
-    if not over.height:
-        return None
-    gone = over.select((~pl.col("complete") | pl.col("late").fill_null(False)).sum()).item()
-    return float(gone) / over.height
 
 
 def _longest_parts(parts: pl.DataFrame) -> dict[str, dict[str, float | None]]:

@@ -87,6 +87,11 @@ class Measurement:
     prediction: JudgedPrediction | None
     left_out: LeftOut
 
+    @property
+    def period_ns(self) -> int | None:
+        """The period of the timer that starts the chain; None: no timer does."""
+        return _period_of(self.analysis)
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -95,23 +100,48 @@ class Comparison:
     chain: str
     measurements: tuple[Measurement, ...]
 
+    @property
+    def remark(self) -> str | None:
+        """What makes its recordings hard to compare: other periods; None: nothing does."""
+        periods = {one.recording.path.name: one.period_ns for one in self.measurements}
+        if len({*periods.values()} - {None}) < 2:
+            return None
+        found = ", ".join(
+            f"every {duration_text(period)} in {name}" for name, period in periods.items() if period
+        )
+        return f"{self.chain} starts {found}: these are different applications"
 
-def chain_of(recording: Recording, chain: str | None) -> str:
-    """The chain that was asked for, or the one that the recording itself names.
 
-    Raises InputError: neither names one.
+class SeveralChainsError(InputError):
+    """No chain was named, and the recording has several, or none."""
+
+
+def chain_of(recording: Recording, chain: str | None, flow: DataFlow | None = None) -> str:
+    """The chain that was asked for, that the recording itself names, or the only one in it.
+
+    ``flow`` is the recording's data flow, where that has been resolved already. Raises
+    SeveralChainsError: none was asked for or named, and it has several, or none.
     """
     named = chain or recording.info.chain
     if named is not None:
         return named
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = flow or data_flow(recording.events, recording.info.clock_offset_ns)
     found = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
+    if found.complete and len(found.chains) == 1:
+        return found.chains[0].spec
     known = " or ".join(f"--chain {one.spec}" for one in found.chains)
     more = "" if found.complete else ", or others (`chainshaper chains`)"
-    raise InputError(
+    raise SeveralChainsError(
         f"{recording.path} names no chain of interest: "
         + (f"add {known}{more}" if known else "and no chain is in it, see `chainshaper graph`")
     )
+
+
+def taken_chain(recording: Recording, chain: str | None, spec: str) -> tuple[str, ...]:
+    """A note that ``spec`` was taken since it is the only chain; none where one was named."""
+    if chain is not None or recording.info.chain is not None:
+        return ()
+    return (f"no --chain was given: {spec} is the only chain in {recording.path}.",)
 
 
 def measure_latency(
@@ -157,12 +187,16 @@ def _measured(
         recording = replace(recording, events=events.happened(recording.events, *spell))
     measurements = []
     for chain in chains:
-        begun = _in_front(chain_of(recording, chain), joint)
+        spec = chain_of(recording, chain, flow)
+        begun = _in_front(spec, joint)
         found = analyse_latency(flow, begun, due=due, between=spell)
-        analysis = replace(found, notes=(*info.notes, *found.notes))
+        notes = (*taken_chain(recording, chain, spec), *info.notes, *found.notes)
+        analysis = replace(found, notes=notes)
         output = analysis.chain.topics[-1]
         own = None if joint is None else plan_of_chain(joint, output)
         planned_for = own is not None and own.chain.output in (None, output)
+        if own is not None and planned_for:
+            _refuse_other_period(own, analysis, recording)
         decided = gate_releases(recording, own, analysis)
         measurements.append(
             Measurement(
@@ -179,6 +213,22 @@ def _measured(
             )
         )
     return measurements
+
+
+def _period_of(analysis: LatencyAnalysis) -> int | None:
+    return analysis.graph.callbacks[analysis.chain.callbacks[0]].period_ns
+
+
+def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recording) -> None:
+    """Refuse to judge by a plan whose cycle is not the chain's period, or several of them (a source
+    may be faster than the cycle)."""
+    period = _period_of(analysis)
+    if period is not None and plan.cycle_ns % period:
+        raise InputError(
+            f"{recording.path}: {analysis.chain.spec} starts every {duration_text(period)} there,"
+            f" and the plan's cycle is {duration_text(plan.cycle_ns)}: name the plan that was in"
+            " force, or plan again"
+        )
 
 
 def _in_front(chain: str, plan: ApplicationPlan | None) -> str:

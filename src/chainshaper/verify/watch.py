@@ -40,7 +40,7 @@ from chainshaper.analysis.latency import (
 from chainshaper.analysis.objects import Objects, resolve_objects
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.gate.decision import clock_offset
-from chainshaper.planning import ApplicationPlan
+from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import (
@@ -60,6 +60,7 @@ from chainshaper.values.events import EventTables
 from chainshaper.values.recording import InForceInfo, Recording, refuse_existing, write_recording
 from chainshaper.verify.measure import PARTS
 from chainshaper.verify.predictions import due_of
+from chainshaper.verify.promises import OutputsDue
 
 SECOND = 1_000_000_000
 SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
@@ -106,7 +107,9 @@ class ChainNow:
     the plan's; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
     ``incomplete``, ``unclear``, whose messages no event before Iron tells apart while
     CLOCK_REALTIME is set, and ``not_used``: older than the message that the chain's timer or
-    synchroniser used, so no output is missing. ``problem`` says why nothing goes through the chain.
+    synchroniser used, so no output is missing. ``kept`` says whether the plan's promise was kept
+    over the hour, as ``outputs`` has it (None: no plan, or no cycle). ``problem`` says why nothing
+    goes through the chain.
     """
 
     chain: str
@@ -119,6 +122,8 @@ class ChainNow:
     moved_ns: int
     counted: Mapping[str, int]
     problem: str | None
+    outputs: OutputsDue
+    kept: bool | None
 
 
 @dataclass(frozen=True)
@@ -146,7 +151,7 @@ class Seen:
         statuses = []
         for one in self.chains:
             minute = one.spans["minute"]
-            missing = (minute.late or 0) + minute.incomplete
+            missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).missed
             level, text = 2, one.problem or "no output in the last minute"
             if minute.count:
                 level = int(missing > 0)
@@ -278,6 +283,11 @@ class Watch:
 
     def _due(self, output: str) -> Due | None:
         return next((due for due in self.due if due.output in (None, output)), None)
+
+    def _plan_of(self, output: str) -> Plan | None:
+        """The plan whose promise is about a chain with this output."""
+        plans = () if self.plan is None else self.plan.chains
+        return next((one for one in plans if one.chain.output in (None, output)), None)
 
     def _slots(self, output: str) -> tuple[tuple[int, int], ...]:
         due = self._due(output) or Due(0)
@@ -413,9 +423,12 @@ class Watch:
         begun = one.cycles["start"].filter(one.cycles["start"] > over_ns - SPANS["minute"])
         shares, early = one.shares()
         lasted = begun[-1] - begun[0] if len(begun) > 1 else 0
+        spans = {name: one.statistics(over_ns - span) for name, span in SPANS.items()}
+        hour, plan = spans["hour"], self._plan_of(one.output)
+        outputs = OutputsDue.of(hour.count, hour.late, hour.incomplete, plan)
         return ChainNow(
             chain=one.text,
-            spans={name: one.statistics(over_ns - span) for name, span in SPANS.items()},
+            spans=spans,
             rate_hz=(len(begun) - 1) * SECOND / lasted if lasted else 0.0,
             hops=tuple(_hops(one)),
             shares=shares,
@@ -424,6 +437,8 @@ class Watch:
             moved_ns=moved_ns,
             counted=dict(one.counted),
             problem=one.problem,
+            outputs=outputs,
+            kept=outputs.kept,
         )
 
     @property
