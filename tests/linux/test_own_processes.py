@@ -13,7 +13,7 @@ from unittest import mock
 
 import pytest
 from known import known
-from processes import wait_for
+from processes import is_alive, wait_for
 from small_chain import small_chain_text
 
 import chainshaper
@@ -293,3 +293,13 @@ def _group(leader: int) -> list[int]:
     """Living processes of a group."""
     stats = ((pid, fields) for pid, fields in all_stats() if fields[0] != b"Z")
     return [pid for pid, (_, _, group, *_) in stats if int(group) == leader]
+
+
+def test_a_group_whose_leader_was_waited_for_is_ended_by_who_is_in_it(tmp_path: Path) -> None:
+    """The number of a process that was waited for may be another's: it is not signalled."""
+    left = tmp_path / "left"
+    command = start_command(["sh", "-c", f"sleep 60 & echo $! > {left}"])
+    command.wait()
+    pid = int(left.read_text())
+    end_command(command, patience_s=2)
+    wait_for(lambda: not is_alive(pid), "what it had left behind to end")

@@ -132,9 +132,11 @@ def test_figures_of_a_run_known_by_hand(page: _Reader, section: str, row: list[s
 
 def test_hops_plan_and_notes_of_a_run_known_by_hand(page: _Reader) -> None:
     first, second, gate, _ = [row[1:] for row in page.rows["hops"][1:]]
-    assert first == ["3", "–", "–", "–", "–", "4.000", "4.000", "4.000", "13.3%"]
+    waited = ["0.000", "0.000", "0.000", "0.0%"]
+    assert first == ["3", "–", "–", "–", "–", "4.000", "4.000", "4.000", "13.3%", *waited]
     assert second[:5] == ["3", "1.000", "1.000", "1.000", "3.3%"]
-    assert gate[5:8] == ["14.020", "14.020", "14.020"]
+    assert gate[5:8] == ["0.000", "0.000", "0.000"], "the gate computes nothing,"
+    assert gate[9:12] == ["14.020", "14.020", "14.020"], "it waits for the slot"
     assert "shaping_node:" in "".join(page.text), "the plan as YAML"
     assert "known: the first 5 cycles warmed up" in page.text
     drawn = page.data["bars"]["slots-0"]
@@ -170,7 +172,7 @@ def test_every_figure_before_and_after_is_the_librarys(
             times = [getattr(one, field) for one in found]
             expected = ["–" if time is None else milliseconds(time) for time in times]
             assert rows[title] == expected, (place, kind, title)
-    hops = hop_breakdown(measurements[1].analysis).select("count", "computation_share")
+    hops = hop_breakdown(measurements[1].analysis).select("count", "waiting_share")
     shares = [(str(count), f"{share:.1%}") for count, share in hops.iter_rows()]
     assert [(row[1], row[-1]) for row in page.rows["hops"]][-len(shares) - 1 : -1] == shares
 

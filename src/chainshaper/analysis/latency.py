@@ -81,13 +81,16 @@ def summary(times: pl.Expr) -> pl.Expr:
 def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     """Count, response and execution times of every callback that was seen to run, one row each.
 
-    Columns: ``callback_id, node, kind, topic, period_ns, symbol, pid, tids, count, unfinished,
-    response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in ns (means as
-    floats), null where no instance has such a time. ``period_ns`` is the timer's own period.
+    Columns: ``callback_id, node, kind, topic, period_ns, symbol, pid, pids, tids, count,
+    unfinished, response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in ns
+    (means as floats), null where no instance has such a time. ``period_ns`` is the timer's own
+    period, ``pids`` are all processes of a node that was started again, ``pid`` is the last.
     """
-    about = flow.objects.callbacks.unique("callback_id", maintain_order=True)
+    # Of a callback's registrations those of its node's last process come first.
+    about = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
     ran = flow.instances.filter(~pl.col("assumed")).group_by("callback_id")
     figures = ran.agg(
+        pids=pl.col("pid").unique(maintain_order=True),
         tids=pl.col("tid").unique().sort(),
         count=pl.len(),
         unfinished=pl.col("end").null_count(),
@@ -150,11 +153,13 @@ def executors(flow: DataFlow) -> list[Executor]:
     Python the main thread, which gives them their work.
     """
     found: list[Executor] = []
-    calls = timer_calls(flow.events, flow.objects).select("callback_id", "tid")
-    ran = pl.concat([flow.instances.select("callback_id", "tid"), calls]).unique()
+    who = ("callback_id", "pid", "tid")  # threads of processes that were followed are no more
+    calls = timer_calls(flow.events, flow.objects).select(who)
+    ran = pl.concat([flow.instances.select(who), calls]).unique()
     about = flow.objects.callbacks.filter((pl.col("kind") != "unknown") | pl.col("observed"))
-    about = about.unique("callback_id").join(
-        ran.group_by("callback_id").agg(tids=pl.col("tid").sort()), on="callback_id"
+    about = about.unique("callback_id", keep="first", maintain_order=True).join(
+        ran.group_by("callback_id", "pid").agg(tids=pl.col("tid").sort()),
+        on=["callback_id", "pid"],
     )
     columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids", "observed")
     for row in about.sort("callback_id").select(*columns).iter_rows():
@@ -248,7 +253,7 @@ def analyse_latency(
     received = reception(flow, found, graph)
     sent, arrived = judged["end"].fill_null(0), received["received"].fill_null(-1)
     on_its_way = pl.Series(stalled_after(flow, sent.to_numpy(), arrived.to_numpy()))
-    frame = judged.drop("origin", "computed_at").with_columns(
+    frame = judged.drop("origin", "computed_at", "expected_at").with_columns(
         *(received["received"], received["reception_ns"]),
         disturbed=hit,
         reception_disturbed=hit | on_its_way,

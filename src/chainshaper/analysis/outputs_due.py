@@ -4,7 +4,8 @@ An output is due for every traversal, but for
 
 * one that was under way as the recording, or the plan's time in force, ended: it was to be out
   later than that;
-* one of a lifecycle node that was not active;
+* one of a lifecycle node that was not active, or of a message of which a timer or a synchroniser
+  used a newer one (:data:`~.traversals.OWES_NO_OUTPUT`);
 * one that a gate replaced by another of its cycle, or let another go first, as its plan has it
   (``messages``).
 
@@ -20,6 +21,7 @@ import polars as pl
 
 from chainshaper.analysis.disturbance import Due
 from chainshaper.analysis.flow import DataFlow
+from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.values.application import Chain
 
 ENDING_NS = 3_000_000_000  # in so long an application ends,
@@ -46,7 +48,8 @@ def with_outputs_due(
     replaced = releases.filter(pl.col("dropped").is_in(_AS_PLANNED))["traversal"]
     reason = pl.col("reason").cast(pl.String)
     expected = (reason == "discarded") | (pl.col("start") + limit <= ended)
-    due = pl.col("complete") | (expected & reason.ne_missing("inactive"))
+    owes_none = reason.is_in(OWES_NO_OUTPUT).fill_null(False)
+    due = pl.col("complete") | (expected & ~owes_none)
     as_planned = pl.col("traversal").is_in(replaced.implode()) & ~pl.col("complete")
     return frame.with_columns(was_due=(due & ~as_planned).fill_null(False))
 

@@ -99,10 +99,12 @@ SINK: list[str] | None = option(
 JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
     "--chain FIRST..LAST",
-    "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
+    "The chain, by topics or nodes: /t1../t5. Default: the one the recording names, or the only"
+    " one in it.",
 )
 CHAINS: list[str] | None = option(
-    "--chain FIRST..LAST", "A chain (may be repeated). Default: the one the recording names."
+    "--chain FIRST..LAST",
+    "A chain (may be repeated). Default: the one the recording names, or the only one in it.",
 )
 STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.", False)
 PLAN_IN_FORCE: Path | None = option(

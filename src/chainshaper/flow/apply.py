@@ -46,6 +46,7 @@ from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, OperationError
+from chainshaper.values.files import write_whole
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
@@ -314,8 +315,8 @@ class _Run:
         self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
 
     def save_plan(self) -> None:
-        with suppress(OSError):  # a full /run ends no plan; recordings lack it then
-            (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
+        with suppress(OperationError):  # a full /run ends no plan; recordings lack it then
+            write_whole(self.folder / PLAN_FILE, [json.dumps(plan_values(self.given)).encode()])
 
     def begins(self, place: int) -> int:
         """Where the chain at this place begins in its cycles."""
@@ -403,6 +404,8 @@ class _Run:
                 drifts = self.drifts = self.drift_watches()
                 following, sent, said = self.follow(servers, drifts), dict[int, int](), list[str]()
             is_over = self.command_ended or self.stop.is_set()
+            for failure in {one.failure for one in drifts} - {None}:
+                self.note(f"whether cycles begin elsewhere by now is not known any more: {failure}")
             followed_ns = next(following)
             seen = {k: ns for k, one in enumerate(drifts) if (ns := one.surely_ns) is not None}
             for k, ns in seen.items():

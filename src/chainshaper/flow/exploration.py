@@ -21,7 +21,7 @@ from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.flow.plan import inputs_of
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.sources.lttng.trace import table_name
+from chainshaper.sources.lttng.sessions import table_name
 from chainshaper.values.application import INTERNAL_TOPICS
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import InputError
@@ -46,7 +46,10 @@ def list_chains(
 def named_chain(file: str | Path, name: str | None = None) -> str:
     """The chain that a CARET architecture file calls ``name``, which only one path needs not."""
     paths = load_named_paths(file)
-    known = ", ".join(paths) or "none"
+    known = ", ".join(paths)
+    if not paths:
+        remedy = "name a path in it (CARET's documentation says how), or leave out --chains"
+        raise InputError(f"{file}: no path is named in it: {remedy}")
     if name is None and len(paths) != 1:
         raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
     name = next(iter(paths)) if name is None else name

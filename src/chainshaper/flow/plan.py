@@ -34,7 +34,7 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
-from chainshaper.verify.measure import chain_of, longest_stall, opened
+from chainshaper.verify.measure import PARTS, chain_of, longest_stall, opened
 from chainshaper.verify.promises import NOT_PUBLISHED
 from chainshaper.workload.description import Application, node_name
 from chainshaper.workload.live import timing_of
@@ -57,10 +57,11 @@ def profile_chains(
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
     ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
-    names. All times but ``every_latency_ns`` are over cycles that the machine did not disturb (of
-    fewer than two: over all). Of ``modes``, each has a profile of its own: of its recording or file
-    of latencies in ``mode_recordings``, or of the cycles that began in it, by the description of
-    what ran. What happened before ``since_ns`` or from ``until_ns`` on is left out.
+    names, or the only one in it. All times but ``every_latency_ns`` are over cycles that the
+    machine did not disturb (of fewer than two: over all). Of ``modes``, each has a profile of its
+    own: of its recording or file of latencies in ``mode_recordings``, or of the cycles that began
+    in it, by the description of what ran. What happened before ``since_ns`` or from ``until_ns`` on
+    is left out.
 
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
@@ -72,7 +73,7 @@ def profile_chains(
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
+    analyses = [analyse_latency(flow, chain_of(recording, chain, flow)) for chain in chains]
     stages = [graph_stages(one.graph, one.chain) for one in analyses]
     planned = {number for own in stages for stage in own for number in stage.members}
     chained = {number for one in analyses for number in one.chain.callbacks}
@@ -166,7 +167,7 @@ def _profile_of(
         every_step_ns=steps[every["traversal"].to_numpy()],
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=analysis.statistics.incomplete,
+        incomplete=analysis.statistics.incomplete - analysis.incomplete.get("not used", 0),
         unpublished=analysis.incomplete.get(NOT_PUBLISHED, 0),
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
@@ -395,7 +396,8 @@ def _steps(
         own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
         own = own.with_columns(pl.coalesce("end", "publish"))
         row, start, end = (own[name].to_numpy() for name in ("traversal", "start", "end"))
-        steps[row, hop] = (own["communication_ns"].fill_null(0) + own["computation_ns"]).to_numpy()
+        parts = (own[f"{part}_ns"].fill_null(0) for part in PARTS)
+        steps[row, hop] = sum(parts, own["hop"] * 0).to_numpy()
         if hop:
             same = [one for one in planned if core[one] == core[number]]
             others = ran.filter(pl.col("callback_id").is_in(same))

@@ -47,7 +47,7 @@ from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.arrays import build_system
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
-from chainshaper.values.files import new_file, write_whole
+from chainshaper.values.files import new_file, open_output, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.verify.promises import OutputsDue
 from chainshaper.workload.description import Application, application_as_written, origin_timer
@@ -578,7 +578,8 @@ def finished_rows(
     """
     about = json.loads(json.dumps(about))
     try:
-        with path.open("a+", encoding="utf-8", errors="surrogateescape") as file:
+        descriptor = open_output(path, os.O_RDWR | os.O_APPEND)
+        with os.fdopen(descriptor, "a+", encoding="utf-8", errors="surrogateescape") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -616,7 +617,10 @@ def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]
     whole = text[: text.rfind("\n") + 1]
     try:
         length = len(whole.encode())  # ValueError, as below: not all of it is UTF-8
-        first, *rows = map(json.loads, whole.splitlines() or [json.dumps(about)])
+        begun = json.dumps(about)
+        if not whole and not begun.startswith(text):
+            raise ValueError  # it has no whole line, and not what a crash leaves of the first
+        first, *rows = map(json.loads, whole.split("\n")[:-1] or [begun])
         finished = {row["number"]: row["row"] for row in rows}
         changed = [name for name in about if first[name] != about[name]]
     except (ValueError, KeyError, TypeError) as error:

@@ -5,6 +5,7 @@ say which nodes a process has, the callbacks that ran which threads execute.
 """
 
 import math
+import os
 import platform
 import re
 import time
@@ -42,12 +43,14 @@ from chainshaper.planning.plan import (
     shaping_nodes,
 )
 from chainshaper.planning.request import simulated_stamps
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError, text_of
+from chainshaper.values.files import read_regular
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
 
 
+_LONGEST_SETTINGS = 1 << 20  # of a file of a node's parameters or profiles (bytes)
 LEAD_NS = 2_000_000  # the cycle starts so long after the chain's timer expires (DESIGN section 6)
 
 
@@ -164,12 +167,14 @@ def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
 
 
 def _follows_clock(pid: int) -> bool:
-    words = read_proc(f"/proc/{pid}/cmdline").decode(errors="replace").split("\0")
+    words = os.fsdecode(read_proc(f"/proc/{pid}/cmdline")).split("\0")
     texts = [one for one in words if one.startswith("use_sim_time")]
     for option, file in pairwise(words):
         if option == "--params-file":  # as `ros2 launch` writes one for each node
             with suppress(OSError):
-                texts.append(Path(f"/proc/{pid}/cwd", file).read_text(errors="replace"))
+                texts.append(
+                    text_of(read_regular(Path(f"/proc/{pid}/cwd", file), _LONGEST_SETTINGS))
+                )
     return any(re.search(r"\buse_sim_time\W+true\b", one, re.IGNORECASE) for one in texts)
 
 
@@ -208,9 +213,8 @@ def _asynchronous(pid: int) -> dict[str, bool]:
     modes: dict[str, bool] = {}
     for name in (*files, "DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml"):
         with suppress(OSError, ElementTree.ParseError):
-            if not (file := Path(f"/proc/{pid}/cwd", name or "")).is_file():
-                continue
-            for one in ElementTree.parse(file).iter():  # noqa: S314 - entities: expat bounds them
+            content = read_regular(Path(f"/proc/{pid}/cwd", name or ""), _LONGEST_SETTINGS)
+            for one in ElementTree.fromstring(content).iter():  # noqa: S314 - expat bounds entities
                 if one.tag.rpartition("}")[2] in ("data_writer", "publisher"):
                     kind = one.findtext(".//{*}publishMode/{*}kind", "").strip()
                     modes.setdefault(one.get("profile_name", ""), kind == "ASYNCHRONOUS")

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from chainshaper.linux.scheduling import signalled_with_parent
-from chainshaper.linux.threads import all_stats
+from chainshaper.linux.threads import all_stats, open_process
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import why_distrusted
 
@@ -130,11 +130,28 @@ def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if _over(started):
             return
-        with contextlib.suppress(ProcessLookupError):
-            os.killpg(started.pid, number)
+        _signal_group(started, number)
         deadline = time.monotonic() + patience_s
         while not _over(started) and time.monotonic() < deadline:
             time.sleep(_LOOK_S)
+
+
+def _signal_group(started: subprocess.Popen[bytes], number: int) -> None:
+    """Signal the command's process group, and no other that has its number by now."""
+    if started.returncode is None:  # it has not been waited for: the number is its own
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(started.pid, number)
+        return
+    stats = dict(all_stats())
+    if started.pid in stats:  # another's, so nothing is left of the group
+        return
+    for pid, (_, _, group, session, *others) in stats.items():
+        if int(group) == int(session) == started.pid:
+            pidfd = open_process(pid, int(others[15]))
+            if pidfd is not None:
+                with contextlib.suppress(OSError):  # it has ended, or is another user's
+                    signal.pidfd_send_signal(pidfd, number)
+                os.close(pidfd)
 
 
 def _over(started: subprocess.Popen[bytes]) -> bool:

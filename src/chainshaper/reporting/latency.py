@@ -405,24 +405,30 @@ def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
 
 
 def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
-    """The breakdown as plain data: ``hops``, and the two parts' shares of the mean latency."""
+    """The breakdown as plain data: ``hops``, and the parts' shares of the mean latency."""
     frame = hop_breakdown(analysis)
     shares = {f"{part}_share": share for part, share in part_shares(frame).items()}
     return {"hops": frame.to_dicts(), **shares}
 
 
 def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
-    """Every hop's communication and computation, and their shares of the mean latency."""
+    """Every hop's communication, computation and waiting, and their shares of the mean latency.
+
+    Where no message waits in a node, that has no columns.
+    """
     frame = hop_breakdown(analysis)
+    waits = frame["waiting_ns"].struct.field("max").fill_null(0).max()
+    shown = PARTS if waits else PARTS[:2]
     cycles = Column("cycles", footer=str(analysis.statistics.count), detail=True)
     columns = [Column("hop", words=True, footer="together"), cycles]
     for part, share in part_shares(frame).items():
-        columns += [Column(f"{part}\nmin", detail=True), *figures(f"{part}\nmean", "max")]
-        columns.append(Column("share", footer=percent(share)))
+        if part in shown:
+            columns += [Column(f"{part}\nmin", detail=True), *figures(f"{part}\nmean", "max")]
+            columns.append(Column("share", footer=percent(share)))
     table = ResultTable("Where it goes, hop by hop [ms]", columns)
     for row in frame.iter_rows(named=True):
         cells: list[str] = []
-        for part in PARTS:
+        for part in shown:
             cells += [*min_mean_max(row[f"{part}_ns"]), percent(row[f"{part}_share"])]
         table.add(f"{row['callback']} → {row['topic']}", row["count"], *cells)
     return table

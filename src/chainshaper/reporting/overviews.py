@@ -44,7 +44,7 @@ from chainshaper.values.recording import (
     event_counts,
     lost_text,
 )
-from chainshaper.verify.measure import Measurement
+from chainshaper.verify.measure import PARTS, Measurement
 
 if TYPE_CHECKING:  # only their verbs import them
     from chainshaper.verify.budgets import Judged
@@ -112,8 +112,9 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
 
 
 def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
-    """Callback statistics as plain data: response and execution times in ns."""
-    columns = ("node", "kind", "topic", "period_ns", "pid", "tids", "count")
+    """Callback statistics as plain data: response and execution times in ns; ``pid`` is the last
+    of ``pids``, the processes of a node that was started again."""
+    columns = ("node", "kind", "topic", "period_ns", "pid", "pids", "tids", "count")
     return statistics.select(*columns, "response_ns", "execution_ns").to_dicts()
 
 
@@ -157,7 +158,7 @@ def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
     return {
         "chain": chain.spec,
         "nodes": [callback.node for callback in path],
-        "callbacks": [callback.label for callback in path],
+        "callbacks": [graph.label(callback) for callback in path],
         "topics": list(chain.topics),
     }
 
@@ -500,13 +501,15 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             table.add(span, own.count, *times, own.late, own.incomplete)
         tables.append(table)
         if one.hops:
-            hops = ResultTable("", [*words("node", "topic"), *figures("waits", "computes")])
+            hops = ResultTable("", [*words("node", "topic"), *figures(*PARTS)])
             for hop in one.hops:
-                hops.add(hop.node, hop.topic, ms(hop.communication_ns), ms(hop.computation_ns))
+                hops.add(hop.node, hop.topic, *(ms(getattr(hop, f"{part}_ns")) for part in PARTS))
             tables.append(hops)
     lost = f"; {seen.lost} events lost" if seen.lost else ""
     if unclear := sum(one.counted["unclear"] for one in seen.chains):
         lost += f"; {unclear} cycles unclear: the clock was set"
+    if unused := sum(one.counted["not_used"] for one in seen.chains):
+        lost += f"; {unused} messages not used: newer ones were stored"
     tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
     return tables
 
