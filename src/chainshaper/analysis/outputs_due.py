@@ -6,6 +6,7 @@ An output is due for every traversal, but for
   later than that;
 * one of a lifecycle node that was not active, or of a message of which a timer or a synchroniser
   used a newer one (:data:`~.traversals.OWES_NO_OUTPUT`);
+* one of a message of which no event says who took it: whether its output came is not known;
 * one that a gate replaced by another of its cycle, or let another go first, as its plan has it
   (``messages``).
 
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis.disturbance import Due
+from chainshaper.analysis.disturbance import Due, timer_period
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.values.application import Chain
@@ -27,6 +28,7 @@ from chainshaper.values.application import Chain
 ENDING_NS = 3_000_000_000  # in so long an application ends,
 ENDING_PART = 10  # or in such a part of a short recording
 _CATCHES_UP = 8  # beginnings in which one that was delayed catches up
+NOT_RECORDED = "take not recorded"
 _AS_PLANNED = ["replaced", "surplus"]
 
 
@@ -48,7 +50,7 @@ def with_outputs_due(
     replaced = releases.filter(pl.col("dropped").is_in(_AS_PLANNED))["traversal"]
     reason = pl.col("reason").cast(pl.String)
     expected = (reason == "discarded") | (pl.col("start") + limit <= ended)
-    owes_none = reason.is_in(OWES_NO_OUTPUT).fill_null(False)
+    owes_none = reason.is_in([*OWES_NO_OUTPUT, NOT_RECORDED]).fill_null(False)
     due = pl.col("complete") | (expected & ~owes_none)
     as_planned = pl.col("traversal").is_in(replaced.implode()) & ~pl.col("complete")
     return frame.with_columns(was_due=(due & ~as_planned).fill_null(False))
@@ -74,8 +76,7 @@ def not_begun(
     Cycles in which its first callback ran and published nothing are not among them. Where a message
     begins the chain nothing was due without one.
     """
-    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
-    if first["period_ns"].max() is None:
+    if timer_period(flow, chain) is None:
         return 0
     own = flow.instances.filter(pl.col("callback_id") == chain.callbacks[0])["start"].sort()
     since_ns, until_ns = between or (0, None)
