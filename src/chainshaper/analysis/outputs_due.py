@@ -6,7 +6,6 @@ An output is due for every traversal, but for
   later than that;
 * one of a lifecycle node that was not active, or of a message of which a timer or a synchroniser
   used a newer one (:data:`~.traversals.OWES_NO_OUTPUT`);
-* one of a message of which no event says who took it: whether its output came is not known;
 * one that a gate replaced by another of its cycle, or let another go first, as its plan has it
   (``messages``).
 
@@ -28,7 +27,6 @@ from chainshaper.values.application import Chain
 ENDING_NS = 3_000_000_000  # in so long an application ends,
 ENDING_PART = 10  # or in such a part of a short recording
 _CATCHES_UP = 8  # beginnings in which one that was delayed catches up
-NOT_RECORDED = "take not recorded"
 _AS_PLANNED = ["replaced", "surplus"]
 
 
@@ -50,7 +48,7 @@ def with_outputs_due(
     replaced = releases.filter(pl.col("dropped").is_in(_AS_PLANNED))["traversal"]
     reason = pl.col("reason").cast(pl.String)
     expected = (reason == "discarded") | (pl.col("start") + limit <= ended)
-    owes_none = reason.is_in([*OWES_NO_OUTPUT, NOT_RECORDED]).fill_null(False)
+    owes_none = reason.is_in(OWES_NO_OUTPUT).fill_null(False)
     due = pl.col("complete") | (expected & ~owes_none)
     as_planned = pl.col("traversal").is_in(replaced.implode()) & ~pl.col("complete")
     return frame.with_columns(was_due=(due & ~as_planned).fill_null(False))
