@@ -246,7 +246,7 @@ def end_run(journal: Journal) -> tuple[str, ...]:
 
 def _wait_for_end(journal: Journal) -> bool:
     # Its command, which it ends on its way, has so long as well, and would run on without it.
-    deadline = time.monotonic() + PATIENCE_S + 3 * own_processes.PATIENCE_S
+    deadline = time.monotonic() + PATIENCE_S + 4 * own_processes.PATIENCE_S
     while journal.path.exists() and journal.owner is not None:
         if time.monotonic() > deadline:
             return False
