@@ -14,6 +14,7 @@ from chainshaper.analysis.disturbance import (
     disturbed,
     due_within,
     stalled_after,
+    timer_period,
     with_punctuality,
 )
 from chainshaper.analysis.flow import DataFlow, data_flow, timer_calls
@@ -192,7 +193,7 @@ class LatencyAnalysis:
     ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
     subscribes to the output). ``incomplete`` counts traversals without an end by reason, ``silent``
     instances of the first callback that began none, ``not_begun`` cycles of a plan in which it did
-    not run at all.
+    not run at all. ``period_ns`` is that of the timer that starts the chain (None: none does).
     """
 
     chain: Chain
@@ -208,6 +209,7 @@ class LatencyAnalysis:
     silent: int
     notes: tuple[str, ...]
     not_begun: int = 0
+    period_ns: int | None = None
 
     @property
     def decided(self) -> pl.DataFrame:
@@ -284,6 +286,7 @@ def analyse_latency(
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),
         not_begun=0 if own is None else not_begun(flow, chain, own, between),
+        period_ns=timer_period(flow, chain),
     )
 
 

@@ -87,11 +87,6 @@ class Measurement:
     prediction: JudgedPrediction | None
     left_out: LeftOut
 
-    @property
-    def period_ns(self) -> int | None:
-        """The period of the timer that starts the chain; None: no timer does."""
-        return _period_of(self.analysis)
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -103,7 +98,7 @@ class Comparison:
     @property
     def remark(self) -> str | None:
         """What makes its recordings hard to compare: other periods; None: nothing does."""
-        periods = {one.recording.path.name: one.period_ns for one in self.measurements}
+        periods = {one.recording.path.name: one.analysis.period_ns for one in self.measurements}
         if len({*periods.values()} - {None}) < 2:
             return None
         found = ", ".join(
@@ -215,14 +210,10 @@ def _measured(
     return measurements
 
 
-def _period_of(analysis: LatencyAnalysis) -> int | None:
-    return analysis.graph.callbacks[analysis.chain.callbacks[0]].period_ns
-
-
 def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recording) -> None:
     """Refuse to judge by a plan whose cycle is not the chain's period, or several of them (a source
     may be faster than the cycle)."""
-    period = _period_of(analysis)
+    period = analysis.period_ns
     if period is not None and plan.cycle_ns % period:
         raise InputError(
             f"{recording.path}: {analysis.chain.spec} starts every {duration_text(period)} there,"
