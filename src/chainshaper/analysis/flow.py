@@ -21,7 +21,7 @@ are assumed (``assumed``, no ``end``, no response time):
 
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import polars as pl
 
@@ -37,6 +37,7 @@ from chainshaper.analysis.messages import (
     with_departures,
 )
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objects
+from chainshaper.analysis.restarts import FOLLOWED, followed_processes
 from chainshaper.analysis.unseen_takes import with_unseen_takes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
@@ -63,6 +64,8 @@ class DataFlow:
     * ``notes``: what cannot be known, in plain words.
     * ``contradictions``: what in the events contradicts itself; their notes are in ``notes``.
     * ``untold``: subscriptions' callbacks that ran without any event of a take.
+    * ``followed``: see :func:`~chainshaper.analysis.restarts.followed_processes`. Callbacks of a
+      node that was started again have one ``callback_id`` in all frames.
     """
 
     objects: Objects
@@ -73,6 +76,7 @@ class DataFlow:
     notes: tuple[str, ...]
     contradictions: tuple[Contradiction, ...] = ()
     untold: frozenset[int] = frozenset()
+    followed: pl.DataFrame = field(default_factory=FOLLOWED.to_frame)
 
 
 def recorded_flow(recording: Recording) -> DataFlow:
@@ -86,12 +90,14 @@ def data_flow(
     clock_offset_ns: int = 0,
     objects: Objects | None = None,
     *,
+    ended: Collection[int] | None = None,
     complete: bool = False,
 ) -> DataFlow:
     """Resolve a recording's events.
 
     ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
-    ``objects`` are the tables' own, where they have been resolved already. ``complete``: it is
+    ``objects`` are the tables' own, where they have been resolved already. ``ended`` are the
+    processes that have ended, where that is known better than from events. ``complete``: it is
     known that no event was lost.
     """
     objects = objects or resolve_objects(tables)
@@ -100,7 +106,7 @@ def data_flow(
         sent, received = service_calls(tables, objects, clock_offset_ns)
         taken = takes(tables, objects, received)
         published = publications(tables, objects, sent)
-        taken, followed = link_takes(tables, taken, published, clock_offset_ns)
+        taken, stamped = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
     ends = without_disproved_ends(tables, instances, taken, objects.callbacks, complete=complete)
     instances = ends.instances
@@ -122,11 +128,15 @@ def data_flow(
         taken=taken,
         ends=ends,
         unseen=unseen,
-        stamped=followed,
+        stamped=stamped,
     )
     notes = (*objects.notes, *_notes(tables, instances, taken), *(one.note for one in seen))
     untold = frozenset(one.callback_id for one in unseen)
-    return DataFlow(objects, instances, published, taken, tables, notes, seen, untold)
+    followed = followed_processes(tables, objects, ended)
+    flow = DataFlow(
+        objects, instances, published, taken, tables, notes, seen, untold, followed=followed
+    )
+    return _with_restarts(flow)
 
 
 def _notes(
@@ -386,39 +396,58 @@ def _published_in(
     )
 
 
-def with_restarts(flow: DataFlow, ended: Collection[int]) -> DataFlow:
-    """The flow in which callbacks of processes that have ended are those that replace them.
+def _with_restarts(flow: DataFlow) -> DataFlow:
+    """The flow in which the callbacks of a node that was started again are those of its last
+    process, with a note for each such node.
 
-    A callback replaces another one where its node, kind and trigger are the same, in a process that
-    runs or, where none does, began later: its node was started again.
+    A callback replaces an earlier one where its node, kind and trigger are the same.
     """
-    gone, alike = pl.col("pid").is_in(list(ended)), ["node", "kind", "period_ns", "of"]
+    if flow.followed.is_empty():
+        return flow
+    alike = ["node", "kind", "period_ns", "of"]
     writes = flow.publications.group_by("callback_id").agg(wrote=pl.col("topic").first())
     known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
-    known = known.join(writes, on="callback_id", how="left", maintain_order="left").sort(
-        ~gone, "valid_from", maintain_order=True
-    )
+    known = known.join(writes, on="callback_id", how="left", maintain_order="left")
+    known = known.join(flow.followed, on=["node", "pid"], how="left", maintain_order="left")
     outside = (pl.col("kind") == "unknown") & (pl.col("handle") == 0)
     of = pl.when(outside).then(pl.col("wrote").cast(pl.String)).otherwise("topic")
-    known = known.with_columns(of=of)
+    known = known.with_columns(pl.coalesce("last_pid", "pid"), of=of)
+    runs_last = pl.col("pid") == pl.col("last_pid")
+    known = known.sort(runs_last, "valid_from", maintain_order=True)
     known = known.with_columns(place=pl.int_range(pl.len()).over("pid", *alike))
-    known = known.with_columns(
-        pl.col("callback_id", "pid").last().over(*alike, "place").name.prefix("new_")
+    latest = pl.col("callback_id").last().over("last_pid", *alike, "place")
+    known = known.with_columns(latest=latest)
+    # Numbers stay without gaps: they are places in the graph.
+    dense = pl.col("latest").rank("dense").cast(pl.UInt32) - 1
+    ids = dict(known.select("callback_id", dense).iter_rows())
+    renumbered = pl.col("callback_id").replace_strict(ids, return_dtype=pl.UInt32)
+    # Of a callback's registrations those of its last process come first: they describe it.
+    replaced = known.filter(pl.col("callback_id") != pl.col("latest"))["callback_id"]
+    superseded = pl.col("callback_id").is_in(replaced.implode())
+    callbacks = flow.objects.callbacks.sort(superseded, maintain_order=True).with_columns(
+        renumbered
     )
-    replaced = known.filter(gone & (pl.col("callback_id") != pl.col("new_callback_id")))
-    if replaced.is_empty():
-        return flow
-    ids = dict(replaced.select("callback_id", "new_callback_id").iter_rows())
-    pids = dict(replaced.select("new_callback_id", "new_pid").iter_rows())
-    number = pl.col("callback_id").replace(ids)
-    callbacks = flow.objects.callbacks.sort(gone, maintain_order=True).with_columns(number)
-    pid = number.replace_strict(pids, default=pl.col("pid"), return_dtype=pl.Int32())
+    buffers = flow.objects.buffers.with_columns(renumbered)
+    names = flow.followed.group_by("node", "last_pid", maintain_order=True).agg("pid")
+    notes = (
+        f"{node} was started again (processes {', '.join(map(str, pids))}): it counts as one node."
+        for node, _, pids in names.iter_rows()
+    )
     return replace(
         flow,
-        objects=replace(flow.objects, callbacks=callbacks),
-        instances=flow.instances.with_columns(number),
-        publications=flow.publications.with_columns(number, pid=pid),
-        takes=flow.takes.with_columns(number),
+        objects=replace(flow.objects, callbacks=callbacks, buffers=buffers),
+        instances=flow.instances.with_columns(renumbered),
+        publications=flow.publications.with_columns(renumbered),
+        takes=flow.takes.with_columns(renumbered),
+        contradictions=tuple(
+            replace(
+                contradiction,
+                callbacks=frozenset(ids[number] for number in contradiction.callbacks),
+            )
+            for contradiction in flow.contradictions
+        ),
+        untold=frozenset(ids[number] for number in flow.untold),
+        notes=(*flow.notes, *notes),
     )
 
 

@@ -451,7 +451,7 @@ def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame
     each subscription of its process; which one took the message, the source timestamp tells. About
     a message without one it was made in an instance on its thread, which began at ``start``.
     """
-    decisions = events.table(tables, "gate_release", ["mode", "moved"])
+    decisions = events.table(tables, "gate_release", ["mode", "moved", "dropped"])
     key = ["pid", "callback"]
     callbacks = objects.callbacks.with_columns(callback="handle")
     handles = callbacks.select(*key, "callback_id").unique()
@@ -486,9 +486,9 @@ def gated_hops(
     """What gates decided about the messages of a chain: one row per hop whose callback is a gate.
 
     ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode,
-    moved_ns`` of `gate_release`, sorted; ``let_go`` is when it did. Several messages may have the
-    same source timestamp (writers stamp in microseconds, a simulated clock stands still): then
-    the decision is meant whose ``arrival`` is nearest to the start of the callback.
+    dropped, moved_ns`` of `gate_release`, sorted; ``let_go`` is when it did. Several messages may
+    have the same source timestamp (writers stamp in microseconds, a simulated clock stands still):
+    then the decision is meant whose ``arrival`` is nearest to the start of the callback.
     """
     key = ["callback_id", "source_timestamp"]
     decided = with_overrun(gate_decisions(tables, objects), due_cycles).with_columns(let_go="time")
@@ -501,6 +501,6 @@ def gated_hops(
     found = found.sort("traversal", "hop", apart, maintain_order=True)
     return found.unique(["traversal", "hop"], keep="first", maintain_order=True).select(
         *("traversal", "hop", "arrival", "origin", "release", "let_go", "slot"),
-        *("cycles_waited", "anchor", "overrun", "mode"),
+        *("cycles_waited", "anchor", "overrun", "mode", "dropped"),
         moved_ns=pl.col("moved").fill_null(0),
     )

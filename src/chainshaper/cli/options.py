@@ -126,7 +126,7 @@ SINCE: int = option(
 )
 UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
-SEED: int | None = option("--seed", "Instead of the description's.", min=0)
+SEED: int | None = option("--seed", "Random seed; overrides the file's.", min=0)
 REALTIME: bool | None = option(
     "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
 )
@@ -255,7 +255,12 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     from chainshaper.planning import Modes
     from chainshaper.values.yaml_file import wrong_values_refused
 
-    topic, _, listed = text.partition(":")
+    topic, colon, listed = text.partition(":")
+    if not colon:
+        raise InputError(
+            f"--modes {text}: write the topic that announces the modes, and each mode once, such as"
+            " /driving_mode:city,highway"
+        )
     pairs = [pair.partition("=") for pair in listed.split(",")]
     bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}
     if listed and "=" not in listed:
@@ -269,10 +274,12 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
 def recording_of(
     named: Path | None, plan: "cs.ApplicationPlan | None" = None
 ) -> "cs.Recording | None":
-    """The recording that an option names, or else the plan's own, where that is still there."""
-    own = None if plan is None else plan.chains[0].evidence.recording
-    if named is None and own and Path(own).is_dir():
-        named = Path(own)
+    """The recording that an option names, or else the first of the plan's own that is still there,
+    whichever chain it was made for.
+    """
+    chains = () if plan is None else plan.chains
+    own = (Path(path) for one in chains if (path := one.evidence.recording) is not None)
+    named = named or next((path for path in own if path.is_dir()), None)
     return None if named is None else cs.open_source(named)
 
 

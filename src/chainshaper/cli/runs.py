@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 STDERR = 2
 PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
+MOST_JUDGED = 100_000  # simulated cycles, which are read again for that: more take memory
 MOST_RECORDED = 100  # by `watch --budget` itself: a limit that breaks for weeks fills no disk
 
 COMMAND: list[str] | None = opt.argument(
@@ -138,12 +139,17 @@ def simulate(
     execution_times: Path | None = opt.option(
         "--execution-times REC", "Draw execution times from those recorded there."
     ),
-    block: int = opt.option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
+    block: int = opt.option(
+        "--block", "Draw execution times in stretches of N consecutive cycles.", 1, min=1, max=1024
+    ),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
 
-    The recording is like that of a live run: every other verb takes it.
+    The recording is like that of a live run: every other verb takes it. With a plan, a note says
+    whether its promise was met.
     """
+    from chainshaper.reporting.latency import verdict
+
     described = cs.load_application(application)
     if execution_times is not None:
         from chainshaper.simulation.simulating import with_recorded_times
@@ -160,6 +166,10 @@ def simulate(
             command=sys.argv,
             progress=report,
         )
+        judged = plan is not None and cycles <= MOST_JUDGED
+        comparisons = cs.compare_chains([recording], least=1) if judged else ()
+    for one in comparisons:
+        out.notes([f"{one.chain}: {verdict(measured)[1]}" for measured in one.measurements])
     out.show_line(recording.path)
 
 
@@ -285,7 +295,7 @@ def watch(
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
         "--environment",
-        "Print the variable that puts the library in front of ROS 2; no more.",
+        "Print the export line that enables watching, and exit.",
         False,
     ),
     json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),

@@ -40,7 +40,8 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
-from chainshaper.verify.measure import chain_of, longest_stall, opened
+from chainshaper.verify.measure import PARTS, chain_of, longest_stall, opened
+from chainshaper.verify.promises import NOT_PUBLISHED
 from chainshaper.workload.description import Application, node_name
 from chainshaper.workload.live import timing_of
 
@@ -172,7 +173,8 @@ def _profile_of(
         every_step_ns=steps[every["traversal"].to_numpy()],
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=analysis.statistics.incomplete,
+        incomplete=analysis.statistics.incomplete - analysis.incomplete.get("not used", 0),
+        unpublished=analysis.incomplete.get(NOT_PUBLISHED, 0),
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),
@@ -400,7 +402,8 @@ def _steps(
         own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
         own = own.with_columns(pl.coalesce("end", "publish"))
         row, start, end = (own[name].to_numpy() for name in ("traversal", "start", "end"))
-        steps[row, hop] = (own["communication_ns"].fill_null(0) + own["computation_ns"]).to_numpy()
+        parts = (own[f"{part}_ns"].fill_null(0) for part in PARTS)
+        steps[row, hop] = sum(parts, own["hop"] * 0).to_numpy()
         if hop:
             same = [one for one in planned if core[one] == core[number]]
             others = ran.filter(pl.col("callback_id").is_in(same))

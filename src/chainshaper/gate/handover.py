@@ -45,14 +45,14 @@ FIELDS = (
     "mode",  # the mode in force, from 1 in their order; 0: there are no modes
     "started_ns",  # when a shaping node started last
     "failed_starts",  # how many did, shortly one after the other, and dealt with no message
-    "starts",
+    "starts",  # of shaping nodes of this launch
     "standby",  # the standby, a process id
     "listening",  # 1: it has received a message, and so receives all that come behind it
     "silent",  # 1: the standby passes nothing on, it counts what is lost
     "bypassing_since_ns",  # 0: a shaping node is in force
     "bypassed",  # how many messages the standby has dealt with: so many are in its ring
     "bypassed_before",  # how many of these before the present time without a shaping node
-    "published",  # how many messages shaping nodes have published
+    "published",  # how many messages shaping nodes of this launch have published
     *DROPPED,  # how many they have dropped, for each of the gate's reasons
     "lost_by_dds",  # how many are missing in what they have received
     "late",  # how many came behind the last slot that they were due in
@@ -76,6 +76,8 @@ PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3
 as the standby although the shaping node has the first, and to move slots."""
 _RINGS = {"released": RELEASED, "bypassed": BYPASSED, "measured": MEASURED}
 """Each has the name under which the numbers in it are counted."""
+_COUNTS = ("starts", "published", *DROPPED, "lost_by_dds", "late")
+"""These begin at 0 with each launch: what a node did for another one is not this one's."""
 _AT = {name: place for place, name in enumerate(FIELDS)}
 _SIZE = 8 * TOPIC + TOPIC_BYTES
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
@@ -272,6 +274,9 @@ class Turn:
         idle_ns = abs(time.monotonic_ns() - page["until_ns"])
         if parent != page["parent"] or idle_ns > AT_ONCE_NS:
             page["mode"] = page["phase_known"] = 0
+            if not page.is_locked():  # by a node of another launch, whose counts they are
+                for count in _COUNTS:
+                    page[count] = 0
         page["parent"] = parent
         self.page, self._in_force = page, False
         # Of the standby's messages: how many there were at the last look, and which.

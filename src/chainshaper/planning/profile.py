@@ -98,6 +98,7 @@ class Profile:
     output_depth: int | None = None
     recording: str | None = None
     incomplete: int = 0
+    unpublished: int = 0
     disturbed: int = 0
     realtime: bool | None = None
     longest_stall_ns: int | None = None
@@ -184,11 +185,10 @@ def other_beginnings(profile: Profile) -> str | None:
     own = {one.node for one in profile.callbacks if (one.node, one.publishes) == first}
     if not own or not (others := [node for node in begin if node not in own]):
         return None
+    begin_apart = ", ".join((profile.nodes[0], *others[:-1]))
     return (
-        f"{profile.name} waits for what {' and '.join(others)} begin{'s' * (len(others) == 1)}, at"
-        f" another time beside {profile.nodes[0]} after every start of the application unless they"
-        " are started together, and its latency is another then: measure it after other starts too,"
-        " or let slots follow (--adapt)"
+        f"{begin_apart} and {others[-1]} start at a new offset to each other at each launch, which"
+        f" changes the latency of {profile.name}. Record several launches, or use --adapt"
     )
 
 

@@ -260,7 +260,8 @@ def _covering(latencies: NDArray[np.int64], profile: Profile, request: PlanReque
     least_ns = margins.least_epsilon_ns(request.publication) + _slot_ns(profile, request)
     latest = None if request.policy in OWN_SLOTS else profile.period_ns - least_ns
     share = request.overrun_probability or margins.OVERRUN_PROBABILITY
-    return margins.covered_latency(latencies, share, latest)
+    independent = margins.independent_cycles(latencies)
+    return margins.covered_latency(latencies, share, latest, independent)
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -403,28 +404,75 @@ def _shaped(
 
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
     every, longest, probability = profile.every, profile.longest_ns, request.overrun_probability
+    independent = margins.independent_cycles(every)
+    clustered = independent if independent < every.size else None
     if request.epsilon_ns is not None:
         if request.epsilon_ns < 0:
             raise InputError("epsilon must be 0 ms or more")
-        late = margins.late_share(every, longest + request.epsilon_ns)
-        return Margin(epsilon_ns=request.epsilon_ns, overrun_probability=late)
+        way = 0 if request.publication == "in-process" else margins.HOP_NS
+        in_time = longest + max(0, request.epsilon_ns - way)
+        late = margins.late_share(every, in_time, independent)
+        return Margin(
+            epsilon_ns=request.epsilon_ns, overrun_probability=late, independent_cycles=clustered
+        )
     covered = profile.latencies_ns if request.ideal_machine else every
-    if probability is not None and probability < margins.MOST_PROBABLE:
-        return margins.derive_margin(covered, probability, request.seed, longest_ns=longest)
-    if probability is not None and covered.size < (needed := margins.cycles_needed(probability)):
-        reason = f"{covered.size} cycles are too few for an overrun probability of {probability:g}"
-        raise OperationError(f"{reason}: measure {needed} or more")
-    stalls = 0
-    shown_late = request.percentile is not None  # what takes longer has been left out
-    if not shown_late and (request.policy not in OWN_SLOTS or request.policy == "pipelined"):
-        stalls = max(0, _covering(covered, profile, request) - longest)  # of no single callback
-    epsilon = margins.least_epsilon_ns(request.publication) + stalls
+    # No margin covers cycles for a slot that stands elsewhere, or those that have been left out.
+    covers = request.policy not in OWN_SLOTS or request.policy == "pipelined"
+    covers &= request.percentile is None
+    if probability is not None and covers:
+        return _asked_margin(covered, profile, request, probability, independent)
+    stalls = max(0, _covering(covered, profile, request) - longest) if covers else 0
+    all_covered = covers and not request.ideal_machine
+    late = _late_by_default(every, longest, stalls, independent, all_covered=all_covered)
+    if probability is not None and late > probability:
+        reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
+        remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"
+        raise OperationError(f"{reason}: {remedy}. Leave out --overrun-probability")
     return Margin(
-        epsilon_ns=epsilon,
+        epsilon_ns=margins.least_epsilon_ns(request.publication) + stalls,
         source="measured",
-        overrun_probability=margins.late_share(every, longest + epsilon),
+        overrun_probability=late,
         stalls_ns=stalls,
+        independent_cycles=clustered,
     )
+
+
+def _asked_margin(
+    covered: NDArray[np.int64],
+    profile: Profile,
+    request: PlanRequest,
+    probability: float,
+    independent: int,
+) -> Margin:
+    """The margin for a share of late outputs that was asked for, of the cycles that are covered;
+    where others are late besides, with the share of all."""
+    longest, least = profile.longest_ns, margins.least_epsilon_ns(request.publication)
+    margin = margins.derive_margin(
+        covered, probability, request.seed, longest_ns=longest, least_ns=least
+    )
+    in_time = longest + margin.epsilon_ns - least
+    if not request.ideal_machine or not np.any(profile.every > in_time):
+        return margin
+    late = margins.late_share(profile.every, in_time, independent)
+    return margin.model_copy(update={"overrun_probability": late})
+
+
+def _late_by_default(
+    every: NDArray[np.int64], longest: int, stalls: int, independent: int, *, all_covered: bool
+) -> float:
+    """The share of outputs that will be late where the least margin is behind ``longest + stalls``.
+
+    It is counted from the latencies themselves: what the least margin adds is the way to the
+    shaping node, and how many cycles end within it is an accident of the sample. Where the usual
+    share is covered, that is promised, or what is smaller by a confidence that leaves no doubt.
+    """
+    usual = margins.OVERRUN_PROBABILITY
+    if all_covered and independent >= margins.cycles_needed(usual):
+        rank = margins.covering_rank(independent, usual)  # fixed before the sample was seen
+        if longest + stalls >= np.sort(every)[-rank]:
+            beyond = rank - 1 if stalls else int(np.count_nonzero(every > longest))
+            return min(usual, margins.most_probable(beyond, independent, margins.WELL_COVERED))
+    return margins.late_share(every, longest + stalls, independent)
 
 
 def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:

@@ -28,7 +28,8 @@ _PAGE = re.compile(rf"/(?:chainshaper/outputs|chainshaper-\d+)/[^/]+\.v{VERSION}
 
 @dataclass(frozen=True)
 class ShapedOutput:
-    """An output with a shaping node, as it is now; it counts since the machine has booted.
+    """An output with a shaping node, as it is now. It counts since the launch of the shaping node
+    began, which may have started that again; ``messages_in_all`` since the machine has booted.
 
     ``state`` is ``bypassed`` or ``silent`` while no shaping node is in force, and ``no standby``
     when one is, but nothing would stand in for it: a gate ``in process`` ends with its publisher.
@@ -109,7 +110,8 @@ def output_text(output: ShapedOutput) -> str:
     }[output.state]
     lost = "".join(f", {count} {why}" for why, count in output.lost.items())
     if output.published or lost:
-        text += f"; so far {output.published} messages published, {output.late} late{lost}"
+        published = f"{output.published} messages published, {output.late} late{lost}"
+        text += f"; in this run so far {published}"
     if output.moved_ns:
         sign = "-" if output.moved_ns < 0 else "+"
         text += f"; its slots are moved by {sign}{duration_text(abs(output.moved_ns))}"

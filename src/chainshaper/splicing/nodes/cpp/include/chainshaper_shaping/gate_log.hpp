@@ -6,6 +6,8 @@
 #include <pthread.h>
 #include <sched.h>
 #include <semaphore.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 #include <atomic>
 #include <cstdio>
@@ -143,6 +145,12 @@ private:
     const int flags = O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK | O_NOFOLLOW;
     const int file = open(path_.c_str(), flags, 0644);
     if (file < 0) return false;
+    struct stat state{};
+    if (fstat(file, &state) != 0 || state.st_nlink > 1 || state.st_uid != geteuid()) {
+      close(file);  // somebody else's was put in its place
+      errno = EPERM;
+      return false;
+    }
     const std::int64_t before = lseek(file, 0, SEEK_END);
     if (before < 0) {
       close(file);

@@ -270,6 +270,11 @@ private:
     if (parent != page->get(Field::parent) || idle_ns > schema::at_once_ns) {
       page->set(Field::mode, 0);  // another launch's
       page->set(Field::phase_known, 0);
+      if (!page->is_locked(schema::publishing)) {  // by a node of another launch, whose counts they are
+        page->set(Field::starts, 0);
+        for (std::size_t count = Field::published; count <= Field::late; ++count)
+          page->set(count, 0);
+      }
     }
     page->set(Field::parent, parent);
     page->set(Field::in_process, in_process_ ? 1 : 0);
