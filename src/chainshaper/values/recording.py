@@ -271,7 +271,7 @@ def write_recording(
                     file = _next_part(partial / f"{name}.parquet", checksums)
                     checksums[str(file.relative_to(partial))] = _write_table(file, frame)
             info = info.model_copy(update={"checksums": checksums})
-            (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
+            (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n", "utf-8")
             open_to_all(partial)
             partial.rename(path)
     except (OSError, pl.exceptions.PolarsError) as error:
