@@ -9,6 +9,8 @@ from command_line import called, json_of, refused
 from field_traces import chain_tables, write_chain
 from reference_traces import CHAINS, TRACES, reference_folder, reference_trace
 
+from chainshaper.verify.measure import PARTS
+
 SYSTEMS = {
     "jazzy_chain_cyclonedds": ("jazzy", "rmw_cyclonedds_cpp"),
     "jazzy_chain_fastrtps_async": ("jazzy", "rmw_fastrtps_cpp"),
@@ -76,11 +78,9 @@ def test_latency_of_every_traversal_and_the_same_once_converted(
     assert found["mean_ns"] == round(mean)
     assert found["lost"] == NO_LOSS
     assert (found["disturbed"], found["stalls_watched"]) == (0, False)
-    shares = found["communication_share"] + found["computation_share"]
-    assert shares == pytest.approx(1.0), "communication and computation are the whole latency"
-    parts = [
-        hop[f"{part}_ns"] for hop in found["hops"] for part in ("communication", "computation")
-    ]
+    shares = sum(found[f"{part}_share"] for part in PARTS)
+    assert shares == pytest.approx(1.0), "the parts are the whole latency"
+    parts = [hop[f"{part}_ns"] for hop in found["hops"] for part in PARTS]
     assert sum(part["mean"] for part in parts if part) == pytest.approx(mean, abs=1)
 
     recording = tmp_path / "recording"
@@ -157,13 +157,14 @@ def test_the_only_chain_of_a_trace_needs_not_to_be_named(tmp_path: Path) -> None
     assert (found["chain"], found["count"]) == (spec, 20)
     assert any(taken in note and spec in note for note in found["notes"])
     assert json_of("plan", trace)["warnings"][0].startswith(taken)
-    for words in (
+    commands: list[list[str | Path]] = [
         ["latency", trace],
         ["plan", trace, "-o", tmp_path / "plan.yaml"],
         ["report", trace, "-o", page],
         ["compare", trace, trace],
         ["budget", trace, "-o", tmp_path / "budget.yaml"],
-    ):
+    ]
+    for words in commands:
         said = called(*words)
         assert said.code == 0, words
         (line,) = (line for line in said.err.splitlines() if taken in line)
@@ -176,7 +177,8 @@ def test_the_only_chain_of_a_trace_needs_not_to_be_named(tmp_path: Path) -> None
     named = called("latency", trace, "--chain", spec)
     assert taken not in named.err
     several = reference_folder("galactic_caret_end_to_end") / "trace"
-    for words in (["latency", several], ["plan", several], ["compare", several, several]):
+    commands = [["latency", several], ["plan", several], ["compare", several, several]]
+    for words in commands:
         assert "add --chain /topic4 or --chain /drive../topic3../topic4 or" in refused(2, *words)
 
 

@@ -126,7 +126,7 @@ SINCE: int = option(
 )
 UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
-SEED: int | None = option("--seed", "Instead of the description's.", min=0)
+SEED: int | None = option("--seed", "Random seed; overrides the file's.", min=0)
 REALTIME: bool | None = option(
     "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
 )
@@ -255,7 +255,12 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     from chainshaper.planning import Modes
     from chainshaper.values.yaml_file import wrong_values_refused
 
-    topic, _, listed = text.partition(":")
+    topic, colon, listed = text.partition(":")
+    if not colon:
+        raise InputError(
+            f"--modes {text}: modes need a topic that announces them: write TOPIC:MODE,MODE, such"
+            " as /driving_mode:city,highway"
+        )
     pairs = [pair.partition("=") for pair in listed.split(",")]
     bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}
     if listed and "=" not in listed:

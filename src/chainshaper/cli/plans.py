@@ -71,7 +71,8 @@ def plan(
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
     taken = () if source is None else taken_chain(source, wanted[0], planned[0].spec or "")
     doubts = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
-    doubts += [*taken, *(doubt for one in profiles for doubt in doubts_about(one))]
+    doubts += taken
+    doubts += dict.fromkeys(doubt for profile in profiles for doubt in doubts_about(profile))
     doubts += [
         f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
         for core in sorted({*(request.cores or ())} - {*available_cores()})
@@ -201,12 +202,11 @@ def sweep(
 ) -> None:
     """Simulate an application at every combination of some values: planned, shaped, judged.
 
-    Ended before it is whole, it keeps the finished points beside the file that it writes; the same
-    command goes on with the others.
+    Interrupted? Run the same command again: finished points are kept beside the file.
     """
-    from chainshaper.flow.sweep import parse_axis, rows_beside
+    from chainshaper.flow.sweep import changing_nothing, parse_axis, rows_beside
     from chainshaper.reporting.figures import ENDINGS, draw_sweep
-    from chainshaper.reporting.overviews import sweep_table
+    from chainshaper.reporting.overviews import sweep_axes, sweep_table
     from chainshaper.values.files import new_file
 
     if workers is not None and scheduler is not None:
@@ -237,6 +237,7 @@ def sweep(
         draw_sweep(frame, draw)
     if out.present(json, frame.to_dicts(), sweep_table(frame)):
         out.notes(frame["error"].drop_nulls().unique(maintain_order=True))
+        out.notes(changing_nothing(frame, sweep_axes(frame)))
         for path in filter(None, (draw, output)):
             out.show_line(path)
 

@@ -223,8 +223,8 @@ def check(
 ) -> None:
     """Check recordings against a budget, or those of before; exit code 1 if they are worse.
 
-    A budget's limits are of all cycles. Where only disturbed cycles break one, that is said. With
-    --baseline all recordings together are compared with those of before, callback by callback.
+    Limits apply to all cycles, disturbed ones included. Where only these break one, that is said.
+    With --baseline all recordings together are compared with those of before, callback by callback.
     """
     from chainshaper.reporting.latency import JSON_FORMAT
     from chainshaper.values.files import new_file, write_whole

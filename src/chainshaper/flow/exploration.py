@@ -17,6 +17,7 @@ from chainshaper.analysis import (
     load_named_paths,
 )
 from chainshaper.analysis.chains import close_names
+from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.graph import ApplicationDescription, services
 from chainshaper.flow.plan import inputs_of
 from chainshaper.linux.scheduling import available_cores
@@ -102,6 +103,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
     published = {topic for one in graph.callbacks for topic in one.publishes}
     nodes: dict[str, Any] = {}
+    periods = shown_periods(flow.contradictions)
     seen: set[int] = set()
     for one in graph.callbacks:
         ours = one.kind in ("timer", "subscription") and one.topic not in INTERNAL_TOPICS
@@ -117,7 +119,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
         if not taken.size or len(began) < 2:  # it hardly ran
             continue
         read = [graph.callbacks[number].topic for number in members]
-        period = one.period_ns or int(began.diff().median() or 0)
+        period = periods.get(one.id) or one.period_ns or int(began.diff().median() or 0)
         trigger: dict[str, Any] = {"timer": format_duration(round(period, -3))}
         if set(read) <= published:
             trigger = {"synchronises": read} if len(read) > 1 else {"subscription": read[0]}

@@ -43,7 +43,8 @@ def table_name(event: str) -> str | None:
     """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``."""
     provider, _, name = event.rpartition(":")
     known = name in events.FIELDS or name == CARET_INIT
-    providers = ("",) if name == "sched_switch" else ("ros2", "ros2_caret")
+    # CARET's provider was called `ros2_hook` in its first version.
+    providers = ("",) if name == "sched_switch" else ("ros2", "ros2_caret", "ros2_hook")
     return name if known and provider in providers else None
 
 
