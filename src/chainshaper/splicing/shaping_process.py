@@ -353,7 +353,12 @@ def gate_library() -> Path:
         options = "--publication in-process", "--publication synchronous"
         return compile_library("c++", words, folder / _GATE_FILE, options)
 
-    made_of = (*(one.read_text() for one in sources), *headers.values(), *_GATE_OPTIONS, _EXPORTED)
+    made_of = (
+        *(one.read_text("utf-8") for one in sources),
+        *headers.values(),
+        *_GATE_OPTIONS,
+        _EXPORTED,
+    )
     return in_cache(_GATE_FILE, made_of, build)
 
 
