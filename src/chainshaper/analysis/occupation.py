@@ -19,7 +19,7 @@ from chainshaper.values.recording import RecordingInfo
 ThreadKey = tuple[int, int]
 """A thread: its process's id and its own."""
 
-SETTLING = 0.1  # of a thread's instances, at the start, in which it may be given its core
+SETTLING = 0.1  # of a thread's time, at the start, in which it may be given its core
 BOUND = 0.99  # the share of the others that ran on one core, if the thread is bound to it
 CONTESTS = 3  # so often a callback must have pre-empted another for its thread to be more urgent
 
@@ -35,27 +35,28 @@ class Occupation:
     * ``cores``: of each thread, None: bound to none.
     * ``urgency``: of each thread on a core with others, by who pre-empted whom: from 0 upwards,
       larger is more urgent.
+    * ``places``: the numbers of the instances on each core to which threads are bound, and of each
+      thread elsewhere, in order of start.
+    * ``settled_ns``: from when on threads that are bound to a core ran on it only.
     * ``measured``: whether CPU times are in the recording.
     """
 
     instances: pl.DataFrame
     cores: dict[ThreadKey, int | None]
     urgency: dict[ThreadKey, int]
+    places: dict[tuple[int, ...], list[int]]
+    settled_ns: int
     measured: bool
-
-    def place(self, thread: ThreadKey) -> tuple[int, ...]:
-        """What a thread shares with others, or has for itself: its core, or the thread."""
-        core = self.cores.get(thread)
-        return thread if core is None else (core,)
 
 
 def occupation(flow: DataFlow, info: RecordingInfo, published: pl.Series) -> Occupation:
     """See :class:`Occupation`. ``published`` is, by instance, the publication that counts (ns)."""
     cores = thread_cores(flow, info)
     frame = flow.instances.with_columns(published=published)
+    places, settled_ns = _places(flow, cores)
     inner = {key: np.zeros(len(frame), np.int64) for key in ("before", "after")}
     contests = Counter[tuple[ThreadKey, ThreadKey]]()
-    for rows in _by_place(frame, cores).values():
+    for rows in places.values():
         _add_preemptions(frame, rows, inner, contests)
     until = pl.coalesce("published", "end")
     response = (until - pl.col("start")) - pl.Series(inner["before"])
@@ -64,18 +65,19 @@ def occupation(flow: DataFlow, info: RecordingInfo, published: pl.Series) -> Occ
     used = (pl.col("execution_ns") - pl.col("after_ns")).clip(0)
     frame = frame.with_columns(before_ns=pl.coalesce(used, "response_ns")).drop("response_ns")
     measured = bool(flow.instances["execution_ns"].count())
-    return Occupation(frame, cores, _urgency(contests), measured)
+    return Occupation(frame, cores, _urgency(contests), places, settled_ns, measured)
 
 
 def thread_cores(flow: DataFlow, info: RecordingInfo) -> dict[ThreadKey, int | None]:
     """The core that each thread which runs callbacks is bound to; None: it is bound to none."""
-    starts = events.table(flow.events, "callback_start").select("pid", "tid", "cpu")
+    starts = events.table(flow.events, "callback_start").select("time", "pid", "tid", "cpu")
     starts = starts.drop_nulls()
     found: dict[ThreadKey, int | None] = {}
     threads = flow.instances.select("pid", "tid").unique(maintain_order=True)
     found = dict.fromkeys(((pid, tid) for pid, tid in threads.iter_rows()), None)
     for (pid, tid), own in starts.group_by("pid", "tid", maintain_order=True):
-        settled = own["cpu"][int(SETTLING * len(own)) :]
+        begun, over = int(own["time"][0]), int(own["time"][-1])
+        settled = own.filter(pl.col("time") >= begun + SETTLING * (over - begun))["cpu"]
         core, count = Counter(settled.to_list()).most_common(1)[0]
         if count >= BOUND * len(settled):
             found[int(str(pid)), int(str(tid))] = int(core)
@@ -86,15 +88,23 @@ def thread_cores(flow: DataFlow, info: RecordingInfo) -> dict[ThreadKey, int | N
     return found
 
 
-def _by_place(
-    frame: pl.DataFrame, cores: dict[ThreadKey, int | None]
-) -> dict[tuple[int, ...], list[int]]:
-    """The instances on each core, or of each thread that is bound to none: in order of start."""
+def _places(
+    flow: DataFlow, cores: dict[ThreadKey, int | None]
+) -> tuple[dict[tuple[int, ...], list[int]], int]:
+    """The ``places`` and ``settled_ns`` of an :class:`Occupation`."""
+    starts = events.table(flow.events, "callback_start").select("pid", "tid", "cpu", start="time")
+    starts = starts.unique(["pid", "tid", "start"], keep="first")
+    ran = flow.instances.select("pid", "tid", "start")
+    ran = ran.join(starts, on=["pid", "tid", "start"], how="left", maintain_order="left")
     found: dict[tuple[int, ...], list[int]] = {}
-    for row, thread in enumerate(frame.select("pid", "tid").iter_rows()):
-        core = cores.get(thread)
-        found.setdefault(thread if core is None else (core,), []).append(row)
-    return found
+    settled_ns = 0
+    for row, (pid, tid, start, cpu) in enumerate(ran.iter_rows()):
+        core = cores.get((pid, tid))
+        elsewhere = core is None or cpu not in (None, core)
+        found.setdefault((pid, tid) if core is None or elsewhere else (core,), []).append(row)
+        if core is not None and elsewhere:
+            settled_ns = start + 1
+    return found, settled_ns
 
 
 def _add_preemptions(
@@ -135,27 +145,28 @@ def _urgency(contests: Counter[tuple[ThreadKey, ThreadKey]]) -> dict[ThreadKey, 
 
 
 def deliveries(flow: DataFlow, found: Occupation) -> pl.DataFrame:
-    """How long each message took to its callback: ``publication, instance, delay_ns, kept_ns,
-    by_thread``.
+    """How long each message took to its callback: ``publication, instance, callback_id, delay_ns,
+    before_ns, kept_ns, by_thread``.
 
     ``delay_ns`` is from its sending to the callback's start. Where another callback had the core or
-    the thread meanwhile, ``kept_ns`` is the part until the last of these ended (null: none had),
-    and ``by_thread`` whether that was one of the same thread.
+    the thread meanwhile, ``before_ns`` and ``kept_ns`` are the parts until the last of these began
+    (0: before the sending) and ended (null: none had), and ``by_thread`` whether that was one of
+    the same thread.
     """
     sent = flow.publications.select("publication", "sent", by="instance")
     starts = found.instances.select("instance", "callback_id", "pid", "tid", "start")
     hops = flow.takes.select("publication", "instance").drop_nulls()
     hops = hops.join(sent, on="publication").join(starts, on="instance").drop_nulls("sent")
-    kept = np.full(len(hops), -1, np.int64)
+    kept, before = np.full((2, len(hops)), -1, np.int64)
     same = np.zeros(len(hops), bool)
-    ends = found.instances["end"]
+    begins, ends = found.instances["start"], found.instances["end"]
     threads = found.instances.select("pid", "tid").rows()
-    places = _by_place(found.instances, found.cores)
+    place_of = {row: place for place, own in found.places.items() for row in own}
     hop_rows: dict[tuple[int, ...], list[int]] = {}
-    for row, thread in enumerate(hops.select("pid", "tid").iter_rows()):
-        hop_rows.setdefault(found.place(thread), []).append(row)
+    for row, instance in enumerate(hops["instance"]):
+        hop_rows.setdefault(place_of[instance], []).append(row)
     for place, rows in hop_rows.items():
-        ended = [(ends[one], one) for one in places[place] if ends[one] is not None]
+        ended = [(ends[one], one) for one in found.places[place] if ends[one] is not None]
         ended.sort()
         times = np.array([time for time, _ in ended], np.int64)
         for row in rows:
@@ -164,13 +175,31 @@ def deliveries(flow: DataFlow, found: Occupation) -> pl.DataFrame:
             if last < 0 or ended[last][0] <= left or ended[last][1] == by:
                 continue
             kept[row], same[row] = ended[last][0] - left, threads[ended[last][1]] == (pid, tid)
+            before[row] = max(0, begins[ended[last][1]] - left)
     known = pl.Series(kept)
     return hops.select(
         *("publication", "instance", "callback_id"),
         delay_ns=pl.col("start") - pl.col("sent"),
+        before_ns=pl.Series(before).set(known < 0, None),
         kept_ns=known.set(known < 0, None),
         by_thread=pl.Series(same),
     )
+
+
+def taken_first(flow: DataFlow, found: Occupation) -> Counter[tuple[int, int]]:
+    """How often a callback got its message before another one, to which an older message went.
+
+    Both waited then, and the executor looks at that callback first.
+    """
+    hops = deliveries(flow, found)
+    starts = found.instances.select("instance", "pid", "tid", "start")
+    hops = hops.join(starts, on="instance").sort("pid", "tid", "start")
+    hops = hops.with_columns(sent=pl.col("start") - pl.col("delay_ns"))
+    after = hops.select("pid", "tid", "callback_id", "sent").shift(-1)
+    same = (hops["pid"] == after["pid"]) & (hops["tid"] == after["tid"])
+    older = same & (after["sent"] < hops["sent"]) & (after["callback_id"] != hops["callback_id"])
+    pairs = zip(hops["callback_id"], after["callback_id"], older.fill_null(False), strict=True)
+    return Counter((one, other) for one, other, overtook in pairs if overtook)
 
 
 def publication_that_counts(flow: DataFlow, topics: frozenset[str]) -> pl.Series:

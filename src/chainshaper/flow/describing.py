@@ -9,6 +9,7 @@ recording cannot tell is said in notes, which stand at the top of the file.
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import cmp_to_key, partial
 from itertools import count
 from pathlib import Path
 from textwrap import fill
@@ -28,6 +29,7 @@ from chainshaper.analysis.occupation import (
     deliveries,
     occupation,
     publication_that_counts,
+    taken_first,
 )
 from chainshaper.flow.exploration import list_chains
 from chainshaper.linux.scheduling import available_cores
@@ -59,8 +61,8 @@ USUALLY, LEAST = 0.1, 0.05  # quantiles: of starts behind expiries, of free deli
 class _Evidence:
     """What a description is made from, and the notes that come up on the way.
 
-    From ``start_ns`` on, the start of the first cycle, all sequences count. ``hops`` are the
-    :func:`~chainshaper.analysis.occupation.deliveries`.
+    From ``start_ns`` on, the start of the first cycle, all sequences count. ``hops`` and ``first``
+    are :func:`~chainshaper.analysis.occupation.deliveries` and :func:`~.occupation.taken_first`.
     """
 
     recording: Recording
@@ -68,6 +70,7 @@ class _Evidence:
     callbacks: dict[int, Callback]
     found: Occupation
     hops: pl.DataFrame
+    first: Mapping[tuple[int, int], int]
     origin: int
     start_ns: int
     notes: list[str] = field(default_factory=list)
@@ -154,12 +157,15 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
     origin = path.callbacks[0]
     wanted = [origin] if origin in timers or not timers else timers
     starts = flow.instances.filter(pl.col("callback_id").is_in(wanted)).sort("start")
+    begun = starts.filter(pl.col("start") >= found.settled_ns)
+    left_out, starts = len(starts) - len(begun), begun
     evidence = _Evidence(
         recording=recording,
         flow=flow,
         callbacks={one.id: one for one in graph.callbacks},
         found=found,
         hops=deliveries(flow, found),
+        first=taken_first(flow, found),
         origin=int(starts["callback_id"][0]) if len(starts) else origin,
         start_ns=int(starts["start"][0]) if len(starts) else 0,
     )
@@ -172,6 +178,10 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
         evidence.notes.append(
             "Some callbacks have no events of their own (Python nodes, threads that publish): they"
             " last until they publish, as far as the description knows."
+        )
+    if left_out:
+        evidence.notes.append(
+            f"The first {left_out} cycles are left out: threads were not on their cores yet."
         )
     gates = events.table(recording.events, "gate_release")
     if len(gates):
@@ -204,7 +214,7 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
         node = nodes.setdefault(name, _Node())
         node.callbacks.append(_described(evidence, node, members, published))
     for node in nodes.values():
-        _in_turn(node)
+        _in_turn(evidence, node)
     calls = {
         str(one.topic)
         for one in evidence.callbacks.values()
@@ -244,7 +254,12 @@ def _inputs(evidence: _Evidence, callback: Callback) -> tuple[int, ...]:
     distinct = len({one.topic for one in together}) == len(together) > 1
     if callback.kind != "subscription" or not distinct:
         return (callback.id,)
-    return tuple(one.id for one in together)
+    return tuple(sorted((one.id for one in together), key=cmp_to_key(partial(_turn, evidence))))
+
+
+def _turn(evidence: _Evidence, one: int, other: int) -> int:
+    """Which of two callbacks an executor looks at first, as far as it was seen: as sorting asks."""
+    return evidence.first.get((other, one), 0) - evidence.first.get((one, other), 0)
 
 
 def _described(
@@ -303,7 +318,7 @@ def _trigger(own: pl.DataFrame, members: Sequence[int]) -> int | None:
 def _by_message(evidence: _Evidence, node: _Node, callback: Callback) -> Numbers:
     """The instances of a subscription by message of its topic; adds the topic's deliveries.
 
-    Where a message did not arrive, the one before it stands for it.
+    A message that did not arrive has none (-1).
     """
     topic = str(callback.topic)
     writers = [one.id for one in evidence.callbacks.values() if topic in _written(one)]
@@ -324,18 +339,22 @@ def _by_message(evidence: _Evidence, node: _Node, callback: Callback) -> Numbers
             " description all do."
         )
     node.deliveries[topic] = _delays(evidence, rows)
-    filled = rows["instance"].forward_fill().backward_fill()
-    return filled.to_numpy().astype(np.int64)
+    return rows["instance"].cast(pl.Int64).fill_null(-1).to_numpy().astype(np.int64)
 
 
 def _spent(evidence: _Evidence, callback: Callback, rows: Numbers) -> tuple[Numbers, Numbers]:
     """CPU time of instances to their publication (or end), and behind it."""
-    frame = evidence.found.instances[rows].select("before_ns", "after_ns")
+    known = rows >= 0
+    frame = evidence.found.instances[rows[known]].select("before_ns", "after_ns")
     if frame["before_ns"].null_count() == len(frame):
         evidence.notes.append(f"How long {callback.label} computes is not in the recording: 0.")
-    filled = frame.select(pl.all().forward_fill().backward_fill().fill_null(0))
-    before, after = (filled[key].to_numpy().astype(np.int64) for key in filled.columns)
-    return before, after
+    filled = frame.select(pl.all().fill_null(pl.all().median()).fill_null(0))
+    both = []
+    for key in filled.columns:
+        spent = np.full(len(rows), int(np.median(filled[key].to_numpy())), np.int64)
+        spent[known] = filled[key].to_numpy()
+        both.append(spent)
+    return both[0], both[1]
 
 
 # Timers ---------------------------------------------------------------------------------------
@@ -411,8 +430,10 @@ def _blocker(evidence: _Evidence, own: pl.DataFrame) -> int | None:
     return blocker if evidence.callbacks[blocker].kind == "timer" else None
 
 
-def _in_turn(node: _Node) -> None:
-    """Put timers behind those that go first: executors look at them in this order."""
+def _in_turn(evidence: _Evidence, node: _Node) -> None:
+    """Put callbacks behind those that go first: executors look at them in this order."""
+    turns = cmp_to_key(lambda one, other: _turn(evidence, one.ids[0], other.ids[0]))
+    node.callbacks.sort(key=turns)
     for described in [*node.callbacks]:
         places = [
             number for number, one in enumerate(node.callbacks) if described.before in one.ids
@@ -664,9 +685,12 @@ def _delays(evidence: _Evidence, rows: pl.DataFrame) -> Numbers:
     costs = sum(_own_costs(evidence))
     alone = (rows["delay_ns"] - costs).clip(0).set(rows["kept_ns"].is_not_null(), None)
     usual = alone.median()
-    waited = rows["kept_ns"].clip(0, None if usual is None else int(usual))  # type: ignore[arg-type]
-    known = alone.zip_with(rows["kept_ns"].is_null(), waited).forward_fill().backward_fill()
-    return known.fill_null(0).to_numpy().astype(np.int64)
+    shorter = rows["kept_ns"].clip(0, int(usual or 0))  # type: ignore[arg-type]
+    unseen = (rows["before_ns"] - costs).clip(0)  # else its thread had begun with it instead
+    waited = pl.select(pl.max_horizontal(shorter, unseen)).to_series()
+    known = waited.zip_with(rows["kept_ns"].is_not_null(), alone)
+    filled: Numbers = known.fill_null(int(known.median() or 0)).to_numpy().astype(np.int64)
+    return filled
 
 
 def _costs(evidence: _Evidence, nodes: Mapping[str, _Node]) -> dict[str, Any]:
