@@ -21,6 +21,7 @@ ThreadKey = tuple[int, int]
 
 SETTLING = 0.1  # of a thread's time, at the start, in which it may be given its core
 BOUND = 0.99  # the share of the others that ran on one core, if the thread is bound to it
+_SHARES = (("execution_ns",), ("before_ns", "after_ns"))
 CONTESTS = 3  # so often a callback must have pre-empted another for its thread to be more urgent
 
 
@@ -29,16 +30,16 @@ class Occupation:
     """What callback instances say about threads and cores.
 
     * ``instances``: those of the flow, in their order, with ``published`` (the first publication
-      that counts, null: none), ``before_ns`` and ``after_ns``: CPU time to that publication (else
-      to the end) and behind it, null where neither is known. Without CPU times in the recording
-      they are response times without those of callbacks that pre-empted it.
+      that counts, null: none), ``before_ns`` and ``after_ns``: from the start to it (else to the
+      end) and behind it, without callbacks that pre-empted it; null where the end is not known.
     * ``cores``: of each thread, None: bound to none.
     * ``urgency``: of each thread on a core with others, by who pre-empted whom: from 0 upwards,
       larger is more urgent.
     * ``places``: the numbers of the instances on each core to which threads are bound, and of each
       thread elsewhere, in order of start.
     * ``settled_ns``: from when on threads that are bound to a core ran on it only.
-    * ``measured``: whether CPU times are in the recording.
+    * ``others``: the share of these times in which the callbacks' threads did not run: interrupts,
+      threads without callbacks, the machine. None: no CPU times are in the recording.
     """
 
     instances: pl.DataFrame
@@ -46,7 +47,7 @@ class Occupation:
     urgency: dict[ThreadKey, int]
     places: dict[tuple[int, ...], list[int]]
     settled_ns: int
-    measured: bool
+    others: float | None
 
 
 def occupation(flow: DataFlow, info: RecordingInfo, published: pl.Series) -> Occupation:
@@ -61,11 +62,11 @@ def occupation(flow: DataFlow, info: RecordingInfo, published: pl.Series) -> Occ
     until = pl.coalesce("published", "end")
     response = (until - pl.col("start")) - pl.Series(inner["before"])
     behind = (pl.col("end") - pl.col("published")).fill_null(0) - pl.Series(inner["after"])
-    frame = frame.with_columns(after_ns=behind.clip(0), response_ns=response.clip(0))
-    used = (pl.col("execution_ns") - pl.col("after_ns")).clip(0)
-    frame = frame.with_columns(before_ns=pl.coalesce(used, "response_ns")).drop("response_ns")
-    measured = bool(flow.instances["execution_ns"].count())
-    return Occupation(frame, cores, _urgency(contests), places, settled_ns, measured)
+    frame = frame.with_columns(before_ns=response.clip(0), after_ns=behind.clip(0))
+    known = frame.drop_nulls(["execution_ns", "before_ns"])
+    used, had = (int(known.select(pl.sum_horizontal(*part).sum()).item() or 0) for part in _SHARES)
+    share = max(0.0, 1 - used / had) if had else None
+    return Occupation(frame, cores, _urgency(contests), places, settled_ns, share)
 
 
 def thread_cores(flow: DataFlow, info: RecordingInfo) -> dict[ThreadKey, int | None]:
@@ -113,7 +114,7 @@ def _add_preemptions(
     inner: dict[str, np.ndarray[tuple[int], np.dtype[np.int64]]],
     contests: Counter[tuple[ThreadKey, ThreadKey]],
 ) -> None:
-    """Add, for the instances of a place, how long others ran inside of each, and whose they were."""
+    """Add how long others ran inside of each instance of a place, and whose threads they were."""
     columns = frame.select("pid", "tid", "start", "end", "published")
     open_rows: list[tuple[int, int, ThreadKey, int | None]] = []
     for row in rows:

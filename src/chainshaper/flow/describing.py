@@ -20,7 +20,7 @@ import numpy.typing as npt
 import polars as pl
 import yaml
 
-from chainshaper.analysis import DataFlow, data_flow, graph_of
+from chainshaper.analysis import DataFlow, analyse_latency, data_flow, graph_of
 from chainshaper.analysis.chains import find_chain
 from chainshaper.analysis.graph import MESSAGE_FILTER
 from chainshaper.analysis.occupation import (
@@ -33,9 +33,10 @@ from chainshaper.analysis.occupation import (
 )
 from chainshaper.flow.exploration import list_chains
 from chainshaper.linux.scheduling import available_cores
+from chainshaper.simulation import simulate_latencies
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, Callback
-from chainshaper.values.durations import duration_text, format_duration
+from chainshaper.values.durations import duration_text, format_duration, milliseconds
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, wrong_values_refused
@@ -53,6 +54,8 @@ EVIDENCE = 10  # so many cases a figure is measured from
 EXACT_PPM = 20  # a timer whose starts drift by more against its period has another one
 ANOTHER_PERIOD = 0.05  # so much of its period off, a timer's starts contradict it
 UNEXPLAINED = 0.05  # the share of a synchroniser's sets that may be completed by chance elsewhere
+NEAR_AVERAGE, NEAR_MAXIMUM = 0.02, 0.05  # so near a simulated description comes, or says so
+MOST_CYCLES = 20_000  # that are simulated to see that
 NEARLY = 0.9  # of the cycles, so that the others are missing at the recording's end
 USUALLY, LEAST = 0.1, 0.05  # quantiles: of starts behind expiries, of free deliveries
 
@@ -133,10 +136,34 @@ def application_file(
     values = _in_whole_cycles(values, len(evidence.instances([evidence.origin])))
     values = _written_out(values, _chosen(evidence, values))
     with wrong_values_refused(Application, f"{recording.path}: "):
-        Application.model_validate(values, context=AS_YAML, strict=False)
-    notes = tuple(dict.fromkeys(evidence.notes))
+        application = Application.model_validate(values, context=AS_YAML, strict=False)
+    compared = _simulated_back(evidence, application)
+    notes = tuple(dict.fromkeys((*evidence.notes, compared)))
     body = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     return "".join((*map(_comment, notes), body)), notes
+
+
+def _simulated_back(evidence: _Evidence, application: Application) -> str:
+    """How near the description comes to the recording: latencies simulated and recorded."""
+    recorded = analyse_latency(evidence.flow, application.chain)
+    complete = recorded.traversals.drop_nulls("latency_ns").sort("latency_ns")
+    simulated = simulate_latencies(application, cycles=min(MOST_CYCLES, 2 * len(complete)))
+    simulated = simulated[simulated >= 0]
+    if complete.is_empty() or not simulated.size:
+        return "No cycle completes: the description cannot be compared with the recording."
+    latencies = complete["latency_ns"].to_numpy()
+    both = [(float(one.mean()), int(one.max())) for one in (simulated, latencies)]
+    (mean, longest), (recorded_mean, recorded_longest) = both
+    said = f"Simulated, {application.chain} takes {milliseconds(mean)} ms on average and"
+    said += f" {milliseconds(longest)} ms at most; recorded were {milliseconds(recorded_mean)} and"
+    said += f" {milliseconds(recorded_longest)} ms."
+    if abs(longest - recorded_longest) > NEAR_MAXIMUM * recorded_longest:
+        since = (complete["start"][-1] - complete["start"].min()) / 1e9
+        said += f" The longest was recorded {since:.1f} s behind the first: what made it so long is"
+        said += " not in the description."
+    if abs(mean - recorded_mean) > NEAR_AVERAGE * recorded_mean:
+        said += " The averages differ: what the notes say matters for this chain."
+    return said
 
 
 def _comment(note: str) -> str:
@@ -156,32 +183,45 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
     timers = [one.id for one in graph.callbacks if one.kind == "timer"]
     origin = path.callbacks[0]
     wanted = [origin] if origin in timers or not timers else timers
-    starts = flow.instances.filter(pl.col("callback_id").is_in(wanted)).sort("start")
+    starts = found.instances.filter(pl.col("callback_id").is_in(wanted)).sort("start")
     begun = starts.filter(pl.col("start") >= found.settled_ns)
-    left_out, starts = len(starts) - len(begun), begun
+    origin = int(begun["callback_id"][0]) if len(begun) else origin
+    start_ns = int(begun["start"][0]) if len(begun) else 0
+    callbacks = {one.id: one for one in graph.callbacks}
+    blocker = _blocker(callbacks, found, begun.filter(callback_id=origin))
+    if blocker is not None and callbacks[blocker].period_ns == callbacks[origin].period_ns:
+        earlier = found.instances.filter(pl.col("start") < start_ns, callback_id=blocker)["start"]
+        if earlier.len():
+            origin, start_ns = blocker, int(earlier[-1])
     evidence = _Evidence(
         recording=recording,
         flow=flow,
-        callbacks={one.id: one for one in graph.callbacks},
+        callbacks=callbacks,
         found=found,
         hops=deliveries(flow, found),
         first=taken_first(flow, found),
-        origin=int(starts["callback_id"][0]) if len(starts) else origin,
-        start_ns=int(starts["start"][0]) if len(starts) else 0,
+        origin=origin,
+        start_ns=start_ns,
     )
-    if not found.measured:
-        evidence.notes.append(
-            "CPU times are not in the recording (no sched_switch, no CPU clock): execution times"
-            " are response times, without those of callbacks that were seen to pre-empt them."
+    evidence.notes.append(
+        "Execution times are response times, without those of callbacks that were seen to pre-empt"
+        " them on their core: "
+        + (
+            "CPU times are not in the recording (no sched_switch, no CPU clock)."
+            if found.others is None
+            else f"in {100 * found.others:.1f} % of them interrupts, threads without callbacks or"
+            " the machine had the core."
         )
+    )
     if flow.instances["assumed"].any():
         evidence.notes.append(
             "Some callbacks have no events of their own (Python nodes, threads that publish): they"
             " last until they publish, as far as the description knows."
         )
-    if left_out:
+    if len(begun) < len(starts):
         evidence.notes.append(
-            f"The first {left_out} cycles are left out: threads were not on their cores yet."
+            f"The first {len(starts) - len(begun)} cycles are left out: threads were not on their"
+            " cores yet."
         )
     gates = events.table(recording.events, "gate_release")
     if len(gates):
@@ -339,7 +379,8 @@ def _by_message(evidence: _Evidence, node: _Node, callback: Callback) -> Numbers
             " description all do."
         )
     node.deliveries[topic] = _delays(evidence, rows)
-    return rows["instance"].cast(pl.Int64).fill_null(-1).to_numpy().astype(np.int64)
+    instances: Numbers = rows["instance"].cast(pl.Int64).fill_null(-1).to_numpy()
+    return instances
 
 
 def _spent(evidence: _Evidence, callback: Callback, rows: Numbers) -> tuple[Numbers, Numbers]:
@@ -370,7 +411,7 @@ def _timer(
             f"{callback.label} is started by nothing that is described: in the description a timer"
             f" starts it, every {duration_text(period)}."
         )
-    blocker = _blocker(evidence, own)
+    blocker = _blocker(evidence.callbacks, evidence.found, own)
     if blocker is not None:
         described.before = blocker
         first = evidence.instances([blocker])
@@ -408,9 +449,9 @@ def _expiry(evidence: _Evidence, callback: Callback, own: pl.DataFrame) -> tuple
     return period, int(np.quantile(behind, USUALLY))
 
 
-def _blocker(evidence: _Evidence, own: pl.DataFrame) -> int | None:
+def _blocker(callbacks: Mapping[int, Callback], found: Occupation, own: pl.DataFrame) -> int | None:
     """The timer behind which a timer's callback starts as a rule, on the same thread."""
-    every = evidence.found.instances.drop_nulls("end").sort("end")
+    every = found.instances.drop_nulls("end").sort("end")
     last = (
         own.select("pid", "tid", "start")
         .sort("start")
@@ -424,20 +465,22 @@ def _blocker(evidence: _Evidence, own: pl.DataFrame) -> int | None:
         )
     )
     close = last.filter(pl.col("start") - pl.col("end") < NEXT_NS)["callback_id"]
-    if 2 * len(close) <= len(own):
+    if not len(close) or 2 * len(close) <= len(own):
         return None
     blocker = int(close.mode()[0])
-    return blocker if evidence.callbacks[blocker].kind == "timer" else None
+    return blocker if callbacks[blocker].kind == "timer" else None
 
 
 def _in_turn(evidence: _Evidence, node: _Node) -> None:
     """Put callbacks behind those that go first: executors look at them in this order."""
-    turns = cmp_to_key(lambda one, other: _turn(evidence, one.ids[0], other.ids[0]))
-    node.callbacks.sort(key=turns)
+
+    def turn(one: _Described, other: _Described) -> int:
+        return _turn(evidence, one.ids[0], other.ids[0])
+
+    node.callbacks.sort(key=cmp_to_key(turn))
     for described in [*node.callbacks]:
-        places = [
-            number for number, one in enumerate(node.callbacks) if described.before in one.ids
-        ]
+        ids = [one.ids for one in node.callbacks]
+        places = [number for number, own in enumerate(ids) if described.before in own]
         if places and node.callbacks.index(described) < places[0]:
             node.callbacks.remove(described)
             node.callbacks.insert(places[0], described)
@@ -685,8 +728,8 @@ def _delays(evidence: _Evidence, rows: pl.DataFrame) -> Numbers:
     costs = sum(_own_costs(evidence))
     alone = (rows["delay_ns"] - costs).clip(0).set(rows["kept_ns"].is_not_null(), None)
     usual = alone.median()
-    shorter = rows["kept_ns"].clip(0, int(usual or 0))  # type: ignore[arg-type]
-    unseen = (rows["before_ns"] - costs).clip(0)  # else its thread had begun with it instead
+    shorter = rows["kept_ns"].clip(0, int(usual or 0))
+    unseen = rows["before_ns"]  # when its thread began that callback, else it had begun with it
     waited = pl.select(pl.max_horizontal(shorter, unseen)).to_series()
     known = waited.zip_with(rows["kept_ns"].is_not_null(), alone)
     filled: Numbers = known.fill_null(int(known.median() or 0)).to_numpy().astype(np.int64)
@@ -694,7 +737,7 @@ def _delays(evidence: _Evidence, rows: pl.DataFrame) -> Numbers:
 
 
 def _costs(evidence: _Evidence, nodes: Mapping[str, _Node]) -> dict[str, Any]:
-    """What the simulator needs to know: deliveries as they were, and no cost that is in other times."""
+    """What the simulator needs: deliveries as they were, and no cost that is in other times."""
     wake_up, take = _own_costs(evidence)
     own = {"wake_up": wake_up, "take": take, "publish": 0, "delivery": 0}
     costs: dict[str, Any] = {

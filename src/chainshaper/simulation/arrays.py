@@ -482,24 +482,18 @@ class Machine:
                 stream = self._streams.add(described.execution, process.node, entity.index)
                 executions[callback] = stream
                 if described.afterwards is not None:
-                    own = (described.afterwards, process.node, FIRST_AFTER + entity.index)
-                    afterwards[callback] = self._streams.add(*own)
+                    times, number_of = described.afterwards, FIRST_AFTER + entity.index
+                    afterwards[callback] = self._streams.add(times, process.node, number_of)
             body = at.COMPUTE
             if gate is not None:
                 body = at.MODE_LISTENER if entity.listens else at.GATE
                 if callback not in bodies:
                     bodies[callback] = _add_gate(rows, system, described, timing)
             elif described.synchronises:
-                body, inputs = at.SYNCHRONISE, len(described.synchronises)
+                body = at.SYNCHRONISE
                 if callback not in bodies:
-                    bodies[callback] = rows.add(inputs, I.COLUMNS).start
-                first, depth = bodies[callback], system.depth(entity.topic or "")
-                trigger = NONE
-                if described.triggered_by is not None:
-                    place = described.synchronises.index(described.triggered_by)
-                    trigger, depth = first + place * I.COLUMNS, 1
-                own = {I.ON_CHAIN: on_chain, I.DEPTH: depth, I.END: first + inputs * I.COLUMNS}
-                rows.set(first + entity.number * I.COLUMNS, own | {I.TRIGGER: trigger})
+                    bodies[callback] = rows.add(len(described.synchronises), I.COLUMNS).start
+                self._fill_input(entity, bodies[callback], on_chain)
             group = system.application.nodes[process.key].exclusive_group(described)
             if group is not None and (entity.process, group) not in groups:
                 groups[entity.process, group] = rows.put([0])[0]
@@ -524,6 +518,15 @@ class Machine:
                 topic = system.application.topic(entity.topic)
                 rows[row + E.DEPTH] = topic.depth if gate is None or entity.listens else gate.depth
                 rows[row + E.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
+
+    def _fill_input(self, entity: Entity, first: int, on_chain: bool) -> None:
+        """The input of a synchroniser, whose inputs stand from ``first`` on, that an entity is."""
+        topics, triggered_by = entity.described.synchronises, entity.described.triggered_by
+        trigger, depth = NONE, self._system.depth(entity.topic or "")
+        if triggered_by is not None:
+            trigger, depth = first + topics.index(triggered_by) * I.COLUMNS, 1
+        own = {I.ON_CHAIN: on_chain, I.DEPTH: depth, I.END: first + len(topics) * I.COLUMNS}
+        self._rows.set(first + entity.number * I.COLUMNS, own | {I.TRIGGER: trigger})
 
     def _fill_publishers(self) -> None:
         rows, system = self._rows, self._system

@@ -51,11 +51,13 @@ SEND, SENT, RECEIVE, RECEIVED = range(7, 11)
 # Entities: what an executor waits for. BODY_ROW is that of the gate, or of the synchroniser's first
 # input, INPUT which of its inputs it is. GROUP is where stands whether its mutually exclusive group
 # is busy, NONE if its executor has one thread, or the group is reentrant. AFTERWARDS is NONE where
-# the callback ends with its last publication. From HEAD on: its history (Q). READY: in the snapshot.
+# the callback ends with its last publication. From HEAD on: its history (Q). READY: in the
+# snapshot.
 E = IntEnum(
     "E",
     "CALLBACK HANDLE RMW_HANDLE THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION AFTERWARDS"
-    " PUBLISHERS PUBLISHERS_END LIFESPAN STARTS_CHAIN ON_CHAIN HEAD TAIL WAITING DEPTH DUE READY COLUMNS",
+    " PUBLISHERS PUBLISHERS_END LIFESPAN STARTS_CHAIN ON_CHAIN HEAD TAIL WAITING DEPTH DUE READY"
+    " COLUMNS",
     start=0,
 )
 

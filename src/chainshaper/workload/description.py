@@ -67,7 +67,7 @@ class ExecutionTime(Part):
 
     @model_validator(mode="after")
     def _one_distribution(self) -> "ExecutionTime":
-        given = [self.constant_ns, self.uniform_ns, self.normal_ns]
+        given: list[object] = [self.constant_ns, self.uniform_ns, self.normal_ns]
         given += [self.samples_ns, self.sequence_ns]
         if given.count(None) != len(given) - 1:
             raise wrong_value("give exactly one of constant, uniform, normal, samples, sequence")
@@ -249,9 +249,10 @@ class NodeDescription(Part):
     """A node in a process of its own.
 
     ``core``, ``priority`` and ``dds_priority`` override ``scheduling``. One that is not ``bound``
-    to its core runs, live, on any; in a simulation its core is where it runs. A multi-threaded executor
-    has ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a callback
-    group, callbacks run one at a time, or, where it is reentrant, whenever a thread is free.
+    to its core runs, live, on any; in a simulation its core is where it runs. A multi-threaded
+    executor has ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a
+    callback group, callbacks run one at a time, or, where it is reentrant, whenever a thread is
+    free.
     """
 
     callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
@@ -356,12 +357,16 @@ class Application(Part):
             reason = "the topics form a cycle, in which messages would circle for ever: "
             reason += f"{' → '.join(error.args[1])}; break it at one of these topics"
             raise wrong_value(reason, "nodes") from error
-        for node in self.simulation.drift:
-            if node not in self.nodes:
-                raise wrong_value("no such node: remove it", "simulation", "drift", node)
-        for node, topics in self.simulation.deliveries.items():
-            if node not in self.nodes:
-                raise wrong_value("no such node: remove it", "simulation", "deliveries", node)
+        self._check_simulation()
+        return self
+
+    def _check_simulation(self) -> None:
+        described = self.simulation
+        for key, named in (("drift", [*described.drift]), ("deliveries", [*described.deliveries])):
+            for node in named:
+                if node not in self.nodes:
+                    raise wrong_value("no such node: remove it", "simulation", key, node)
+        for node, topics in described.deliveries.items():
             read = {topic for one in self.nodes[node].callbacks for topic in one.subscriptions}
             for topic in topics:
                 if topic not in read:
@@ -369,7 +374,6 @@ class Application(Part):
                     raise wrong_value(
                         f"{reason} remove it", "simulation", "deliveries", node, topic
                     )
-        return self
 
     def _refuse_unpublished(
         self, callback: CallbackDescription, published: set[str], where: tuple[str | int, ...]

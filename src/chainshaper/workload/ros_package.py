@@ -113,7 +113,7 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
         and "work behind the publications, which generated nodes do not do; remove it, or add it to"
         " `execution`",
         "triggered_by": callback.triggered_by is not None
-        and "a set that one input completes with the newest of the others, for which message_filters"
+        and "a set of one input's message and the newest of the others, for which message_filters"
         " has no class; remove it",
         "kind": callback.kind != "subscription"
         and f"a {callback.kind}'s messages on a topic, which ROS 2 has not; remove `kind`",
