@@ -6,12 +6,14 @@ the recording, or follow from who ran when (:mod:`chainshaper.analysis.occupatio
 recording cannot tell is said in notes, which stand at the top of the file.
 """
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cmp_to_key, partial
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from textwrap import fill
 from typing import Any
 
@@ -33,7 +35,7 @@ from chainshaper.analysis.occupation import (
 )
 from chainshaper.flow.exploration import list_chains
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.simulation import simulate_latencies
+from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import duration_text, format_duration, milliseconds
@@ -147,10 +149,11 @@ def _simulated_back(evidence: _Evidence, application: Application) -> str:
     """How near the description comes to the recording: latencies simulated and recorded."""
     recorded = analyse_latency(evidence.flow, application.chain)
     complete = recorded.traversals.drop_nulls("latency_ns").sort("latency_ns")
-    simulated = simulate_latencies(application, cycles=min(MOST_CYCLES, 2 * len(complete)))
-    simulated = simulated[simulated >= 0]
-    if complete.is_empty() or not simulated.size:
+    if complete.is_empty():
         return "No cycle completes: the description cannot be compared with the recording."
+    simulated = _latencies(application, min(MOST_CYCLES, 2 * len(complete)))
+    if not simulated.size:
+        return f"Simulated, no cycle of {application.chain} completes, as the recorded ones did."
     latencies = complete["latency_ns"].to_numpy()
     both = [(float(one.mean()), int(one.max())) for one in (simulated, latencies)]
     (mean, longest), (recorded_mean, recorded_longest) = both
@@ -220,8 +223,8 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
         )
     if len(begun) < len(starts):
         evidence.notes.append(
-            f"The first {len(starts) - len(begun)} cycles are left out: threads were not on their"
-            " cores yet."
+            "Cycles before all threads were on their cores are left out:"
+            f" {len(starts) - len(begun)} of {len(starts)}."
         )
     gates = events.table(recording.events, "gate_release")
     if len(gates):
@@ -230,6 +233,18 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
             " computes while it holds a message. Describe a recording without it."
         )
     return evidence, spec
+
+
+def _latencies(application: Application, cycles: int) -> Numbers:
+    """The latencies of a description's chain that are completed in simulation (ns)."""
+    try:
+        found = simulate_latencies(application, cycles=cycles)
+    except InputError:  # stored messages lead through nodes of which events alone tell
+        with TemporaryDirectory() as folder:
+            recording = simulate(application, Path(folder) / "simulated", cycles=cycles)
+            traversals = analyse_latency(recording, application.chain).traversals
+            found = traversals["latency_ns"].drop_nulls().to_numpy()
+    return found[found >= 0]
 
 
 # Nodes and their callbacks --------------------------------------------------------------------
@@ -250,7 +265,7 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
     published = {topic for one in ran for topic in _written(one)}
     nodes: dict[str, _Node] = {}
     for members in chosen:
-        name = evidence.callbacks[members[0]].node.strip("/")
+        name = _name(evidence, evidence.callbacks[members[0]].node)
         node = nodes.setdefault(name, _Node())
         node.callbacks.append(_described(evidence, node, members, published))
     for node in nodes.values():
@@ -266,6 +281,16 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
             " has topics only."
         )
     return nodes
+
+
+def _name(evidence: _Evidence, node: str) -> str:
+    """A node's name as descriptions permit it."""
+    name = re.sub(r"[^A-Za-z0-9_/]", "_", node).strip("/")
+    if not re.match(r"[A-Za-z_]", name):
+        name = f"node_{name}"
+    if name != node.strip("/"):
+        evidence.notes.append(f"{node} is no name of a node in a description: it is {name} there.")
+    return name
 
 
 def _describable(callback: Callback) -> bool:
@@ -430,7 +455,8 @@ def _expiry(evidence: _Evidence, callback: Callback, own: pl.DataFrame) -> tuple
     starts = own["start"].sort().to_numpy().astype(np.int64)
     apart = int(np.median(np.diff(starts))) if len(starts) > 1 else 0
     period = callback.period_ns or max(1_000, round(apart, -3))
-    if callback.period_ns and abs(apart - period) > ANOTHER_PERIOD * period:
+    contradicted = abs(apart - period) > ANOTHER_PERIOD * period and 10 * apart > period
+    if callback.period_ns and contradicted:
         evidence.notes.append(
             f"{callback.label} started every {duration_text(round(apart, -3))}: that is its period"
             " in the description."
@@ -660,15 +686,17 @@ def _cores_of_threads(
 
 def _note_shared(evidence: _Evidence, threads: Mapping[str, Sequence[ThreadKey]]) -> None:
     """Say which nodes share threads: described nodes have processes of their own."""
-    homes: dict[ThreadKey, list[str]] = {}
+    groups: list[tuple[set[ThreadKey], list[str]]] = []
     for name, own in threads.items():
-        for one in own:
-            homes.setdefault(one, []).append(name)
-    shared = {tuple(names) for names in homes.values() if len(names) > 1}
-    for names in sorted(shared):
-        evidence.notes.append(
-            f"{', '.join(names)} share an executor: in the description each has one of its own."
-        )
+        together = [one for one in groups if not one[0].isdisjoint(own)]
+        groups = [one for one in groups if one not in together]
+        names = [member for _, members in together for member in members]
+        groups.append(({*own}.union(*(keys for keys, _ in together)), [*names, name]))
+    for _, names in groups:
+        if len(names) > 1:
+            evidence.notes.append(
+                f"{', '.join(names)} share an executor: in the description each has one of its own."
+            )
 
 
 # Topics and costs -----------------------------------------------------------------------------
