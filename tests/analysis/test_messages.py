@@ -174,6 +174,35 @@ def test_intra_process_messages_travel_by_buffer_and_index() -> None:
     assert [callback.kind for callback in callbacks if callback.handle] == ["subscription"]
 
 
+@pytest.mark.parametrize(
+    "dispatch", ["dispatch_intra_process_subscription_callback", "dispatch_intra_process"]
+)
+@pytest.mark.parametrize("copies", [0, 1, 2])
+def test_caret_dispatches_messages_of_a_process_by_their_address(
+    dispatch: str, copies: int
+) -> None:
+    """All messages lie at one address, or are copied to another one, once or twice. The
+    events of the fourth message's publication are lost."""
+    story = Story()
+    node = story.node("/a", pid=1)
+    publisher, reader = story.publisher(node, "/x"), story.subscription(node, "/x")
+    for sent in (10, 30, 50, 70):
+        at = {"publisher_handle": publisher.handle, "message": 7}
+        if sent != 70:
+            story.event("rclcpp_intra_publish", sent, 1, **at)
+        for copy in range(copies if sent != 70 else 0):
+            addresses = {"original_message": 7 + copy, "constructed_message": 8 + copy}
+            story.event("message_construct", sent + 1 + copy, 1, **addresses)
+        story.event(dispatch, sent + 5, 1, message=7 + copies, callback=reader.handle)
+        story.start(reader, sent + 6, intra=1)
+        story.end(reader, sent + 9)
+    flow = data_flow(story.tables())
+    assert read(flow) == [(15, 10), (35, 30), (55, 50), (75, None)]
+    assert flow.takes["instance"].to_list() == [0, 1, 2, 3]
+    assert flow.takes["intra_process"].all()
+    assert not any("no other event tells" in note for note in flow.notes)
+
+
 def test_a_gate_s_decision_about_a_message_without_dds_is_found_by_its_instance() -> None:
     """The gate's thread has no other instance meanwhile; the process has other subscriptions."""
     story = Story()

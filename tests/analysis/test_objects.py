@@ -3,7 +3,7 @@
 from collections.abc import Callable
 
 import pytest
-from story import Story
+from story import Callback, Story
 
 from chainshaper.analysis import application_graph, callback_instances, resolve_objects
 
@@ -97,6 +97,40 @@ def test_lost_init_events_leave_what_is_known() -> None:
     (callback,) = application_graph(story.tables()).callbacks
     found = (callback.kind, callback.topic, callback.node)
     assert found == ("subscription", None, "unknown (process 1)")
+
+
+@pytest.mark.parametrize("executes", [False, True])
+@pytest.mark.parametrize("registered", [False, True])
+def test_takes_tell_whose_a_callback_of_an_unregistered_address_is(
+    executes: bool, registered: bool
+) -> None:
+    """The callback was registered at another address, or not at all. /a publishes /y in it. Another
+    unregistered callback, of a timer, starts in between: no take comes right before it.
+
+    Loaned messages have no event of a take, but of their execution.
+    """
+    story = Story()
+    node = story.node("/a", pid=1)
+    reader = story.subscription(node, "/x", callbackless=not registered)
+    writer = story.publisher(node, "/y")
+    moved, timer = Callback(1, 0x63), Callback(1, 0x77)
+    for time in range(100, 1000, 100):
+        if executes:
+            handle = story.rows["rcl_subscription_init"][0]["subscription_handle"]
+            story.event("rclcpp_executor_execute", time, 1, handle=handle)
+        else:
+            story.take(reader, time, sent=time - 10)
+        story.runs(moved, time + 1, time + 5, writes=((writer, time + 3),))
+        story.runs(timer, time + 10, time + 15)
+    tables = story.tables()
+    graph, objects = application_graph(tables), resolve_objects(tables)
+    labels = [one.label for one in graph.callbacks]
+    assert sorted(labels) == ["/a ← /x", "unknown (process 1) callback 0x77"]
+    assert graph.callbacks[labels.index("/a ← /x")].publishes == ("/y",)
+    found = callback_instances(tables, objects.callbacks).group_by("callback_id").len()
+    assert set(found["len"]) == {9}
+    assert sum("0x63, which was not registered" in note for note in objects.notes) == 1
+    assert not any("without callback events" in note for note in objects.notes)
 
 
 def test_publisher_created_before_its_node_as_rosout_is() -> None:

@@ -217,8 +217,8 @@ def test_the_latency_ends_when_the_message_was_sent(
     assert rows == [(latency, why, why and "/t1") for latency, why in expected]
     if outcomes[0]:
         assert found.traversals["reception_ns"][0] == 80
-        first = found.hops.select("publish", "end", "computation_ns").row(0)
-        assert first == (160, 105, 70), "it left when its callback instance had ended"
+        first = found.hops.select("publish", "end", "computation_ns", "waiting_ns").row(0)
+        assert first == (160, 105, 10, 60), "it left when its callback instance had ended"
 
 
 def test_where_no_event_says_when_it_was_sent_as_in_ros_the_first_reader_does() -> None:
@@ -239,8 +239,9 @@ def test_inside_a_chain_waiting_for_the_thread_belongs_to_the_hop_that_publishes
     found = analyse_latency(story.tables(), "/t1../t2", OFFSET)
     rows = found.traversals.select("latency_ns", "reason", "broken_at").rows()
     assert rows == [(95, None, None), (None, "discarded", "/t1")]
-    hops = found.hops.filter(traversal=0).select("communication_ns", "computation_ns")
-    assert hops.rows() == [(None, 70), (20, 5)]
+    parts = ("communication_ns", "computation_ns", "waiting_ns")
+    hops = found.hops.filter(traversal=0).select(parts)
+    assert hops.rows() == [(None, 10, 60), (20, 5, 0)], "for the thread it waits"
 
 
 def test_what_a_gate_discarded_is_not_lost() -> None:

@@ -3,16 +3,28 @@
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import polars as pl
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from story import Callback, Node, Publisher, Story
+from story import OFFSET, Callback, Node, Publisher, Story
 from test_messages import hand_over, intra_process, receive
 
 from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_of, traverse
 from chainshaper.analysis.traversals import Traversals
+from chainshaper.reporting.latency import breakdown_json, breakdown_table
+from chainshaper.values.recording import RecordingInfo, write_recording
+from chainshaper.verify.budgets import (
+    LEAST_MISSING,
+    Budget,
+    ChainBudget,
+    check_budget,
+    propose_budget,
+)
+
+PARTS = ["communication_ns", "computation_ns", "waiting_ns"]
 
 
 @dataclass
@@ -65,10 +77,10 @@ def test_a_message_goes_through(spec: str) -> None:
     assert found.frame.select("start", "end", "latency_ns", "complete").rows() == [
         (10, 30, 20, True)
     ]
-    columns = ["hop", "take", "start", "publish", "end", "communication_ns", "computation_ns"]
+    columns = ["hop", "take", "start", "publish", "end", *PARTS]
     assert found.hops.select(columns).rows() == [
-        (0, None, 10, 12, 13, None, 2),
-        (1, 19, 20, 30, 31, 8, 10),
+        (0, None, 10, 12, 13, None, 2, 0),
+        (1, 19, 20, 30, 31, 8, 10, 0),
     ]
 
 
@@ -229,6 +241,87 @@ def test_messages_stored_for_a_timer() -> None:
     assert spans(traversals(story, "/t1../out")) == [(10, 50), (110, 150)]
 
 
+def stored_twice(cycles: int = 10, unit: int = 1) -> Story:
+    """A camera every 50, whose messages are stored; a timer every 100, which publishes at 84."""
+    story = Story()
+    camera, image = story.source("/camera", 1, "/image", 50 * unit)
+    node = story.node("/planner", 2)
+    store, timer = story.subscription(node, "/image"), story.timer(node, period=100 * unit)
+    out = story.publisher(node, "/plan")
+    for begin in range(1_000 * unit, (1_000 + 100 * cycles) * unit, 100 * unit):
+        for sent in (begin + 2 * unit, begin + 52 * unit):
+            story.runs(camera, sent - 2 * unit, sent + 2 * unit, writes=((image, sent),))
+            story.runs(store, sent + 5 * unit, sent + 8 * unit, reads=sent)
+        done = ((out, begin + 84 * unit),)
+        story.runs(timer, begin + 80 * unit, begin + 85 * unit, writes=done)
+    return story
+
+
+def test_of_several_messages_stored_for_a_timer_the_newest_counts() -> None:
+    found = analyse_latency(stored_twice().tables(), "/image../plan")
+    assert found.traversals["latency_ns"].to_list() == [None, 34] * 10, "not 34 and 84 in turns"
+    assert found.incomplete == {"not used": 10}
+    assert found.traversals["broken_at"].to_list() == ["/plan", None] * 10
+    counted = found.statistics.count, found.statistics.incomplete, found.silent
+    assert counted == (10, 10, 0), "none disappears"
+    last = found.hops.filter(pl.col("hop") == 1).drop_nulls("publish")
+    assert last.select(PARTS).rows() == [(5, 3 + 4, 20)] * 10
+
+
+def test_what_waited_and_what_was_not_used_in_budget_table_and_page(tmp_path: Path) -> None:
+    ms = 1_000_000
+    info = RecordingInfo(source="lttng", clock_offset_ns=OFFSET)
+    recording = write_recording(tmp_path / "recording", stored_twice(unit=ms).tables(), info)
+    (chain,) = propose_budget(recording, ["/image../plan"]).chains
+    assert (chain.missing, chain.hops[0].waiting_ns) == (LEAST_MISSING, None)
+    limits = (chain.hops[1].computation_ns, chain.hops[1].waiting_ns)
+    assert limits == pytest.approx((7.7 * ms, 22 * ms), rel=0.01)
+    shorter = chain.hops[1].model_copy(update={"waiting_ns": 19 * ms})
+    budget = Budget(chains=(chain.model_copy(update={"hops": (shorter,)}),))
+    (broken,) = [one for one in check_budget(recording, budget) if not one.met]
+    assert (broken.what, broken.found) == ("waiting of /plan", 20 * ms)
+    budget = Budget(chains=(ChainBudget(chain="/image../plan", maximum_ns=ms),))
+    (broken,) = check_budget(recording, budget)
+    assert broken.because == "its longest hop is /planner (20 ms of waiting on average to /plan)"
+    analysis = analyse_latency(recording, "/image../plan")
+    titles = [column.title for column in breakdown_table(analysis).columns]
+    assert "waiting\nmean" in titles
+    values = breakdown_json(analysis)
+    assert (values["hops"][1]["waiting_ns"]["max"], round(values["waiting_share"], 3)) == (
+        20 * ms,
+        round(20 / 34, 3),
+    )
+
+
+def two_lefts(symbol: str) -> Story:
+    """Two messages of the left input in each set, 82 and 42 before the output."""
+    run = Fusion(symbol)
+    for begin in (1_000, 1_300):
+        left, points = run.timers["left"]
+        for start in (begin, begin + 40):
+            run.story.runs(left, start, start + 10, writes=((points, start + 8),))
+            run.story.runs(run.inputs["left"], start + 12, start + 15, reads=start + 8)
+        right, points = run.timers["right"]
+        run.story.runs(right, begin + 60, begin + 70, writes=((points, begin + 68),))
+        done = ((run.fused, begin + 82),)
+        run.story.runs(run.inputs["right"], begin + 80, begin + 83, reads=begin + 68, writes=done)
+    return run.story
+
+
+def test_a_synchroniser_of_the_application_s_own_has_the_newest_input() -> None:
+    found = traversals(two_lefts("Fusion::left(Cloud)"), LEFT)
+    assert found.frame["latency_ns"].to_list() == [None, 42] * 2
+    assert found.notes == ()
+
+
+def test_which_message_a_queue_had_in_its_set_no_event_says() -> None:
+    found = traversals(two_lefts(MESSAGE_FILTER), LEFT)
+    assert found.frame["latency_ns"].to_list() == [82, 42] * 2
+    assert [note.partition(":")[0] for note in found.notes] == [
+        "2 messages on /left/points count with the same publication on /fused as another one"
+    ]
+
+
 def test_the_whole_analysis_with_the_reception_of_a_subscriber() -> None:
     # Published at 30 and 130; the sink's callback starts at 36, the second message is lost.
     run = Relay()
@@ -298,7 +391,7 @@ def test_traversals_agree_with_following_each_message_by_hand(cycles: list[Cycle
     assert sorted(complete.select("start", "end").iter_rows()) == sorted(expected)
     assert found.frame.height - complete.height == incomplete
     assert found.silent == silent
-    parts = pl.col("communication_ns").sum() + pl.col("computation_ns").sum()
+    parts = pl.sum_horizontal(pl.col(PARTS).sum())
     joined = complete.join(found.hops.group_by("traversal").agg(total=parts), on="traversal")
     assert joined["total"].to_list() == joined["latency_ns"].to_list()
 
@@ -398,6 +491,37 @@ def test_a_synchronised_message_leaves_with_the_input_that_completes_the_set(
     if (told, spec) == (RIGHT_LAST, LEFT):
         assert found.hops.filter(hop=1)["via"].to_list() == ["sibling", "sibling"]
         assert found.notes == ()
+
+
+def test_waiting_for_the_other_input_is_no_computation() -> None:
+    """The right input comes 100 behind the left one; each callback computes for 3."""
+    run = Fusion(symbol=MESSAGE_FILTER)
+    for begin in (1_000, 1_300):
+        for side, start in (("left", begin), ("right", begin + 100)):
+            timer, points = run.timers[side]
+            run.story.runs(timer, start, start + 10, writes=((points, start + 8),))
+        left, right = (run.inputs[side] for side in ("left", "right"))
+        run.story.runs(left, begin + 10, begin + 13, reads=begin + 8)
+        done = ((run.fused, begin + 112),)
+        run.story.runs(right, begin + 110, begin + 113, reads=begin + 108, writes=done)
+    for spec, fused in ((LEFT, (2, 5, 97)), (RIGHT, (2, 2, 0))):
+        found = traversals(run.story, spec)
+        hops = found.hops.filter(pl.col("hop") == 1).select(PARTS)
+        assert hops.rows() == [fused, fused], "3 of one callback and 2 of the other"
+        assert found.hops.filter(pl.col("hop") == 0).select(PARTS).rows() == [(None, 8, 0)] * 2
+
+
+@pytest.mark.parametrize("came", [30, 25])
+def test_what_a_gate_holds_back_waits(came: int) -> None:
+    """Of 45 between start and publication the gate held the message for 33, from its arrival."""
+    story = Story()
+    timer, t1 = story.source("/source", 1, "/tmp")
+    hold, out = story.relay("/gate", 2, "/tmp", "/t1")
+    story.runs(timer, 0, 20, writes=((t1, 10),))
+    story.runs(hold, 25, 75, reads=10, writes=((out, 70),))
+    story.gate(hold, 10, came, 63, origin=0)
+    found = traversals(story, "/tmp../t1")
+    assert found.hops.select(PARTS).rows() == [(None, 10, 0), (15, 45 - (63 - came), 63 - came)]
 
 
 def test_outputs_without_a_new_input_give_a_holding_synchroniser_away() -> None:

@@ -212,7 +212,7 @@ def test_chains_take_turns_where_they_can(saved: Callable[..., Path], tmp_path: 
     values = json_of("offsets", *files, "-o", tmp_path / "placed")
     first, second = values["plans"]
     assert (first["offset_ns"], second["offset_ns"]) == (0, 41 * MS)
-    assert "cycle 100.000, starting 41.000 late" in " ".join(called("offsets", *files).out.split())
+    assert "cycle 100.000, offset 41.000" in " ".join(called("offsets", *files).out.split())
     assert [Path(file).name for file in values["files"]] == ["1_a.yaml", "2_b.yaml"]
     assert load_plan(tmp_path / "placed" / "2_b.yaml").offset_ns == 41 * MS
     again = refused(2, "offsets", *files, "-o", tmp_path / "placed")

@@ -6,7 +6,10 @@ from typing import Any
 
 import pytest
 from command_line import called, json_of, refused
+from field_traces import chain_tables, write_chain
 from reference_traces import CHAINS, TRACES, reference_folder, reference_trace
+
+from chainshaper.verify.measure import PARTS
 
 SYSTEMS = {
     "jazzy_chain_cyclonedds": ("jazzy", "rmw_cyclonedds_cpp"),
@@ -75,11 +78,9 @@ def test_latency_of_every_traversal_and_the_same_once_converted(
     assert found["mean_ns"] == round(mean)
     assert found["lost"] == NO_LOSS
     assert (found["disturbed"], found["stalls_watched"]) == (0, False)
-    shares = found["communication_share"] + found["computation_share"]
-    assert shares == pytest.approx(1.0), "communication and computation are the whole latency"
-    parts = [
-        hop[f"{part}_ns"] for hop in found["hops"] for part in ("communication", "computation")
-    ]
+    shares = sum(found[f"{part}_share"] for part in PARTS)
+    assert shares == pytest.approx(1.0), "the parts are the whole latency"
+    parts = [hop[f"{part}_ns"] for hop in found["hops"] for part in PARTS]
     assert sum(part["mean"] for part in parts if part) == pytest.approx(mean, abs=1)
 
     recording = tmp_path / "recording"
@@ -118,6 +119,67 @@ def test_named_paths_of_a_caret_architecture_file(tmp_path: Path) -> None:
     file.write_text("named_paths:" + path.format(name="one") + path.format(name="two"))
     message = refused(2, "latency", trace, "--chains", file)
     assert "choose one of its named_paths with --chain: one, two" in message
+
+
+def test_named_paths_of_carets_files_for_galactic(tmp_path: Path) -> None:
+    """They name the paths as callbacks; the file that CARET writes has none yet."""
+    folder = reference_folder("galactic_caret_end_to_end")
+    text, trace = (folder / "architecture.yaml").read_text(), folder / "trace"
+    said = refused(2, "latency", trace, "--chains", folder / "architecture.yaml")
+    assert "no path is named in it" in said
+    path = """path_name_aliases:
+- path_name: to_filter
+  callbacks:
+  - /sensor_dummy_node/timer_callback_0
+  - /filter_node/subscription_callback_0
+"""
+    file = tmp_path / "architecture.yaml"
+    file.write_text(text.replace("path_name_aliases: []", path))
+    named = json_of("latency", trace, "--chains", file)
+    assert named["count"] == 75
+    assert [hop["topic"] for hop in named["hops"]] == ["/topic1", "/topic2"]
+    written = "/sensor_dummy_node../topic1../filter_node../topic2"
+    assert named["chain"] == written
+    longer = path + "  - /message_driven_node/subscription_callback_0\n"
+    file.write_text(text.replace("path_name_aliases: []", longer))
+    assert json_of("latency", trace, "--chains", file)["chain"] == (
+        f"{written}../message_driven_node../topic3"
+    )
+    file.write_text(text.replace("path_name_aliases: []", path.replace("callback_0", "callback_7")))
+    said = refused(2, "latency", trace, "--chains", file)
+    assert "names the callback /sensor_dummy_node/timer_callback_7" in said
+
+
+def test_the_only_chain_of_a_trace_needs_not_to_be_named(tmp_path: Path) -> None:
+    trace, page = write_chain(tmp_path / "trace", chain_tables()), tmp_path / "page.html"
+    taken, spec = "no --chain was given", "/image../objects"
+    found = json_of("latency", trace)
+    assert (found["chain"], found["count"]) == (spec, 20)
+    assert any(taken in note and spec in note for note in found["notes"])
+    assert json_of("plan", trace)["warnings"][0].startswith(taken)
+    commands: list[list[str | Path]] = [
+        ["latency", trace],
+        ["plan", trace, "-o", tmp_path / "plan.yaml"],
+        ["report", trace, "-o", page],
+        ["compare", trace, trace],
+        ["budget", trace, "-o", tmp_path / "budget.yaml"],
+    ]
+    for words in commands:
+        said = called(*words)
+        assert said.code == 0, words
+        (line,) = (line for line in said.err.splitlines() if taken in line)
+        assert spec in line
+    assert taken in page.read_text()
+    assert called("check", trace, "--budget", tmp_path / "budget.yaml").code == 0
+    exported = called("export", trace, "--perfetto", "-o", tmp_path / "trace.pftrace")
+    assert exported.code == 0
+    assert spec.encode() in (tmp_path / "trace.pftrace").read_bytes()
+    named = called("latency", trace, "--chain", spec)
+    assert taken not in named.err
+    several = reference_folder("galactic_caret_end_to_end") / "trace"
+    commands = [["latency", several], ["plan", several], ["compare", several, several]]
+    for words in commands:
+        assert "add --chain /topic4 or --chain /drive../topic3../topic4 or" in refused(2, *words)
 
 
 def test_tables_are_for_people() -> None:

@@ -4,7 +4,6 @@ The node's timer expires every 10 ms; its server is open for 30 ms of every 100 
 random moments, drawn from a fixed seed for each kind of fault.
 """
 
-import fcntl
 import json
 import os
 import random
@@ -50,7 +49,7 @@ from processes import wait_for
 
 from chainshaper import __file__ as package_file
 from chainshaper.linux import cgroups
-from chainshaper.linux.runs import journals_folder
+from chainshaper.linux.runs import all_runs_locked, journals_folder
 from chainshaper.linux.threads import list_threads, parents
 from chainshaper.planning import Plan, plan_shaping, save_plan
 
@@ -198,9 +197,7 @@ def test_ctrl_c_ends_it_in_every_phase(tmp_path: Path, phase: str) -> None:
         options = [*FIFO, "--wait", f"{LONG_S}s"]
         if phase == "claiming":
             journals_folder().mkdir(exist_ok=True)
-            folder = os.open(journals_folder(), os.O_RDONLY | os.O_DIRECTORY)
-            stack.callback(os.close, folder)
-            fcntl.flock(folder, fcntl.LOCK_EX)
+            stack.enter_context(all_runs_locked(journals_folder(), lambda *_: None))
             line = ""
         if phase == "starting":
             options += ["--", "sleep", str(LONG_S)]
@@ -213,7 +210,8 @@ def test_ctrl_c_ends_it_in_every_phase(tmp_path: Path, phase: str) -> None:
             while line not in (said := known(run.stderr).readline()):
                 assert said, "it ended"
         else:
-            wait_for(lambda: journals_folder() in open_files(run.pid), "it to wait for the others")
+            lock = journals_folder() / ".lock"
+            wait_for(lambda: lock in open_files(run.pid), "it to wait for the others")
         asked = time.monotonic()
         run.send_signal(signal.SIGINT)
         said = ended(run)

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -21,9 +21,11 @@ from typing import TypeAlias, cast
 
 import pytest
 from applied_plans import Governed, needs_fifo, node_to_govern
-from gated import CORE, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups
+from gated import CORE, ahead_of_others, cpu_ns, groups_left, kill, needs_cgroups, own_cgroup
 from known import known
+from odd_names import ODD_NAMES, process_named
 from processes import is_alive, wait_for
+from strangers import needs_root
 
 from chainshaper.enforcement.freezer import CoreNumbers, CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, _Watch, let_go
@@ -91,12 +93,17 @@ class Run:
 
 @contextmanager
 def run_on(
-    node: Governed, back_end: str = "freezer", cycle_ms: int = MINUTE, slot_ms: int = 2
+    node: Governed,
+    back_end: str = "freezer",
+    cycle_ms: int = MINUTE,
+    slot_ms: int = 2,
+    *,
+    inside: tuple[str, ...] = (),
 ) -> Iterator[Run]:
     runs = node.folder / f"runs-{time.monotonic_ns()}"
     arguments = (back_end, runs, CORE, cycle_ms, slot_ms, node.pid)
     with subprocess.Popen(
-        [sys.executable, str(OWNER), *map(str, arguments)],
+        [*inside, sys.executable, str(OWNER), *map(str, arguments)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=(node.folder / "said").open("w"),
@@ -175,6 +182,26 @@ def test_whichever_two_are_killed_or_stopped_all_is_as_before(
     with ThreadPoolExecutor(max_workers=4) as several:
         wanted = [one for one in FAULTS if without.isdisjoint(name for name, _ in one)]
         list(several.map(lose, wanted))
+
+
+@needs_root
+@pytest.mark.parametrize("lost", [("owner",), ("owner", "dispatcher"), ("dispatcher",)])
+def test_names_that_are_no_text_appear_while_servers_are_in_force(
+    node: Governed, tmp_path: Path, lost: tuple[str, ...]
+) -> None:
+    """Somebody mounts something, makes groups and starts programs that no encoding can read."""
+    with run_on(node, inside=("unshare", "--mount")) as run, ExitStack() as undo:
+        for number, name in enumerate(ODD_NAMES):
+            folder = tmp_path / f"{number}{os.fsdecode(name.replace(b'/', b''))}"
+            folder.mkdir()
+            there = ("nsenter", "--mount", f"--target={run.owner.pid}")
+            subprocess.run([*there, "mount", "-t", "tmpfs", "none", folder], check=True)
+            undo.enter_context(process_named(name))
+            if b"\n" not in name:
+                undo.enter_context(own_cgroup(folder.name))
+        for pid in [pid for name in lost for pid in run.pids(name)]:
+            kill(pid)
+        run.wait_until_restored()
 
 
 @pytest.mark.parametrize(("name", "number"), [("guardian", KILL), ("guardians", STOP)])

@@ -108,7 +108,7 @@ def run_of(
     if slots is not None:
         server = plan.servers[0].model_copy(update={"slots": slots})
         plan = plan.model_copy(update={"servers": (server,), "cycle_ns": 100 * MS})
-    here: Any = SimpleNamespace(path=folder / "j", strangers=None, **seen)
+    here: Any = SimpleNamespace(path=folder / "j", strangers=None, **{"threads": (), **seen})
     joint = whole(plan)
     run = _Run(joint, open_until_done(joint), Choice(back_end, ""), here, (), frozenset(), Event())
     run.waits_ns, run.found, run.anchor_ns = [*waits_ns], here, 50 * MS
@@ -288,7 +288,7 @@ def found(*tids: int) -> Allocation:
 class Watch:
     """A watch over where a thread begins, that sees nothing."""
 
-    looks, latest_ns, surely_ns, look_soon = 0, None, None, False
+    looks, latest_ns, surely_ns, look_soon, failure = 0, None, None, False, None
 
     def __init__(
         self, _: int, tids: Sequence[int], __: int, expected_ns: int, *___: Any, **____: Any
@@ -429,3 +429,21 @@ def test_of_two_chains_only_the_timer_that_is_new_is_measured(
     del known[1]
     assert threads.carried_out(given, again, None, known=known)[1:3] == (anchor_ns, waits_ns)
     assert measured == [8]
+
+
+def test_a_thread_that_fails_while_it_looks_or_follows_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(*_: object) -> int:
+        raise ZeroDivisionError("nothing to divide by")
+
+    monkeypatch.setattr(DriftWatch, "_look", fail)
+    monkeypatch.setattr(DriftWatch, "EVERY_S", 0.0)
+    watch = DriftWatch(1, [1], 100 * MS, 48 * MS)
+    wait_for(lambda: watch.failure is not None, "the watch to end")
+    assert watch.failure == "looking for it has failed (ZeroDivisionError: nothing to divide by)"
+    follower = SlotFollower.__new__(SlotFollower)
+    follower._cores, follower._stop, follower.failure = (), Event(), None
+    follower._chain, follower._tail = cast("Plan", SimpleNamespace(cycle_ns=1)), cast("Tail", None)
+    follower._follow()
+    assert str(follower.failure).startswith("following has failed (AttributeError: ")

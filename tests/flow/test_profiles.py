@@ -353,7 +353,7 @@ def test_who_begins_what_the_chain_waits_for_is_named() -> None:
     names: dict[str, Any] = {"nodes": ("/front", "/fusion"), "topics": ("/a", "/c")}
     profile = Profile(np.array([10, 11]) * MS, 100 * MS, spec="/a../c", callbacks=times, **names)
     said = known(other_beginnings(profile))
-    assert said.startswith("/a../c waits for what /rear begins, at another time beside /front")
+    assert said.startswith("/front and /rear start at a new offset to each other at each launch")
     alone = (times[0], replace(times[2], after=(0,)))
     assert other_beginnings(replace(profile, callbacks=alone)) is None
     assert other_beginnings(Profile(np.array([10, 11]) * MS, 100 * MS)) is None

@@ -10,6 +10,7 @@ import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 
+import polars as pl
 import pytest
 from command_line import Running, called, chainshaper, json_of, refused
 from lttng_node import LTTNG, chain_command, required_node
@@ -17,6 +18,8 @@ from processes import wait_for
 
 from chainshaper import open_recording
 from chainshaper.flow import record
+from chainshaper.values import events
+from chainshaper.values import recording as recording_module
 from chainshaper.values.errors import OperationError
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import RecordingInfo
@@ -205,6 +208,9 @@ class BrokenTracer:
     def recording(self) -> tuple[EventTables, RecordingInfo]:
         raise self.error
 
+    def written(self) -> None:
+        raise AssertionError("nothing was")
+
 
 @pytest.mark.parametrize("error", [OperationError("it cannot be read"), MemoryError()])
 def test_a_trace_is_kept_and_named_whatever_reading_it_ends_with(
@@ -264,3 +270,61 @@ def test_real_nodes_are_recorded_with_types_and_qos(tmp_path: Path) -> None:
     executors = {thread.node for thread in info.threads if thread.role == "executor"}
     assert executors == {"/talker", "/listener"}
     assert json_of("latency", path, "--chain", "/talker../chatter")["count"] >= 3
+
+
+class FullTracer(BrokenTracer):
+    """A tracer with an event, whose files say no more than that."""
+
+    def __init__(self, folder: Path) -> None:
+        super().__init__(OperationError("-"), folder)
+
+    def failure(self) -> None:
+        return None
+
+    def recording(self) -> tuple[EventTables, RecordingInfo]:
+        table = events.empty("rcl_take").clear(1).with_columns(time=pl.lit(1), message=pl.lit(7))
+        assert (self.folder / "events").exists()
+        return {"rcl_take": table}, RecordingInfo(source="preload", clock_offset_ns=0)
+
+    def written(self) -> None:
+        (self.folder / "events").unlink()
+
+
+@pytest.fixture
+def full_tracer(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(record, "_tracer", lambda _, folder, *__, **___: (FullTracer(folder), ()))
+
+
+@pytest.mark.usefixtures("full_tracer")
+def test_what_was_traced_is_removed_when_the_tables_are_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    record.record_command(tmp_path / "rec", ["true"])
+    assert files_in(tmp_path) == ["rec"]
+    assert open_recording(tmp_path / "rec").events["rcl_take"]["message"].to_list() == [7]
+
+    def full(*_: object) -> None:
+        raise OperationError("the disk is full")
+
+    monkeypatch.setattr(recording_module, "write_recording", full)
+    with pytest.raises(OperationError, match="the disk is full; what was traced stays in "):
+        record.record_command(tmp_path / "lost", ["true"])
+    (left,) = (one for one in tmp_path.iterdir() if one.name != "rec")
+    assert (left / "events").exists()
+
+
+@pytest.mark.usefixtures("full_tracer")
+def test_events_are_written_whatever_fails_beside_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(*_: object) -> None:
+        raise ValueError("an odd name")
+
+    for name in ("_look", "_known_endpoints", "_recorded_threads", "with_found_nodes"):
+        monkeypatch.setattr(record, name, fail)
+    found = record.record_command(tmp_path / "rec", duration_ns=1, source="preload").recording
+    assert found.events["rcl_take"].height == 1
+    said = "".join(found.info.notes)
+    for what in ("nodes", "threads", "endpoints"):
+        assert f"the application's {what} are not known: reading them failed (ValueError" in said
+    assert "looking at it has failed (ValueError: an odd name)" in said

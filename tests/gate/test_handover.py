@@ -316,7 +316,10 @@ def test_what_a_node_counts_is_in_the_page_for_those_who_look(
     folder: Path, program: list[str]
 ) -> None:
     command = [*program, "counting", "t5", "0", "0"]
-    for times in (1, 2):  # a node that starts again goes on counting
+    for times in (1, 2):  # a node that its launch starts again goes on counting
+        if times == 2:
+            page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
+            page["until_ns"] = time.monotonic_ns()
         subprocess.run(command, check=True, timeout=60)
         page = Page(str(folder), "t5.0.v3")
         assert [page[reason] for reason in DROPPED] == [times, 2 * times, 3 * times, 4 * times]
@@ -334,6 +337,21 @@ def test_what_a_node_counts_is_in_the_page_for_those_who_look(
     latencies, each = page.latest("measured", 0), [0, 1, 1, 2, 2, 2, 3, 3, 3, 3]
     assert latencies == [one for last in (77, 77, -5, 0, 77) for one in (*each, last)]
     assert page.latest("measured", 54) == [77]
+
+
+def test_each_launch_counts_from_nought(folder: Path, program: list[str]) -> None:
+    command = [*program, "counting", "t5", "0", "0"]
+    launch = ["sh", "-c", '"$@"; true', "launch"]  # a parent of its own
+    for _ in range(3):
+        subprocess.run([*launch, *command], check=True, timeout=60)
+        page = Page(str(folder), "t5.0.v3")
+        counts = [page[name] for name in ("starts", "published", *DROPPED, "lost_by_dds", "late")]
+        assert counts == [1, 1, 1, 2, 3, 4, 0 + 2 * 1 + 3 * 2 + 4 * 3, 2 + 4]
+    assert page["measured"] == 3 * 11, "who reads latencies goes on where it was"
+    page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
+    assert page.lock()  # a node of another launch is in force: its counts stay
+    subprocess.run([*launch, *program, "starting", "t5", "0", "0"], check=True, timeout=60)
+    assert page["published"] == 1
 
 
 @pytest.mark.parametrize("how", ["mode", "owner", "link", "file", "foreign page"])

@@ -3,17 +3,18 @@
 import os
 import pwd
 import re
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
 
 import pytest
 from known import known
-from processes import wait_for
+from processes import is_alive, wait_for
 from small_chain import small_chain_text
 
 import chainshaper
@@ -249,6 +250,77 @@ def test_what_a_command_leaves_behind_in_its_group_is_ended_too() -> None:
     assert not _group(process.pid)
 
 
+NODE = (
+    "import signal, sys, time\n"
+    "def end(*_):\n"
+    "    signal.signal(signal.SIGINT, signal.SIG_DFL)\n"  # as rclcpp and rclpy do
+    "    time.sleep(1)\n"
+    "    sys.exit(0)\n"
+    "signal.signal(signal.SIGINT, end)\n"
+    "print('ready', flush=True)\n"
+    "time.sleep(60)\n"
+)
+LAUNCHER = f"""
+import signal, subprocess, sys, time
+nodes = [subprocess.Popen([sys.executable, '-c', {NODE!r}], stdout=-1) for _ in range(3)]
+for node in nodes:
+    node.stdout.readline()
+forwards = '--noninteractive' in sys.argv or not sys.stdin.isatty()  # as `ros2 launch` does
+def end(*_):
+    time.sleep(0.3)  # it is an event like others
+    for node in nodes if forwards else ():
+        node.send_signal(signal.SIGINT)
+signal.signal(signal.SIGINT, end)
+print('ready', flush=True)
+print([node.wait() for node in nodes], flush=True)
+"""
+"""Launches three nodes, which take a second to shut down, and says how these ended."""
+
+
+@pytest.fixture
+def terminal() -> Iterator[None]:
+    """Our input is a terminal, and so is that of what we start."""
+    outer, inner = os.openpty()
+    before = os.dup(0)
+    os.dup2(inner, 0)
+    yield
+    os.dup2(before, 0)
+    for descriptor in (outer, inner, before):
+        os.close(descriptor)
+
+
+def ends_of_nodes(command: list[str]) -> str:
+    """How the nodes of a launcher ended, by its own words, when the command was ended."""
+    reading, writing = os.pipe()
+    process = start_command(command, stdout=writing)
+    os.close(writing)
+    with os.fdopen(reading) as said:
+        assert said.readline() == "ready\n"
+        end_command(process)
+        return said.readline()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [sys.executable, "-c", LAUNCHER],
+        ["bash", "-c", f"{shlex.join([sys.executable, '-c', LAUNCHER])}; echo after"],
+        ["sh", "-c", f"{shlex.join([sys.executable, '-c', LAUNCHER])}; echo after"],
+    ],
+    ids=["a launcher", "a script of bash", "a script of dash"],
+)
+def test_without_a_terminal_nodes_get_the_signal_from_their_launcher_alone(
+    command: list[str],
+) -> None:
+    assert ends_of_nodes(command) == "[0, 0, 0]\n"
+
+
+@pytest.mark.parametrize("words", [[], ["--noninteractive"]])
+@pytest.mark.usefixtures("terminal")
+def test_in_a_terminal_nodes_get_one_signal_whoever_sends_it(words: list[str]) -> None:
+    assert ends_of_nodes([sys.executable, "-c", LAUNCHER, *words]) == "[0, 0, 0]\n"
+
+
 def test_the_environment_is_ours_and_what_is_added(tmp_path: Path) -> None:
     said = tmp_path / "said"
     with said.open("wb") as file:
@@ -293,3 +365,13 @@ def _group(leader: int) -> list[int]:
     """Living processes of a group."""
     stats = ((pid, fields) for pid, fields in all_stats() if fields[0] != b"Z")
     return [pid for pid, (_, _, group, *_) in stats if int(group) == leader]
+
+
+def test_a_group_whose_leader_was_waited_for_is_ended_by_who_is_in_it(tmp_path: Path) -> None:
+    """The number of a process that was waited for may be another's: it is not signalled."""
+    left = tmp_path / "left"
+    command = start_command(["sh", "-c", f"sleep 60 & echo $! > {left}"])
+    command.wait()
+    pid = int(left.read_text())
+    end_command(command, patience_s=2)
+    wait_for(lambda: not is_alive(pid), "what it had left behind to end")

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,17 @@ import pytest
 from applied_plans import needs_fifo
 from gated import needs_cgroups
 from known import known
+from processes import wait_for
 from small_chain import EXECUTOR_CORE, small_chain_plan, small_chain_text
+from strangers import needs_root, open_folder, strange
 
 from chainshaper import measure_latency, open_recording, save_plan
 from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.enforcement.undoing import (
+    PATIENCE_S,
     RunState,
     ServerState,
+    claim_run,
     find_runs,
     remove_run,
     save_run_state,
@@ -29,17 +34,22 @@ from chainshaper.linux import runs as module
 from chainshaper.linux.runs import (
     Governed,
     Journal,
+    LockHolder,
+    all_runs_locked,
     discard_journal,
     find_journals,
     governing,
     in_force_throughout,
     journals_folder,
+    locked,
     open_journal,
     process_of,
     remembered_journal,
 )
 from chainshaper.planning import Plan
 from chainshaper.values.errors import OperationError, PlatformError
+
+__all__ = ["open_folder"]
 
 
 def paths(journal: Journal) -> list[str]:
@@ -260,3 +270,110 @@ def _asynchronous_plan() -> Plan:
     return small_chain_plan(
         4 * MS, 24 * MS, publication="asynchronous", publish_slot_ns=10 * MS, core=EXECUTOR_CORE
     )
+
+
+def _never(holder: LockHolder | None, waited_s: float) -> None:
+    raise AssertionError((holder, waited_s))
+
+
+def test_a_lock_that_was_removed_is_not_taken(tmp_path: Path) -> None:
+    """Who waits for the lock of a folder that is made anew waits for the new one."""
+    seen: list[LockHolder | None] = []
+
+    def waiting(holder: LockHolder | None, _: float) -> None:
+        seen.append(holder)
+        if len(seen) == 2:
+            stack.close()
+
+    with ExitStack() as stack:
+        stack.enter_context(all_runs_locked(tmp_path, _never))
+        with all_runs_locked(tmp_path, waiting):
+            (lock,) = tmp_path.iterdir()
+            assert lock.stat().st_mode & 0o777 == 0o700
+    assert [one and one.pid for one in seen] == [os.getpid()] * 2
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_each_holder_is_waited_for_by_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two processes have the lock one after the other: the wait for the second begins anew."""
+    first, second = (LockHolder(pid, 1, os.geteuid()) for pid in (4_000_001, 4_000_002))
+    waits: dict[LockHolder | None, list[float]] = {first: [], second: []}
+    monkeypatch.setattr(
+        module, "_holder_of", lambda _: second if max([0.0, *waits[first]]) > 0.3 else first
+    )
+
+    def waiting(holder: LockHolder | None, waited_s: float) -> None:
+        waits[holder].append(waited_s)
+        if holder == second:
+            stack.close()
+
+    with ExitStack() as stack:
+        stack.enter_context(locked(tmp_path, _never))
+        with locked(tmp_path, waiting):
+            assert max(waits[first]) > 0.3 > waits[second][0]
+
+
+@needs_root
+def test_a_stranger_that_has_the_folder_locked_is_not_waited_for(open_folder: Path) -> None:
+    program = (
+        "import fcntl, os, sys, time\n"
+        "fcntl.flock(os.open(sys.argv[1], os.O_RDONLY), fcntl.LOCK_EX); time.sleep(60)\n"
+    )
+    # The folder of all runs is there for everybody to read, so everybody can lock it.
+    with strange(["/usr/bin/python3", "-c", program, str(open_folder)]) as stranger:
+        lock = f" {stranger.pid} "
+        wait_for(lambda: lock in Path("/proc/locks").read_text(), "the stranger to have it locked")
+        refused = rf"process {stranger.pid} of another user \(nobody"
+        with pytest.raises(OperationError, match=refused), locked(open_folder, _never):
+            pass
+        begun = time.monotonic()
+        open_folder.chmod(0o755)
+        claim_run({0}, {"/n"}, open_folder)
+        assert time.monotonic() - begun < PATIENCE_S / 2
+        assert stranger.poll() is None
+
+
+_UNDOES = """
+import os, sys
+from pathlib import Path
+from chainshaper.enforcement import undoing
+from chainshaper.linux.runs import find_journals
+undoing.PATIENCE_S = 0.4
+(journal,) = find_journals(sys.argv[1])
+print(journal.path.parent.stat().st_ino, flush=True)
+print(undoing.undo_run(journal), flush=True)
+"""
+_HAS_LOCKED = (
+    "import fcntl, os, sys, time\n"
+    "fcntl.flock(os.open(sys.argv[1], os.O_RDONLY), fcntl.LOCK_EX); print(flush=True)\n"
+    "time.sleep(60)\n"
+)
+
+
+@needs_root
+def test_undoing_ends_who_hangs_with_the_lock_and_no_stranger(tmp_path: Path) -> None:
+    """A stranger has a file of the same number locked, on another device."""
+    program = """
+set -e
+mkdir runs others
+mount -t tmpfs none runs; mount -t tmpfs none others
+"$0" -c "from chainshaper.linux.runs import open_journal; open_journal('runs', 'crashed')"
+wanted=$(stat -c %i runs/crashed)
+touch others/x
+while [ "$(stat -c %i others/x)" != "$wanted" ]; do
+    [ "$(stat -c %i others/x)" -lt "$wanted" ]; mv others/x others/$RANDOM$RANDOM; touch others/x
+done
+"$0" -c "$2" others/x & stranger=$!
+"$0" -c "$2" runs/crashed & hangs=$!
+while [ $(grep -c "FLOCK.*:$wanted " /proc/locks) -lt 2 ]; do sleep 0.05; done
+"$0" -c "$1" runs
+kill -0 $stranger && echo "the stranger lives"; kill $stranger
+kill -0 $hangs 2>/dev/null || echo "who hung was ended"
+[ -z "$(ls -A runs)" ] && echo "undone"
+"""
+    words = ["unshare", "--mount", "bash", "-c", program, sys.executable, _UNDOES, _HAS_LOCKED]
+    done = subprocess.run(words, capture_output=True, check=False, cwd=tmp_path, text=True)
+    _, *said = filter(None, done.stdout.split("\n"))
+    assert said == ["()", "the stranger lives", "who hung was ended", "undone"], done

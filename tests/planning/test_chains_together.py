@@ -130,7 +130,7 @@ def test_bands_are_where_outputs_come_and_the_last_is_behind_all_that_may_delay(
         seen, evidence = known(expected(chain)), chain.evidence
         assert evidence.min_latency_ns <= int(profile.latencies_ns.min())
         assert seen.leave_ns[-1] >= evidence.max_latency_ns + chain.margin.epsilon_ns
-        assert f" to {milliseconds(chain.predicted.mean_ns)};" in expected_text(chain)
+        assert f" to {milliseconds(chain.predicted.mean_ns)}" in expected_text(chain)
         said = known(measure_latency(shaped, chain.chain.spec).prediction)
         assert not said.broken
         for band in said.bands:  # the gate of the other output may be in the way

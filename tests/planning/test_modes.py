@@ -83,6 +83,8 @@ def test_each_mode_has_the_slot_of_its_own_latencies(tmp_path: Path) -> None:
     shared = CITY_HIGHWAY.model_copy(update={"bands": {"city": 1, "highway": 1}})
     plan = plan_chain(_profile(), PlanRequest(modes=shared, epsilon_ns=MS))
     assert publish_slots(plan) == ((31 * MS, 32 * MS),), "modes that share a band are both covered"
+    said = "the modes city, highway have the same slot, [31.000, 32.000) ms"
+    assert any(said in warning for warning in plan_warnings(plan))
 
 
 @given(

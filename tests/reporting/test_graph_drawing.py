@@ -53,7 +53,9 @@ def application() -> ApplicationDescription:
 
 def test_as_data(application: ApplicationDescription) -> None:
     found = json.loads(json.dumps(application_json(application)))
-    assert found["nodes"] == [{"name": "/source", "pid": 1}, {"name": "/relay", "pid": 2}]
+    assert found["nodes"] == [
+        {"name": name, "pid": pid, "pids": [pid]} for name, pid in (("/source", 1), ("/relay", 2))
+    ]
     by_topic = {topic.pop("name"): topic for topic in found["topics"]}
     ends = {"publishers": ["/source"], "subscribers": ["/relay"]}
     assert by_topic["/x"] == {**ends, "internal": False}

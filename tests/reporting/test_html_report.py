@@ -27,7 +27,7 @@ from chainshaper import (
     save_plan,
     write_report,
 )
-from chainshaper.reporting.latency import headline
+from chainshaper.reporting.latency import headline, verdict
 from chainshaper.reporting.page import (
     distinct_names,
     latency_histogram,
@@ -38,6 +38,7 @@ from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import Measurement
+from chainshaper.verify.promises import OutputsDue
 
 
 class _Reader(HTMLParser):
@@ -131,9 +132,11 @@ def test_figures_of_a_run_known_by_hand(page: _Reader, section: str, row: list[s
 
 def test_hops_plan_and_notes_of_a_run_known_by_hand(page: _Reader) -> None:
     first, second, gate, _ = [row[1:] for row in page.rows["hops"][1:]]
-    assert first == ["3", "–", "–", "–", "–", "4.000", "4.000", "4.000", "13.3%"]
+    waited = ["0.000", "0.000", "0.000", "0.0%"]
+    assert first == ["3", "–", "–", "–", "–", "4.000", "4.000", "4.000", "13.3%", *waited]
     assert second[:5] == ["3", "1.000", "1.000", "1.000", "3.3%"]
-    assert gate[5:8] == ["14.020", "14.020", "14.020"]
+    assert gate[5:8] == ["0.000", "0.000", "0.000"], "the gate computes nothing,"
+    assert gate[9:12] == ["14.020", "14.020", "14.020"], "it waits for the slot"
     assert "shaping_node:" in "".join(page.text), "the plan as YAML"
     assert "known: the first 5 cycles warmed up" in page.text
     drawn = page.data["bars"]["slots-0"]
@@ -169,7 +172,7 @@ def test_every_figure_before_and_after_is_the_librarys(
             times = [getattr(one, field) for one in found]
             expected = ["–" if time is None else milliseconds(time) for time in times]
             assert rows[title] == expected, (place, kind, title)
-    hops = hop_breakdown(measurements[1].analysis).select("count", "computation_share")
+    hops = hop_breakdown(measurements[1].analysis).select("count", "waiting_share")
     shares = [(str(count), f"{share:.1%}") for count, share in hops.iter_rows()]
     assert [(row[1], row[-1]) for row in page.rows["hops"]][-len(shares) - 1 : -1] == shares
 
@@ -214,19 +217,56 @@ def test_the_headline_says_as_predicted_only_of_what_was_judged_and_broke_no_pro
     judged = known_value(measured.prediction)
     figures = ("mean", "max", "jitter")
     said = "Jitter 0.000 ms (known); average 30.020 ms (known)"
-    for changes, verdict in (
-        ({}, "as predicted, 0 of 3 late"),
+    for changes, judgement in (
+        ({}, "as predicted, 0 of 3 outputs late"),
         (
             {name: replace(getattr(judged, name), holds=None) for name in figures},
-            "not judged, 0 of 3 late",
+            "not judged, 0 of 3 outputs late",
         ),
         (
-            {"late_of_all": 12, "cycles": 320, "most_late": 0},
+            {"outputs": OutputsDue(320, 12, promised=0.0)},
             "differs from the prediction: 12 of 320 outputs late, none expected",
         ),
     ):
         one = replace(measured, prediction=replace(judged, **changes))
-        assert headline(["known"], [one]) == f"{said}; {verdict}."
+        stall = "Stalls of the machine, 2 ms at most, disturbed no cycle."
+        assert headline(["known"], [one]) == f"{said}; {judgement}. {stall}"
+
+
+@pytest.mark.parametrize(
+    ("overran", "late_at_all"),
+    [((1,), "1 of 4 outputs late, none expected"), ((), None)],
+)
+def test_one_line_says_what_a_stall_did_and_what_remains_without_it(
+    overran: tuple[int, ...], late_at_all: str | None, tmp_path: Path
+) -> None:
+    """Core 1 stands for 21.5 ms while /second computes in cycle 1, whose output is let go at once
+    as it comes, 31 ms behind the start: 0.98 ms behind all others. Of 4 latencies, of which one
+    differs by d, p99.5 is 0.985 d above the others (linear between the two nearest).
+    """
+    known = known_run(tmp_path / "known", 4, overran=overran)
+    (stall,) = known.events["machine_stall"].to_dicts()
+    stalls = pl.DataFrame([stall | {"duration": 21_500_000}], known.events["machine_stall"].schema)
+    measured = measure_latency(replace(known, events={**known.events, "machine_stall": stalls}))
+    what = "stalls of the machine, 21.5 ms at most, disturbed 1 of 4 cycles"
+    remains = "without them jitter 0.000 ms, spread 0.000 ms, 0 late"
+    met, said = verdict(measured)
+    if late_at_all is None:
+        hit = "with these jitter 0.000 ms, spread 0.000 ms, 0 late"
+        assert met
+        assert said.startswith("known: promise met: jitter 0.000 ms")
+    else:
+        hit = "with these jitter 0.980 ms, spread 0.965 ms, 1 late"
+        assert not met
+        assert said.startswith(f"known: promise broken: {late_at_all}")
+    assert said.endswith(f"; {what}: {hit}; {remains}")
+    assert "\n" not in said
+    assert headline(["known"], [measured]).endswith(f" S{what[1:]}: {hit}; {remains}.")
+
+
+def test_where_no_stall_was_looked_for_none_is_named(tmp_path: Path) -> None:
+    unwatched = measure_latency(known_run(tmp_path / "known", stall_meter=None))
+    assert "stall" not in verdict(unwatched)[1]
 
 
 def test_where_the_machine_was_not_watched_no_cycle_is_called_undisturbed(tmp_path: Path) -> None:

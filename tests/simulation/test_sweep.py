@@ -19,6 +19,7 @@ from chainshaper.flow.sweep import (
     FIGURES,
     OTHER_RUN,
     application_at,
+    changing_nothing,
     grid_of,
     groups_of,
     parse_axis,
@@ -158,7 +159,8 @@ def test_points_that_differ_in_the_plan_only_share_a_profile() -> None:
         ({"epsilon": (1,)}, "axis epsilon: 1 has no unit"),
         ({"epsilon": ("1m",)}, "'1m' is not a duration"),
         ({"interference": (20,)}, "axis interference: 20 has no unit"),
-        ({"nodes.third.core": (1,)}, "nodes.third.core=1: nodes.third.callbacks: is missing"),
+        ({"nodes.third.core": (1,)}, "axis nodes.third.core: the application has no node 'third'"),
+        ({"nodes.secnd.core": (1,)}, "no node 'secnd'; did you mean second?"),
         ({"nodes.first.core": (-1,)}, "nodes.first.core=-1: nodes.first.core:"),
         ({"nodes.first.callbacks.5.timer": ("1ms",)}, "nodes.first.callbacks.5.timer=1ms: "),
         ({"plan.overrun": ("wait",)}, "axis plan.overrun is a value of a plan's file: give the"),
@@ -247,10 +249,29 @@ def test_outputs_that_outgrow_a_given_plan_are_late_or_lost_by_hand(tmp_path: Pa
     for row in (in_time, in_time_too):
         assert (row["count"], row["late"], row["max_ns"]) == (20, 0, 5 * MS)
     assert (waited["count"], waited["late"]) == (20, 20)
+    assert [(one["missed"], one["kept"]) for one in (in_time, waited, discarded)] == [
+        *((0, True), (20, False), (20, False))
+    ]
     assert (waited["min_ns"], waited["max_ns"]) == (55 * MS, 55 * MS)
     assert waited["per_band"][0]["share"] == 0.0
     assert (discarded["count"], discarded["incomplete"], discarded["late"]) == (0, 20, 0)
     assert discarded["mean_ns"] is None
+
+
+def test_axes_that_change_nothing_are_said(tmp_path: Path) -> None:
+    """A load of the lowest priority does not reach a chain that is in front of all others."""
+    axes: dict[str, Any] = {"interference": ("0ms", "20ms"), "bands": (1, 2)}
+    application = quick_chain(VARYING, VARYING)
+    frame = sweep(application, axes, tmp_path / "rows.parquet", cycles=50)
+    said = "interference changes nothing: its load has the lowest priority, or another core"
+    assert changing_nothing(frame, ["interference_ns", "bands"]) == [said]
+    some = frame.with_columns(
+        mean_ns=pl.when((pl.col("bands") == 2) & (pl.col("interference_ns") > 0))
+        .then(1)
+        .otherwise("mean_ns")
+    )
+    (said,) = changing_nothing(some, ["interference_ns", "bands"])
+    assert said.startswith("interference changes nothing where bands is 1: ")
 
 
 def test_a_chain_is_profiled_in_front_of_all_others() -> None:

@@ -131,7 +131,7 @@ def test_names_of_any_length_and_alignment_are_put_together_again(
     lines = [*reversed(lines), event] if reversed_lines else [event, *lines]
     printed = read(tmp_path_factory.mktemp("printed"), [point("rcl_service_init")], *lines, "")
     row = printed.tables["rcl_service_init"].row(0, named=True)
-    assert row["service_name"] == name.decode(errors="replace")
+    assert row["service_name"] == name.decode(errors="backslashreplace")
     assert (row["service_handle"], row["node_handle"], row["rmw_service_handle"]) == (21, 22, 23)
     assert printed.cut_names == 0
 

@@ -39,6 +39,7 @@ from chainshaper.sources.preload import (
     event_names,
     in_cache,
     installed_library,
+    memories,
     preloading,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -386,6 +387,8 @@ for n in range(3, 6) if child else range(10, 15): take(n)
 if child: os.waitpid(child, 0)
 else: os._exit(0)
 """
+CHILDREN_THAT_NOBODY_IS_TOLD_OF = CHILDREN.replace("os.fork()", "library._Fork()")
+"""Made by a bare system call, behind the back of `pthread_atfork`."""
 THREADS = """
 for n in range(300):
     thread = threading.Thread(target=take, args=(n,))
@@ -404,7 +407,8 @@ for thread in threads: thread.join()
 
 
 @pytest.mark.parametrize(("program", "by_process", "lost"), [
-    (CHILDREN, [6, 5], 0), (THREADS, [300], 0), (MORE_THREADS_THAN_RINGS, [RINGS], 6),
+    (CHILDREN, [6, 5], 0), (CHILDREN_THAT_NOBODY_IS_TOLD_OF, [6, 5], 0),
+    (THREADS, [300], 0), (MORE_THREADS_THAN_RINGS, [RINGS], 6),
     (f"for n in range(40 * {RING}): take(n)", [40 * RING], None),  # faster than it may be read
 ])  # fmt: skip
 def test_every_event_is_there_or_counted(
@@ -442,6 +446,125 @@ def test_what_cannot_have_memory_runs_on(tmp_path: Path) -> None:
         traced(tracer_of(tmp_path), lambda: python(program))
 
 
+@pytest.mark.parametrize("limit", ["RLIMIT_FSIZE", "RLIMIT_AS"])
+def test_limits_cost_the_trace_only(tmp_path: Path, limit: str) -> None:
+    """Of the size of files, for which the kernel sends SIGXFSZ, which nodes do not ignore as Python
+    does; and of memory.
+    """
+    program = f"""
+import resource, signal
+signal.signal(signal.SIGXFSZ, signal.SIG_DFL)
+resource.setrlimit(resource.{limit}, (4096, 4096))
+take(1)
+assert not signal.sigpending()
+print("ran", flush=True)
+"""
+    with pytest.raises(OperationError, match="no process has loaded the tracing library"):
+        traced(tracer_of(tmp_path), lambda: python(program))
+
+
+REUSED = """
+take(1)
+os.closerange(3, 100)  # as daemons do
+files = [os.open("/dev/null", os.O_RDONLY) for _ in range(20)]
+if not os.fork():
+    take(2)
+    assert {os.fstat(file).st_rdev for file in files} == {os.stat('/dev/null').st_rdev}
+    os._exit(0)
+_, status = os.wait()
+assert status == 0, "a file of the node was closed in the child"
+"""
+
+
+def test_a_descriptor_of_the_node_under_our_number_stays_open_in_its_children(
+    tmp_path: Path,
+) -> None:
+    assert sorted(taken(traced(tracer_of(tmp_path), lambda: python(REUSED)))) == [1, 2]
+
+
+FAILING = """
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <errno.h>
+#include <stdlib.h>
+#include <time.h>
+#include <unistd.h>
+int memfd_create(const char *name, unsigned flags) {  /* the first thread stays within */
+  static int (*behind)(const char *, unsigned);
+  static int calls;
+  if (!behind) behind = (int (*)(const char *, unsigned))dlsym(RTLD_NEXT, "memfd_create");
+  if (__sync_fetch_and_add(&calls, 1) == 0 && getenv("SLOW_MEMORY")) {
+    if (write(atoi(getenv("SLOW_MEMORY")), "w", 1) != 1) abort();
+    nanosleep(&(struct timespec){3, 0}, NULL);
+    if (write(atoi(getenv("SLOW_MEMORY")), "e", 1) != 1) abort();
+  }
+  return behind(name, flags);
+}
+int madvise(void *area, size_t size, int advice) {
+  static int (*behind)(void *, size_t, int);
+  if (!behind) behind = (int (*)(void *, size_t, int))dlsym(RTLD_NEXT, "madvise");
+  if (advice == 23 && size == (1 << 20) && getenv("NO_MEMORY")) return errno = ENOMEM, -1;
+  return behind(area, size, advice);
+}
+"""
+"""Stands before the C library: the memory of a process is made slowly, or there is none left."""
+
+
+@pytest.fixture
+def failing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "failing.c").write_text(FAILING)
+    library = tmp_path / "failing.so"
+    source = tmp_path / "failing.c"
+    subprocess.run(["cc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+    monkeypatch.setenv("LD_PRELOAD", str(library))
+
+
+@pytest.mark.usefixtures("failing")
+def test_a_thread_waits_for_no_other_that_makes_the_memory(tmp_path: Path) -> None:
+    """A SCHED_FIFO thread that did would keep an ordinary one of its core from ever ending it."""
+    program = """
+reading, writing = os.pipe()
+os.environ["SLOW_MEMORY"] = str(writing)
+first = threading.Thread(target=take, args=(1,))
+first.start()
+assert os.read(reading, 1) == b"w"  # it makes the memory
+take(2)
+os.set_blocking(reading, False)
+try:
+    assert not os.read(reading, 1), "the second thread has waited for it"
+except BlockingIOError:
+    pass
+first.join()
+take(3)
+"""
+    assert sorted(taken(traced(tracer_of(tmp_path), lambda: python(program)))) == [1, 2, 3]
+
+
+@pytest.mark.usefixtures("failing")
+def test_where_the_kernel_has_no_memory_left_events_are_counted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Written to without having been claimed it would be a SIGBUS."""
+    monkeypatch.setenv("NO_MEMORY", "1")
+    run = traced(tracer_of(tmp_path), lambda: python("for n in range(5): take(n)"))
+    assert run.info.lost["lost_events"] == 5
+
+
+def test_a_node_built_with_address_sanitizer_is_traced_as_any_other(tmp_path: Path) -> None:
+    source, node = tmp_path / "node.c", tmp_path / "node"
+    source.write_text("extern void ros_trace_rcl_take(long) __attribute__((weak));\n"
+                      "int main(void) { ros_trace_rcl_take(13); return 0; }\n")  # fmt: skip
+    words = ["cc", "-fsanitize=address", "-o", str(node), str(source)]
+    if subprocess.run(words, check=False, capture_output=True).returncode:
+        pytest.skip("this compiler has no AddressSanitizer")
+
+    def run() -> list[list[str]]:
+        subprocess.run([node], check=True, timeout=60)
+        return []
+
+    assert taken(traced(tracer_of(tmp_path), run)) == [13]
+
+
 def test_memory_of_others_is_refused(tmp_path: Path) -> None:
     plain = os.open(tmp_path / "file", os.O_RDWR | os.O_CREAT)
     shrinking, garbage = (
@@ -454,6 +577,72 @@ def test_memory_of_others_is_refused(tmp_path: Path) -> None:
         with pytest.raises(InputError, match=message):
             TracedProcess(descriptor)
         os.close(descriptor)
+
+
+def all_but(pid: int) -> set[int]:
+    """All processes but this one."""
+    return {int(folder.name) for folder in Path("/proc").iterdir() if folder.name.isdigit()} - {pid}
+
+
+HOSTILE = """
+import fcntl, os, struct
+header = (0x63687368, 2, os.getpid(), {rings}, {records}, {objects})
+file = os.memfd_create("chainshaper-trace", os.MFD_ALLOW_SEALING)
+os.truncate(file, {size})
+os.pwrite(file, struct.pack("<6I", *header), 0)
+fcntl.fcntl(file, 1033, 2)
+print(os.getpid(), flush=True)
+input()
+"""
+
+
+@pytest.mark.parametrize(
+    ("rings", "records", "objects", "size"),
+    [
+        (8_000_000, 1, 0, 64 + 8_000_000 * 128),
+        (64, 1 << 14, 1 << 15, 1 << 40),
+        (64, 1 << 14, 1 << 15, 1 << 20),
+        (0xFFFFFFFF, 0xFFFFFFFF, 0xFFFFFFFF, 1 << 20),
+    ],
+)
+def test_a_memory_of_another_shape_is_refused_at_once(
+    rings: int, records: int, objects: int, size: int
+) -> None:
+    program = HOSTILE.format(rings=rings, records=records, objects=objects, size=size)
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert int(process.stdout.readline()) == process.pid
+        known = all_but(process.pid)
+        assert [*memories({os.geteuid()}, known)] == []
+        process.communicate(b"\n")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="a file in the root of a file system takes root")
+def test_a_pipe_with_the_name_of_a_memory_is_not_opened() -> None:
+    """Opening it would wait for a writer for ever; a device might do something."""
+    program = """
+import os
+file = os.open("/memfd:chainshaper-trace", os.O_RDWR)
+print(os.getpid(), flush=True)
+input()
+"""
+    pipe = Path("/memfd:chainshaper-trace")
+    os.mkfifo(pipe)
+    try:
+        with subprocess.Popen(
+            [sys.executable, "-c", program],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+        ) as process:
+            assert process.stdout is not None
+            assert int(process.stdout.readline()) == process.pid
+            known = all_but(process.pid)
+            assert [*memories({os.geteuid()}, known)] == []
+            process.communicate(b"\n")
+    finally:
+        pipe.unlink(missing_ok=True)
 
 
 def test_the_command_records_and_the_chain_is_measured(tmp_path: Path) -> None:
@@ -471,7 +660,9 @@ def test_the_command_records_and_the_chain_is_measured(tmp_path: Path) -> None:
 def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> None:
     """Objects of before are known, events of before are not: the run lasts longer than its part."""
     environment = {**os.environ, "LD_PRELOAD": str(installed_library())}
-    words = built().command("chain", "40")
+    words = built().command(
+        "chain", "200"
+    )  # ten seconds: `record` takes its time on a busy machine
     with (
         subprocess.Popen(words, env=environment, stdout=subprocess.PIPE) as process,
         subprocess.Popen(words, env=environment, stdout=subprocess.DEVNULL) as other,
@@ -483,12 +674,12 @@ def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> N
         assert (made.code, process.poll()) == (0, None), made.err
         printed = process.communicate()[0]
         other.kill()
-    assert printed.count(b"instance") == 80
+    assert printed.count(b"instance") == 400
     tables = cs.open_recording(tmp_path / "rec").events
     started = tables["callback_start"]
     assert set(started["pid"]) == {process.pid}
     assert (started["time"] >= begun).all()
-    assert 10 <= started.height < 70
+    assert 10 <= started.height < 350
     assert (tables["rcl_node_init"]["time"] < begun).all()
     assert json_of("latency", tmp_path / "rec", "--chain", "/ebpf1../ebpf2", "--json")["count"] >= 5
 

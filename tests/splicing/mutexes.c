@@ -1,5 +1,6 @@
 // A low thread has a mutex while a middle one takes their core; a high one waits for the mutex.
-// Prints how long the high one waited, in milliseconds.
+// Prints how long the high one waited, in milliseconds. With MIDDLEWARE it is the library that makes
+// the mutex, as a DDS does; as a program it takes the core, and a word when the library is to make it.
 #define _GNU_SOURCE
 #include <pthread.h>
 #include <sched.h>
@@ -7,6 +8,11 @@
 #include <stdlib.h>
 #include <time.h>
 #include <unistd.h>
+
+#ifdef MIDDLEWARE
+void make_mutex(pthread_mutex_t *mutex) { pthread_mutex_init(mutex, NULL); }
+#else
+void make_mutex(pthread_mutex_t *mutex);
 
 static pthread_mutex_t mutex;
 static volatile int locked;
@@ -46,10 +52,13 @@ static void *middle(void *core) {
   return NULL;
 }
 
-int main(int count, char **words) {  // the core
+int main(int count, char **words) {
   int core = atoi(words[1]);
   pthread_t threads[2];
-  pthread_mutex_init(&mutex, NULL);
+  if (count > 2)
+    make_mutex(&mutex);
+  else
+    pthread_mutex_init(&mutex, NULL);
   pthread_create(&threads[0], NULL, low, &core);
   while (!locked) usleep(100);
   pthread_create(&threads[1], NULL, middle, &core);
@@ -61,3 +70,4 @@ int main(int count, char **words) {  // the core
   pthread_mutex_unlock(&mutex);
   return 0;
 }
+#endif

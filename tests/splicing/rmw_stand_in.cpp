@@ -9,6 +9,7 @@
 // which is asked for by "ready". A STAMP counts from there too; - is none. What is written to DDS, and what
 // tracers see, is on standard output.
 
+#include <sys/stat.h>
 #include <sys/wait.h>
 #include <time.h>
 #include <unistd.h>
@@ -258,6 +259,7 @@ int main() {
   std::deque<void *> subscriptions;
   std::deque<std::string> names;
   std::deque<Node> nodes;
+  std::deque<std::FILE *> own_files;
   std::int64_t number = 0;
   for (std::string what; std::cin >> what;) {
     if (what == "publisher") {
@@ -304,6 +306,11 @@ int main() {
                   static_cast<long long>(now(CLOCK_MONOTONIC) - start));
       continue;
     }
+    if (what == "reuse") {  // as a daemon: closes all descriptors, and has files under the same numbers
+      for (int file = 3; file < 100; ++file) close(file);
+      for (int count = 0; count < 20; ++count) own_files.push_back(std::tmpfile());
+      continue;
+    }
     Publisher *& publisher = publishers[std::stoul(word)];
     if (what == "fork") {  // a child that ends as its parent would
       const pid_t child = fork();
@@ -337,6 +344,11 @@ int main() {
   }
   for (auto * one : subscriptions) rmw_destroy_subscription(nullptr, one);
   for (auto * publisher : publishers) rmw_destroy_publisher(&nodes[0], publisher);
+  for (auto * file : own_files) {
+    struct stat found {};
+    const bool is_open = fstat(fileno(file), &found) == 0;
+    std::printf("own %d %lld\n", is_open, static_cast<long long>(found.st_size));
+  }
 }
 
 #endif

@@ -8,7 +8,9 @@ from launch_cases import NDT, plan_for, robot_file
 
 from chainshaper import Plan, Splicing, splice_launch_files, undo_splice
 from chainshaper.planning.plan import revised
+from chainshaper.splicing import spliced_launch
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
+from chainshaper.values.files import rename_output
 
 robot = pytest.fixture(robot_file)
 
@@ -117,15 +119,15 @@ def test_an_empty_folder_may_be_filled_but_it_needs_a_parent_and_the_original(
 def test_the_older_folder_comes_back_where_the_new_one_cannot_take_its_place(
     spliced: Splicing, robot: Path, plan: Plan
 ) -> None:
-    before, rename = _tree(spliced.folder), Path.rename
+    before = _tree(spliced.folder)
 
-    def failing(source: Path, target: Path) -> Path:
-        if ".partial-" in source.name and source.is_dir():
+    def failing(made: Path, path: Path) -> Path:
+        if ".partial-" in made.name:
             raise OSError(5, "Input/output error")
-        return rename(source, target)
+        return rename_output(made, path)
 
     with (
-        mock.patch.object(Path, "rename", failing),
+        mock.patch.object(spliced_launch, "rename_output", failing),
         pytest.raises(OperationError, match=r"cannot be written: .*Input/output error"),
     ):
         splice_launch_files(revised(plan, overrun="discard"), [robot], spliced.folder)

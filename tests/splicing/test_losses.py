@@ -178,3 +178,22 @@ def test_a_disk_that_hangs_does_not_stop_the_output(tmp_path: Path, plan: Plan) 
         run.end()
     rows = read_gate_log(log)
     assert rows["row"].to_list() == list(range(1, 32)), "the pipe had room for them"
+
+
+def test_a_link_in_the_place_of_the_log_is_not_followed(tmp_path: Path, plan: Plan) -> None:
+    """Before the node starts, and while it runs: the output goes on, the target is not touched."""
+    secret, log = tmp_path / "secret", tmp_path / "gate.csv"
+    secret.write_text("mine\n")
+    log.symlink_to(secret)
+    with at_work(plan, tmp_path, log, OPEN) as run:
+        (first,) = send(run, 1, 1)
+        run.hear_published(first)
+        log.unlink()
+        wait_for(lambda: bool(send(run, 1, 2, 0.1)) and log.exists(), "a new log")
+        log.unlink()
+        log.hardlink_to(secret)
+        (last,) = send(run, 1, 99)
+        run.hear_published(last)
+        assert any("no log is written to" in text for text in run.logged)
+        run.end()
+    assert secret.read_text() == "mine\n"

@@ -14,8 +14,9 @@ import pytest
 from known import known
 from node_run import NodeRun, banded, outputs, parameters_of, running_node, stamped
 from processes import wait_for
+from strangers import NOBODY, needs_root, strange
 
-from chainshaper.gate.handover import Page, open_page
+from chainshaper.gate.handover import MOVING, VERSION, Page, open_page
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
@@ -285,6 +286,31 @@ def test_pages_of_others_are_looked_at_without_trust(
     for path in (folder, good.path):
         os.chown(path, 65534, -1)
     assert find_outputs([str(folder)]) == (), "root's process is named on another user's page"
+
+
+@needs_root
+def test_a_stranger_s_page_says_nothing_of_our_outputs() -> None:
+    """A stranger may write any topic into a page, and by how much its slots are moved."""
+    topic, folder = f"/of_{os.getpid()}", Path(f"/dev/shm/chainshaper-{NOBODY}")
+    with strange(["/bin/sleep", "600"]) as stranger:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        os.chown(folder, NOBODY, NOBODY)
+        file = folder / f"of_{os.getpid()}.0.v{VERSION}"
+        file.touch(0o600)
+        os.chown(file, NOBODY, NOBODY)
+        page = Page(str(folder), file.name, topic, os.O_RDWR)
+        try:
+            assert page.lock()
+            assert page.lock(MOVING)
+            page["holder"], page["moved_ns"], page["moved_from_ns"] = stranger.pid, 50_000_000, 1
+            (output,) = (output for output in find_outputs() if output.topic == topic)
+            assert (output.user, output.shaping_node) == (NOBODY, stranger.pid)
+            text = output_text(output)
+            assert text.startswith(f"{topic} of user nobody is shaped by process {stranger.pid}")
+            with pytest.raises(OperationError, match="no gates publish it now"):
+                FollowedOutput(topic)
+        finally:
+            file.unlink()
 
 
 def test_a_program_is_started_again_until_it_is_to_end(tmp_path: Path, plan: Plan) -> None:

@@ -94,11 +94,22 @@ def test_what_is_missing_in_a_recording_breaks_its_limits(recording: Recording) 
 
 
 def without_takes(recording: Recording, place: Path, after: int, every: int = 1) -> Recording:
-    """The last node of the chain takes no message of each such cycle behind so many."""
+    """The last node of the chain takes no message of each such cycle behind so many, and so does
+    not run; if it takes none, its callback ran once nevertheless."""
     hops = measure_latency(recording).analysis.hops.filter(hop=2).sort("start")
-    gone = hops["source_timestamp"][after:].gather_every(every)
-    left = recording.events["rmw_take"].filter(~pl.col("source_timestamp").is_in(gone.implode()))
-    return write_recording(place, {**recording.events, "rmw_take": left}, recording.info)
+    gone = hops[after:].gather_every(every)
+    left = dict(recording.events)
+    for name, column, times in (
+        ("rmw_take", "source_timestamp", "source_timestamp"),
+        ("callback_start", "time", "start"),
+        ("rmw_publish", "time", "publish"),
+        ("callback_end", "time", "end"),
+    ):
+        table = recording.events[name]
+        values = gone[times] if after or name == "rmw_take" else gone[times][1:]
+        own = pl.col(column).is_in(values.implode())
+        left[name] = table.filter(~own)
+    return write_recording(place, left, recording.info)
 
 
 def test_missing_counts_late_outputs_and_those_that_never_came(

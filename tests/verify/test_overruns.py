@@ -352,7 +352,7 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
     assert values["max_all_ns"] == longest >= stopped["latency_ns"]
     assert values["jitter_all_ns"] == values["max_all_ns"] - values["min_ns"]
     judged = known(measure_latency(recording).prediction)
-    assert (judged.late_of_all, judged.cycles) == (late, values["count"])
+    assert (judged.outputs.late, judged.outputs.due) == (late, values["count"])
 
 
 def test_of_gates_in_one_process_each_chain_has_its_own_rows(shaped: Recording, plan: Plan) -> None:

@@ -35,7 +35,8 @@ def _measured(
     placed = values if places is None else np.array(places, dtype=np.int64)
     late = placed >= due
     rows = pl.DataFrame({"latency_ns": values, "place_ns": placed, "late": late})
-    rows = rows.with_columns(complete=True, disturbed=False).with_row_index("traversal")
+    rows = rows.with_columns(complete=True, disturbed=False, was_due=True)
+    rows = rows.with_columns(reason=pl.lit(None, pl.String)).with_row_index("traversal")
     statistics = latency_statistics(values, late=int(late.sum()))
     return replace(like, traversals=rows, releases=like.releases.clear(), statistics=statistics)
 
@@ -256,6 +257,7 @@ def test_late_outputs_are_counted_in_all_cycles(like: LatencyAnalysis) -> None:
     analysis = _measured([85 * MS, 85 * MS, 185 * MS, 185 * MS], like)
     hidden = analysis.traversals.with_columns(disturbed=pl.Series([False, False, False, True]))
     said = judge_prediction(_bands(1), replace(analysis, traversals=hidden))
-    assert (said.late, said.late_of_all, said.cycles) == (1, 2, 4)
-    assert late_text(said) == "of all 4 outputs 2 came late, 1 of them in disturbed cycles"
+    assert (said.late, said.outputs.late, said.outputs.due) == (1, 2, 4)
+    found = "of all cycles: 2 of 4 outputs late, 1 of the late ones in disturbed cycles"
+    assert late_text(said) == found
     assert prediction_json(said)["late_of_all"] == 2

@@ -143,7 +143,7 @@ def test_places_count_from_the_chains_own_cycle(tmp_path: Path) -> None:
     assert origins.unique().to_list() == [last.offset_ns]
     assert measured.analysis.traversals["place_ns"].unique().to_list() == [opens]
     assert measured.prediction is not None
-    assert (measured.prediction.counted_from, measured.prediction.late_of_all) == ("cycle", 0)
+    assert (measured.prediction.counted_from, measured.prediction.outputs.late) == ("cycle", 0)
 
 
 @pytest.mark.parametrize(

@@ -42,6 +42,7 @@ from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
 from chainshaper.verify.budgets import load_budget
 from chainshaper.verify.measure import measure_latency
+from chainshaper.verify.promises import OutputsDue
 from chainshaper.verify.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 
 pytestmark = pytest.mark.waiting
@@ -109,10 +110,10 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     last = seen.chains[0]
     assert (last.spans["hour"].count, last.spans["hour"].max_ns) == (count, found.max())
     assert last.rate_hz == pytest.approx((count - 1) * SECOND / (begun[-1] - begun[0]))
-    total = sum(h.communication_ns + h.computation_ns for h in last.hops)
+    total = sum(h.communication_ns + h.computation_ns + h.waiting_ns for h in last.hops)
     assert total == pytest.approx(found.mean(), rel=1e-6)
     own = analysis.hops.join(same_time, on="traversal", how="semi").group_by("hop")
-    most = own.agg(pl.col("communication_ns", "computation_ns").max()).sort("hop")
+    most = own.agg(pl.col("communication_ns", "computation_ns", "waiting_ns").max()).sort("hop")
     assert [hop.node for hop in last.hops] == ["/first", "/second"]
     assert [hop.longest_ns for hop in last.hops] == most.drop("hop").rows()
     (second,) = (one for one in seen.callbacks if one.node == "/second")
@@ -288,7 +289,7 @@ def test_a_clock_that_is_set_spoils_no_figure(
 def test_memory_does_not_grow() -> None:
     """An hour of cycles stays: hours are simulated by setting the clock on."""
     (chain,) = own_watch().chains
-    names = ["traversal", "hop", "communication_ns", "computation_ns"]
+    names = ["traversal", "hop", "communication_ns", "computation_ns", "waiting_ns"]
     hops = pl.DataFrame(schema=dict.fromkeys(names, pl.UInt32))
     minute = pl.DataFrame({"start": range(0, 60 * SECOND, SECOND // 10)}).with_columns(
         latency_ns=pl.lit(5_000_000),
@@ -401,7 +402,9 @@ def seen_with(figures: LatencyStatistics, at_ns: int = 0, hops: tuple[Hop, ...] 
     """A look at one chain, which has the same figures over all spans."""
     counted = {"complete": figures.count, "late": figures.late or 0, "incomplete": 0, "unclear": 0}
     spans = dict.fromkeys(SPANS, figures)
-    chain = ChainNow(CHAIN, spans, 20.0, hops, (), 0.0, None, 0, counted, problem=None)
+    outputs = OutputsDue.of(figures.count, figures.late, figures.incomplete)
+    about = {"problem": None, "outputs": outputs, "kept": outputs.kept}
+    chain = ChainNow(CHAIN, spans, 20.0, hops, (), 0.0, None, 0, counted, **about)  # type: ignore[arg-type]
     return Seen(at_ns, {1: "/first"}, 0, (chain,))
 
 
@@ -440,7 +443,8 @@ class Collector(BaseHTTPRequestHandler):
 
 def test_metrics_are_the_figures_that_are_shown() -> None:
     hour = latency_statistics(np.arange(5, 25) * 1_000_000, late=1)
-    hops = (Hop("/first", "/ebpf1", 0.0, 2e6, (0, 2)), Hop("/second", "/ebpf2", 1e6, 3e6, (1, 3)))
+    first = Hop("/first", "/ebpf1", 0.0, 2e6, 0.0, (0, 2, 0))
+    hops = (first, Hop("/second", "/ebpf2", 1e6, 3e6, 0.0, (1, 3, 0)))
     seen = seen_with(hour, 0, hops)
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -483,7 +487,9 @@ def test_wrong_use_and_the_environment(tmp_path: Path, monkeypatch: pytest.Monke
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     said = called("watch", "--environment")
     assert said.code == 0
-    library = Path(said.out.removeprefix("export LD_PRELOAD=").strip())
+    loaded, options = said.out.splitlines()
+    assert options == "export ASAN_OPTIONS=verify_asan_link_order=0"
+    library = Path(loaded.removeprefix("export LD_PRELOAD="))
     assert library.is_file()
     brought = Path(preload.__file__).with_name(library.name)  # by a wheel, which has it compiled
     assert library == brought if brought.is_file() else library.is_relative_to(tmp_path)

@@ -176,3 +176,24 @@ def test_looks_that_come_late_count_all_cycles_and_the_recorder_has_those_of_the
     first = min(int(tables[one]["time"][0]) for one in tables.keys() - events.CREATION)
     since = min(one.application.now - 10 * SECOND, before)
     assert since <= first < since + SECOND // 10
+
+
+def test_one_of_two_that_run_with_the_same_name_can_be_watched(
+    simulated: "Callable[..., Simulated]",
+) -> None:
+    one = simulated()
+    one.go_on(10)
+    one.stay = True
+    one.start_again()
+    problem = one.go_on(4)[-1].chains[0].problem or ""
+    assert "(write /a1../a2../a_2@" in problem, (
+        "of several nodes twice no way point alone is enough"
+    )
+    running = one.application.running[2:6]
+    nodes = [f"/a_{number}@{process.pid}" for number, process in enumerate(running, start=2)]
+    topics = ["/a3", "/a4", "/a5"]
+    points = [point for both in zip(nodes, topics, strict=False) for point in both]
+    one.watch = Watch(["..".join(("/a1", *points))], users=())
+    (named,) = one.go_on(10)[-1].chains
+    assert named.problem is None
+    assert named.counted["complete"] > 100

@@ -4,7 +4,8 @@ A chain is written ``FIRST..LAST``, with more way points (topics, services or no
 paths match. One that begins with a topic starts at the callback that publishes it, and every chain
 ends with the publication of its last topic (paper, section 2.3): of a last node that is the topic
 it publishes, or, if it publishes nothing, the one it subscribes to. A service is its request as
-long as the chain goes on behind it, and its response where the chain ends.
+long as the chain goes on behind it, and its response where the chain ends. Of nodes of one name
+that ran at the same time, ``/talker@4711`` is the one in process 4711.
 
 The number of simple paths grows exponentially with cycles and fan-in, and counting them is #P-hard.
 Without cycles every step forward leads to an end, so listing needs no search. With cycles the
@@ -15,7 +16,7 @@ over the edges that lead forwards in one order of the vertices: exact without cy
 
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import SequenceMatcher
 from heapq import heappop, heappush
 from itertools import pairwise
@@ -29,6 +30,7 @@ from chainshaper.values.application import (
     REQUEST,
     RESPONSE,
     ApplicationGraph,
+    Callback,
     Chain,
 )
 from chainshaper.values.errors import InputError
@@ -105,14 +107,14 @@ class ChainEnumeration:
 
 def find_chain(graph: ApplicationGraph, spec: str) -> Chain:
     """The one chain of ``graph`` that ``spec`` means; of a shaping node that a standby has stood in
-    for, it is the path by that node.
+    for, it is the path by that node, and traversals go on through the standby where that published.
 
     Raises InputError: a topic or node that does not exist, no path, or only a cyclic one.
     SeveralPathsError: several.
     """
     search = _Search(graph, spec, parse_chain(spec))
     paths, complete, _ = search.listed(HANDFUL + 1)
-    chains = list(dict.fromkeys(_chain(spec, path) for path in paths))
+    chains = list(dict.fromkeys(_chain(graph, spec, path) for path in paths))
     if not chains:
         raise search.no_path()
     standbys = {one.id for one in graph.callbacks if one.node.endswith(STANDBY)}
@@ -145,8 +147,8 @@ def enumerate_chains(
     paths, complete, met = search.listed(limit)
     if not paths and waypoints:
         raise search.no_path()
-    chains = tuple(dict.fromkeys(_chain(None, path) for path in paths))
-    heaviest = _chain(None, heaviest_path) if heaviest_path and weights else None
+    chains = tuple(dict.fromkeys(_chain(graph, None, path) for path in paths))
+    heaviest = _chain(graph, None, heaviest_path) if heaviest_path and weights else None
     for chain in chains if weights else ():
         weight = sum(weights.get(callback, 0.0) for callback in chain.callbacks)
         if heaviest is None or weight > heaviest_ns:
@@ -161,24 +163,51 @@ def enumerate_chains(
     )
 
 
-def _chain(spec: str | None, path: GraphPath) -> Chain:
+def _chain(graph: ApplicationGraph, spec: str | None, path: GraphPath) -> Chain:
     callbacks = tuple(vertex for vertex in path if isinstance(vertex, int))
     topics = tuple(vertex for vertex in path if isinstance(vertex, str))
-    return Chain("..".join(topics) if spec is None else spec, callbacks[: len(topics)], topics)
+    chain = Chain(spec or "", callbacks[: len(topics)], topics)
+    return chain if spec is not None else replace(chain, spec="..".join(_way_points(graph, chain)))
+
+
+def _way_points(graph: ApplicationGraph, chain: Chain) -> Iterator[str]:
+    """The topics of a chain, and its nodes where others of their name ran at the same time."""
+    for callback, topic in zip(graph.path(chain), chain.topics, strict=True):
+        if (node := graph.node_text(callback)) != callback.node:
+            yield node
+        yield topic
 
 
 def _ambiguous(graph: ApplicationGraph, spec: str, chains: Sequence[Chain], complete: bool) -> str:
     more = "" if complete and len(chains) <= HANDFUL else "at least "
     lines = [f"chain {spec!r}: {more}{len(chains)} paths match; add a way point:"]
     shown = chains[:HANDFUL]
-    passed = [(*one.topics, *(c.node for c in graph.path(one))) for one in shown]
-    for chain, names in zip(shown, passed, strict=True):
+    paths = [graph.path(one) for one in shown]
+    passed = [
+        (*one.topics, *(c.node for c in path), *(graph.node_text(c) for c in path))
+        for one, path in zip(shown, paths, strict=True)
+    ]
+    for chain, path, names in zip(shown, paths, passed, strict=True):
         others = {name for other in passed if other is not names for name in other}
         own = next((name for name in names if name not in others), None)
-        remedy = f"  (only this one passes {own})" if own else ""
-        way = " → ".join((graph.path(chain)[0].label, *chain.topics))
+        points = tuple(_way_points(graph, chain))
+        remedy = f"  (only this one passes {own})"
+        if own is None:
+            remedy = f"  (write {'..'.join(points)})"
+            if points == chain.topics:
+                remedy = _without_way_point(path, paths)
+        way = " → ".join((graph.label(path[0]), *chain.topics))
         lines.append(f"  {way}{remedy}")
     return "\n".join(lines)
+
+
+def _without_way_point(path: Sequence[Callback], paths: Sequence[Sequence[Callback]]) -> str:
+    """Which callback sets a path apart that no way point does."""
+    others = {callback.id for one in paths if one is not path for callback in one}
+    apart = next((one for one in path if one.id not in others), None)
+    if apart is None:
+        return ""  # way points together tell it apart
+    return f"  (by {apart.symbol or f'callback {apart.handle:#x}'} of {apart.node})"
 
 
 def _some(names: Iterable[str]) -> str:
@@ -258,6 +287,9 @@ class _Search:
                 return candidate, frozenset[Vertex]((candidate,))
             if candidate in nodes:
                 return candidate, frozenset[Vertex](nodes[candidate])
+            node, at, process = candidate.rpartition("@")
+            if at and node in nodes:
+                return candidate, self._in_process(node, nodes[node], process)
             if calls := topics & {candidate + REQUEST, candidate + RESPONSE}:
                 return candidate, frozenset[Vertex](calls)
             if candidate in services:
@@ -274,6 +306,15 @@ class _Search:
         if close := close_names(name, topics | nodes.keys()):
             hint = f"did you mean {' or '.join(close)}?"
         raise self.wrong(f"no topic or node is called {name}; {hint}")
+
+    def _in_process(self, node: str, own: Iterable[int], process: str) -> frozenset[Vertex]:
+        """Of a node's callbacks those in a process."""
+        found = [one for one in own if process in map(str, self.callbacks[one].processes)]
+        if not found:
+            ran = sorted({pid for one in own for pid in self.callbacks[one].processes})
+            there = ", ".join(f"{node}@{pid}" for pid in ran) or node
+            raise self.wrong(f"{node} did not run in process {process}; write {there}")
+        return frozenset[Vertex](found)
 
     def _starts(self, name: str, vertices: frozenset[Vertex]) -> set[int]:
         if not any(isinstance(vertex, str) for vertex in vertices):
@@ -516,23 +557,58 @@ class _NamedPath(BaseModel):
     node_chain: tuple[_PathNode, ...] = Field(min_length=1)
 
 
+class _Publishes(BaseModel):
+    topic_name: str
+    callback_name: str | None = None
+    callback_names: tuple[str, ...] = ()
+
+
+class _Callback(BaseModel):
+    callback_name: str
+    topic_name: str | None = None
+
+
+class _Node(BaseModel):
+    node_name: str
+    callbacks: tuple[_Callback, ...] = ()
+    publishes: tuple[_Publishes, ...] = ()
+
+
+class _PathAlias(BaseModel):
+    path_name: str
+    callbacks: tuple[str, ...] = Field(min_length=1)
+
+
 class _Architecture(BaseModel):
     named_paths: tuple[_NamedPath, ...]
+
+
+class _ArchitectureOfGalactic(BaseModel):
+    path_name_aliases: tuple[_PathAlias, ...]
+    nodes: tuple[_Node, ...] = ()
 
 
 def load_named_paths(file: str | Path) -> dict[str, str]:
     """The named paths of a CARET architecture file: path name → chain as we write it.
 
     Each node of a path becomes a way point together with the topic it publishes. A last node that
-    publishes nothing ends the chain with the topic it subscribes to.
+    publishes nothing ends the chain with the topic it subscribes to. Galactic's files name the
+    paths ``path_name_aliases``, as callbacks.
 
-    Raises InputError: not readable, not YAML, no ``named_paths``, a path without nodes.
+    Raises InputError: not readable, not YAML, no named paths, a path without nodes, or with
+    callbacks that the file does not have.
     """
     path = Path(file)
     root = compose(read_text(path, "CARET's architecture file"), path)
     plain = PlainData(path, ours=False)
+    values = None if root is None else plain.of(root)
+    if isinstance(values, dict) and "named_paths" not in values and "path_name_aliases" in values:
+        try:
+            return _paths_of_callbacks(path, _ArchitectureOfGalactic.model_validate(values))
+        except ValidationError as error:
+            raise InputError(plain.problems(error, _ArchitectureOfGalactic)) from error
     try:
-        architecture = _Architecture.model_validate(None if root is None else plain.of(root))
+        architecture = _Architecture.model_validate(values)
     except ValidationError as error:
         raise InputError(
             f"{plain.problems(error, _Architecture)}; chains are read from the `named_paths` of a"
@@ -548,3 +624,46 @@ def load_named_paths(file: str | Path) -> dict[str, str]:
             points.pop(-2)
         chains[named.path_name] = "..".join(point for point in points if point is not None)
     return chains
+
+
+def _paths_of_callbacks(file: Path, architecture: _ArchitectureOfGalactic) -> dict[str, str]:
+    """The chains of paths that name their callbacks, as ``/node/subscription_callback_0``.
+
+    A message leads from a callback to the next one of another node, so its topic is a way point;
+    within a node what passes is a variable, which the node's name stands for.
+    """
+    nodes = {node.node_name: node for node in architecture.nodes}
+    chains = {}
+    for alias in architecture.path_name_aliases:
+        points: list[str] = []
+        for number, unique_name in enumerate(alias.callbacks):
+            node_name, _, callback_name = unique_name.rpartition("/")
+            known = nodes[node_name].callbacks if node_name in nodes else ()
+            callback = next((c for c in known if c.callback_name == callback_name), None)
+            if callback is None:
+                where = f"{file}: path {alias.path_name!r}"
+                raise InputError(
+                    f"{where} names the callback {unique_name}, which no node in it has: correct"
+                    " one of the two"
+                )
+            if number and callback.topic_name is not None and node_name not in points:
+                points.append(callback.topic_name)
+            points.append(node_name)
+        published = _published(nodes[points[-1]], alias.callbacks[-1].rpartition("/")[2])
+        if published is not None:
+            points.append(published)
+        elif len(points) > 1 and not nodes[points[-1]].publishes:
+            points.pop()
+        chains[alias.path_name] = "..".join(dict.fromkeys(points))
+    return chains
+
+
+def _published(node: _Node, callback_name: str) -> str | None:
+    """The topic that a callback publishes; None where the file does not say which, or none."""
+    own = [
+        one.topic_name
+        for one in node.publishes
+        if callback_name in {one.callback_name, *one.callback_names}
+    ]
+    topics = own or [one.topic_name for one in node.publishes]
+    return topics[0] if len(topics) == 1 else None

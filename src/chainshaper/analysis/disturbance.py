@@ -13,7 +13,9 @@ moment at which its output was due**, and by no other:
 * **At two instants** any stall disturbs what a gate lets go: where the origin is taken (between the
   traversal's start and the anchor's origin), and around the moment at which the output was due.
 * **In between** stalls add up, on one core, within [start, due]. Without a gate they disturb from
-  ``COMPUTING_THRESHOLD_NS`` in all; a gate absorbs what the plan's margin ε has room for.
+  ``COMPUTING_THRESHOLD_NS`` in all; a gate absorbs what the plan's margin ε has room for. Without
+  a gate a cycle is looked at from when the timer that starts it was due: a stall that ends just
+  before a late callback begins has made it late, and what piled up meanwhile runs beside it.
 * A traversal that began before its disturbed predecessor was computed may have queued behind it,
   and counts as disturbed with it, unless the plan has them overlap (logical execution time,
   pipelines), or they overlap anyhow, in a chain that mostly takes longer than its period.
@@ -26,11 +28,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.traversals import Traversals
 from chainshaper.gate.decision import STALL_NS
 from chainshaper.values import events
+from chainshaper.values.application import Chain
 
 WAKE_UP_NS = 250_000
 
@@ -72,20 +76,21 @@ def with_punctuality(
     * ``late``: whether it left behind the last slot it was due in, or the cycle (null: nothing says
       when it was due).
     * ``origin``: from when the gate counted (null: no gate decided); ``computed_at``: when the
-      chain was done, at the gate's door or with the publication.
+      chain was done, at the gate's door or with the publication; ``expected_at``: when the timer
+      that starts the chain was due (:func:`timer_due`), or else the start.
 
     The decisions are those of :func:`~chainshaper.analysis.messages.gated_hops`.
     """
     hops, chain = traversals.hops, traversals.chain
     releases = gated_hops(flow.events, flow.objects, hops, 0 if due is None else due.cycles)
     decided = releases.filter(pl.col("hop") == len(chain.callbacks) - 1).drop("hop")
+    # A standby publishes at once what went around the gate: no slot was chosen for it.
+    decided = decided.filter(pl.col("overrun").ne_missing("bypass"))
     frame = traversals.frame.join(decided, on="traversal", how="left", maintain_order="left")
     start, end, counted_from = pl.col("start"), pl.col("end"), pl.col("origin")
-    # The period of the timer that starts the chain stands for the cycle of a plan.
-    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
-    period: int | None = first["period_ns"].max()  # type: ignore[assignment]
-    cycle_ns = period if due is None else due.cycle_ns
-    limit = pl.lit(cycle_ns if due is None else (due.cycles + 1) * due.cycle_ns, dtype=pl.Int64)
+    within = due_within(flow, chain, due)
+    cycle_ns = within if due is None else due.cycle_ns
+    limit = pl.lit(within, dtype=pl.Int64)
     began = start
     if due is not None and due.from_cycle:
         began = start - pl.lit(lateness_in_cycle(frame["start"], due.cycle_ns))
@@ -104,7 +109,59 @@ def with_punctuality(
         late=late.otherwise(place >= limit) & end.is_not_null(),
         origin="origin",
         computed_at=pl.coalesce("arrival", "end"),
+        expected_at=_expected(flow, traversals, timer_period(flow, chain)),
     ), releases
+
+
+def _expected(flow: DataFlow, traversals: Traversals, period_ns: int | None) -> pl.Expr:
+    """When the timer of each traversal's first callback was due; without a timer its start."""
+    if period_ns is None:
+        return pl.col("start")
+    first = flow.instances.filter(pl.col("callback_id") == traversals.chain.callbacks[0])
+    processes = first.sort("start").partition_by("pid")  # each has its own timer
+    due = [own.select("start", expected=timer_due(own["start"], period_ns)) for own in processes]
+    if not due:
+        return pl.col("start")
+    known = pl.concat(due).unique("start", keep="first")
+    rows = traversals.frame.select("start").join(
+        known, on="start", how="left", maintain_order="left"
+    )
+    return pl.lit(rows.select(pl.coalesce("expected", "start")).to_series())
+
+
+def timer_due(starts: pl.Series, period_ns: int) -> pl.Series:
+    """When a timer was due for each start of its callback, in order: at the latest at the start.
+
+    A timer keeps its phase, and one that missed several expiries fires once: it was due at the
+    first expiry behind the start before. Where starts show no phase (a clock of a simulation, a
+    timer that was reset), it was due a period behind the start before. One that mostly starts less
+    often than its period says is not late each time: it has the period that it shows.
+    """
+    usual: float = starts.diff().median() or 0.0  # type: ignore[assignment]
+    if usual > 1.5 * period_ns:
+        period_ns = round(usual)
+    late = lateness_in_cycle(starts, period_ns)
+    before = starts.shift(1)
+    due = before + period_ns
+    if starts.len() and (late.median() or 0) < period_ns / 4:  # type: ignore[operator]
+        due = before - late.shift(1) + period_ns
+    frame = pl.DataFrame({"start": starts, "due": due})
+    return frame.select(pl.min_horizontal("start", "due")).to_series()
+
+
+def due_within(flow: DataFlow, chain: Chain, due: Due | None) -> int | None:
+    """How long after its beginning an output is late whatever the slots are (ns; None: not known).
+
+    The period of the timer that starts the chain stands for the cycle of a plan.
+    """
+    return timer_period(flow, chain) if due is None else (due.cycles + 1) * due.cycle_ns
+
+
+def timer_period(flow: DataFlow, chain: Chain) -> int | None:
+    """The period of the timer that starts a chain, as its starts show it (ns; None: no timer)."""
+    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
+    declared: int | None = first["period_ns"].max()  # type: ignore[assignment]
+    return shown_periods(flow.contradictions).get(chain.callbacks[0], declared)
 
 
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:
@@ -156,13 +213,13 @@ def disturbed(flow: DataFlow, frame: pl.DataFrame, margin_ns: int = 0) -> Mask:
     """
     began, ended, core = _stalls(flow)
     complete, gated = frame["complete"].to_numpy(), frame["origin"].is_not_null().to_numpy()
-    start, due, origin, computed = (
+    start, due, origin, computed, expected = (
         frame[name].fill_null(frame["start"]).to_numpy()
-        for name in ("start", "due_at", "origin", "computed_at")
+        for name in ("start", "due_at", "origin", "computed_at", "expected_at")
     )
     at_instants = overlapping(np.minimum(start, origin), np.maximum(start, origin), began, ended)
     at_instants |= overlapping(due - WAKING_NS, due + WAKING_NS, began, ended)
-    lost = stalled_within(start, due, began, ended, core)
+    lost = stalled_within(np.where(gated, start, expected), due, began, ended, core)
     most = np.where(gated, max(COMPUTING_THRESHOLD_NS, margin_ns + 1), COMPUTING_THRESHOLD_NS)
     hit = complete & ((gated & at_instants) | (lost >= most))
     # A predecessor that was to be out later than the next began is not waited for.

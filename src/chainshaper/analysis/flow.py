@@ -21,10 +21,12 @@ are assumed (``assumed``, no ``end``, no response time):
 
 from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import polars as pl
 
+from chainshaper.analysis.contradictions import Contradiction, contradictions
+from chainshaper.analysis.lost_ends import LOOKS, without_disproved_ends
 from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
 from chainshaper.analysis.messages import (
     link_takes,
@@ -35,11 +37,12 @@ from chainshaper.analysis.messages import (
     with_departures,
 )
 from chainshaper.analysis.objects import CALLBACK_SCHEMA, Objects, resolve_objects
+from chainshaper.analysis.restarts import FOLLOWED, followed_processes
+from chainshaper.analysis.unseen_takes import with_unseen_takes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 
 _ACTION = "/_action/"
-_LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
 
 
 @dataclass(frozen=True)
@@ -47,8 +50,10 @@ class DataFlow:
     """A recording, resolved.
 
     * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`.
-    * ``instances``: see :func:`callback_instances`, with those that no event shows added. An
-      instance's number is its row.
+    * ``instances``: see :func:`callback_instances`, with those that no event shows added, and
+      without the ends that other events disprove (:mod:`~chainshaper.analysis.lost_ends`: then,
+      and where an end was lost, ``until`` is when it had ended at the latest, null if not known).
+      An instance's number is its row.
     * ``publications``: see :func:`~chainshaper.analysis.messages.publications`, with the
       ``instance`` in which each was published and its ``callback_id`` (null: outside callbacks),
       and when it was ``sent`` (null: it never was).
@@ -56,6 +61,10 @@ class DataFlow:
       was read and the ``instance`` that got the message (null: none did).
     * ``events``: the tables all this came from.
     * ``notes``: what cannot be known, in plain words.
+    * ``contradictions``: what in the events contradicts itself; their notes are in ``notes``.
+    * ``untold``: subscriptions' callbacks that ran without any event of a take.
+    * ``followed``: see :func:`~chainshaper.analysis.restarts.followed_processes`. Callbacks of a
+      node that was started again have one ``callback_id`` in all frames.
     """
 
     objects: Objects
@@ -64,15 +73,23 @@ class DataFlow:
     takes: pl.DataFrame
     events: events.EventTables
     notes: tuple[str, ...]
+    contradictions: tuple[Contradiction, ...] = ()
+    untold: frozenset[int] = frozenset()
+    followed: pl.DataFrame = field(default_factory=FOLLOWED.to_frame)
 
 
 def data_flow(
-    tables: events.EventTables, clock_offset_ns: int = 0, objects: Objects | None = None
+    tables: events.EventTables,
+    clock_offset_ns: int = 0,
+    objects: Objects | None = None,
+    *,
+    ended: Collection[int] | None = None,
 ) -> DataFlow:
     """Resolve a recording's events.
 
     ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
-    ``objects`` are the tables' own, where they have been resolved already.
+    ``objects`` are the tables' own, where they have been resolved already. ``ended`` are the
+    processes that have ended, where that is known better than from events.
     """
     objects = objects or resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
@@ -80,10 +97,13 @@ def data_flow(
         sent, received = service_calls(tables, objects, clock_offset_ns)
         taken = takes(tables, objects, received)
         published = publications(tables, objects, sent)
-        taken = link_takes(tables, taken, published, clock_offset_ns)
+        taken, stamped = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
+    ends = without_disproved_ends(tables, instances, taken)
+    instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
+    taken, unseen = with_unseen_takes(taken, instances, published, objects)
     published = _published_in(published, instances, objects)
     if "rcl_timer_call" not in tables and instances["assumed"].any():
         published = _begun_outside(published, instances)
@@ -91,11 +111,28 @@ def data_flow(
         published = _answered(published, taken)
     objects, instances, published = _with_assumed_writers(objects, instances, published)
     published = with_departures(published, tables, objects)
-    notes = (*objects.notes, *_notes(tables, instances))
-    return DataFlow(objects, instances, published, taken, tables, notes)
+    seen = contradictions(
+        tables=tables,
+        objects=objects,
+        instances=instances,
+        published=published,
+        taken=taken,
+        ends=ends,
+        unseen=unseen,
+        stamped=stamped,
+    )
+    notes = (*objects.notes, *_notes(tables, instances, taken), *(one.note for one in seen))
+    untold = frozenset(one.callback_id for one in unseen)
+    followed = followed_processes(tables, objects, ended)
+    flow = DataFlow(
+        objects, instances, published, taken, tables, notes, seen, untold, followed=followed
+    )
+    return _with_restarts(flow)
 
 
-def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]:
+def _notes(
+    tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame
+) -> Iterator[str]:
     """What cannot be known of instances and messages, in plain words."""
     if "sched_switch" in tables and instances.height and not instances["execution_ns"].count():
         yield (
@@ -103,7 +140,7 @@ def _notes(tables: events.EventTables, instances: pl.DataFrame) -> Iterator[str]
             "container threads have other numbers): execution times cannot be known."
         )
     within = int(instances["intra_process"].sum())
-    if within and not events.table(tables, "rclcpp_ring_buffer_dequeue").height:
+    if within and not taken["intra_process"].any():
         yield (
             f"{within} callback instances got their message within their process, of which no "
             "other event tells (before Iron, or not enabled): chains cannot be followed through "
@@ -263,7 +300,7 @@ def _with_assumed_readers(
         return instances, taken.with_columns(assumed_instance=pl.lit(None, dtype=pl.UInt32))
     if assumed["by_executor"].any():
         looks = pl.concat(
-            events.table(tables, name).select("pid", "tid", end="time") for name in _LOOKS
+            events.table(tables, name).select("pid", "tid", end="time") for name in LOOKS
         )
         assumed = first_after(assumed, looks.sort("end"), ["pid", "tid"], "start", "end")
         end = pl.when("by_executor").then("end")
@@ -313,7 +350,8 @@ def _published_in(
 ) -> pl.DataFrame:
     """Add ``instance`` and ``callback_id``: the innermost instance running on the thread then.
 
-    An instance without an end is taken to run until the thread's next instance. A publication in
+    An instance without an end is taken to run until the thread's next instance, or until its thread
+    looked for other work. A publication in
     the nanosecond in which one instance ends and the next begins is the first one's. Where a
     callback runs others inside itself (it spins an executor), what it publishes after them is its
     own: the search is repeated among the instances that contain others, per level of nesting.
@@ -323,7 +361,8 @@ def _published_in(
     running = instances.join(nodes, on="callback_id", how="left", maintain_order="left")
     running = running.drop("execution_ns", "intra_process")
     key, columns = ["pid", "tid"], ["publication", "instance", "callback_id"]
-    inside = (pl.col("end").is_null() | (pl.col("time") <= pl.col("end"))) & (
+    over = pl.coalesce("end", "until")
+    inside = (over.is_null() | (pl.col("time") <= over)) & (
         ~pl.col("assumed") | (pl.col("owner") == pl.col("node"))
     )
     rest, found, strictly = published.select("publication", "time", *key, "node"), [], True
@@ -348,39 +387,58 @@ def _published_in(
     )
 
 
-def with_restarts(flow: DataFlow, ended: Collection[int]) -> DataFlow:
-    """The flow in which callbacks of processes that have ended are those that replace them.
+def _with_restarts(flow: DataFlow) -> DataFlow:
+    """The flow in which the callbacks of a node that was started again are those of its last
+    process, with a note for each such node.
 
-    A callback replaces another one where its node, kind and trigger are the same, in a process that
-    runs or, where none does, began later: its node was started again.
+    A callback replaces an earlier one where its node, kind and trigger are the same.
     """
-    gone, alike = pl.col("pid").is_in(list(ended)), ["node", "kind", "period_ns", "of"]
+    if flow.followed.is_empty():
+        return flow
+    alike = ["node", "kind", "period_ns", "of"]
     writes = flow.publications.group_by("callback_id").agg(wrote=pl.col("topic").first())
     known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
-    known = known.join(writes, on="callback_id", how="left", maintain_order="left").sort(
-        ~gone, "valid_from", maintain_order=True
-    )
+    known = known.join(writes, on="callback_id", how="left", maintain_order="left")
+    known = known.join(flow.followed, on=["node", "pid"], how="left", maintain_order="left")
     outside = (pl.col("kind") == "unknown") & (pl.col("handle") == 0)
     of = pl.when(outside).then(pl.col("wrote").cast(pl.String)).otherwise("topic")
-    known = known.with_columns(of=of)
+    known = known.with_columns(pl.coalesce("last_pid", "pid"), of=of)
+    runs_last = pl.col("pid") == pl.col("last_pid")
+    known = known.sort(runs_last, "valid_from", maintain_order=True)
     known = known.with_columns(place=pl.int_range(pl.len()).over("pid", *alike))
-    known = known.with_columns(
-        pl.col("callback_id", "pid").last().over(*alike, "place").name.prefix("new_")
+    latest = pl.col("callback_id").last().over("last_pid", *alike, "place")
+    known = known.with_columns(latest=latest)
+    # Numbers stay without gaps: they are places in the graph.
+    dense = pl.col("latest").rank("dense").cast(pl.UInt32) - 1
+    ids = dict(known.select("callback_id", dense).iter_rows())
+    renumbered = pl.col("callback_id").replace_strict(ids, return_dtype=pl.UInt32)
+    # Of a callback's registrations those of its last process come first: they describe it.
+    replaced = known.filter(pl.col("callback_id") != pl.col("latest"))["callback_id"]
+    superseded = pl.col("callback_id").is_in(replaced.implode())
+    callbacks = flow.objects.callbacks.sort(superseded, maintain_order=True).with_columns(
+        renumbered
     )
-    replaced = known.filter(gone & (pl.col("callback_id") != pl.col("new_callback_id")))
-    if replaced.is_empty():
-        return flow
-    ids = dict(replaced.select("callback_id", "new_callback_id").iter_rows())
-    pids = dict(replaced.select("new_callback_id", "new_pid").iter_rows())
-    number = pl.col("callback_id").replace(ids)
-    callbacks = flow.objects.callbacks.sort(gone, maintain_order=True).with_columns(number)
-    pid = number.replace_strict(pids, default=pl.col("pid"), return_dtype=pl.Int32())
+    buffers = flow.objects.buffers.with_columns(renumbered)
+    names = flow.followed.group_by("node", "last_pid", maintain_order=True).agg("pid")
+    notes = (
+        f"{node} was started again (processes {', '.join(map(str, pids))}): it counts as one node."
+        for node, _, pids in names.iter_rows()
+    )
     return replace(
         flow,
-        objects=replace(flow.objects, callbacks=callbacks),
-        instances=flow.instances.with_columns(number),
-        publications=flow.publications.with_columns(number, pid=pid),
-        takes=flow.takes.with_columns(number),
+        objects=replace(flow.objects, callbacks=callbacks, buffers=buffers),
+        instances=flow.instances.with_columns(renumbered),
+        publications=flow.publications.with_columns(renumbered),
+        takes=flow.takes.with_columns(renumbered),
+        contradictions=tuple(
+            replace(
+                contradiction,
+                callbacks=frozenset(ids[number] for number in contradiction.callbacks),
+            )
+            for contradiction in flow.contradictions
+        ),
+        untold=frozenset(ids[number] for number in flow.untold),
+        notes=(*flow.notes, *notes),
     )
 
 

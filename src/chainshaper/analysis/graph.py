@@ -48,15 +48,22 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
     known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
     known = known.sort("callback_id").rename({"callback_id": "id"})
     known = known.select("kind", "node", "pid", "handle", "topic", "period_ns", "symbol", "id")
-    callbacks = [
-        Callback(**row, publishes=tuple(sorted(writes[row["id"]])))
-        for row in known.iter_rows(named=True)
-    ]
+    last = {(node, pid): last_pid for node, pid, last_pid in flow.followed.iter_rows()}
+    earlier = defaultdict[tuple[str, int], tuple[int, ...]](tuple)
+    for (node, pid), last_pid in last.items():
+        if pid != last_pid:
+            earlier[node, last_pid] += (pid,)
+    callbacks = []
+    for row in known.iter_rows(named=True):
+        row["pid"] = last.get((row["node"], row["pid"]), row["pid"])
+        row |= {"earlier_pids": earlier[row["node"], row["pid"]]}
+        callbacks.append(Callback(**row, publishes=tuple(sorted(writes[row["id"]]))))
     of_node = defaultdict[tuple[int, str], list[Callback]](list)
     for callback in callbacks:
         of_node[callback.pid, callback.node].append(callback)
     turns = _in_turns(flow, of_node.values())
-    nodes = flow.objects.nodes.select("node", "pid").unique(maintain_order=True)
+    created = flow.objects.nodes.select("node", "pid").unique(maintain_order=True).iter_rows()
+    nodes = dict.fromkeys((node, last.get((node, pid), pid)) for node, pid in created)
     complete = []
     for one in callbacks:
         passed = _passed_on(one, of_node[one.pid, one.node])
@@ -64,7 +71,7 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
         publishes, passes_on, in_turns = (tuple(sorted(topics)) for topics in sets)
         complete.append(replace(one, publishes=publishes, passes_on=passes_on, in_turns=in_turns))
     return ApplicationGraph(
-        nodes=tuple(Node(name, pid) for name, pid in nodes.iter_rows()),
+        nodes=tuple(Node(name, pid, earlier[name, pid]) for name, pid in nodes),
         callbacks=tuple(complete),
         publishers=_by_topic(flow.objects.publishers),
         subscribers=_by_topic(flow.objects.subscriptions),

@@ -9,9 +9,16 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.analysis.disturbance import Due, disturbed, stalled_after, with_punctuality
+from chainshaper.analysis.disturbance import (
+    Due,
+    disturbed,
+    due_within,
+    stalled_after,
+    with_punctuality,
+)
 from chainshaper.analysis.flow import DataFlow, data_flow, timer_calls
 from chainshaper.analysis.graph import graph_of
+from chainshaper.analysis.outputs_due import not_begun, with_outputs_due
 from chainshaper.analysis.traversals import reception, traverse
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Chain, trigger_text
@@ -74,13 +81,16 @@ def summary(times: pl.Expr) -> pl.Expr:
 def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     """Count, response and execution times of every callback that was seen to run, one row each.
 
-    Columns: ``callback_id, node, kind, topic, period_ns, symbol, pid, tids, count, unfinished,
-    response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in ns (means as
-    floats), null where no instance has such a time. ``period_ns`` is the timer's own period.
+    Columns: ``callback_id, node, kind, topic, period_ns, symbol, pid, pids, tids, count,
+    unfinished, response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in ns
+    (means as floats), null where no instance has such a time. ``period_ns`` is the timer's own
+    period, ``pids`` are all processes of a node that was started again, ``pid`` is the last.
     """
-    about = flow.objects.callbacks.unique("callback_id", maintain_order=True)
+    # Of a callback's registrations those of its node's last process come first.
+    about = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
     ran = flow.instances.filter(~pl.col("assumed")).group_by("callback_id")
     figures = ran.agg(
+        pids=pl.col("pid").unique(maintain_order=True),
         tids=pl.col("tid").unique().sort(),
         count=pl.len(),
         unfinished=pl.col("end").null_count(),
@@ -143,11 +153,13 @@ def executors(flow: DataFlow) -> list[Executor]:
     Python the main thread, which gives them their work.
     """
     found: list[Executor] = []
-    calls = timer_calls(flow.events, flow.objects).select("callback_id", "tid")
-    ran = pl.concat([flow.instances.select("callback_id", "tid"), calls]).unique()
+    who = ("callback_id", "pid", "tid")  # threads of processes that were followed are no more
+    calls = timer_calls(flow.events, flow.objects).select(who)
+    ran = pl.concat([flow.instances.select(who), calls]).unique()
     about = flow.objects.callbacks.filter((pl.col("kind") != "unknown") | pl.col("observed"))
-    about = about.unique("callback_id").join(
-        ran.group_by("callback_id").agg(tids=pl.col("tid").sort()), on="callback_id"
+    about = about.unique("callback_id", keep="first", maintain_order=True).join(
+        ran.group_by("callback_id", "pid").agg(tids=pl.col("tid").sort()),
+        on=["callback_id", "pid"],
     )
     columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids", "observed")
     for row in about.sort("callback_id").select(*columns).iter_rows():
@@ -171,14 +183,16 @@ class LatencyAnalysis:
     """The end-to-end latency of one chain in one recording.
 
     ``traversals`` is the frame of :class:`~chainshaper.analysis.traversals.Traversals` with
-    ``place_ns``, ``due_at``, ``late`` (:func:`~.disturbance.with_punctuality`), ``disturbed``,
+    ``place_ns``, ``due_at``, ``late`` (:func:`~.disturbance.with_punctuality`), ``was_due``
+    (:func:`~.outputs_due.with_outputs_due`), ``disturbed``,
     ``received``, ``reception_ns`` (latency to the subscriber's `callback_start`) and
     ``reception_disturbed`` (also by a stall between the two), ``hops`` its frame of hops,
     ``releases`` what gates decided about them (:func:`~.messages.gated_hops`). ``statistics`` are
     over all complete traversals, ``undisturbed`` over those that the machine did not disturb;
     ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
     subscribes to the output). ``incomplete`` counts traversals without an end by reason, ``silent``
-    instances of the first callback that began none.
+    instances of the first callback that began none, ``not_begun`` cycles of a plan in which it did
+    not run at all.
     """
 
     chain: Chain
@@ -193,6 +207,7 @@ class LatencyAnalysis:
     incomplete: dict[str, int]
     silent: int
     notes: tuple[str, ...]
+    not_begun: int = 0
 
     @property
     def decided(self) -> pl.DataFrame:
@@ -238,11 +253,13 @@ def analyse_latency(
     received = reception(flow, found, graph)
     sent, arrived = judged["end"].fill_null(0), received["received"].fill_null(-1)
     on_its_way = pl.Series(stalled_after(flow, sent.to_numpy(), arrived.to_numpy()))
-    frame = judged.drop("origin", "computed_at").with_columns(
+    frame = judged.drop("origin", "computed_at", "expected_at").with_columns(
         *(received["received"], received["reception_ns"]),
         disturbed=hit,
         reception_disturbed=hit | on_its_way,
     )
+    until = None if between is None else between[1]
+    frame = with_outputs_due(flow, frame, releases, due_within(flow, chain, own), until)
     hops = found.hops
     if between is not None:
         since_ns, until_ns = between
@@ -266,6 +283,7 @@ def analyse_latency(
         incomplete=dict(reasons.iter_rows()),
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),
+        not_begun=0 if own is None else not_begun(flow, chain, own, between),
     )
 
 

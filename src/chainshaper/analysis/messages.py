@@ -7,13 +7,16 @@ of ROS 2 show different halves of that:
   `rmw_take` the same timestamp: the match is exact;
 * before Jazzy `rmw_publish` has neither. Its publisher is that of the `rcl_publish` with the same
   message just before it on the same thread; a take is linked to the latest publication on its
-  topic at or before its source timestamp;
+  topic at or before its source timestamp, as the clocks were then
+  (:mod:`~chainshaper.analysis.wall_clock`);
 * CARET (Galactic) has neither `rmw_publish` nor `rmw_take`: `dds_write` is the publication,
   `dds_bind_addr_to_stamp` right after it on the same thread gives the source timestamp, and
   `dispatch_subscription_callback` is the take;
 * intra-process messages have no timestamp at all: the publication is the `rclcpp_intra_publish`
   before a ring buffer's enqueue on the same thread, the take is the dequeue of the same place in
-  the same buffer.
+  the same buffer;
+* CARET (Galactic, Humble) has no events of ring buffers: the take is its dispatch of the message's
+  address, or of a copy's, to the callback.
 
 Requests and responses of services are messages, too: a client publishes ``SERVICE:request``, which
 the server takes, and takes ``SERVICE:response``. In place of a source timestamp they have the
@@ -29,6 +32,7 @@ import polars as pl
 
 from chainshaper.analysis.matching import by_number, first_after, grows, in_order, latest_before
 from chainshaper.analysis.objects import Objects
+from chainshaper.analysis.wall_clock import StampedMessages, messages_of_stamps
 from chainshaper.values import events
 from chainshaper.values.application import REQUEST
 
@@ -42,10 +46,14 @@ _NO_TIME = pl.lit(None, dtype=pl.Int64)
 
 _CALLS = {"rmw_send_request": "client", "rmw_take_request": "service"}
 _CALLS |= {"rmw_send_response": "service", "rmw_take_response": "client"}
+_DISPATCHES = ("dispatch_intra_process_subscription_callback", "dispatch_intra_process")
+_COPIES = 3  # so often a message may be copied on its way to a callback of its process
 _CALL_BITS = 40
 _GID = 16  # bytes that mean anything
 _CLOCKS_AGREE = 2_000
 """So far apart (ns) the clocks of events and stamps may be; no writer publishes twice meanwhile."""
+_HELD_UP = 1_000_000
+"""So long (ns) a message is hardly ever on its way from its event to its stamp."""
 
 
 def service_calls(
@@ -208,8 +216,8 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
 
     Columns: ``take`` (numbered from 0), ``time``, ``pid``, ``tid``, ``callback_id`` (null if the
     subscription has no callback), ``node``, ``topic``, ``source_timestamp``, ``intra_process``,
-    and for those the ``buffer`` and ``index`` the message lay in. A take that found nothing
-    (``taken`` = 0) carries no message and is left out.
+    and for those the ``buffer`` and ``index`` the message lay in (null where CARET's events tell of
+    them). A take that found nothing (``taken`` = 0) carries no message and is left out.
     """
     types = {name: objects.subscriptions.schema[name] for name in ("node", "topic")}
     callbacks = objects.callbacks.cast(types)  # type: ignore[arg-type]
@@ -223,59 +231,127 @@ def takes(tables: events.EventTables, objects: Objects, calls: pl.DataFrame) -> 
     if calls.height:
         calls = calls.rename({"call": "source_timestamp"})
         parts.append(latest_before(calls, from_dds, key, "time", "created"))
+    owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
     if taken.is_empty():
-        owners = callbacks.select("pid", *columns, callback="handle", created="valid_from")
         dispatched = events.table(tables, "dispatch_subscription_callback")
         dispatched = dispatched.rename({"source_stamp": "source_timestamp"})
         parts.append(latest_before(dispatched, owners, ["pid", "callback"], "time", "created"))
+    dispatched = _dispatched(tables)
+    dispatched = latest_before(dispatched, owners, ["pid", "callback"], "time", "created")
+    within = {"source_timestamp": _NO_TIME, "intra_process": pl.lit(True)}
+    parts.append(dispatched.with_columns(**within))
     owners = callbacks.unique("callback_id", maintain_order=True).select(columns)
     buffers = objects.buffers.join(owners, on="callback_id", how="left")
     dequeued = events.table(tables, "rclcpp_ring_buffer_dequeue")
     dequeued = latest_before(dequeued, buffers, ["pid", "buffer"], "time", "valid_from")
-    parts.append(dequeued.drop_nulls("callback_id").with_columns(source_timestamp=_NO_TIME))
+    parts.append(dequeued.drop_nulls("callback_id").with_columns(**within))
     nowhere = pl.lit(None, dtype=pl.UInt64)
     parts = [
         part.select(
             *("time", "pid", "tid", *columns),
             pl.when(pl.col("source_timestamp") != 0).then("source_timestamp"),
             *(pl.col(n) if n in part.columns else nowhere.alias(n) for n in ("buffer", "index")),
+            intra_process=pl.lit("intra_process" in part.columns),
         )
         for part in parts
     ]
     every = pl.concat([part for part in parts if part.height] or parts[:1])
     every = every.drop_nulls("topic") if every["topic"].null_count() else every
-    every = in_order(every, "time", "pid", "tid").with_row_index("take")
-    return every.with_columns(intra_process=pl.col("buffer").is_not_null())
+    return in_order(every, "time", "pid", "tid").with_row_index("take")
+
+
+def _dispatched(tables: events.EventTables) -> pl.DataFrame:
+    """CARET's dispatches of messages within a process: ``time, pid, tid, message, callback``.
+
+    None where ring buffers' events tell of the same messages.
+    """
+    rows = [events.table(tables, name) for name in _DISPATCHES]
+    if events.table(tables, "rclcpp_ring_buffer_dequeue").height:
+        rows = [row.clear() for row in rows]
+    every = pl.concat(row.select("time", "pid", "tid", "message", "callback") for row in rows)
+    return in_order(every, "time")
 
 
 def link_takes(
     tables: events.EventTables, taken: pl.DataFrame, published: pl.DataFrame, clock_offset_ns: int
-) -> pl.DataFrame:
+) -> tuple[pl.DataFrame, StampedMessages | None]:
     """``taken`` with a column ``publication``: which publication each take read (null: unknown).
 
     ``clock_offset_ns`` is what to add to event times for CLOCK_REALTIME, the clock of source
-    timestamps; it is used only where publications carry no source timestamp.
+    timestamps, when the recording began; it is used only where publications carry no source
+    timestamp. Also returns what was found there, if the clocks' distance alone did not tell.
     """
     found = _with_same_stamp(taken, published)
     linked = taken.with_columns(by_number(found, "take", "publication", taken.height))
-    columns = linked.columns
+    columns, followed = linked.columns, None
     through_buffer = pl.col("intra_time").is_not_null() & (pl.col("time") <= pl.col("intra_time"))
     stampless = published.filter(pl.col("source_timestamp").is_null() & ~through_buffer)
-    if stampless.height:
-        stampless = stampless.select("topic", guess="publication", published="time")
-        rows = linked.with_columns(
-            sent=pl.col("source_timestamp") - clock_offset_ns + _CLOCKS_AGREE
-        )
-        rows = latest_before(rows, stampless, ["topic"], "sent", "published")
-        # A subscription gets a message once: a second take of it read one whose events were lost.
-        again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
-        guess = pl.when(~again.fill_null(False)).then("guess")
-        linked = rows.with_columns(pl.coalesce("publication", guess)).sort("take").select(columns)
-    if taken["intra_process"].any():
+    unknown = linked.filter(pl.col("publication").is_null() & (pl.col("source_timestamp") > 0))
+    if stampless.height and unknown.height:
+        stampless = stampless.select("topic", "publisher", "time", guess="publication")
+        rows = _by_fixed_clocks(unknown, stampless, clock_offset_ns)
+        if rows is None:
+            stampless = stampless.rename({"guess": "publication"})
+            followed = messages_of_stamps(unknown, stampless, clock_offset_ns)
+            message = ["topic", "source_timestamp"]
+            guesses = followed.frame.rename({"publication": "guess"})
+            rows = unknown.join(guesses, on=message, how="left", maintain_order="left")
+        guess = by_number(rows, "take", "guess", linked.height)
+        linked = linked.with_columns(pl.coalesce("publication", guess))
+    if _dispatched(tables).height:
+        linked = _with_dispatched(tables, linked, published)
+    if taken["buffer"].count():
         stored = _enqueued(tables, published)
         rows = latest_before(linked, stored, ["pid", "buffer", "index"], "time", "enqueued")
         linked = rows.with_columns(pl.coalesce("publication", "stored")).sort("take")
-    return linked.select(columns)
+    return linked.select(columns), followed
+
+
+def _by_fixed_clocks(
+    unknown: pl.DataFrame, stampless: pl.DataFrame, clock_offset_ns: int
+) -> pl.DataFrame | None:
+    """``unknown`` takes with the latest publication before their stamps as ``guess``; None where
+    the clocks did not keep their distance, or a message's publication is not there."""
+    sent = pl.col("source_timestamp") - clock_offset_ns + _CLOCKS_AGREE
+    known = stampless.select("topic", "guess", published="time")
+    rows = latest_before(unknown.with_columns(sent=sent), known, ["topic"], "sent", "published")
+    # A subscription gets a message once: a second take of it read one whose events were lost.
+    again = pl.col("guess") == pl.col("guess").shift(1).over("pid", "node", "callback_id")
+    late = pl.col("sent") - pl.col("published") > _CLOCKS_AGREE + _HELD_UP
+    early = pl.col("published") > pl.col("time")
+    odd = pl.col("guess").is_null() | again.fill_null(False) | late | early
+    return None if rows.select(odd.any()).item() else rows
+
+
+def _with_dispatched(
+    tables: events.EventTables, linked: pl.DataFrame, published: pl.DataFrame
+) -> pl.DataFrame:
+    """``linked`` with the publications of messages that CARET saw dispatched in their process.
+
+    Addresses are used again: a message is the latest one handed over, or copied, at its address.
+    """
+    address, thread = ["pid", "message"], ["pid", "tid"]
+    handed = events.table(tables, "rclcpp_intra_publish").select("time", *thread, "message")
+    known = published.drop_nulls("intra_time").select(*thread, "intra_time", stored="publication")
+    handed = latest_before(handed, known, thread, "time", "intra_time")
+    handed = handed.filter(pl.col("time") == pl.col("intra_time"))
+    origins = handed.select(*address, "stored", since="time")
+    copied = events.table(tables, "message_construct")
+    copied = copied.select("time", "pid", "constructed_message", message="original_message")
+    for _ in range(_COPIES if copied.height else 0):
+        of_original = latest_before(copied, origins, address, "time", "since").drop_nulls("stored")
+        copies = of_original.select(
+            "pid", "stored", message="constructed_message", since="time"
+        ).select(origins.columns)
+        origins = pl.concat([origins, copies]).unique().sort("since", maintain_order=True)
+    took = _dispatched(tables).select(*thread, "message", dispatched="time")
+    rows = linked.filter(pl.col("intra_process") & pl.col("buffer").is_null())
+    rows = latest_before(rows, took, thread, "time", "dispatched")
+    rows = latest_before(rows, origins, address, "time", "since").drop_nulls("stored")
+    # A callback gets a message once: the second time it is one whose events were lost.
+    rows = rows.unique(["callback_id", "stored"], keep="first", maintain_order=True)
+    stored = by_number(rows, "take", "stored", linked.height)
+    return linked.with_columns(pl.coalesce("publication", stored))
 
 
 def _with_same_stamp(taken: pl.DataFrame, published: pl.DataFrame) -> pl.DataFrame:
@@ -374,7 +450,7 @@ def gate_decisions(tables: events.EventTables, objects: Objects) -> pl.DataFrame
     each subscription of its process; which one took the message, the source timestamp tells. About
     a message without one it was made in an instance on its thread, which began at ``start``.
     """
-    decisions = events.table(tables, "gate_release", ["mode", "moved"])
+    decisions = events.table(tables, "gate_release", ["mode", "moved", "dropped"])
     key = ["pid", "callback"]
     callbacks = objects.callbacks.with_columns(callback="handle")
     handles = callbacks.select(*key, "callback_id").unique()
@@ -409,9 +485,9 @@ def gated_hops(
     """What gates decided about the messages of a chain: one row per hop whose callback is a gate.
 
     ``traversal, hop, arrival, origin, release, let_go, slot, cycles_waited, anchor, overrun, mode,
-    moved_ns`` of `gate_release`, sorted; ``let_go`` is when it did. Several messages may have the
-    same source timestamp (writers stamp in microseconds, a simulated clock stands still): then
-    the decision is meant whose ``arrival`` is nearest to the start of the callback.
+    dropped, moved_ns`` of `gate_release`, sorted; ``let_go`` is when it did. Several messages may
+    have the same source timestamp (writers stamp in microseconds, a simulated clock stands still):
+    then the decision is meant whose ``arrival`` is nearest to the start of the callback.
     """
     key = ["callback_id", "source_timestamp"]
     decided = with_overrun(gate_decisions(tables, objects), due_cycles).with_columns(let_go="time")
@@ -424,6 +500,6 @@ def gated_hops(
     found = found.sort("traversal", "hop", apart, maintain_order=True)
     return found.unique(["traversal", "hop"], keep="first", maintain_order=True).select(
         *("traversal", "hop", "arrival", "origin", "release", "let_go", "slot"),
-        *("cycles_waited", "anchor", "overrun", "mode"),
+        *("cycles_waited", "anchor", "overrun", "mode", "dropped"),
         moved_ns=pl.col("moved").fill_null(0),
     )

@@ -16,6 +16,7 @@ from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_SERVICES, REQUEST, RESPONSE
 
 _CALL = ("request", "response")
+_NEARLY_ALWAYS = 0.9
 
 CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "callback_id": pl.UInt32(),
@@ -71,7 +72,11 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         _timer_callbacks(tables, nodes),
         _service_callbacks(tables, ends, subscriptions),
     ]
-    registered = _with_symbols(tables, pl.concat(found, how="diagonal_relaxed"))
+    registered = pl.concat(found, how="diagonal_relaxed")
+    unknown = _unregistered(tables, registered)
+    told = _told_by_takes(tables, subscriptions, unknown)
+    unknown = unknown.join(told, on=["pid", "handle"], how="anti", maintain_order="left")
+    registered = _with_symbols(tables, pl.concat([registered, told], how="diagonal_relaxed"))
     # No version of rclcpp says when the callbacks of clients run.
     clients = (
         ends.filter(role="client")
@@ -81,7 +86,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
     clients = _listening(clients, subscriptions, RESPONSE)
     listening = pl.concat([registered, clients], how="diagonal_relaxed")
     others = [
-        _unregistered(tables, registered),
+        unknown,
         _callbackless(tables, subscriptions, listening),
         _timers_of_python(tables, nodes),
         clients,
@@ -98,7 +103,7 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         callbacks=callbacks.select(pl.col(name).cast(t) for name, t in CALLBACK_SCHEMA.items()),
         buffers=_buffers(tables, callbacks),
         activity=_activity(tables, nodes),
-        notes=_notes(tables, callbacks),
+        notes=(*_notes(tables, callbacks), *_notes_of_told(told)),
     )
 
 
@@ -236,6 +241,58 @@ def _unregistered(tables: events.EventTables, registered: pl.DataFrame) -> pl.Da
     early = pl.col("valid_to").is_null() | (pl.col("valid_from") < pl.col("valid_to"))
     unknown = first.with_columns(kind=pl.lit("unknown"), observed=pl.lit(True))
     return unknown.filter(early).sort("valid_from", *key)
+
+
+def _told_by_takes(
+    tables: events.EventTables, subscriptions: pl.DataFrame, unknown: pl.DataFrame
+) -> pl.DataFrame:
+    """Those of ``unknown`` callbacks that are subscriptions', as what their threads did right
+    before nearly all of their starts tells: take a message of one subscription, or execute it.
+
+    A callback that was copied, or moved, runs at another address than was registered.
+    """
+    thread, key = ["pid", "tid"], ["pid", "handle"]
+    columns = ["node", "topic", "subscription"]
+    if unknown.is_empty() or subscriptions.is_empty():
+        return unknown.clear().with_columns(subscriptions.clear().select(columns))
+    started = events.table(tables, "callback_start", ["is_intra_process"])
+    starts = started.filter(pl.col("is_intra_process").fill_null(0) == 0)
+    starts = starts.select("time", *thread, handle="callback")
+    starts = starts.join(unknown, on=key, how="semi", maintain_order="left")
+    before = [
+        latest_before(starts, rows.select(*thread, before="time"), thread, "time", "before",
+                      strictly=name == "callback_start")["before"]
+        for name, rows in (("callback_start", started),
+                           ("callback_end", events.table(tables, "callback_end")))
+    ]  # fmt: skip
+    starts = starts.with_columns(before=pl.max_horizontal(*before))
+    votes = []
+    for name, handle, owner in (
+        ("rmw_take", "rmw_subscription_handle", "rmw_handle"),
+        ("rclcpp_executor_execute", "handle", "handle"),
+    ):
+        rows = events.table(tables, name).select(*thread, end=handle, did="time")
+        rows = latest_before(starts, rows, thread, "time", "did")
+        rows = rows.filter(pl.col("before").is_null() | (pl.col("did") > pl.col("before")))
+        ends = subscriptions.select("pid", *columns, end=owner, created="valid_from")
+        votes.append(latest_before(rows, ends, ["pid", "end"], "did", "created"))
+    found = pl.concat(vote.select(*key, "time", *columns) for vote in votes)
+    found = found.drop_nulls("subscription").unique([*key, "time", "subscription"])
+    found = found.group_by(*key, "subscription").agg(pl.len(), *map(pl.first, columns[:2]))
+    found = found.join(starts.group_by(key).agg(starts=pl.len()), on=key)
+    found = found.filter(pl.col("len") >= _NEARLY_ALWAYS * pl.col("starts"))
+    told = found.unique(key, keep="none").select(*key, *columns)
+    return unknown.join(told, on=key, maintain_order="left").with_columns(
+        kind=pl.lit("subscription")
+    )
+
+
+def _notes_of_told(told: pl.DataFrame) -> tuple[str, ...]:
+    return tuple(
+        f"the callback of {node} for {topic} ran at the address {handle:#x}, which was not"
+        " registered: what its thread took right before its starts tells that it is this one."
+        for node, topic, handle in told.select("node", "topic", "handle").iter_rows()
+    )
 
 
 def _callbackless(

@@ -13,14 +13,24 @@ complete it. For message_filters that is the soonest set that the message can be
 approximate-time synchroniser may hold messages back; outputs into which no new input went give that
 away, and ``notes`` says that L is a lower bound.
 
+**The newest message counts.** Of several messages that a node stored for one publication, of a
+timer or of a synchroniser of its own, the newest is taken to be in it, as in a variable that is
+overwritten: L is the age of what was published. The others are incomplete, "not used"; no output is
+missing for them. message_filters has queues instead: there each message counts, also where several
+came before one publication, of which only one can have been in it; ``notes`` says so.
+
 **One row per data flow.** An instance that publishes a topic twice makes two traversals, with
-the same start; two messages that go into one publication are two traversals with the same end.
+the same start.
+
+**A standby.** What a shaping node's standby published for it, while it was not there, is the
+chain's output: the traversal goes on with the standby's instance.
 
 **Silent instances.** An instance of the first callback that ended and published nothing on the
 chain's first topic begins no traversal: callbacks may publish on a condition. Further down, where
 data had arrived, an instance that publishes nothing leaves its traversal incomplete.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,15 +39,24 @@ import polars as pl
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.graph import MESSAGE_FILTER, goes_on_elsewhere, graph_of
 from chainshaper.analysis.matching import by_number, first_after, in_order, latest_before
-from chainshaper.analysis.messages import discarded_instances, overwritten_in, why_not_sent
+from chainshaper.analysis.messages import (
+    discarded_instances,
+    gated_hops,
+    overwritten_in,
+    why_not_sent,
+)
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
+from chainshaper.values.plan_choices import STANDBY
 
 REASONS: dict[str, str] = {
     "lost": "published, but never taken, though a later message of the topic was",
     "overwritten": "published, but overwritten in a full intra-process ring buffer",
     "not taken": "published, but not taken by the time the recording ended",
+    "take not recorded": "published, but which of its subscriber's callback instances got it, no "
+    "event says: there are none of its takes",
     "not executed": "taken, but no callback instance got it",
-    "not published": "its callback instance ended without publishing",
+    "not published": "its callback instance, or its process, ended without publishing",
+    "not used": "stored for a timer or a synchroniser of its node, which used a newer message",
     "inactive": "its node is a lifecycle node, which was not active then",
     "discarded": "withheld on purpose: it had overrun its slot or outlived its lifespan, or newer "
     "messages had filled its asynchronous publisher's history",
@@ -48,8 +67,12 @@ REASONS: dict[str, str] = {
 }
 """Why a traversal is incomplete."""
 
+OWES_NO_OUTPUT = ("not used", "inactive")
+"""Reasons for which no output is missing."""
+
 _SILENT = ["not published", "inactive"]
-_IN_NODE = [*_SILENT, "discarded", "not sent", "still running"]
+_IN_NODE = [*_SILENT, "not used", "discarded", "not sent", "still running"]
+_WITHOUT_EFFECT = ["not published", "lost", "not taken", "take not recorded", "not executed"]
 _REASON = pl.Enum(list(REASONS))
 _VIA = pl.Enum(["instance", "sibling"])
 
@@ -64,12 +87,15 @@ class Traversals:
     topic where an incomplete one stopped) and ``reason`` (a key of :data:`REASONS`).
 
     ``hops`` has one row per traversal and callback reached, sorted by hop: ``traversal``,
-    ``hop`` (from 0), ``callback_id``, ``topic`` (that it publishes), ``instance``, the times
+    ``hop`` (from 0), ``callback_id`` (of a standby where that published for its shaping node),
+    ``topic`` (that it publishes), ``instance``, the times
     ``take``, ``start``, ``publish`` and ``end`` (of the instance), ``source_timestamp`` (of the
     message it took), ``communication_ns`` (previous publication to start: transport and waiting),
-    ``computation_ns`` (start to publication), and ``via``: ``instance`` when the instance itself
-    published, ``sibling`` when another callback of its node did. Over a complete traversal the two
-    parts add up to the latency.
+    ``computation_ns`` (start to publication, without the next), ``waiting_ns`` (in the node: from
+    the end of the instance until another callback of the node began, which published for it; in a
+    gate, from the arrival until it let go; for a publisher's thread, until that sent it), and
+    ``via``: ``instance`` when the instance itself published, ``sibling`` when another callback of
+    its node did. Over a complete traversal the three parts add up to the latency.
 
     ``silent`` counts instances of the first callback that published nothing.
     """
@@ -94,19 +120,25 @@ def traverse(flow: DataFlow, chain: Chain, graph: ApplicationGraph | None = None
     state = _begun(flow, path[0])
     silent, notes = 0, list[str]()
     for hop, (callback, topic) in enumerate(zip(path, chain.topics, strict=True)):
+        standby = _standby(graph, callback, topic)
         if hop:
-            state = _take(flow, state, hop, callback)
-        state = _publish(flow, state, hop, callback, topic)
+            state = _take(flow, state, hop, callback, standby=standby, topic=topic)
+        state = _publish(flow, state, hop, [callback.id, *standby], topic)
         if topic in callback.passes_on or (hop and goes_on_elsewhere(graph, callback, topic)):
             state, note = _publish_by_sibling(flow, state, hop, callback, topic)
+            if _keeps_newest(graph, callback, topic):
+                state = _newest_alone(state, hop)
             notes += note
         state = _unless_published(flow, state, hop)
         state = _unless_active(flow, state, hop, callback)
         if hop == 0:
-            begun = state.filter(~pl.col("reason").is_in(_SILENT).fill_null(False))
+            # One whose process died as it ran is no silent one: it might have published.
+            ended = _looked_up(flow.instances, "end", "instance_0").is_not_null()
+            begun = state.filter(~(ended & pl.col("reason").is_in(_SILENT).fill_null(False)))
             silent, state = state.height - begun.height, begun
     frame = _described(flow, chain, state)
     hops = pl.concat(_hop(flow, chain, frame, hop) for hop in range(len(path)))
+    hops = _without_holds(flow, hops)
     return Traversals(chain, frame.select(_SUMMARY), hops, silent, tuple(notes))
 
 
@@ -123,11 +155,22 @@ def _begun(flow: DataFlow, first: Callback) -> pl.DataFrame:
     )
 
 
+def _standby(graph: ApplicationGraph, callback: Callback, topic: str) -> list[int]:
+    """The callback that publishes the topic while this one, a shaping node's, is not there."""
+    return [
+        one.id
+        for one in graph.callbacks
+        if one.node == callback.node + STANDBY
+        and one.trigger == callback.trigger
+        and topic in one.publishes
+    ]
+
+
 def _publish(
-    flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback, topic: str
+    flow: DataFlow, state: pl.DataFrame, hop: int, callbacks: Sequence[int], topic: str
 ) -> pl.DataFrame:
     """Add the publications of the hop's topic inside each traversal's instance."""
-    own = (pl.col("callback_id") == callback.id) & (pl.col("topic") == topic)
+    own = pl.col("callback_id").is_in(callbacks) & (pl.col("topic") == topic)
     inside = flow.publications.filter(own & pl.col("instance").is_not_null())
     instance, publication = f"instance_{hop}", f"publication_{hop}"
     first = by_number(inside, "instance", "publication", flow.instances.height)
@@ -145,11 +188,11 @@ def _publish_by_sibling(
     """Fill in what the node's first instance after this one's start publishes.
 
     A node that was created anew in between knows nothing of the messages of the one before it.
-    Also returns a note if outputs of a synchroniser got no input that came since the one before.
+    Also returns notes where it is not clear which input an output of message_filters got.
     """
     publication, sibling = f"publication_{hop}", f"sibling_{hop}"
     publishers = flow.objects.publishers.select("publisher", created="valid_from")
-    of_node = (pl.col("pid") == callback.pid) & (pl.col("node") == callback.node)
+    of_node = pl.col("pid").is_in(callback.processes) & (pl.col("node") == callback.node)
     here = flow.publications.filter((pl.col("topic") == topic) & of_node)
     began = pl.coalesce(_looked_up(flow.instances, "start", "instance"), "time")
     here = here.select("publisher", "callback_id", "time", later="publication", began=began)
@@ -175,7 +218,38 @@ def _publish_by_sibling(
         f"{callback.topic}: {callback.node} holds messages back or uses old ones again, for how "
         "long the events do not show; latencies through it are lower bounds."
     )
-    return state, [note] if missed > 0 else []
+    if missed > 0:
+        return state, [note]
+    shared = reached.len() - reached.n_unique()
+    note = (
+        f"{shared} messages on {callback.topic} count with the same publication on {topic} as "
+        f"another one: {callback.node} has one of them in it, and no event says which."
+    )
+    return state, [note] if shared else []
+
+
+def _keeps_newest(graph: ApplicationGraph, callback: Callback, topic: str) -> bool:
+    """Whether a node that stores what the callback reads has the newest message only."""
+    if callback.kind == "service":
+        return False  # each goal of an action has feedback of its own
+    by_timer = any(
+        one.kind == "timer" and topic in one.publishes
+        for one in graph.callbacks
+        if (one.node, one.pid) == (callback.node, callback.pid)
+    )
+    return by_timer or MESSAGE_FILTER not in (callback.symbol or MESSAGE_FILTER)
+
+
+def _newest_alone(state: pl.DataFrame, hop: int) -> pl.DataFrame:
+    """The state in which of several messages that went into one publication the newest did alone.
+
+    A node that stores messages has the newest when it publishes: those before it are not used.
+    """
+    instance, publication = f"instance_{hop}", f"publication_{hop}"
+    newest = pl.col(instance).max().over(publication)
+    older = (pl.col(publication).is_not_null() & (pl.col(instance) < newest)).fill_null(False)
+    state = _broken(state, older, hop, pl.lit("not used"))
+    return state.with_columns(pl.when(~older).then(publication).alias(publication))
 
 
 def _begun_with_last_input(here: pl.DataFrame, stored: pl.Series, callback: int) -> pl.DataFrame:
@@ -196,6 +270,9 @@ def _unless_published(flow: DataFlow, state: pl.DataFrame, hop: int) -> pl.DataF
     instance, publication = pl.col(f"instance_{hop}"), pl.col(f"publication_{hop}")
     stuck = instance.is_not_null() & publication.is_null()
     ended = _looked_up(flow.instances, "end", f"instance_{hop}").is_not_null()
+    if flow.followed.height:  # processes that were started again, as which nothing runs any more
+        followed = flow.followed.filter(pl.col("pid") != pl.col("last_pid"))["pid"].unique()
+        ended |= _looked_up(flow.instances, "pid", f"instance_{hop}").is_in(followed.implode())
     why = pl.when(ended).then(pl.lit("not published")).otherwise(pl.lit("still running"))
     if "gate_release" in flow.events:
         withheld = discarded_instances(flow.takes, flow.events, flow.objects, flow.instances)
@@ -215,8 +292,10 @@ def _unless_active(
 ) -> pl.DataFrame:
     """Say so of traversals that stopped at this hop because its lifecycle node was not active: in
     the node, also where its subscription did not even exist."""
-    changes = flow.objects.activity.filter(pid=callback.pid, node=callback.node)
-    stopped = pl.col("reason").is_in(["not published", "lost", "not taken", "not executed"])
+    changes = flow.objects.activity.filter(
+        pl.col("pid").is_in(callback.processes), node=callback.node
+    )
+    stopped = pl.col("reason").is_in(_WITHOUT_EFFECT)
     stopped &= pl.col("broken_hop") == hop
     if changes.is_empty() or state.filter(stopped).is_empty():
         return state
@@ -230,14 +309,30 @@ def _unless_active(
     return state.with_columns(reason=pl.when(stopped & ~active).then(idle).otherwise("reason"))
 
 
-def _take(flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback) -> pl.DataFrame:
-    """Add the instance of ``callback`` that took each traversal's latest publication."""
-    own = (pl.col("callback_id") == callback.id) & pl.col("publication").is_not_null()
-    taken = flow.takes.filter(own).select("publication", "take", "instance")
+def _take(
+    flow: DataFlow,
+    state: pl.DataFrame,
+    hop: int,
+    callback: Callback,
+    *,
+    standby: Sequence[int],
+    topic: str,
+) -> pl.DataFrame:
+    """Add the instance of ``callback`` that took each traversal's latest publication, or that of
+    its ``standby`` which published for it."""
+    taken = flow.takes.filter(pl.col("publication").is_not_null())
+    own = taken.filter(pl.col("callback_id") == callback.id)
+    own = own.select("publication", "take", "instance")
     # Should a message have been taken twice, the take that led to an execution is followed, of
     # several the first: what is laid out last stays.
     executed = pl.col("instance").is_not_null()
-    taken = pl.concat([taken.filter(~executed).reverse(), taken.filter(executed).reverse()])
+    layers = [own.filter(~executed).reverse(), own.filter(executed).reverse()]
+    if standby:
+        published = flow.publications.filter(pl.col("topic") == topic)["instance"].drop_nulls()
+        passed_on = pl.col("instance").is_in(published.implode())
+        for_it = taken.filter(pl.col("callback_id").is_in(standby)).select(own.columns)
+        layers += [for_it.filter(passed_on).reverse(), own.filter(passed_on).reverse()]
+    taken = pl.concat(layers)
     before, height = pl.col(f"publication_{hop - 1}"), flow.publications.height
     laid_out = {name: by_number(taken, "publication", name, height) for name in taken.columns[1:]}
     state = state.with_columns(
@@ -246,6 +341,8 @@ def _take(flow: DataFlow, state: pl.DataFrame, hop: int, callback: Callback) -> 
     latest = pl.lit(taken["publication"].max(), dtype=pl.UInt32)
     later = (before < latest).fill_null(False)  # they are numbered in order of time
     why = pl.when(later).then(pl.lit("lost")).otherwise(pl.lit("not taken"))
+    if callback.id in flow.untold:
+        why = pl.lit("take not recorded")
     if flow.publications["intra_time"].count():
         buffers = flow.objects.buffers
         overwritten = overwritten_in(flow.events, flow.publications, buffers, callback.id)
@@ -296,25 +393,54 @@ def _hop(flow: DataFlow, chain: Chain, frame: pl.DataFrame, hop: int) -> pl.Data
     instance, take = f"instance_{hop}", f"take_{hop}"
     sent = _published_at(flow, hop - 1, chain) if hop else pl.lit(None, dtype=pl.Int64)
     via = pl.when(f"sibling_{hop}").then(pl.lit("sibling")).otherwise(pl.lit("instance"))
+    start = _looked_up(flow.instances, "start", instance)
+    done = pl.coalesce(_looked_up(flow.instances, "end", instance), start)
+    # What a thread of the node's publishes, without a callback, it may have computed meanwhile.
+    publisher = _looked_up(flow.publications, "instance", f"publication_{hop}")
+    began = pl.lit(flow.instances["start"]).gather(publisher)
+    waiting = pl.when(f"sibling_{hop}").then((began - done).clip(lower_bound=0)).fill_null(0)
+    publish = _published_at(flow, hop, chain)
+    handed_over = _looked_up(flow.publications, "time", f"publication_{hop}")
+    waiting += (publish - handed_over).clip(lower_bound=0).fill_null(0)
     reached = frame.filter(pl.col(instance).is_not_null()).select(
         "traversal",
         hop=pl.lit(hop, dtype=pl.UInt8),
-        callback_id=pl.lit(chain.callbacks[hop], dtype=pl.UInt32),
+        callback_id=_looked_up(flow.instances, "callback_id", instance),
         topic=pl.lit(chain.topics[hop], dtype=pl.Enum(list(chain.topics))),
         instance=instance,
         take=_looked_up(flow.takes, "time", take),
-        start=_looked_up(flow.instances, "start", instance),
-        publish=_published_at(flow, hop, chain),
+        start=start,
+        publish=publish,
         end=_looked_up(flow.instances, "end", instance),
         source_timestamp=_looked_up(flow.takes, "source_timestamp", take),
         communication_ns=sent,
+        waiting_ns=waiting,
         via=via.cast(_VIA),
     )
+    published = pl.col("publish").is_not_null()
     return reached.with_columns(
         communication_ns=pl.col("start") - pl.col("communication_ns"),
-        computation_ns=pl.col("publish") - pl.col("start"),
-        via=pl.when(pl.col("publish").is_not_null()).then("via"),
+        computation_ns=pl.col("publish") - pl.col("start") - pl.col("waiting_ns"),
+        waiting_ns=pl.when(published).then("waiting_ns"),
+        via=pl.when(published).then("via"),
     )
+
+
+def _without_holds(flow: DataFlow, hops: pl.DataFrame) -> pl.DataFrame:
+    """Hops in which what a gate held a message back is waiting, not computation."""
+    if "gate_release" not in flow.events:
+        return hops
+    gated = gated_hops(flow.events, flow.objects, hops).select(
+        "traversal", "hop", "arrival", "let_go"
+    )
+    rows = hops.join(gated, on=["traversal", "hop"], how="left", maintain_order="left")
+    until = pl.min_horizontal("let_go", "publish")
+    since = pl.max_horizontal("arrival", "start")
+    between = pl.when(pl.col("let_go").is_not_null()).then(until - since)
+    held = pl.min_horizontal(between.clip(lower_bound=0).fill_null(0), "computation_ns")
+    return rows.with_columns(
+        computation_ns=pl.col("computation_ns") - held, waiting_ns=pl.col("waiting_ns") + held
+    ).select(hops.columns)
 
 
 def _published_at(flow: DataFlow, hop: int, chain: Chain) -> pl.Expr:

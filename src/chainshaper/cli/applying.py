@@ -38,7 +38,7 @@ def threads(
 
     pid = int(where) if where is not None and where.isdecimal() else None
     plan = None if where is None or pid is not None else cs.load_application_plan(where)
-    known = opt.recording_of(recording, plan)
+    known = opt.recording_of(recording)
     found = cs.find_threads(plan if pid is None else pid, known, users=user or ())
     if out.present(json, threads_json(found), threads_table(found)):
         out.notes(found.notes)
@@ -62,7 +62,8 @@ def apply(
     ),
     recording: Path | None = opt.option(
         "--recording REC",
-        "Of these very processes, or of an earlier run: it tells which threads execute what.",
+        "Of these very processes, or of an earlier run: it tells which threads execute what. "
+        "Default: the plan's own, where it exists.",
     ),
     wait: int | None = opt.option(
         "--wait DURATION",

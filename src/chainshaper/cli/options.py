@@ -99,10 +99,12 @@ SINK: list[str] | None = option(
 JSON: bool = option("--json", "Print the figures as JSON (integer ns).", False)
 CHAIN: str | None = option(
     "--chain FIRST..LAST",
-    "The chain, by topics or nodes: /t1../t5. Default: the one the recording names.",
+    "The chain, by topics or nodes: /t1../t5. Default: the one the recording names, or the only"
+    " one in it.",
 )
 CHAINS: list[str] | None = option(
-    "--chain FIRST..LAST", "A chain (may be repeated). Default: the one the recording names."
+    "--chain FIRST..LAST",
+    "A chain (may be repeated). Default: the one the recording names, or the only one in it.",
 )
 STRICT: bool = option("--strict", "Exit code 1 unless the plan's promise is met.", False)
 PLAN_IN_FORCE: Path | None = option(
@@ -124,7 +126,7 @@ SINCE: int = option(
 )
 UNTIL: int | None = option("--to DURATION", "Leave out what happened this long after it began.")
 CYCLES: int = option("--cycles", "Cycles to record.", 320, min=1)
-SEED: int | None = option("--seed", "Instead of the description's.", min=0)
+SEED: int | None = option("--seed", "Random seed; overrides the file's.", min=0)
 REALTIME: bool | None = option(
     "--realtime/--no-realtime", "Use SCHED_FIFO. Default: where it is permitted."
 )
@@ -253,7 +255,12 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     from chainshaper.planning import Modes
     from chainshaper.values.yaml_file import wrong_values_refused
 
-    topic, _, listed = text.partition(":")
+    topic, colon, listed = text.partition(":")
+    if not colon:
+        raise InputError(
+            f"--modes {text}: modes need a topic that announces them: write TOPIC:MODE,MODE, such"
+            " as /driving_mode:city,highway"
+        )
     pairs = [pair.partition("=") for pair in listed.split(",")]
     bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}
     if listed and "=" not in listed:

@@ -17,8 +17,9 @@ def plan(
     recording: Path | None = opt.argument("[REC]", "A recording's or a trace's folder."),
     chain: list[str] | None = opt.option(
         "--chain FIRST..LAST",
-        "The chain, by topics or nodes: /t1../t5. Default: the one the recording names."
-        " Give several to plan them together: what they share, and when each one's cycles start.",
+        "The chain, by topics or nodes: /t1../t5. Default: the one the recording names, or the"
+        " only one in it. Give several to plan them together: what they share, and when each one's"
+        " cycles start.",
     ),
     output: Path | None = opt.option(
         "--output -o plan.yaml",
@@ -54,6 +55,7 @@ def plan(
     from chainshaper.planning.request import on_cores
     from chainshaper.reporting import figures, overviews
     from chainshaper.values.files import new_file
+    from chainshaper.verify.measure import taken_chain
 
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
@@ -64,10 +66,13 @@ def plan(
     wanted: list[str | None] = [*chain] if chain else [None]
     how: dict[str, Any] = {"modes": request.modes, "since_ns": since, "until_ns": until}
     how["mode_recordings"] = opt.mode_profiles(mode_profile, request)
-    profiles = _profiles(recording, latencies, period, [*wanted, *(sink or [])], how)
+    source = None if recording is None else cs.open_source(recording)
+    profiles = _profiles(source, latencies, period, [*wanted, *(sink or [])], how)
     planned, sinks = profiles[: len(wanted)], profiles[len(wanted) :]
+    taken = () if source is None else taken_chain(source, wanted[0], planned[0].spec or "")
     doubts = [] if request.percentile else [*filter(None, map(deciding_cycles, profiles))]
-    doubts += [doubt for one in profiles for doubt in doubts_about(one)]
+    doubts += taken
+    doubts += dict.fromkeys(doubt for profile in profiles for doubt in doubts_about(profile))
     doubts += [
         f"this machine has no core {core}, as --cores wants it: the plan is for another machine"
         for core in sorted({*(request.cores or ())} - {*available_cores()})
@@ -102,7 +107,7 @@ def plan(
 
 
 def _profiles(
-    recording: Path | None,
+    recording: "cs.Recording | None",
     latencies: Path | None,
     period: int | None,
     chains: Sequence[str | None],
@@ -197,12 +202,11 @@ def sweep(
 ) -> None:
     """Simulate an application at every combination of some values: planned, shaped, judged.
 
-    Ended before it is whole, it keeps the finished points beside the file that it writes; the same
-    command goes on with the others.
+    Interrupted? Run the same command again: finished points are kept beside the file.
     """
-    from chainshaper.flow.sweep import parse_axis, rows_beside
+    from chainshaper.flow.sweep import changing_nothing, parse_axis, rows_beside
     from chainshaper.reporting.figures import ENDINGS, draw_sweep
-    from chainshaper.reporting.overviews import sweep_table
+    from chainshaper.reporting.overviews import sweep_axes, sweep_table
     from chainshaper.values.files import new_file
 
     if workers is not None and scheduler is not None:
@@ -233,6 +237,7 @@ def sweep(
         draw_sweep(frame, draw)
     if out.present(json, frame.to_dicts(), sweep_table(frame)):
         out.notes(frame["error"].drop_nulls().unique(maintain_order=True))
+        out.notes(changing_nothing(frame, sweep_axes(frame)))
         for path in filter(None, (draw, output)):
             out.show_line(path)
 

@@ -30,6 +30,7 @@ if TYPE_CHECKING:
 
 STDERR = 2
 PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
+MOST_JUDGED = 100_000  # simulated cycles, which are read again for that: more take memory
 MOST_RECORDED = 100  # by `watch --budget` itself: a limit that breaks for weeks fills no disk
 
 COMMAND: list[str] | None = opt.argument(
@@ -138,12 +139,17 @@ def simulate(
     execution_times: Path | None = opt.option(
         "--execution-times REC", "Draw execution times from those recorded there."
     ),
-    block: int = opt.option("--block", "So many consecutive ones at a time.", 1, min=1, max=1024),
+    block: int = opt.option(
+        "--block", "Draw execution times in stretches of N consecutive cycles.", 1, min=1, max=1024
+    ),
 ) -> None:
     """Simulate an application, with a plan in force or without, and record its events.
 
-    The recording is like that of a live run: every other verb takes it.
+    The recording is like that of a live run: every other verb takes it. With a plan, a note says
+    whether its promise was met.
     """
+    from chainshaper.reporting.latency import verdict
+
     described = cs.load_application(application)
     if execution_times is not None:
         from chainshaper.simulation.simulating import with_recorded_times
@@ -160,6 +166,10 @@ def simulate(
             command=sys.argv,
             progress=report,
         )
+        judged = plan is not None and cycles <= MOST_JUDGED
+        comparisons = cs.compare_chains([recording], least=1) if judged else ()
+    for one in comparisons:
+        out.notes([f"{one.chain}: {verdict(measured)[1]}" for measured in one.measurements])
     out.show_line(recording.path)
 
 
@@ -285,7 +295,7 @@ def watch(
     user: list[str] | None = opt.USERS,
     environment: bool = opt.option(
         "--environment",
-        "Print the variable that puts the library in front of ROS 2; no more.",
+        "Print the export line that enables watching, and exit.",
         False,
     ),
     json: bool = opt.option("--json", "Print a JSON object a line at each look.", False),
@@ -298,13 +308,14 @@ def watch(
     from chainshaper.linux import own_processes
     from chainshaper.linux.processes import run_users
     from chainshaper.reporting.overviews import watch_tables
-    from chainshaper.sources.preload import installed_library, preloading
+    from chainshaper.sources.preload import in_front, installed_library
     from chainshaper.values.recording import refuse_existing
     from chainshaper.verify.budgets import Budget, load_budget
     from chainshaper.verify.watch import Watch, exporting
 
     if environment:
-        out.show_line(f"export LD_PRELOAD={shlex.quote(preloading(installed_library()))}")
+        for name, value in in_front(installed_library()).items():
+            out.show_line(f"export {name}={shlex.quote(value)}")
         return
     known = opt.plan_in_force(plan)
     specs = () if known is None else (one.chain.spec for one in known.chains)
@@ -321,7 +332,7 @@ def watch(
     with out.stop_on_signals() as stop, ExitStack() as until:
         started = None
         if command:
-            variables = {"LD_PRELOAD": preloading(installed_library())}
+            variables = in_front(installed_library())
             started = own_processes.start_command(command, variables, STDERR)
             until.callback(own_processes.end_command, started)
         show = until.enter_context(out.live())

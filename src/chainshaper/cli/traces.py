@@ -1,5 +1,6 @@
 """Verbs that look at recordings and traces, one or several, and write what they find elsewhere."""
 
+from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -184,11 +185,14 @@ def budget(
     """
     from chainshaper.values.files import new_file
     from chainshaper.verify.budgets import propose_budget, save_budget
+    from chainshaper.verify.measure import taken_chain
 
     new_file(output)
     with out.opened("budget", trace) as (recording, _):
         proposed = propose_budget(recording, chain or [], room)
     out.show_line(save_budget(proposed, output))
+    if not chain:
+        out.notes(taken_chain(recording, None, proposed.chains[0].chain))
 
 
 def _matching(recordings: list[Path]) -> list[Path]:
@@ -220,8 +224,8 @@ def check(
 ) -> None:
     """Check recordings against a budget, or those of before; exit code 1 if they are worse.
 
-    A budget's limits are of all cycles. Where only disturbed cycles break one, that is said. With
-    --baseline all recordings together are compared with those of before, callback by callback.
+    Limits apply to all cycles, disturbed ones included. Where only these break one, that is said.
+    With --baseline all recordings together are compared with those of before, callback by callback.
     """
     from chainshaper.reporting.latency import JSON_FORMAT
     from chainshaper.values.files import new_file, write_whole
@@ -303,6 +307,17 @@ def comparison_tables(*comparisons: "cs.Comparison") -> "list[ResultTable]":
     return tables
 
 
+def taken_chains(comparisons: "Sequence[cs.Comparison]", chain: str | None) -> list[str]:
+    """Notes about recordings whose only chain was taken, since none was named."""
+    from chainshaper.verify.measure import taken_chain
+
+    measured = [
+        (one.chain, found) for one in comparisons for found in one.measurements if not found.plan
+    ]
+    notes = (taken_chain(found.recording, chain, spec) for spec, found in measured)
+    return list(dict.fromkeys(note for several in notes for note in several))
+
+
 def judge(comparisons: "Sequence[cs.Comparison]", *, strict: bool, json: bool) -> None:
     """Say whether promises of plans were met.
 
@@ -351,6 +366,7 @@ def compare(
             raise InputError("--figures draws one chain: name it with --chain")
         draw_comparison(comparisons[0].measurements, figures)
     out.present(json, comparisons_json(comparisons), *comparison_tables(*comparisons))
+    out.notes(taken_chains(comparisons, chain))
     judge(comparisons, strict=strict, json=json)
 
 
@@ -385,6 +401,7 @@ def report(
         written = cs.write_report(comparisons, output, cycles or ()).absolute()
     if out.present(json, {"report": str(written), **comparisons_json(comparisons)}):
         out.show_line(written)
+    out.notes(taken_chains(comparisons, chain))
 
 
 def export(
@@ -399,19 +416,22 @@ def export(
 ) -> None:
     """Write a recording for another tool: threads, callbacks, messages, slots, stalls.
 
-    The chain's traversals are a track of their own where a chain is named or recorded.
+    The chain's traversals are a track of their own where a chain is named or recorded, or the only
+    one.
     """
     if perfetto == mcap:
         raise InputError("the format is missing: add --perfetto or --mcap")
     from chainshaper.reporting.perfetto import ENDINGS
     from chainshaper.values.files import new_file
+    from chainshaper.verify.measure import SeveralChainsError
 
     new_file(output, (".mcap",) if mcap else ENDINGS)
     in_force = opt.plan_in_force(plan)
     with out.opened("export", trace) as (recording, report):
         report(0.5, "analysing")
-        named = chain or recording.info.chain
-        measured = None if named is None else cs.measure_latency(recording, named, in_force)
+        measured = None
+        with suppress(SeveralChainsError):
+            measured = cs.measure_latency(recording, chain, in_force)
         report(0.7, "writing")
         write = cs.export_mcap if mcap else cs.export_perfetto
         written = write(measured or recording, output)

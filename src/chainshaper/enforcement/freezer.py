@@ -101,15 +101,20 @@ def stray_groups(journals: Iterable[Journal]) -> tuple[Path, ...]:
 
 
 def _all_groups() -> list[tuple[Path, "re.Match[str]"]]:
-    while True:
-        try:
-            found = sorted(cgroups.mount_point().rglob(f"{_PREFIX}*"))
-        except PlatformError:
-            return []
-        except FileNotFoundError:  # one was removed while we looked: once more
-            continue
-        names = ((folder, _NAME.match(folder.name)) for folder in found)
-        return [(folder, name) for folder, name in names if name is not None]
+    try:
+        unseen = [cgroups.mount_point()]
+    except PlatformError:
+        return []
+    found = []
+    while unseen:
+        # Others make and remove groups all the time, and name them as they like.
+        with contextlib.suppress(OSError), os.scandir(unseen.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    unseen.append(Path(entry.path))
+                    if (name := _NAME.match(entry.name)) is not None:
+                        found.append((unseen[-1], name))
+    return sorted(found, key=lambda group: group[0])
 
 
 def thaw(groups: Iterable[Path]) -> None:

@@ -30,9 +30,9 @@ from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTa
 from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import Scheduling, SchedulingClass, apply_scheduling
-from chainshaper.linux.threads import find_thread
+from chainshaper.linux.threads import find_thread, read_proc
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 
 NOTE = "litmus-plugin"
 Command = tuple[str, ...]
@@ -144,7 +144,7 @@ def restore_plugin(journal: Journal) -> None:
 
 def _active_plugin(proc: Path) -> str:
     try:
-        return (proc / "active_plugin").read_text().strip()
+        return text_of(read_proc(proc / "active_plugin")).strip()
     except OSError as error:
         raise PlatformError(
             f"{proc / 'active_plugin'} cannot be read ({error.strerror}): is this kernel LITMUS^RT?"
@@ -154,13 +154,13 @@ def _active_plugin(proc: Path) -> str:
 def _run(command: Command) -> None:
     """Run a command of LITMUS^RT's; its complaint becomes ours."""
     text = f"`{' '.join(command)}`"
-    run = partial(subprocess.run, env=tool_environment(), timeout=_COMMAND_S, check=False)
+    how: dict[str, Any] = {"env": tool_environment(), "timeout": _COMMAND_S}
     try:
-        done = run(command, capture_output=True, text=True)
+        done = subprocess.run(command, capture_output=True, check=False, **how)
     except (OSError, subprocess.TimeoutExpired) as error:
         raise OperationError(f"{text} cannot be run: {error}") from error
     if done.returncode:
-        said = (done.stderr + done.stdout).strip().splitlines()
+        said = text_of(done.stderr + done.stdout).strip().splitlines()
         reason = said[0] if said else f"exit code {done.returncode}"
         raise OperationError(f"{text}: {reason}; `dmesg` has LITMUS^RT's own words")
 

@@ -26,11 +26,19 @@ from chainshaper.enforcement.scheduling_memory import (
 )
 from chainshaper.enforcement.servers import ReservationServer, ServerCounters
 from chainshaper.linux import cgroups, own_processes, runs
-from chainshaper.linux.runs import Journal, find_journals, locked, process_of
+from chainshaper.linux.runs import (
+    Journal,
+    LockHolder,
+    all_runs_locked,
+    find_journals,
+    locked,
+    process_of,
+)
 from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import find_thread, open_process
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import OperationError, PlatformError
+from chainshaper.values.errors import OperationError, PlatformError, storable
+from chainshaper.values.files import open_output
 
 CLAIMS = "claims"
 PATIENCE_S = 20.0
@@ -95,7 +103,9 @@ def save_run_state(folder: Path, state: RunState) -> None:
     """Write `run.json`, whole. Raises OSError; a plan in force needs it for nothing."""
     partial_file = folder / f"{runs.STATE_FILE}.partial"
     try:
-        partial_file.write_text(json.dumps(asdict(state)))
+        partial_file.unlink(missing_ok=True)
+        with os.fdopen(open_output(partial_file), "w") as file:
+            file.write(json.dumps(storable(asdict(state))))
         partial_file.replace(folder / runs.STATE_FILE)
     finally:
         partial_file.unlink(missing_ok=True)  # a part of it would fill the disk for good
@@ -142,18 +152,22 @@ def claim_run(
     base = runs.journals_folder(folder)
     wanted: dict[str, set[Any]] = {"core": set(cores), "node": set(nodes)}
 
-    def waiting(holder: int | None, waited_s: float) -> None:
+    def waiting(holder: LockHolder | None, waited_s: float) -> None:
         go_on()
         if waited_s > PATIENCE_S:
+            late = f"begins a run, and has not got on with it for {PATIENCE_S:g} s"
+            if holder is None:
+                raise OperationError(f"a process that is not to be seen from here {late}: end it")
+            pid = holder.pid
             raise OperationError(
-                f"process {holder} begins a run, and has not got on with it for {PATIENCE_S:g} s: "
-                f"let it go on (`kill -CONT {holder}`), or end it (`kill -KILL {holder}`)"
+                f"process {pid} {late}: let it go on (`kill -CONT {pid}`), or end it "
+                f"(`kill -KILL {pid}`)"
             )
 
     with contextlib.ExitStack() as stack:
         try:
             base.mkdir(mode=0o755, parents=True, exist_ok=True)  # ours alone: it is believed
-            stack.enter_context(locked(base, waiting))
+            stack.enter_context(all_runs_locked(base, waiting))
         except OSError as error:
             raise PlatformError(
                 f"{base}, where runs keep a journal of what they change, cannot be used "
@@ -232,7 +246,7 @@ def end_run(journal: Journal) -> tuple[str, ...]:
 
 def _wait_for_end(journal: Journal) -> bool:
     # Its command, which it ends on its way, has so long as well, and would run on without it.
-    deadline = time.monotonic() + PATIENCE_S + 3 * own_processes.PATIENCE_S
+    deadline = time.monotonic() + PATIENCE_S + 4 * own_processes.PATIENCE_S
     while journal.path.exists() and journal.owner is not None:
         if time.monotonic() > deadline:
             return False
@@ -252,6 +266,8 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
             stack.enter_context(locked(journal.path.parent, _hasten))
         except FileNotFoundError:
             return ()  # another process was quicker
+        except OperationError as error:
+            return (str(error),)
         except OSError:
             pass  # its folder is gone, and there is no room for another: it is in memory
         _end_processes(journal, runs.DISPATCHER)
@@ -266,8 +282,8 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
             try:
                 if not journal.outdated:
                     undo()
-            except (OperationError, PlatformError) as error:
-                left.append(str(error))
+            except Exception as error:
+                left.append(str(error) or type(error).__name__)
         is_over = by_owner or journal.owner is None
         if is_over and not left and not strange_lines(journal):
             _end_processes(journal, runs.GUARDIAN)
@@ -275,13 +291,16 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
     return tuple(left)
 
 
-def _hasten(holder: int | None, waited_s: float) -> None:
+def _hasten(holder: LockHolder | None, waited_s: float) -> None:
     """Another process undoes this run: one that was stopped goes on, one that hangs is ended."""
-    if holder not in (None, os.getpid()):
+    if holder is None or holder.pid == os.getpid():
+        return
+    if (pidfd := open_process(holder.pid, holder.started)) is not None:
         with contextlib.suppress(OSError):
-            os.kill(holder, signal.SIGCONT)
+            signal.pidfd_send_signal(pidfd, signal.SIGCONT)
             if waited_s > PATIENCE_S / 2:
-                os.kill(holder, signal.SIGKILL)
+                signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+        os.close(pidfd)
 
 
 def _end_processes(journal: Journal, role: str) -> None:

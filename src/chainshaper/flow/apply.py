@@ -46,6 +46,7 @@ from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, OperationError
+from chainshaper.values.files import write_whole
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
@@ -92,8 +93,9 @@ def apply_plan(
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
     (None: those of all chains are measured). With ``adapt`` slots follow the latencies, to no later
     end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of the very
-    processes, or of an earlier run; ``users`` are as for :func:`.find_threads`. ``watch`` gets the
-    state every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
+    processes, or of an earlier run (None: those that the plan names); ``users`` are as for
+    :func:`.find_threads`. ``watch`` gets the state every second; ``folder`` is where runs stand
+    (default: `/run/chainshaper`).
 
     Raises InputError: no such user, or the plan cannot be carried out. PlatformError: the machine
     lacks a core or the back end, or we a privilege. OperationError: another run governs a core or
@@ -111,10 +113,11 @@ def apply_plan(
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     # Looked up once: that takes longer than looking at processes.
-    recorded = () if recording is None else threads.recorded_processes(recording)[0]
+    recordings, unread = threads.evidence_of(given, recording)
+    recorded, unread = threads.recorded_in(recordings, unread)
     cores, stop = {server.core for server in given.servers}, stop or threading.Event()
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
-    run = _Run(given, given, choice, journal, recorded, taken, stop)
+    run = _Run(given, given, choice, journal, recorded, taken, stop, unread)
     try:
         run.guardians = Guardians(journal)
         if command:
@@ -122,7 +125,7 @@ def apply_plan(
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
         run.guardians.await_ready(run.go_on)
         threads.refuse_simulated(given, run.found)
-        said = threads.check_publishers(given, run.found, recording)
+        said = threads.check_publishers(given, run.found, recordings)
         said += allocation.waiting_receivers(given, run.schedule())
         run.begin_state(command, plan_path)
         run.note(*said, *(one for one in run.found.notes if one.endswith(allocation.IN_ORDER)))
@@ -159,6 +162,7 @@ class _Run:
     recorded: tuple[allocation.RecordedProcess, ...]
     users: frozenset[int]
     stop: threading.Event
+    unread: tuple[str, ...] = ()  # recordings that say nothing of this machine, or cannot be read
     guardians: Guardians | None = None
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
@@ -265,6 +269,7 @@ class _Run:
             notes=tuple(note for one in self.plan.chains for note in publication_warnings(one)),
         )
         self.name_strangers(self.found)
+        self.name_absent(self.found)
 
     def find_anchor(self, phase_ns: int | None, progress: Callable[[float, str], None]) -> None:
         """Measure where chains begin, and see from when on their slots count."""
@@ -314,8 +319,8 @@ class _Run:
         self.show(anchor_ns=anchor, in_force_ns=since + (anchor - since) % cycle_ns)
 
     def save_plan(self) -> None:
-        with suppress(OSError):  # a full /run ends no plan; recordings lack it then
-            (self.folder / PLAN_FILE).write_text(json.dumps(plan_values(self.given)))
+        with suppress(OperationError):  # a full /run ends no plan; recordings lack it then
+            write_whole(self.folder / PLAN_FILE, [json.dumps(plan_values(self.given)).encode()])
 
     def begins(self, place: int) -> int:
         """Where the chain at this place begins in its cycles."""
@@ -403,6 +408,8 @@ class _Run:
                 drifts = self.drifts = self.drift_watches()
                 following, sent, said = self.follow(servers, drifts), dict[int, int](), list[str]()
             is_over = self.command_ended or self.stop.is_set()
+            for failure in {one.failure for one in drifts} - {None}:
+                self.note(f"whether cycles begin elsewhere by now is not known any more: {failure}")
             followed_ns = next(following)
             seen = {k: ns for k, one in enumerate(drifts) if (ns := one.surely_ns) is not None}
             for k, ns in seen.items():
@@ -529,6 +536,7 @@ class _Run:
                     " the thread that started it, and is left so"
                 )
         self.name_strangers(now)
+        self.name_absent(now)
         gone, servers_now = {one.thread.tid for one in ended}, self.state.servers
         left = {one.name: tuple(t for t in one.threads if t not in gone) for one in servers_now}
         self.show_servers(threads=left)
@@ -605,6 +613,14 @@ class _Run:
         if found.strangers is not None:
             said = [one for one in self.state.notes if one.startswith(allocation.LEFT_ALONE)]
             self.note(found.strangers, instead=said)
+
+    def name_absent(self, found: Allocation) -> None:
+        """One line about receivers that do not run, or are not recognised, for as long as so."""
+        running = {node for one in found.threads for node in one.nodes}
+        absent = allocation.absent_receivers(self.plan.shaping_nodes, running)
+        said = [one for one in self.state.notes if one.startswith(allocation.NOT_RECOGNISED)]
+        reasons = "".join(f"; {reason}" for reason in self.unread)
+        self.note(*filter(None, [absent and absent + reasons]), instead=said)
 
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""

@@ -1,6 +1,5 @@
 """A described application, live: shaped by a plan; and the demonstration, the whole flow."""
 
-import shutil
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
@@ -22,6 +21,7 @@ from chainshaper.planning.plan_file import plan_values
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import OperationError
+from chainshaper.values.files import write_whole
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 from chainshaper.workload.description import Application, load_application
@@ -185,7 +185,7 @@ def run_demo(
     report = part(0.0, "unshaped run")
     try:
         folder.mkdir(exist_ok=True)
-        shutil.copyfile(path, copy)
+        write_whole(copy, [path.read_bytes()])
         before = run_application(description, folder / "before", progress=report, **how)
     except OSError as error:
         raise OperationError(f"{folder}: cannot be written: {error}") from error

@@ -24,6 +24,7 @@ import yaml
 
 from chainshaper.analysis import DataFlow, analyse_latency, data_flow, graph_of
 from chainshaper.analysis.chains import find_chain
+from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.graph import MESSAGE_FILTER
 from chainshaper.analysis.occupation import (
     Occupation,
@@ -54,7 +55,6 @@ MOST_VALUES = 150_000  # durations in a description, which a file may have witho
 NEXT_NS = 100_000  # so close behind an end on its thread, a start was waiting for that
 EVIDENCE = 10  # so many cases a figure is measured from
 EXACT_PPM = 20  # a timer whose starts drift by more against its period has another one
-ANOTHER_PERIOD = 0.05  # so much of its period off, a timer's starts contradict it
 UNEXPLAINED = 0.05  # the share of a synchroniser's sets that may be completed by chance elsewhere
 NEAR_AVERAGE, NEAR_MAXIMUM = 0.02, 0.05  # so near a simulated description comes, or says so
 MOST_CYCLES = 20_000  # that are simulated to see that
@@ -454,14 +454,13 @@ def _expiry(evidence: _Evidence, callback: Callback, own: pl.DataFrame) -> tuple
     """A timer's period, and an instant at which it expired (ns)."""
     starts = own["start"].sort().to_numpy().astype(np.int64)
     apart = int(np.median(np.diff(starts))) if len(starts) > 1 else 0
-    period = callback.period_ns or max(1_000, round(apart, -3))
-    contradicted = abs(apart - period) > ANOTHER_PERIOD * period and 10 * apart > period
-    if callback.period_ns and contradicted:
+    shown = shown_periods(evidence.flow.contradictions).get(callback.id)
+    if shown is not None:
         evidence.notes.append(
-            f"{callback.label} started every {duration_text(round(apart, -3))}: that is its period"
+            f"{callback.label} started every {duration_text(round(shown, -3))}: that is its period"
             " in the description."
         )
-        period = max(1_000, round(apart, -3))
+    period = shown or callback.period_ns or max(1_000, round(apart, -3))
     number = np.rint((starts - starts[0]) / period).astype(np.int64)
     behind = starts - number * period
     third = len(starts) // 3

@@ -15,6 +15,7 @@ from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import MIDDLEWARE_LIMITS
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
+from chainshaper.values.errors import text_of
 from chainshaper.values.recording import Check, MachineReport, State
 
 
@@ -79,11 +80,11 @@ def _bpftrace() -> Check:
         return _check(name, purpose, None, "limited", "needs root", "run as root, with sudo")
     trial = [path, "-e", "BEGIN { exit(); } tracepoint:sched:sched_switch { }"]
     try:
-        run = subprocess.run(
-            trial, capture_output=True, text=True, check=False, timeout=30, env=environment
-        )
+        run = subprocess.run(trial, capture_output=True, check=False, timeout=30, env=environment)
         good = path if run.returncode == 0 else None
-        problems = [line for line in run.stderr.splitlines() if "RLIMIT_MEMLOCK" not in line]
+        problems = [
+            line for line in text_of(run.stderr).splitlines() if "RLIMIT_MEMLOCK" not in line
+        ]
     except subprocess.TimeoutExpired:
         good, problems = None, ["it did not end within 30 s"]
     remedy = "mount -t tracefs tracefs /sys/kernel/tracing"

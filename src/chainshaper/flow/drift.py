@@ -26,7 +26,7 @@ from chainshaper.planning.margins import OVERRUN_PROBABILITY, Tail
 from chainshaper.planning.offsets import chain_name
 from chainshaper.planning.plan import Adaptation, Plan, publish_slots
 from chainshaper.splicing.shaped_outputs import FollowedOutput
-from chainshaper.values.errors import ChainshaperError
+from chainshaper.values.errors import ChainshaperError, OperationError
 
 SEEN_NS = 250_000  # later than usual by so much, a thread was woken by its timer, not the slot
 MOVE_NS = 250_000  # slots move by no less
@@ -187,6 +187,8 @@ class SlotFollower:
         except ChainshaperError as error:  # also a place where slots may not be, beside others'
             if not self._stop.is_set():
                 self.failure = error
+        except Exception as error:  # a thread that ends in silence follows no more
+            self.failure = OperationError(f"following has failed ({type(error).__name__}: {error})")
 
     def _move(self, start_ns: int, before_ns: int) -> None:
         moved_ns = start_ns - self._planned_ns

@@ -13,7 +13,7 @@ from chainshaper.analysis import (
 )
 from chainshaper.analysis.chains import close_names
 from chainshaper.analysis.graph import ApplicationDescription, services
-from chainshaper.sources.lttng.trace import table_name
+from chainshaper.sources.lttng.sessions import table_name
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording, RecordingInfo, event_counts, write_recording
 from chainshaper.verify.measure import opened
@@ -34,7 +34,10 @@ def list_chains(
 def named_chain(file: str | Path, name: str | None = None) -> str:
     """The chain that a CARET architecture file calls ``name``, which only one path needs not."""
     paths = load_named_paths(file)
-    known = ", ".join(paths) or "none"
+    known = ", ".join(paths)
+    if not paths:
+        remedy = "name a path in it (CARET's documentation says how), or leave out --chains"
+        raise InputError(f"{file}: no path is named in it: {remedy}")
     if name is None and len(paths) != 1:
         raise InputError(f"{file}: choose one of its named_paths with --chain: {known}")
     name = next(iter(paths)) if name is None else name

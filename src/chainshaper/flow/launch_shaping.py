@@ -244,7 +244,7 @@ def _planned(
     """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
     if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
-    doubts = [doubt for one in profiles[:chains] for doubt in doubts_about(one)]
+    doubts = list(dict.fromkeys(text for one in profiles[:chains] for text in doubts_about(one)))
     if chains > 1:
         plan, remarks = planning.plan_application(profiles, request)
         return plan, remarks + doubts

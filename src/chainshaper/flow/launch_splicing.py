@@ -18,13 +18,15 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 from chainshaper.gate.decision import Rule
 from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
 from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
+from chainshaper.sources.preload import ANY_ORDER, SANITIZER
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
 from chainshaper.splicing import shaping_process as ours
 from chainshaper.splicing import spliced_launch as launching
 from chainshaper.splicing.application import nothing_to_splice
 from chainshaper.splicing.redirection import Redirect
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError, storable
+from chainshaper.values.files import write_whole
 from chainshaper.values.plan_choices import STANDBY, Fallback, NodeKind
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
@@ -96,6 +98,12 @@ def splice_launch_files(
     if without := [chain for chain in joint.chains if chain.shaping_node is None]:
         raise nothing_to_splice(without[0])
     folder = launching.usable(Path(output))
+    for path in (folder, *launch_files):
+        if storable(str(path)) != str(path):
+            raise InputError(
+                f"{path}: the files that are written for ROS 2 name it, and hold names in UTF-8"
+                " only: rename it"
+            )
     known = _endpoints(recording, "publisher")
     every = [
         (chain, one, _publisher(chain, one, known))
@@ -132,9 +140,10 @@ def splice_launch_files(
         if not any(blocks):
             return made, {}
         into.mkdir(parents=True, exist_ok=True)
-        (into / "gates").write_text("".join(blocks), encoding="utf-8")
+        write_whole(into / "gates", ["".join(blocks).encode()])
         return made, {
             "LD_PRELOAD": str(ours.gate_library()),
+            SANITIZER: ANY_ORDER,
             ours.GATES: str(folder / launching.NODES / "gates"),
         }
 
@@ -242,7 +251,7 @@ def _spliced(
     with place as partial:
         made, environment = written(Path(partial, launching.NODES))
         text = launching.launch_text(words, made, redirects, environment)
-        Path(partial, name).write_text(text, encoding="utf-8")
+        write_whole(Path(partial, name), [text.encode()])
     found = [] if dry is None else _tried(words, redirects, dry)
     diff = difflib.unified_diff([], text.splitlines(keepends=True), "/dev/null", str(copy))
     strange = [file for file in files if not executable and str(file) not in words]

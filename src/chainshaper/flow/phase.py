@@ -191,7 +191,8 @@ class DriftWatch:
     ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
     thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
     takes a fifth of a core: it is done on ``cores`` or, where there are none, less often, and only
-    near where the cycle began last, unless it is not seen there. It ends with one of the threads.
+    near where the cycle began last, unless it is not seen there. It ends with one of the threads,
+    or with a ``failure``: why, as half a sentence.
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -211,9 +212,10 @@ class DriftWatch:
         self.latest_ns: int | None = None
         self._before_ns = 0  # what the look before saw
         self.looks, self.look_soon = 0, False
+        self.failure: str | None = None
         self._threads, self._cycle_ns, self._expected_ns = (pid, tids), cycle_ns, expected_ns
         self._slots, self._cores, self._stop = slots, cores, threading.Event()
-        threading.Thread(target=self._look_again, name="drift-watch", daemon=True).start()
+        threading.Thread(target=self._look_until_over, name="drift-watch", daemon=True).start()
 
     def expect(self, expected_ns: int) -> None:
         """The thread is to begin elsewhere from now on; what is seen of it till then is void."""
@@ -228,6 +230,12 @@ class DriftWatch:
     @property
     def surely_ns(self) -> int | None:
         return None if self.latest_ns is None else min(self.latest_ns, self._before_ns)
+
+    def _look_until_over(self) -> None:
+        try:
+            self._look_again()
+        except Exception as error:  # a thread that ends in silence sees no drift
+            self.failure = f"looking for it has failed ({type(error).__name__}: {error})"
 
     def _look_again(self) -> None:
         if self._cores:

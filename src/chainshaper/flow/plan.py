@@ -19,6 +19,7 @@ import numpy.typing as npt
 import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, data_flow, executors
+from chainshaper.analysis.contradictions import refuse_contradicted, shown_periods
 from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
@@ -33,7 +34,8 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
-from chainshaper.verify.measure import chain_of, longest_stall, opened
+from chainshaper.verify.measure import PARTS, chain_of, longest_stall, opened
+from chainshaper.verify.promises import NOT_PUBLISHED
 from chainshaper.workload.description import Application, node_name
 from chainshaper.workload.live import timing_of
 
@@ -55,10 +57,11 @@ def profile_chains(
     """What the planner needs of recorded chains: see :func:`chainshaper.planning.plan_chain`.
 
     ``period_ns`` is for chains that no timer starts; None stands for the chain that the recording
-    names. All times but ``every_latency_ns`` are over cycles that the machine did not disturb (of
-    fewer than two: over all). Of ``modes``, each has a profile of its own: of its recording or file
-    of latencies in ``mode_recordings``, or of the cycles that began in it, by the description of
-    what ran. What happened before ``since_ns`` or from ``until_ns`` on is left out.
+    names, or the only one in it. All times but ``every_latency_ns`` are over cycles that the
+    machine did not disturb (of fewer than two: over all). Of ``modes``, each has a profile of its
+    own: of its recording or file of latencies in ``mode_recordings``, or of the cycles that began
+    in it, by the description of what ran. What happened before ``since_ns`` or from ``until_ns`` on
+    is left out.
 
     Raises InputError: no such chain or mode, or a chain's period is not known, or known and given
     as well. OperationError: fewer than two complete traversals of a chain, or in a mode.
@@ -70,9 +73,11 @@ def profile_chains(
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
-    analyses = [analyse_latency(flow, chain_of(recording, chain)) for chain in chains]
+    analyses = [analyse_latency(flow, chain_of(recording, chain, flow)) for chain in chains]
     stages = [graph_stages(one.graph, one.chain) for one in analyses]
     planned = {number for own in stages for stage in own for number in stage.members}
+    chained = {number for one in analyses for number in one.chain.callbacks}
+    refuse_contradicted(flow.contradictions, planned | chained, recording.path)
     profile_of = partial(
         _profile_of, recording, flow, begun_ns=begun, period_ns=period_ns, planned=planned
     )
@@ -126,14 +131,15 @@ def _profile_of(
     calm = every.filter(~pl.col("disturbed"))
     all_disturbed = calm.height < 2
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
-    period = _period(analysis, period_ns)
+    period = _period(flow, analysis, period_ns)
     simulated = _simulated(flow, analysis)
     nodes = taking_part(graph, chain, stages)
     running, named, cores, priority = _executors(recording, flow, graph, stages)
     core_of = {node: cores.get(node, DEFAULT_CORE) for node in nodes}
     instances = _instances_apart_from(flow, disturbed)
     measured = every if all_disturbed else calm
-    branches = {n for stage in stages for n in stage.members} - {*chain.callbacks}
+    own = {*chain.callbacks, *(n for stage in stages for n in stage.members)}
+    branches = own - {*chain.callbacks}
     steps = _steps(flow, analysis, cores, {*planned, *chain.callbacks} - branches)
     sends = events.table(flow.events, "asynchronous_send")
     return Profile(
@@ -161,7 +167,8 @@ def _profile_of(
         every_step_ns=steps[every["traversal"].to_numpy()],
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
-        incomplete=analysis.statistics.incomplete,
+        incomplete=analysis.statistics.incomplete - analysis.incomplete.get("not used", 0),
+        unpublished=analysis.incomplete.get(NOT_PUBLISHED, 0),
         disturbed=int(every["disturbed"].sum()),
         realtime=recording.info.realtime,
         longest_stall_ns=longest_stall(recording),
@@ -171,6 +178,7 @@ def _profile_of(
         **_writer(recording, flow, stages[-1].node, chain.topics[-1]),
         simulated=simulated,
         interfering=_interfering(flow, analysis, running, {*planned, *chain.callbacks}),
+        contradictions=tuple(one.note for one in flow.contradictions if own & one.callbacks),
         all_disturbed=all_disturbed or None,
     )
 
@@ -201,14 +209,15 @@ def _modes_in_force(
     return pl.Series([modes.default, *(mode for _, mode in known)]).gather(place)
 
 
-def _period(analysis: LatencyAnalysis, given: int | None) -> int:
+def _period(flow: DataFlow, analysis: LatencyAnalysis, given: int | None) -> int:
     first, spec = analysis.graph.callbacks[analysis.chain.callbacks[0]], analysis.chain.spec
-    if first.period_ns is not None and given not in (None, first.period_ns):
+    of_timer = shown_periods(flow.contradictions).get(first.id, first.period_ns)
+    if of_timer is not None and given not in (None, of_timer):
         raise InputError(
             "--period goes with --latencies, or with a chain that no timer starts, which"
             f" {first.label} does: leave it out"
         )
-    period = given if first.period_ns is None else first.period_ns
+    period = given if of_timer is None else of_timer
     if period is None:
         apart = _between_starts(analysis)
         seen = "" if apart is None else f" (starts are {duration_text(int(apart))} apart, mostly)"
@@ -387,7 +396,8 @@ def _steps(
         own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
         own = own.with_columns(pl.coalesce("end", "publish"))
         row, start, end = (own[name].to_numpy() for name in ("traversal", "start", "end"))
-        steps[row, hop] = (own["communication_ns"].fill_null(0) + own["computation_ns"]).to_numpy()
+        parts = (own[f"{part}_ns"].fill_null(0) for part in PARTS)
+        steps[row, hop] = sum(parts, own["hop"] * 0).to_numpy()
         if hop:
             same = [one for one in planned if core[one] == core[number]]
             others = ran.filter(pl.col("callback_id").is_in(same))

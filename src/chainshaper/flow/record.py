@@ -16,8 +16,9 @@ import time
 from collections.abc import Callable, Collection, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 from chainshaper.analysis.objects import resolve_objects
 from chainshaper.enforcement.threads import allocate, strangers_text
@@ -41,10 +42,11 @@ from chainshaper.values import events
 from chainshaper.values import recording as recordings
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
-from chainshaper.values.files import open_to_all
+from chainshaper.values.files import open_to_all, rename_output
 from chainshaper.values.recording import EndpointInfo, Recording, ThreadInfo
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
+_T = TypeVar("_T")
 Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[Process]], bool]]
 """Changes how the application's threads run for as long as its context lasts. What it gives is
 called about once a second with the processes, and says whether all is as it shall be from now on.
@@ -144,12 +146,13 @@ def record_command(
             _trace(run, scheduling, command_stdout, stalls=watch_stalls)
             progress(1.0, "reading the events")
             recording = _written(output, run, chain, plan)
+            run.tracer.written()
         except BaseException as error:  # the trace may be of hours: nothing costs it
             if not run.ended_ns:
                 raise
             said = "".join(f"; {note.rstrip('.')}" for note in run.notes)
             if any(folder.iterdir()):
-                left = folder.rename(output.with_name(folder.name.lstrip(".")))
+                left = rename_output(folder, output.with_name(folder.name.lstrip(".")))
                 said += f"; what was traced stays in {left}"
             if isinstance(error, ChainshaperError):
                 raise OperationError(f"{error}{said}") from error
@@ -157,7 +160,7 @@ def record_command(
             raise
         if any(folder.iterdir()):
             open_to_all(folder)
-            folder.rename(recording.path / TRACE_FOLDER)
+            rename_output(folder, recording.path / TRACE_FOLDER)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
     return Recorded(recording, run.exit_code)
@@ -242,7 +245,12 @@ def _watch(run: _Run) -> None:
             failure = run.tracer.failure()
             if failure is None and shutil.disk_usage(run.folder).free < SPARE_DISK:
                 failure = f"the disk of {run.folder.parent} is full"
-            _look(run)
+            try:
+                _look(run)
+            except ChainshaperError:
+                raise
+            except Exception as error:  # what was traced is not lost for it
+                failure = failure or f"looking at it has failed ({type(error).__name__}: {error})"
             if failure is not None:
                 run.notes += (f"tracing ended before the application did: {failure}.",)
             if over or failure is not None or (run.command is None and not run.processes):
@@ -289,9 +297,15 @@ def _written(
     tables, missing = with_gate_logs(tables, run.gate_logs, since_ns, run.ended_ns)
     run.notes += missing
     if run.command is None:  # its nodes were created before tracing began
-        tables, info = with_found_nodes(tables, info, run.endpoints, run.processes)
+        found = partial(with_found_nodes, tables, info, run.endpoints, run.processes)
+        tables, info = _beside_events(run, "nodes", found, (tables, info))
     recording = Recording(output, info, tables)
-    threads = _recorded_threads(run.processes, recording)
+    threads: tuple[ThreadInfo, ...] = ()
+    endpoints: tuple[EndpointInfo, ...] = ()
+    ask_threads = partial(_recorded_threads, run.processes, recording)
+    threads = _beside_events(run, "threads", ask_threads, threads)
+    ask_endpoints = partial(_known_endpoints, tables, run.endpoints)
+    endpoints = _beside_events(run, "endpoints", ask_endpoints, endpoints)
     notes = [*info.notes, *run.notes, *filter(None, [run.strangers])]
     if run.no_qos_because is not None:
         notes.append(f"types and QoS of topics could not be asked for: {run.no_qos_because}.")
@@ -312,7 +326,7 @@ def _written(
         "rmw": variables.get("RMW_IMPLEMENTATION") or info.rmw,
         "command": tuple(run.words),
         "threads": threads,
-        "endpoints": _known_endpoints(tables, run.endpoints),
+        "endpoints": endpoints,
         "realtime": run.schedule is not None or in_real_time,
         "stall_meter": run.stalls.info,
         "chain": chain,
@@ -325,6 +339,16 @@ def _written(
         facts |= {"plan": governed.plan, "in_force": spell}
     info = with_trace_events(recording).model_copy(update=facts)
     return recordings.write_recording(output, tables, info)
+
+
+def _beside_events(run: _Run, what: str, ask: Callable[[], _T], otherwise: _T) -> _T:
+    """What is known of an application beside its events, which are written whatever fails here."""
+    try:
+        return ask()
+    except Exception as error:
+        failed = f"{type(error).__name__}: {error}"
+        run.notes += (f"the application's {what} are not known: reading them failed ({failed}).",)
+        return otherwise
 
 
 def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tuple[ThreadInfo, ...]:

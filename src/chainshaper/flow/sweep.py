@@ -47,8 +47,9 @@ from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.arrays import build_system
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
-from chainshaper.values.files import new_file, write_whole
+from chainshaper.values.files import new_file, open_output, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
+from chainshaper.verify.promises import OutputsDue
 from chainshaper.workload.description import Application, application_as_written, origin_timer
 
 Values: TypeAlias = Mapping[str, Any]  # one for every axis: a point
@@ -82,8 +83,9 @@ _OF_RUN = ("min_ns", "mean_ns", "max_ns", "jitter_ns", "spread_ns")
 FIGURES: dict[str, Any] = {
     **dict.fromkeys(("profile_min_ns", "profile_mean_ns", "profile_max_ns"), pl.Int64),
     **dict.fromkeys(("predicted_mean_ns", "predicted_max_ns", "predicted_jitter_ns"), pl.Int64),
-    **dict.fromkeys(("count", "incomplete", "late", *_OF_RUN), pl.Int64),
+    **dict.fromkeys(("count", "incomplete", "late", "missed", "most_missed", *_OF_RUN), pl.Int64),
     **{f"p{percentile:g}_ns": pl.Int64 for percentile in PERCENTILES},
+    "kept": pl.Boolean,
     "band_jitter_ns": pl.Int64,
     "per_band": pl.List(pl.Struct(_BAND)),
     "error": pl.String,
@@ -93,8 +95,10 @@ FIGURES: dict[str, Any] = {
 
 ``profile_…`` are L̲, the average and L̄ that the plan rests on, ``predicted_…`` the plan's own
 (eq. 5). All others are of the judged run: ``incomplete`` instances of the chain gave no output,
-``late`` ones behind the last slot (without slots: later than the plan says); ``band_jitter_ns`` is
-the widest of those ``per_band``. ``seconds`` were computed, the profile, which points share, apart.
+``late`` ones behind the last slot (without slots: later than the plan says); ``missed`` are both,
+``most_missed`` so many at most as the plan promises, and ``kept`` says whether it is so
+(:class:`~chainshaper.verify.promises.OutputsDue`); ``band_jitter_ns`` is the widest of those
+``per_band``. ``seconds`` were computed, the profile, which points share, apart.
 """
 
 
@@ -295,6 +299,8 @@ def application_at(grid: Grid, values: Values) -> Application:
     if not changes:
         return grid.application
     described: Any = application_as_written(grid.application)
+    for name in changes:
+        _refuse_unknown_node(name, described)
     if (load := changes.get(INTERFERENCE)) is not None:
         _, timer = origin_timer(grid.application)
         described = _interfered(described, timer.timer_ns or 0, _nanoseconds(INTERFERENCE, load))
@@ -334,6 +340,16 @@ def _changed(model: type[_Model], data: Any, changes: Values, without: str = "")
     said = ", ".join(f"{name}={value}" for name, value in changes.items())
     with wrong_values_refused(model, f"{said}: "):
         return model.model_validate_json(json.dumps(data), context=AS_YAML)
+
+
+def _refuse_unknown_node(name: str, described: Mapping[str, Any]) -> None:
+    """Refuse a path to a node that the description has not: it would be added, with one value."""
+    (first, *within), known = name.split("."), [*described.get("nodes", {})]
+    node = within[0] if within else ""
+    if first == "nodes" and within[1:] and node not in (*known, INTERFERENCE):
+        near = difflib.get_close_matches(node, known, n=1)
+        meant = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+        raise InputError(f"axis {name}: the application has no node {node!r}; {meant}")
 
 
 def _replaced(data: Any, path: list[str], value: Any) -> Any:
@@ -430,14 +446,14 @@ def row_at(
         measured = latency_statistics(complete, incomplete=latencies.size - complete.size)
         figures |= {name: getattr(measured, name) for name in ("count", "incomplete", *_OF_RUN)}
         figures |= {f"p{name}_ns": value for name, value in measured.percentiles_ns.items()}
-        figures |= {} if plan is None else _beside(plan, complete)
+        figures |= {} if plan is None else _beside(plan, complete, measured.incomplete)
     except ChainshaperError as error:
         figures["error"] = str(error)
     return {**figures, "seconds": round(time.perf_counter() - began, 6)}
 
 
-def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
-    """What the plan says, and what became of its bands."""
+def _beside(plan: Plan, latencies: Any, incomplete: int) -> dict[str, Any]:
+    """What the plan says, what became of its bands, and whether its promise was kept."""
     slots = slots_of_latency(plan)
     shares: Sequence[float | None] = plan.predicted.shares
     if len(shares) != len(slots):  # slots were edited in number
@@ -453,6 +469,8 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
         bands.append(dict(zip(_BAND, (start, end, share, seen, jitter), strict=True)))
     latest = slots[-1][1] - 1 if slots else plan.predicted.max_ns
     evidence, predicted = plan.evidence, plan.predicted
+    late = int(np.count_nonzero(latencies > latest))
+    outputs = OutputsDue.of(latencies.size, late, incomplete, plan)
     return {
         "profile_min_ns": evidence.min_latency_ns,
         "profile_mean_ns": evidence.mean_latency_ns,
@@ -460,10 +478,43 @@ def _beside(plan: Plan, latencies: Any) -> dict[str, Any]:
         "predicted_mean_ns": predicted.mean_ns,
         "predicted_max_ns": predicted.max_ns,
         "predicted_jitter_ns": predicted.jitter_ns,
-        "late": int(np.count_nonzero(latencies > latest)),
+        **{"late": late, "missed": outputs.missed, "most_missed": outputs.most_missed},
+        "kept": outputs.kept,
         "band_jitter_ns": max(jitters, default=None),
         "per_band": bands,
     }
+
+
+def changing_nothing(frame: pl.DataFrame, axes: Sequence[str]) -> list[str]:
+    """Which axes of a sweep's frame change no figure of the judged run, or some of their values
+    beside some of the others' only; a sentence each.
+    """
+    figures = ["count", "incomplete", "late", *_OF_RUN, *(n for n in FIGURES if n[:2] == "p9")]
+    said = []
+    for axis in axes:
+        others = [name for name in axes if name != axis]
+        run = frame.filter(pl.col("error").is_null()).with_columns(all_one=pl.lit(0))
+        groups = run.group_by("all_one", *others, maintain_order=True)
+        found = groups.agg(points=pl.len(), same=pl.struct(figures).n_unique() == 1)
+        found = found.filter(pl.col("points") > 1)
+        same = found.filter("same")
+        if not same.height:
+            continue
+        name = axis.removesuffix("_ns")
+        where = "" if same.height == found.height else _where(same, others)
+        why = ": its load has the lowest priority, or another core" if name == INTERFERENCE else ""
+        said.append(f"{name} changes nothing{where}{why}")
+    return said
+
+
+def _where(same: pl.DataFrame, others: Sequence[str]) -> str:
+    """Beside which values of the other axes: `` where policy is shaped``."""
+    shown = [
+        " and ".join(f"{name.removesuffix('_ns')} is {row[name]}" for name in others)
+        for row in same.head(3).to_dicts()
+    ]
+    more = f" (and {same.height - 3} more)" if same.height > 3 else ""
+    return f" where {', or '.join(shown)}{more}"
 
 
 Points: TypeAlias = list[tuple[int, Values]]  # by their numbers
@@ -527,7 +578,8 @@ def finished_rows(
     """
     about = json.loads(json.dumps(about))
     try:
-        with path.open("a+", encoding="utf-8", errors="surrogateescape") as file:
+        descriptor = open_output(path, os.O_RDWR | os.O_APPEND)
+        with os.fdopen(descriptor, "a+", encoding="utf-8", errors="surrogateescape") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
@@ -565,7 +617,10 @@ def _read(file: IO[str], path: Path, about: Mapping[str, Any]) -> dict[int, Row]
     whole = text[: text.rfind("\n") + 1]
     try:
         length = len(whole.encode())  # ValueError, as below: not all of it is UTF-8
-        first, *rows = map(json.loads, whole.splitlines() or [json.dumps(about)])
+        begun = json.dumps(about)
+        if not whole and not begun.startswith(text):
+            raise ValueError  # it has no whole line, and not what a crash leaves of the first
+        first, *rows = map(json.loads, whole.split("\n")[:-1] or [begun])
         finished = {row["number"]: row["row"] for row in rows}
         changed = [name for name in about if first[name] != about[name]]
     except (ValueError, KeyError, TypeError) as error:

@@ -20,7 +20,6 @@ Standard library only, as the gate; `handover.hpp`, the node's side in C++, has 
 """
 
 import fcntl
-import mmap
 import os
 import select
 import stat
@@ -46,14 +45,14 @@ FIELDS = (
     "mode",  # the mode in force, from 1 in their order; 0: there are no modes
     "started_ns",  # when a shaping node started last
     "failed_starts",  # how many did, shortly one after the other, and dealt with no message
-    "starts",
+    "starts",  # of shaping nodes of this launch
     "standby",  # the standby, a process id
     "listening",  # 1: it has received a message, and so receives all that come behind it
     "silent",  # 1: the standby passes nothing on, it counts what is lost
     "bypassing_since_ns",  # 0: a shaping node is in force
     "bypassed",  # how many messages the standby has dealt with: so many are in its ring
     "bypassed_before",  # how many of these before the present time without a shaping node
-    "published",  # how many messages shaping nodes have published
+    "published",  # how many messages shaping nodes of this launch have published
     *DROPPED,  # how many they have dropped, for each of the gate's reasons
     "lost_by_dds",  # how many are missing in what they have received
     "late",  # how many came behind the last slot that they were due in
@@ -77,6 +76,8 @@ PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3
 as the standby although the shaping node has the first, and to move slots."""
 _RINGS = {"released": RELEASED, "bypassed": BYPASSED, "measured": MEASURED}
 """Each has the name under which the numbers in it are counted."""
+_COUNTS = ("starts", "published", *DROPPED, "lost_by_dds", "late")
+"""These begin at 0 with each launch: what a node did for another one is not this one's."""
 _AT = {name: place for place, name in enumerate(FIELDS)}
 _SIZE = 8 * TOPIC + TOPIC_BYTES
 _FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
@@ -125,39 +126,65 @@ def _private(folder: str) -> str:
 
 
 class Page:
-    """A page and its lock; numbers are read and written under the names of :data:`FIELDS`."""
+    """A page and its lock; numbers are read and written under the names of :data:`FIELDS`.
+
+    The file is read and written, never mapped: a process that maps a file which another one cuts,
+    or for which the disk has no room, is ended by SIGBUS. What is not there reads as 0, what cannot
+    be written is missing, and shaping goes on.
+    """
 
     def __init__(
         self, folder: str, name: str, topic: str | None = None, flags: int = os.O_RDONLY
     ) -> None:
-        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at. In `/proc`,
-        the folder of a process's open files, all are links.
+        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at, as it was
+        at the last :meth:`look`. In `/proc`, the folder of a process's open files, all are links.
+
+        Raises OSError: it cannot be opened, or it is not a file of the folder's owner. ValueError:
+        it is too short for a page.
         """
         self.path = f"{folder}/{name}"
-        flags |= os.O_CLOEXEC | os.O_NONBLOCK | (not folder.startswith("/proc/")) * os.O_NOFOLLOW
+        flags |= os.O_CLOEXEC | os.O_NONBLOCK
+        if not folder.startswith("/proc/"):
+            flags |= os.O_NOFOLLOW
         self._file = os.open(self.path, flags, 0o600)
+        self._seen: bytes | None = None
         try:
             found = os.fstat(self._file)
             if not stat.S_ISREG(found.st_mode) or found.st_uid != os.lstat(folder).st_uid:
                 raise PermissionError(f"{name} is not a file of the folder's owner")
-            if topic is not None:  # memory that a full file system lacks later would be a SIGBUS
-                os.posix_fallocate(self._file, 0, _SIZE)
-            self._memory = mmap.mmap(-1 if topic is None else self._file, _SIZE)
             if topic is None:
                 self.look()
+            else:  # one for which there is no room is of no use to others
+                os.posix_fallocate(self._file, 0, _SIZE)
+                text = topic.encode()[:TOPIC_BYTES].ljust(TOPIC_BYTES, b"\0")
+                os.pwrite(self._file, text, 8 * TOPIC)
         except BaseException:
             os.close(self._file)
             raise
-        self._inode, self.owner = found.st_ino, found.st_uid
-        self._numbers = memoryview(self._memory).cast("q")
-        if topic is not None:
-            self._memory[8 * TOPIC :] = topic.encode()[:TOPIC_BYTES].ljust(TOPIC_BYTES, b"\0")
+        self._identity, self.owner = (found.st_dev, found.st_ino), found.st_uid
+
+    def _read(self, at: int, size: int) -> bytes:
+        """So many bytes of the page from there on."""
+        content = b""
+        if self._seen is not None:
+            content = self._seen[at : at + size]
+        else:
+            with suppress(OSError):
+                content = os.pread(self._file, size, at)
+        return content.ljust(size, b"\0")
+
+    def _numbers(self, place: int, count: int) -> tuple[int, ...]:
+        return struct.unpack(f"={count}q", self._read(8 * place, 8 * count))
+
+    def _write(self, place: int, value: int) -> None:
+        with suppress(OSError):
+            os.pwrite(self._file, value.to_bytes(8, sys.byteorder, signed=True), 8 * place)
 
     def __getitem__(self, field: str) -> int:
-        return self._numbers[_AT[field]]
+        return self._numbers(_AT[field], 1)[0]
 
     def __setitem__(self, field: str, value: int) -> None:
-        self._numbers[_AT[field]] = value
+        self._write(_AT[field], value)
 
     def look(self) -> None:
         """Read the page anew, for who only looks. ValueError: it has become shorter, or is gone."""
@@ -166,39 +193,36 @@ class Page:
         content = os.pread(self._file, _SIZE, 0)
         if len(content) < _SIZE:
             raise ValueError(f"{self.path} is no page of an output")
-        self._memory[:] = content
-
-    def put(self, field: str, value: int) -> None:
-        """Write a number of a page that is only looked at."""
-        os.pwrite(self._file, value.to_bytes(8, sys.byteorder, signed=True), 8 * _AT[field])
+        self._seen = content
 
     def add(self, ring: str, value: int) -> None:
         """Put a number into a ring, and count it."""
         number = self[ring]
-        self._numbers[_RINGS[ring] + number % RING] = value
+        self._write(_RINGS[ring] + number % RING, value)
         self[ring] = number + 1
 
     def noted(self, ring: str) -> list[int]:
         """The latest numbers of a ring, in no order."""
-        return self._numbers[_RINGS[ring] : _RINGS[ring] + RING].tolist()
+        return [*self._numbers(_RINGS[ring], RING)]
 
     def latest(self, ring: str, since: int) -> list[int]:
         """The numbers of a ring behind the first ``since``, as far as they are there."""
-        last, place = self[ring], _RINGS[ring]
-        return [self._numbers[place + n % RING] for n in range(max(since, last - RING), last)]
+        last, numbers = self[ring], self.noted(ring)
+        return [numbers[number % RING] for number in range(max(since, last - RING), last)]
 
     @property
     def topic(self) -> str:
         """The output."""
-        return self._memory[8 * TOPIC :].rstrip(b"\0").decode(errors="replace")
+        return self._read(8 * TOPIC, TOPIC_BYTES).rstrip(b"\0").decode(errors="replace")
 
     @property
     def is_current(self) -> bool:
-        """Whether the page has its name still: folders of a session go when its user logs out."""
+        """Whether others find the page whole: folders of a session go when its user logs out."""
         try:
-            return os.stat(self.path).st_ino == self._inode  # noqa: PTH116
+            there = os.stat(self.path)  # noqa: PTH116
         except OSError:
             return False
+        return (there.st_dev, there.st_ino) == self._identity and there.st_size >= _SIZE
 
     # Locks of open files (F_OFD_…): several in one file, each visible without taking it.
 
@@ -224,8 +248,6 @@ class Page:
 
     def close(self) -> None:
         """Give up the page, and with it whatever it has locked."""
-        self._numbers.release()
-        self._memory.close()
         os.close(self._file)
 
 
@@ -252,6 +274,9 @@ class Turn:
         idle_ns = abs(time.monotonic_ns() - page["until_ns"])
         if parent != page["parent"] or idle_ns > AT_ONCE_NS:
             page["mode"] = page["phase_known"] = 0
+            if not page.is_locked():  # by a node of another launch, whose counts they are
+                for count in _COUNTS:
+                    page[count] = 0
         page["parent"] = parent
         self.page, self._in_force = page, False
         # Of the standby's messages: how many there were at the last look, and which.
@@ -261,7 +286,9 @@ class Turn:
     def wait_s(self) -> float:
         """For how long to wait before starting: nodes before this one have failed at once."""
         failed = self.page["failed_starts"] - 1 - BACK_OFF_AFTER
-        return 0.0 if failed < 0 else min(10.0, 0.5 * 2**failed)
+        return (
+            0.0 if failed < 0 else min(10.0, 0.5 * 2 ** min(failed, 10))
+        )  # a page may say anything
 
     def go_on(self, shaper: Shaper) -> None:
         """Have cycles of a gate begin where they did for the one before it in the same launch, in

@@ -11,10 +11,12 @@ import contextlib
 import ctypes
 import errno
 import os
+import re
 import time
 from pathlib import Path
 
-from chainshaper.values.errors import OperationError, PlatformError
+from chainshaper.linux.threads import lines_of, read_proc
+from chainshaper.values.errors import OperationError, PlatformError, text_of
 
 MOUNTS = Path("/proc/mounts")
 QUICK_MOVES = "favordynmods"
@@ -30,6 +32,8 @@ _REMOUNT = 32
 _MOUNT_FLAGS = {"rw": 0, "ro": 1, "nosuid": 2, "nodev": 4, "noexec": 8}
 _MOUNT_FLAGS |= {"noatime": 1 << 10, "nodiratime": 1 << 11, "relatime": 1 << 21}
 """Of mount(2); an option that is none of them is the file system's own."""
+_OCTAL = re.compile(rb"\\([0-3][0-7]{2})")
+"""Blanks, line feeds, backslashes and number signs in names of mount points."""
 _ATTEMPTS = 3
 _THREADED_CONTROLLERS = {"cpu", "cpuset", "perf_event", "pids"}
 _REMEDY = (
@@ -50,10 +54,11 @@ def mount_options() -> str:
 
 def _mount() -> tuple[Path, str]:
     # Beside version 1 hierarchies it usually stands at /sys/fs/cgroup/unified.
-    for line in MOUNTS.read_text().splitlines():
-        _, folder, kind, options, *_ = line.split()
-        if kind == "cgroup2":
-            return Path(folder.encode().decode("unicode_escape")), options
+    for line in filter(None, lines_of(read_proc(MOUNTS))):
+        _, folder, kind, options, *_ = line.split(b" ")
+        if kind == b"cgroup2":
+            folder = _OCTAL.sub(lambda escaped: bytes([int(escaped[1], 8)]), folder)
+            return Path(os.fsdecode(folder)), os.fsdecode(options)
     raise PlatformError(
         "no cgroup v2 hierarchy is mounted here, so threads cannot be frozen: "
         "`mount -t cgroup2 none /sys/fs/cgroup/unified`"
@@ -71,7 +76,7 @@ def remount(options: str) -> None:
     flags = _REMOUNT | sum(_MOUNT_FLAGS.get(name, 0) for name in names)
     own = ",".join(name for name in names if name not in _MOUNT_FLAGS)
     folder = os.fsencode(mount_point())
-    ctypes.CDLL(None).mount(b"none", folder, b"cgroup2", ctypes.c_ulong(flags), own.encode())
+    ctypes.CDLL(None).mount(b"none", folder, b"cgroup2", ctypes.c_ulong(flags), os.fsencode(own))
 
 
 def make_moves_quick() -> None:
@@ -79,14 +84,14 @@ def make_moves_quick() -> None:
     if not moves_are_quick():
         before = mount_options()
         with contextlib.suppress(OSError):  # without the privilege there is no remounting either
-            os.setxattr(mount_point(), _BEFORE, before.encode())
+            os.setxattr(mount_point(), _BEFORE, os.fsencode(before))
             remount(f"{before},{QUICK_MOVES}")
 
 
 def restore_mount() -> None:
     """Undo :func:`make_moves_quick`, where a run of ours did it; harmless when repeated."""
     with contextlib.suppress(OSError):  # none did
-        before = os.getxattr(mount_point(), _BEFORE).decode()
+        before = os.fsdecode(os.getxattr(mount_point(), _BEFORE))
         if moves_are_quick():
             remount(before)
         os.removexattr(mount_point(), _BEFORE)
@@ -95,10 +100,10 @@ def restore_mount() -> None:
 def cgroup_of(tid: int) -> Path:
     """The folder of a thread's group. Raises OperationError: no thread. PlatformError: hidden."""
     try:
-        lines = Path(f"/proc/{tid}/cgroup").read_text().splitlines()
+        lines = lines_of(read_proc(f"/proc/{tid}/cgroup"))
     except OSError:
         raise OperationError(f"there is no thread {tid}: it has ended, or never was") from None
-    path = next((line[3:] for line in lines if line.startswith("0::")), "")
+    path = next((os.fsdecode(line[3:]) for line in lines if line.startswith(b"0::")), "")
     root = mount_point()
     folder = root / path.lstrip("/")
     # A thread outside our cgroup namespace shows as "/../…", or as a path that is not here.
@@ -242,6 +247,6 @@ def _own_groups(name: str) -> list[Path]:
 
 def _read(path: Path) -> str:
     try:
-        return path.read_text()
+        return text_of(read_proc(path))
     except OSError:  # gone, or a file that this kind of group does not have
         return ""

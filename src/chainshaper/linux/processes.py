@@ -28,12 +28,13 @@ from chainshaper.linux.threads import (
     dds_kind,
     innermost_id,
     is_of_zenoh,
+    lines_of,
     list_threads,
     parents,
     read_proc,
     status_field,
 )
-from chainshaper.values.errors import InputError
+from chainshaper.values.errors import InputError, text_of
 
 _AT_UID = 11
 _AUXILIARY = struct.Struct("@NN")
@@ -117,7 +118,7 @@ def user_in(folder: int) -> int | None:
     if started_by is None:  # what is root's by its ids may be a set-user-ID program
         return None if user == 0 and os.geteuid() == 0 else user
     starters = {started_by}
-    for line in read_proc("uid_map", folder).splitlines():  # of its user namespace
+    for line in lines_of(read_proc("uid_map", folder)):  # of its user namespace
         inside, outside, count = map(int, line.split())
         if inside <= started_by < inside + count:
             starters.add(outside + started_by - inside)
@@ -163,7 +164,7 @@ def read_process(pid: int) -> Process | None:
     return Process(
         pid=pid,
         parent=status_field(status, "PPid")[0],
-        command=tuple(command.rstrip(b"\0").decode(errors="replace").split("\0")),
+        command=tuple(map(text_of, command.rstrip(b"\0").split(b"\0"))),
         inner_pid=innermost_id(status) or pid,
         participates=participates,
         threads=threads,
@@ -218,10 +219,11 @@ class Region(NamedTuple):
 
 def regions_in(maps: bytes) -> Iterator[Region]:
     """The regions in the content of a file /proc/PID/maps, by address."""
-    for line in maps.decode(errors="replace").splitlines():
+    for line in filter(None, lines_of(maps)):
         span, rights, offset, _, _, *path = line.split(maxsplit=5)
-        start, end = (int(bound, 16) for bound in span.split("-"))
-        yield Region(start, end, int(offset, 16), "x" in rights, path[0] if path else "")
+        start, end = (int(bound, 16) for bound in span.split(b"-"))
+        name = os.fsdecode(path[0]) if path else ""  # it may be opened
+        yield Region(start, end, int(offset, 16), b"x" in rights, name)
 
 
 def region_at(regions: Sequence[Region], address: int) -> Region | None:

@@ -17,10 +17,19 @@ from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from io import FileIO
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from chainshaper.linux.threads import find_thread, has_ended, open_process, read_proc, start_of
-from chainshaper.values.errors import OperationError, PlatformError
+from chainshaper.linux.processes import user_name, user_of
+from chainshaper.linux.threads import (
+    find_thread,
+    has_ended,
+    lines_of,
+    open_process,
+    read_proc,
+    start_of,
+)
+from chainshaper.values.errors import OperationError, PlatformError, text_of
+from chainshaper.values.files import open_output
 
 _T = TypeVar("_T")
 
@@ -29,6 +38,8 @@ FORMAT = 1
 OPENED, PROCESS = "opened", "process"
 GUARDIAN, DISPATCHER = "guardian", "dispatcher"
 _LOOK_S = 0.02
+_LOCK = ".lock"
+_NO_LINK = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 @dataclass(frozen=True)
@@ -48,7 +59,7 @@ class Journal:
         lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in all_)
         try:
             self.keep()
-            descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | os.O_CLOEXEC)
+            descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | _NO_LINK)
             with os.fdopen(descriptor, "r+b", buffering=0) as file:
                 size = os.fstat(descriptor).st_size
                 if size and os.pread(descriptor, 1, size - 1) != b"\n":  # a crash cut a line off
@@ -97,14 +108,17 @@ class Journal:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
             written = self.path.with_name(f"{FILE}.{os.getpid()}")
             try:
-                written.touch(mode=0o600)
-                written.write_bytes(content)
+                with os.fdopen(open_output(written, mode=0o600), "wb") as file:
+                    file.write(content)
                 with contextlib.suppress(FileExistsError):  # another process of the run was first
                     os.link(written, self.path)
             finally:
                 written.unlink(missing_ok=True)
-        with self.path.open("rb") as file:
-            os.dup2(file.fileno(), self.memory.fileno(), inheritable=False)
+        descriptor = os.open(self.path, os.O_RDONLY | _NO_LINK)
+        try:
+            os.dup2(descriptor, self.memory.fileno(), inheritable=False)
+        finally:
+            os.close(descriptor)
         return True
 
     def size(self) -> int:
@@ -136,12 +150,13 @@ class Journal:
 
     def _lines(self) -> list[str]:
         try:
-            content = self.path.read_bytes()
+            with os.fdopen(os.open(self.path, os.O_RDONLY | _NO_LINK), "rb") as file:
+                content = file.read()
         except FileNotFoundError:
             content = self._remembered()
         except OSError as error:
             raise OperationError(f"{self.path} cannot be read: {error.strerror}") from error
-        return content.decode(errors="replace").split("\n")[:-1]
+        return text_of(content).split("\n")[:-1]
 
     def _remembered(self) -> bytes:
         if self.memory is None or self.memory.closed:
@@ -203,7 +218,7 @@ def open_journal(folder: str | Path | None = None, run: str | None = None) -> Jo
     path = place / FILE
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        os.close(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
+        os.close(open_output(path, mode=0o600))
         for directory in (place, base):  # the names themselves must survive as well
             descriptor = os.open(directory, os.O_RDONLY | os.O_DIRECTORY)
             os.fsync(descriptor)
@@ -223,7 +238,7 @@ def open_journal(folder: str | Path | None = None, run: str | None = None) -> Jo
 
 def remembered_journal(path: Path) -> Journal:
     """The journal at a path, open for :meth:`Journal.keep`. Raises OSError: there is none."""
-    return Journal(path, FileIO(path, "r"))
+    return Journal(path, FileIO(os.open(path, os.O_RDONLY | _NO_LINK), "r"))
 
 
 def journals_folder(named: str | Path | None = None) -> Path:
@@ -247,7 +262,10 @@ def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
 def discard_journal(journal: Journal) -> None:
     """Remove a journal when all is undone. Emptied first: who has it open knows then."""
     with contextlib.suppress(FileNotFoundError):
-        os.truncate(journal.path, 0)
+        with contextlib.suppress(OSError):  # a link: who has it open has no journal of ours
+            descriptor = os.open(journal.path, os.O_WRONLY | _NO_LINK)
+            os.ftruncate(descriptor, 0)
+            os.close(descriptor)
         journal.path.unlink()
     if journal.memory is not None:
         journal.memory.close()
@@ -256,38 +274,112 @@ def discard_journal(journal: Journal) -> None:
 
 
 def boot_id() -> str:
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    return text_of(read_proc("/proc/sys/kernel/random/boot_id")).strip()
+
+
+class LockHolder(NamedTuple):
+    """A process that has a folder locked, by id and start; ``user`` None: no single user's."""
+
+    pid: int
+    started: int
+    user: int | None
+
+
+Waiting: TypeAlias = Callable[[LockHolder | None, float], None]
+"""Called with who has a folder locked, if that is known, and for how long that one has been waited
+for by now (s); may raise."""
 
 
 @contextlib.contextmanager
-def locked(folder: Path, waiting: Callable[[int | None, float], None]) -> Iterator[None]:
-    """Inside, no other process has this folder locked. Until then ``waiting`` is called with the
-    one that has, if it is known, and the seconds waited so far, and may raise.
+def locked(folder: Path, waiting: Waiting) -> Iterator[None]:
+    """Inside, no other process has this folder locked, which its user alone may open; until then
+    ``waiting`` is called. Raises OperationError: a process of another user has it locked, which is
+    not waited for. OSError: there is no such folder.
     """
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    descriptor = _lock(folder, waiting)
     try:
-        begun = time.monotonic()
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                waiting(_holder_of(folder), time.monotonic() - begun)
-                time.sleep(_LOOK_S)
         yield
     finally:
         os.close(descriptor)
 
 
-def _holder_of(folder: Path) -> int | None:
-    """The process that has a folder locked, as far as the kernel shows it (proc_locks(5))."""
+@contextlib.contextmanager
+def all_runs_locked(base: Path, waiting: Waiting) -> Iterator[None]:
+    """:func:`locked` for the folder of all runs. Others may read that, and so lock it; the lock is
+    a folder in it, of a mode that keeps them out, and gone when nobody has it.
+    """
+    place = base / _LOCK
+    with contextlib.ExitStack() as stack:
+        while True:
+            with contextlib.suppress(FileNotFoundError):  # who had it has just removed it
+                place.mkdir(mode=0o700, exist_ok=True)
+                stack.enter_context(locked(place, waiting))
+                break
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                place.rmdir()
+
+
+def _lock(folder: Path, waiting: Waiting) -> int:
+    while True:
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC)
+        try:
+            _wait_for_lock(descriptor, folder, waiting)
+            if os.path.samestat(os.fstat(descriptor), folder.lstat()):  # it was not made anew
+                return descriptor
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)
+
+
+def _wait_for_lock(descriptor: int, folder: Path, waiting: Waiting) -> None:
+    holder, since = None, time.monotonic()
+    while True:
+        with contextlib.suppress(BlockingIOError):
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            return
+        before, holder = holder, _holder_of(descriptor)
+        if holder != before:
+            since = time.monotonic()
+        if holder is not None and holder.user not in (0, os.geteuid()):
+            raise OperationError(
+                f"{folder} is locked by process {holder.pid} of another user "
+                f"({user_name(holder.user)}): end that, or see that only you may open the folder"
+            )
+        waiting(holder, time.monotonic() - since)
+        time.sleep(_LOOK_S)
+
+
+def _holder_of(descriptor: int) -> LockHolder | None:
+    """The process that has an open folder locked, as far as the kernel shows it (proc_locks(5)).
+
+    Inodes of other devices have the same numbers; and the kernel names who asked for the lock: that
+    number may be another's since, unless it has the folder open.
+    """
+    state = os.fstat(descriptor)
+    place = b"%02x:%02x:%d" % (os.major(state.st_dev), os.minor(state.st_dev), state.st_ino)
     with contextlib.suppress(OSError):
-        inode = str(folder.stat().st_ino)
-        for line in read_proc("/proc/locks").decode().splitlines():
+        for line in lines_of(read_proc("/proc/locks")):
             fields = line.split()
-            if fields[1] == "FLOCK" and fields[5].rpartition(":")[2] == inode and fields[4] != "-1":
-                return int(fields[4])
+            if fields[1:2] != [b"FLOCK"] or fields[5] != place or int(fields[4]) <= 0:
+                continue
+            pid = int(fields[4])
+            started = start_of(pid, pid)
+            if started is not None and _has_open(pid, state) and start_of(pid, pid) == started:
+                return LockHolder(pid, started, user_of(pid))
     return None
+
+
+def _has_open(pid: int, state: os.stat_result) -> bool:
+    with contextlib.suppress(OSError):
+        for entry in Path(f"/proc/{pid}/fd").iterdir():
+            with contextlib.suppress(OSError):  # closed meanwhile
+                if os.path.samestat(entry.stat(), state):
+                    return True
+    return False
 
 
 @dataclass(frozen=True)

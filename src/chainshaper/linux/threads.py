@@ -18,6 +18,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal, TypeAlias
 
+from chainshaper.values.errors import text_of
+
 SCHED_DEADLINE = 6
 RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
 """A flag that shares the word with the policy."""
@@ -197,11 +199,22 @@ def parents() -> dict[int, int]:
     return {pid: int(fields[1]) for pid, fields in all_stats()}
 
 
-def read_proc(path: str, folder: int | None = None) -> bytes:
-    """A whole file of /proc, or of an open ``folder`` in it. Raises OSError: gone, or forbidden."""
+def read_proc(path: str | Path, folder: int | None = None) -> bytes:
+    """A whole file of /proc or /sys, or of an open ``folder`` in it: bytes, since whoever names a
+    program, a file or a group chooses any. Raises OSError: gone, or forbidden.
+    """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     with os.fdopen(descriptor, "rb", buffering=0) as file:
         return file.readall()
+
+
+def lines_of(content: bytes) -> list[bytes]:
+    """The lines of a file of the kernel, which ends each with a line feed.
+
+    Names in them may have whatever else ends a line elsewhere: with `splitlines`, a program that is
+    called ``a\\rUid:\\t0`` would be root's.
+    """
+    return content.removesuffix(b"\n").split(b"\n")
 
 
 def read_stat(folder: str) -> tuple[str, list[bytes]]:
@@ -209,13 +222,13 @@ def read_stat(folder: str) -> tuple[str, list[bytes]]:
     stat = read_proc(f"{folder}/stat")
     name_end = stat.rindex(b")")  # a name may contain spaces and brackets
     name = stat[stat.index(b"(") + 1 : name_end]
-    return name.decode(errors="replace"), stat[name_end + 1 :].split()
+    return text_of(name), stat[name_end + 1 :].split()
 
 
 def status_field(status: bytes, name: str, base: int = 10) -> list[int]:
     """The numbers of one line of /proc/…/status, empty where it has no such line."""
     start = f"{name}:".encode()
-    line = next((line for line in status.splitlines() if line.startswith(start)), b"")
+    line = next((line for line in lines_of(status) if line.startswith(start)), b"")
     return [int(number, base) for number in line.split()[1:]]
 
 

@@ -5,19 +5,28 @@ of those that the machine disturbed: an actuator does not care who caused a dela
 measured cycles may lie beyond follows from the binomial distribution alone (Wilks, Annals of
 Mathematical Statistics 12, 1941), if the cycles to come are like those measured.
 
-**Beyond the sample** (:func:`derive_margin`) the excesses of latencies over a high threshold u
-follow, in the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan). With ζ the share
-of latencies above u, ξ the shape and σ the scale, the latency exceeded with probability p is
+**Clusters** (:func:`independent_cycles`): where one long cycle follows another, n cycles tell as
+much as n / d independent ones do, where d = 1 + 2 Σ ρ_h is the variance of the number of long
+cycles beside that of independent ones (ρ_h: the correlation at h cycles' distance). All of the
+above holds with that number in place of n.
 
-    x_p = u + σ/ξ · ((ζ/p)^ξ − 1),
+**Beyond the sample** (:func:`fit_tail`) the excesses of latencies over a high threshold u follow,
+in the limit, a generalised Pareto distribution (Pickands–Balkema–de Haan). With ζ the share of
+latencies above u, ξ the shape and σ the scale, the latency exceeded with probability p is
 
-and the margin is ε = x_p − L̄, if that is positive. This holds for independent executions of an
-unchanging system and such a tail. Each of the three is tested; where one fails there is no number.
+    x_p = u + σ/ξ · ((ζ/p)^ξ − 1).
 
-The parameters are estimated by L-moments (Hosking and Wallis, Technometrics 29, 1987). They may put
-the end of a bounded tail before the longest latency measured, which is then made the end (Dupuis
-and Tsao, Communications in Statistics 27, 1998). The goodness of fit (Anderson–Darling) and the
-confidence interval come from one parametric bootstrap.
+This holds for independent executions of an unchanging system and such a tail. Each of the three is
+tested; where one fails there is no number. The parameters are estimated by L-moments (Hosking and
+Wallis, Technometrics 29, 1987). They may put the end of a bounded tail before the longest latency
+measured, which is then made the end (Dupuis and Tsao, Communications in Statistics 27, 1998). The
+goodness of fit (Anderson–Darling) and the bounds come from one parametric bootstrap.
+
+**What is planned is a bound, not the estimate.** The upper end of x_p is taken with no tail lighter
+than an exponential one, over all thresholds above which the fit is good, and not farther than to a
+:data:`FARTHEST` part of what the sample has one cycle of: an estimate alone is too low in half of
+all plans, and one that passes a test of its own width is too low in most. So the promise holds in
+95 % of plans (`experiments/promises.py`), and less risk never gives an earlier slot.
 
 **On line** (:class:`Tail`) the same is estimated from the latencies as they come, so that slots can
 follow them: on stationary input a move is the rare exception, however long that lasts.
@@ -45,14 +54,20 @@ OVERRUN_PROBABILITY = 0.01  # the share of all cycles that may be late by defaul
 
 # A tail is the n^(2/3) longest of n latencies, or these parts of it. A fixed share would leave
 # large samples with a systematic error.
-TAILS = (1.0, 0.85, 0.7, 0.6, 0.5)
+TAILS = (1.0, 0.7, 0.5)
 FEWEST_EXCESSES, MOST_EXCESSES = 50, 2_000
-MOST_PROBABLE = 0.001
-SIGNIFICANCE = 0.01  # below it, independence or an unchanging system is given up
+FEWEST_CYCLES = 1_000  # with fewer, the shape of a heavy tail is too uncertain for any bound
+FARTHEST = 10  # times as rare as one cycle of the sample: so far a tail is followed
+SIGNIFICANCE = 0.01  # below it, an unchanging system is given up
 GOODNESS = 0.10  # the fit's own test must not come near rejection
 CONFIDENCE = 0.95
-BOOTSTRAPS = 999
-WIDEST_INTERVAL = 0.5  # of the latency itself; wider, the sample does not tell
+WELL_COVERED = 0.99  # confidence of a smaller share of late outputs than was asked for
+OF_TAIL = 0.99  # of the bound on a tail: what the fit itself may be wrong by comes on top
+BOOTSTRAPS = 499
+# Long cycles are the longest such parts of all; they are counted together so many cycles apart.
+LONG_CYCLES, FEWEST_LONG = (4, 8, 16, 32, 64, 128, 256), 8
+APART = (1, 2, 4, 8, 16, 32, 64, 128)
+DOUBT_CLUSTER = 3e-4  # more pairs of long cycles than chance makes in so many samples
 # On line: what slots are moved to is late in this part of the promised share. Counts that chance
 # makes rarer than this are none of chance: looked at once in a while, and with every late output.
 AIM = 0.8
@@ -140,7 +155,8 @@ def check_latencies(latencies: object) -> _Latencies:
 
 class TailFit(NamedTuple):
     """The shape of a generalised Pareto tail, the p-value of the Anderson–Darling test of the fit,
-    the latency that is exceeded with the probability asked for, and its 95 % confidence interval.
+    the latency that is exceeded with the probability asked for, and the bounds on it: 2.5 %, and
+    the upper one that is planned with.
     """
 
     shape: float
@@ -155,71 +171,160 @@ def cycles_needed(overrun_probability: float) -> int:
     >>> cycles_needed(0.01)
     299
     """
-    return math.ceil(math.log(1 - CONFIDENCE) / math.log(1 - overrun_probability))
+    return math.ceil(math.log1p(-CONFIDENCE) / math.log1p(-overrun_probability))
 
 
-def late_share(every_latency_ns: _Latencies, latency_ns: int) -> float:
-    """The share of cycles that take longer than ``latency_ns``, at most, with 95 % confidence
-    (Clopper and Pearson's upper bound).
+def independent_cycles(latencies_ns: _Latencies) -> int:
+    """As many independent cycles tell as much about long ones as these do, in the order of time.
+
+    Of the longest quarter, eighth, … the pairs are counted that are a few cycles apart. Where they
+    are more than chance makes of independent cycles, the variance of the number of long cycles
+    grows by twice the excess for each of them.
     """
-    from scipy.special import betaincinv
+    size, growth = latencies_ns.size, 1.0
+    drawn = np.random.default_rng(0).permutation(size)  # which of equal ones are the longer
+    ascending = drawn[np.argsort(latencies_ns[drawn], kind="stable")]
+    for part in LONG_CYCLES:
+        count = size // part
+        if count < FEWEST_LONG:
+            break
+        places = np.sort(ascending[-count:])
+        for apart in APART:
+            if apart > size // 20:
+                break
+            within = np.searchsorted(places, places + apart, side="right")
+            pairs = int((within - np.arange(1, count + 1)).sum())
+            by_chance = apart * count * (count - 1) / size
+            if pairs > by_chance and _more_than(pairs, by_chance) < DOUBT_CLUSTER:
+                growth = max(growth, 1 + 2 * (pairs - by_chance) / count)
+    return max(1, int(size / growth))
 
+
+def _more_than(count: int, mean: float) -> float:
+    """The probability that a Poisson variable of this ``mean`` is ``count`` or more."""
+    term = math.exp(count * math.log(mean) - mean - math.lgamma(count + 1))
+    total, number = 0.0, float(count)
+    while term > 1e-12 * total or number < mean:
+        total += term
+        number += 1
+        term *= mean / number
+    return total
+
+
+def late_share(every_latency_ns: _Latencies, latency_ns: int, independent: int = 0) -> float:
+    """The share of cycles that take longer than ``latency_ns``, at most, with 95 % confidence
+    (Clopper and Pearson's upper bound); of cycles that are worth so many ``independent`` ones.
+
+        >>> round(late_share(np.arange(1, 300), 299), 4)
+        0.01
+    """
+    size = every_latency_ns.size
     beyond = int(np.count_nonzero(every_latency_ns > latency_ns))
-    if beyond == every_latency_ns.size:
+    trials = independent or size
+    return most_probable(math.ceil(beyond * trials / size), trials)
+
+
+def most_probable(hits: int, trials: int, confidence: float = CONFIDENCE) -> float:
+    """The probability of a hit, at most, with 95 % confidence, where so many trials had ``hits``.
+
+    >>> round(most_probable(0, 299), 4)
+    0.01
+    """
+    if hits >= trials:
         return 1.0
-    return float(betaincinv(beyond + 1, every_latency_ns.size - beyond, CONFIDENCE))
+    # P(Bin(n, p) ≤ hits) falls with p, to what is not confident. Far below the last, terms are 0.
+    low, high = hits / trials, 1.0
+    logarithms = np.concatenate([[0.0], np.cumsum(np.log(np.arange(1, trials + 1)))])
+    few = np.arange(max(0, hits - 40 * math.isqrt(trials) - 40), hits + 1)
+    ways = logarithms[-1] - logarithms[few] - logarithms[trials - few]
+    for _ in range(60):
+        share = (low + high) / 2
+        terms = ways + few * math.log(share) + (trials - few) * math.log1p(-share)
+        low, high = (share, high) if np.exp(terms).sum() > 1 - confidence else (low, share)
+    return high
+
+
+def covering_rank(independent: int, overrun_probability: float) -> int:
+    """Which longest latency covers all cycles but a share: the largest k of
+    :func:`covered_latency`.
+
+    >>> covering_rank(299, 0.01), covering_rank(473, 0.01)
+    (1, 2)
+    """
+    return max(1, _by_chance(independent, overrun_probability, CONFIDENCE))
 
 
 def covered_latency(
-    latencies_ns: _Latencies, overrun_probability: float, latest_ns: int | None = None
+    latencies_ns: _Latencies,
+    overrun_probability: float,
+    latest_ns: int | None = None,
+    independent: int = 0,
 ) -> int:
     """The shortest measured latency that covers all cycles but a share, with 95 % confidence (ns).
 
     It is the k-th longest of n, with the largest k for which P(Bin(n, p) ≥ k) is 95 % at least, or
     the longest of too small a sample; where that is behind ``latest_ns``, the longest that is not.
+    In place of n are the ``independent`` cycles that the sample is worth, where they are known.
 
         >>> covered_latency(np.arange(1, 300), 0.01), covered_latency(np.arange(1, 601), 0.01)
         (299, 599)
     """
     ordered = np.sort(latencies_ns)
-    covered = ordered[-max(1, _by_chance(ordered.size, overrun_probability, CONFIDENCE))]
+    covered = ordered[-covering_rank(independent or ordered.size, overrun_probability)]
     if latest_ns is not None and covered > latest_ns:
         covered = ordered[ordered <= latest_ns].max(initial=0)
     return int(covered)
 
 
 def derive_margin(
-    latencies_ns: _Latencies, probability: float, seed: int = 0, *, longest_ns: int | None = None
+    latencies_ns: _Latencies,
+    probability: float,
+    seed: int = 0,
+    *,
+    longest_ns: int | None = None,
+    least_ns: int = EPSILON_NS,
 ) -> Margin:
-    """The margin ε, with its confidence interval, beyond ``longest_ns`` (default: the longest of
-    them) with which an execution overruns its slot with the given probability: :func:`fit_tail`.
+    """The margin ε beyond ``longest_ns`` (default: the longest of them) with which a cycle is late
+    with the given probability, at most: ``least_ns`` behind the latency that covers it.
+
+    Where the sample is large enough, that is one of its own latencies, without any assumption
+    (:func:`covered_latency`), otherwise the bound on its tail (:func:`fit_tail`). Less risk never
+    gives an earlier slot. Raises OperationError: the sample cannot say; how many cycles could.
     """
-    fit = fit_tail(latencies_ns, probability, seed)
-    longest = int(np.max(latencies_ns)) if longest_ns is None else longest_ns
-    low, high = (max(0, end - longest) for end in fit.interval_ns)
+    latencies = check_latencies(latencies_ns)
+    if not 0 < probability < 1:
+        raise InputError(f"an overrun probability of {probability}: write one between 0 and 1")
+    longest = int(latencies.max()) if longest_ns is None else longest_ns
+    independent = independent_cycles(latencies)
+    interval = None
+    if independent >= cycles_needed(probability):
+        covered = covered_latency(latencies, probability, independent=independent)
+    else:
+        low, covered = fit_tail(latencies, probability, seed).interval_ns
+        interval = (max(0, low - longest) + least_ns, max(0, covered - longest) + least_ns)
+    beyond = max(0, covered - longest)
     return Margin(
-        epsilon_ns=max(0, fit.latency_ns - longest),
-        source="derived",
+        epsilon_ns=least_ns + beyond,
+        source="measured" if interval is None else "derived",
         overrun_probability=probability,
-        confidence_interval_ns=(low, high),
+        stalls_ns=beyond if interval is None else 0,
+        confidence_interval_ns=interval,
+        independent_cycles=independent if independent < latencies.size else None,
     )
 
 
 def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> TailFit:
-    """The tail of a sample, in the order of time, above the lowest of a few thresholds of good fit.
+    """The tail of a sample, in the order of time, over a few thresholds of good fit.
+
+    The estimate is that above the lowest of them; the upper bound is the largest of all, with an
+    exponential tail in place of a lighter one, and not below the longest latency measured.
 
     Raises OperationError: the data do not allow an answer: too few, not stationary, not
-    independent, no generalised Pareto tail, or an answer too vague to plan with.
+    independent, or no generalised Pareto tail; and how many cycles would.
     """
     latencies = check_latencies(latencies_ns)
-    if not 0 < probability < MOST_PROBABLE:
-        reason = f"must be between 0 and {MOST_PROBABLE}"
-        raise InputError(f"overrun probability {probability}: {reason}")
-    fewest = round(FEWEST_EXCESSES**1.5)
-    if latencies.size <= fewest:
-        reason = f"{latencies.size} latencies are too few to say anything about rarer ones: measure"
-        raise OperationError(f"{reason} more than {fewest} cycles, or give the margin yourself")
-    _refuse_not_stationary(latencies)
+    _refuse_too_few(latencies, probability)
+    _refuse_not_stationary(latencies, probability)
     ordered = np.sort(latencies)
     longest = min(ordered.size ** (2 / 3), MOST_EXCESSES)
     thresholds = []
@@ -229,43 +334,65 @@ def fit_tail(latencies_ns: _Latencies, probability: float, seed: int = 0) -> Tai
         # Equal latencies may leave too few beyond, or none but equal ones, which have no shape.
         if beyond.size >= FEWEST_EXCESSES and beyond[0] < beyond[-1]:
             thresholds.append(threshold)
-    random, best = np.random.default_rng(seed), 0.0
-    for threshold in thresholds[:1]:
-        _refuse_clusters(latencies, threshold)
-    for threshold in thresholds:
-        fit = _fit_above(latencies, threshold, probability, random)
-        best = max(best, fit.goodness)
-        if fit.goodness >= GOODNESS:
-            low, high = fit.interval_ns
-            if high - low <= WIDEST_INTERVAL * fit.latency_ns:
-                return fit
-            reason = f"{latencies.size} latencies are too few for an overrun probability of"
-            where = f"its latency lies between {duration_text(low)} and {duration_text(high)}"
-            remedy = "Measure more cycles, or ask for less"
-            raise OperationError(f"{reason} {probability:g}: {where}. {remedy}")
-    reason = "the longest latencies do not follow a generalised Pareto distribution above any of"
-    remedy = "look for two modes of the application in one recording, or give the margin"
-    raise OperationError(f"{reason} {len(thresholds)} thresholds (best p {best:.3f}): {remedy}")
+    random, fits = np.random.default_rng(seed), list[TailFit]()
+    fits = [_fit_above(latencies, one, probability, random) for one in thresholds]
+    good = [fit for fit in fits if fit.goodness >= GOODNESS]
+    if not good:
+        best = max((fit.goodness for fit in fits), default=0.0)
+        raise OperationError(
+            "the longest latencies do not follow a generalised Pareto distribution above any of"
+            f" {len(fits)} thresholds (best p {best:.3f}). {_remedy(latencies.size, probability)}."
+            " Or look for two modes of the application in one recording"
+        )
+    upper = max(int(ordered[-1]), *(fit.interval_ns[1] for fit in good))
+    first = good[0]
+    return first._replace(interval_ns=(min(first.interval_ns[0], upper), upper))
+
+
+def _refuse_too_few(latencies: _Latencies, probability: float) -> None:
+    size, independent = latencies.size, independent_cycles(latencies)
+    asked = f"an overrun probability of {probability:g}"
+    if independent < size:
+        needed = math.ceil(cycles_needed(probability) * size / independent)
+        raise OperationError(
+            f"long latencies come in clusters, as when one delays the next: {size} cycles tell as"
+            f" much as {independent} independent ones, too few for {asked}. Remove the cause,"
+            f" measure {needed} cycles, or give the margin (--epsilon)"
+        )
+    if size < FEWEST_CYCLES or size * FARTHEST * probability < 1:
+        raise OperationError(f"{size} cycles are too few for {asked}. {_remedy(size, probability)}")
+
+
+def _remedy(size: int, probability: float) -> str:
+    """What would make an answer possible: more cycles, or a promise that these can give."""
+    by_tail = max(FEWEST_CYCLES, math.ceil(round(1 / (FARTHEST * probability), 6)))
+    needed, shown = cycles_needed(probability), 1 - (1 - CONFIDENCE) ** (1 / size)
+    cycles = f"{needed} cycles, with which it holds for any distribution"
+    if size < by_tail < needed:
+        cycles = f"{by_tail} cycles, if their tail is regular, or {cycles}"
+    least = math.ceil(shown * 1e6) / 1e6
+    return f"Measure {cycles}; or ask for {least:g} or more, which {size} cycles show"
 
 
 def _fit_above(
     latencies: _Latencies, threshold: int, probability: float, random: np.random.Generator
 ) -> TailFit:
-    from scipy.stats import genpareto  # SciPy takes a moment to import
-
     excesses = np.sort(latencies[latencies > threshold] - threshold).astype(float)[np.newaxis, :]
     shape, scale = _l_moment_fit(excesses)
     distance = _anderson_darling(excesses, shape, scale)[0]
     share = excesses.size / latencies.size
 
-    size = (BOOTSTRAPS, excesses.size)
-    drawn = genpareto.rvs(shape[0], scale=scale[0], size=size, random_state=random)
+    uniform = random.random((BOOTSTRAPS, excesses.size))
+    drawn = scale * np.expm1(-_not_zero(shape) * np.log1p(-uniform)) / _not_zero(shape)
     drawn.sort(axis=1)
     shapes, scales = _l_moment_fit(drawn)
     distances = _anderson_darling(drawn, shapes, scales)
     shares = random.binomial(latencies.size, share, BOOTSTRAPS) / latencies.size
-    quantiles = _quantile(shapes, scales, shares, probability)
-    low, high = np.quantile(quantiles, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2])
+    low = np.quantile(_quantile(shapes, scales, shares, probability), (1 - CONFIDENCE) / 2)
+    # An exponential tail of the same mean stands for a lighter one.
+    scales = np.where(shapes < 0, scales / (1 - np.minimum(shapes, 0.0)), scales)
+    bounds = _quantile(np.maximum(shapes, 0.0), scales, shares, probability)
+    high = np.quantile(bounds, OF_TAIL)
     return TailFit(
         shape=float(shape[0]),
         goodness=float((1 + np.sum(distances >= distance)) / (1 + BOOTSTRAPS)),
@@ -313,29 +440,38 @@ def _anderson_darling(ordered: _Floats, shape: _Floats, scale: _Floats) -> _Floa
     return result
 
 
-def _refuse_not_stationary(latencies: _Latencies) -> None:
-    from scipy import stats
-
-    half = latencies.size // 2
-    halves = stats.ks_2samp(latencies[:half], latencies[half:], method="asymp").pvalue
-    trend = stats.kendalltau(np.arange(latencies.size), latencies).pvalue
+def _refuse_not_stationary(latencies: _Latencies, probability: float) -> None:
+    halves, trend = _halves_alike(latencies), _no_trend(latencies)
     if min(halves, trend) < SIGNIFICANCE / 2:
-        reason = f"not stationary (two halves alike: p = {halves:.2g}; no trend: p = {trend:.2g})"
-        remedy = "measure after start-up, in one mode and the order of time, or give the margin"
-        raise OperationError(f"the latencies are {reason}: {remedy} yourself")
+        raise OperationError(
+            f"the latencies are not stationary (two halves alike: p = {halves:.2g}; no trend:"
+            f" p = {trend:.2g}): measure after start-up, in one mode and the order of time, or"
+            f" give the margin (--epsilon). Without a tail, {probability:g} needs"
+            f" {cycles_needed(probability)} cycles"
+        )
 
 
-def _refuse_clusters(latencies: _Latencies, threshold: int) -> None:
-    from scipy import stats
+def _halves_alike(latencies: _Latencies) -> float:
+    """The p-value of Kolmogorov and Smirnov's test (its limit) that two halves are alike."""
+    half = latencies.size // 2
+    first, second = np.sort(latencies[:half]), np.sort(latencies[half:])
+    shares = [np.searchsorted(part, latencies, "right") / part.size for part in (first, second)]
+    apart = float(np.abs(shares[0] - shares[1]).max())
+    scaled = apart * math.sqrt(half * (latencies.size - half) / latencies.size)
+    if scaled < 0.2:  # the series converges slowly there, and to one
+        return 1.0
+    terms = (2 * (-1) ** (k - 1) * math.exp(-2 * (k * scaled) ** 2) for k in range(1, 101))
+    return float(np.clip(sum(terms), 0.0, 1.0))
 
-    above = latencies > threshold
-    long, followed = int(above[:-1].sum()), int(np.count_nonzero(above[:-1] & above[1:]))
-    share = float(above.mean())
-    chance = stats.binomtest(followed, long, share, alternative="greater").pvalue
-    if chance < SIGNIFICANCE:
-        reason = f"({followed} of {long} are followed by another, p = {chance:.2g})"
-        remedy = "as when one delays the next: remove the cause, or give the margin"
-        raise OperationError(f"long latencies come in clusters {reason}, {remedy}")
+
+def _no_trend(latencies: _Latencies) -> float:
+    """The p-value of Spearman's rank correlation of the latencies with time."""
+    _, places, counts = np.unique(latencies, return_inverse=True, return_counts=True)
+    ranks = (np.cumsum(counts) - (counts - 1) / 2)[places]  # of equal ones the middle
+    if counts.size == 1:
+        return 1.0
+    correlation = float(np.corrcoef(np.arange(latencies.size), ranks)[0, 1])
+    return math.erfc(abs(correlation) * math.sqrt((latencies.size - 1) / 2))
 
 
 # On line ------------------------------------------------------------------------------------------

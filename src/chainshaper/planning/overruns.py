@@ -6,6 +6,7 @@ asynchronous publisher cannot, but DDS can, by an output's age: with a **lifespa
 what waited for the slot of a later cycle has expired when the thread may run again.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import chain, combinations, pairwise, product
@@ -314,6 +315,14 @@ def _leaves_at(plan: Plan) -> int:
     return slots[-1][0] if slots else plan.evidence.max_latency_ns + plan.margin.epsilon_ns
 
 
+def evidence_cycles(plan: Plan) -> int:
+    """How many cycles a plan rests on, disturbed ones included."""
+    evidence = plan.evidence
+    if evidence.all_disturbed:
+        return max(evidence.samples, evidence.disturbed)
+    return evidence.samples + evidence.disturbed
+
+
 def _about_late_outputs(plan: Plan) -> Iterator[str]:
     """Which bands hardly any cycle takes, how many outputs will be late, if the sample tells, and
     what the machine's stalls cost.
@@ -323,12 +332,16 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     if idle and len(shares) > 1 and plan.modes is None:
         said = f"bands with less than {IDLE_BAND:.0%} of the cycles: {', '.join(idle)} of"
         yield f"{said} {len(shares)}: limit --mean-at-most or --max-share, or plan fewer."
-    cycles, needed = evidence.samples + evidence.disturbed, cycles_needed(OVERRUN_PROBABILITY)
-    if evidence.all_disturbed:
-        cycles = max(evidence.samples, evidence.disturbed)
+    cycles, needed = evidence_cycles(plan), cycles_needed(OVERRUN_PROBABILITY)
     apart = [one.samples + one.disturbed for one in (evidence.modes or {}).values()]
     fewest = min([cycles, *apart])
-    if fewest < needed:
+    independent = margin.independent_cycles
+    if independent is not None and independent < needed:
+        more = math.ceil(needed * evidence_cycles(plan) / independent)
+        said = f"long cycles come in clusters: {evidence_cycles(plan)} cycles tell as much as"
+        said += f" {independent} independent ones, too few to say how late one output in a hundred"
+        yield f"{said} will be. Record {more} cycles or more."
+    elif fewest < needed:
         of = " of a mode" if fewest < cycles else ""
         said = f"the sample is small: {fewest} cycles{of} are too few to say how late one output in"
         yield f"{said} a hundred will be. Record {needed} cycles{of} or more."
@@ -350,8 +363,24 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
         yield f"{said} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."
 
 
+def modes_with_one_slot(plan: Plan) -> Iterator[tuple[tuple[str, ...], Slot]]:
+    """Modes that the announcement of another does not change anything for, and their slot."""
+    slots = plans.publish_slots(plan)
+    bands = {} if plan.modes is None else plan.modes.bands
+    for number, slot in enumerate(slots, start=1):
+        modes = tuple(mode for mode, band in bands.items() if band == number)
+        if len(modes) > 1:
+            yield modes, slot
+
+
 def _about_evidence(plan: Plan) -> Iterator[str]:
     """What is doubtful about the measurements, or about how much of the cycle is used."""
+    for modes, slot in modes_with_one_slot(plan):
+        opens, closes = map(milliseconds, slot)
+        yield (
+            f"the modes {', '.join(modes)} have the same slot, [{opens}, {closes}) ms: their"
+            " longest latencies are too near for two, so outputs leave at the same time in each"
+        )
     if plan.modes is not None and plan.evidence.modes is None:
         said = "nothing says which mode was in force, so the modes share bands of them all"
         yield f"{said}: one that takes longer is late. Give each one's profile (--mode-profile)."
@@ -372,8 +401,8 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         yield f"{said} latencies, which may be the longest, are not in the plan."
     if margin.confidence_interval_ns:
         low, high = map(duration_text, margin.confidence_interval_ns)
-        epsilon = duration_text(margin.epsilon_ns)
-        yield f"the margin {epsilon} is an estimate, 95 % confidence between {low} and {high}."
+        said = f"the margin {high} is the upper end of an estimate from the tail of the latencies"
+        yield f"{said}, which lies between {low} and that."
     if NEARLY_FULL * cycle < last <= cycle:
         said = f"the plan fills {last / cycle:.1%} of the cycle {duration_text(cycle)}"
         yield f"{said}: an execution a little longer than any measured delays the next one."

@@ -97,7 +97,8 @@ class Evidence(Part):
 
     They are of undisturbed cycles, or of all, where the machine disturbed all but one at most
     (``all_disturbed``). ``max_of_all_ns`` is of all, ``incomplete`` counts traversals without an
-    end, ``utilisation`` is the share of its core that the chain takes, ``interference_ns`` the part
+    end, ``unpublished`` those of them that the application ended without a publication,
+    ``utilisation`` is the share of its core that the chain takes, ``interference_ns`` the part
     of the average and the longest latency that is for others
     (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's asynchronous
     publisher, ``longest_publication_ns`` of its synchronous one; ``publish_slot`` says where Δ is
@@ -111,6 +112,7 @@ class Evidence(Part):
     max_latency_ns: PositiveDuration
     max_of_all_ns: PositiveDuration | None = None
     incomplete: Count = 0
+    unpublished: Count = 0
     disturbed: Count = 0
     realtime: bool | None = None
     longest_stall_ns: Duration | None = None
@@ -135,8 +137,9 @@ class Margin(Part):
     """How far the chain's slot reaches beyond the longest undisturbed latency (ε of eq. 1).
 
     ``given``; ``measured``: it covers all cycles but a share, for which ``stalls_ns`` of it are
-    needed; ``derived`` from the tail of the latencies, with its confidence interval.
-    ``overrun_probability`` is the share of late outputs, at most, with 95 % confidence.
+    needed; ``derived``: it is the upper end of an interval that the tail of the latencies has.
+    ``overrun_probability`` is the share of late outputs, at most, with 95 % confidence;
+    ``independent_cycles`` is how many the sample is worth, where long cycles come in clusters.
     """
 
     epsilon_ns: Duration
@@ -144,6 +147,7 @@ class Margin(Part):
     overrun_probability: Annotated[float, Field(gt=0, le=1)] | None = None
     stalls_ns: Duration = 0
     confidence_interval_ns: tuple[Duration, Duration] | None = None
+    independent_cycles: FromOne | None = None
 
 
 def _callback(value: str) -> str:

@@ -70,7 +70,8 @@ class Profile:
     ``every_step_ns`` are what each callback of the chain took, a row per latency.
     ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
     are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
-    ``interfering`` what else the chain's threads run. The rest is
+    ``interfering`` what else the chain's threads run, ``contradictions`` what in the recording's
+    events contradicts itself about its callbacks, in words. The rest is
     :class:`~chainshaper.planning.plan.Evidence`, and :class:`~.plan.ChainOfPlan`.
     """
 
@@ -97,6 +98,7 @@ class Profile:
     output_depth: int | None = None
     recording: str | None = None
     incomplete: int = 0
+    unpublished: int = 0
     disturbed: int = 0
     realtime: bool | None = None
     longest_stall_ns: int | None = None
@@ -108,6 +110,7 @@ class Profile:
     intra_process: Literal[True] | None = None
     simulated: tuple[str, ...] = ()
     interfering: tuple[Interfering, ...] = ()
+    contradictions: tuple[str, ...] = ()
     lost_events: int | None = None
     all_disturbed: bool | None = None
     of_modes: Mapping[str, "Profile"] = field(default_factory=dict)
@@ -169,8 +172,10 @@ def up_to(profile: Profile, percentile: float) -> Profile:
 
 
 def doubts_about(profile: Profile) -> list[str]:
-    """What else than the chain decides its latencies, one sentence each."""
-    return [*filter(None, (other_beginnings(profile), interfering_callback(profile)))]
+    """What else than the chain decides its latencies, and what in the evidence contradicts itself,
+    one sentence each."""
+    doubts = (other_beginnings(profile), interfering_callback(profile), *profile.contradictions)
+    return [*filter(None, doubts)]
 
 
 def other_beginnings(profile: Profile) -> str | None:
@@ -180,11 +185,10 @@ def other_beginnings(profile: Profile) -> str | None:
     own = {one.node for one in profile.callbacks if (one.node, one.publishes) == first}
     if not own or not (others := [node for node in begin if node not in own]):
         return None
+    begin_apart = ", ".join((profile.nodes[0], *others[:-1]))
     return (
-        f"{profile.name} waits for what {' and '.join(others)} begin{'s' * (len(others) == 1)}, at"
-        f" another time beside {profile.nodes[0]} after every start of the application unless they"
-        " are started together, and its latency is another then: measure it after other starts too,"
-        " or let slots follow (--adapt)"
+        f"{begin_apart} and {others[-1]} start at a new offset to each other at each launch, which"
+        f" changes the latency of {profile.name}. Record several launches, or use --adapt"
     )
 
 

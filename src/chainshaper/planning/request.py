@@ -261,7 +261,8 @@ def _covering(latencies: NDArray[np.int64], profile: Profile, request: PlanReque
     least_ns = margins.least_epsilon_ns(request.publication) + _slot_ns(profile, request)
     latest = None if request.policy in OWN_SLOTS else profile.period_ns - least_ns
     share = request.overrun_probability or margins.OVERRUN_PROBABILITY
-    return margins.covered_latency(latencies, share, latest)
+    independent = margins.independent_cycles(latencies)
+    return margins.covered_latency(latencies, share, latest, independent)
 
 
 def _slot_ns(profile: Profile, request: PlanRequest) -> int:
@@ -404,27 +405,55 @@ def _shaped(
 
 def _margin(profile: Profile, request: PlanRequest) -> Margin:
     every, longest, probability = profile.every, profile.longest_ns, request.overrun_probability
+    independent = margins.independent_cycles(every)
+    clustered = independent if independent < every.size else None
     if request.epsilon_ns is not None:
         if request.epsilon_ns < 0:
             raise InputError("epsilon must be 0 ms or more")
-        late = margins.late_share(every, longest + request.epsilon_ns)
-        return Margin(epsilon_ns=request.epsilon_ns, overrun_probability=late)
+        way = 0 if request.publication == "in-process" else margins.HOP_NS
+        in_time = longest + max(0, request.epsilon_ns - way)
+        late = margins.late_share(every, in_time, independent)
+        return Margin(
+            epsilon_ns=request.epsilon_ns, overrun_probability=late, independent_cycles=clustered
+        )
     covered = profile.latencies_ns if request.ideal_machine else every
-    if probability is not None and probability < margins.MOST_PROBABLE:
-        return margins.derive_margin(covered, probability, request.seed, longest_ns=longest)
-    if probability is not None and covered.size < (needed := margins.cycles_needed(probability)):
-        reason = f"{covered.size} cycles are too few for an overrun probability of {probability:g}"
-        raise OperationError(f"{reason}: measure {needed} or more")
-    stalls = 0
-    shown_late = request.percentile is not None  # what takes longer has been left out
-    if not shown_late and (request.policy not in OWN_SLOTS or request.policy == "pipelined"):
-        stalls = max(0, _covering(covered, profile, request) - longest)  # of no single callback
-    epsilon = margins.least_epsilon_ns(request.publication) + stalls
+    least = margins.least_epsilon_ns(request.publication)
+    # No margin covers cycles for a slot that stands elsewhere, or those that have been left out.
+    covers = request.policy not in OWN_SLOTS or request.policy == "pipelined"
+    if request.percentile is not None:
+        covers = False
+    if probability is not None and covers:
+        margin = margins.derive_margin(
+            covered, probability, request.seed, longest_ns=longest, least_ns=least
+        )
+        if not request.ideal_machine:
+            return margin
+        in_time = longest + margin.epsilon_ns - least
+        late = margins.late_share(every, in_time, independent)
+        beyond = np.any(every > in_time)
+        return margin.model_copy(update={"overrun_probability": late}) if beyond else margin
+    stalls = max(0, _covering(covered, profile, request) - longest) if covers else 0
+    # Of the latencies themselves: what the least margin adds is the way to the shaping node, and
+    # how many cycles end within it is an accident of the sample.
+    late = margins.late_share(every, longest + stalls, independent)
+    usual = margins.OVERRUN_PROBABILITY
+    if covers and covered is every and independent >= margins.cycles_needed(usual):
+        # Which of the longest covers the usual share was fixed before they were seen.
+        rank = margins.covering_rank(independent, usual)
+        if longest + stalls >= np.sort(every)[-rank]:
+            fewer = int(np.count_nonzero(every > longest)) if stalls == 0 else rank - 1
+            surely = margins.most_probable(fewer, independent, margins.WELL_COVERED)
+            late = min(usual, surely)
+    if probability is not None and late > probability:
+        reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
+        remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"
+        raise OperationError(f"{reason}: {remedy}. Leave out --overrun-probability")
     return Margin(
-        epsilon_ns=epsilon,
+        epsilon_ns=least + stalls,
         source="measured",
-        overrun_probability=margins.late_share(every, longest + epsilon),
+        overrun_probability=late,
         stalls_ns=stalls,
+        independent_cycles=clustered,
     )
 
 

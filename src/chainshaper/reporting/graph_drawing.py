@@ -28,7 +28,7 @@ import numpy as np
 from chainshaper.analysis.chains import depth_first_order
 from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.planning.offsets import linked
-from chainshaper.reporting.tables import Column, ResultTable, words
+from chainshaper.reporting.tables import Column, ResultTable, listed, words
 from chainshaper.values.application import INTERNAL_SERVICES, INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import format_duration
 from chainshaper.values.errors import escape, shown
@@ -103,7 +103,8 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
     graph = application.graph
     names = ("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes", "passes_on")
     callbacks = [
-        {name: getattr(one, name) for name in names} | {"internal": is_internal(one.topic)}
+        {name: getattr(one, name) for name in names}
+        | {"pids": list(one.processes), "internal": is_internal(one.topic)}
         for one in graph.callbacks
     ]
     topics = []
@@ -117,7 +118,10 @@ def application_json(application: ApplicationDescription) -> dict[str, Any]:
         fresh = {"name": name, "servers": [], "clients": [], "internal": is_internal(name)}
         services.setdefault(name, fresh)[f"{role}s"].append(node or "")
     return {
-        "nodes": [{"name": node.name, "pid": node.pid} for node in graph.nodes],
+        "nodes": [
+            {"name": node.name, "pid": node.pid, "pids": list(node.processes)}
+            for node in graph.nodes
+        ],
         "callbacks": callbacks,
         "topics": topics,
         "services": list(services.values()),
@@ -136,7 +140,7 @@ def application_table(application: ApplicationDescription) -> ResultTable:
             for one in node.callbacks
         ]
         for own in cells or [("", "", "")]:
-            table.add(node.name, str(node.pid), *own)
+            table.add(node.name, node.processes, *own)
     return table
 
 
@@ -174,11 +178,12 @@ class _NodeBox:
 
     name: str
     pid: int
+    processes: str  # of a node that was started again all
     callbacks: Sequence[Callback]
 
     @property
     def box(self) -> "Box":
-        widths = [CHARACTER * (len(self.name) + 1) + SMALL * (len(str(self.pid)) + 4)]
+        widths = [CHARACTER * (len(self.name) + 1) + SMALL * (len(self.processes) + 4)]
         for callback in self.callbacks:
             trigger, function = _row_texts(callback)
             widths += [CHARACTER * len(trigger) + 14, SMALL * len(function) + 14]
@@ -192,7 +197,8 @@ class _NodeBox:
             f'<rect class="head" x="1" y="1" width="{width - 2:.1f}" height="{TITLE - 2:.1f}"'
             ' rx="4"/>',
             f'<text class="title" x="{PAD}" y="18">{escape(self.name)}</text>',
-            f'<text class="small" x="{width - PAD:.1f}" y="18" text-anchor="end">{self.pid}</text>',
+            f'<text class="small" x="{width - PAD:.1f}" y="18" text-anchor="end">'
+            f"{self.processes}</text>",
         ]
         for row, callback in enumerate(self.callbacks):
             top, (trigger, function) = TITLE + ROW * row, _row_texts(callback)
@@ -216,12 +222,15 @@ def _row_texts(callback: Callback) -> tuple[str, str]:
 
 
 def _nodes(application: ApplicationDescription) -> list[_NodeBox]:
-    rows: dict[tuple[str, int], list[Callback]] = {
-        (node.name, node.pid): [] for node in application.graph.nodes
-    }
-    for callback in application.graph.callbacks:
+    graph = application.graph
+    rows: dict[tuple[str, int], list[Callback]] = {(one.name, one.pid): [] for one in graph.nodes}
+    for callback in graph.callbacks:
         rows.setdefault((callback.node, callback.pid), []).append(callback)
-    return [_NodeBox(name, pid, own) for (name, pid), own in rows.items()]
+    processes = {(one.name, one.pid): listed(one.processes) for one in graph.nodes}
+    return [
+        _NodeBox(name, pid, processes.get((name, pid), str(pid)), own)
+        for (name, pid), own in rows.items()
+    ]
 
 
 def application_svg(application: ApplicationDescription) -> str:
@@ -307,7 +316,7 @@ def application_dot(application: ApplicationDescription) -> str:
     if any(application.lost.values()):
         lines.append(f"  label={_quoted(lost_text(application.lost))};")
     for index, node in enumerate(_nodes(application)):
-        title = _quoted(f"{node.name} (process {node.pid})")
+        title = _quoted(f"{node.name} (process {node.processes})")
         lines += [f"  subgraph cluster_{index} {{", f"    label={title};"]
         lines.append(f'    node_{index} [shape=point, style=invis, label=""];')
         for one in node.callbacks:

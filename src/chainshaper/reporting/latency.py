@@ -24,7 +24,7 @@ from chainshaper.reporting.tables import (
     slots_ms,
     words,
 )
-from chainshaper.values.durations import milliseconds
+from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
 from chainshaper.verify.overruns import (
     dropped_text,
@@ -33,7 +33,8 @@ from chainshaper.verify.overruns import (
     next_cycles,
     overruns_text,
 )
-from chainshaper.verify.predictions import JudgedFigure, JudgedPrediction
+from chainshaper.verify.predictions import JudgedFigure, JudgedPrediction, jitter_within_band
+from chainshaper.verify.promises import outputs_due
 
 LATE = ("came late", "maximum", "jitter (max − min)")
 """The rows that say what happened to cycles that are called disturbed."""
@@ -123,7 +124,8 @@ def comparison_json(comparison: Comparison) -> dict[str, Any]:
         if measurement.prediction is not None:
             entry["prediction"] = prediction_json(measurement.prediction)
         entries.append(entry)
-    return {"format": JSON_FORMAT, "chain": comparison.chain, "recordings": entries}
+    about = {"format": JSON_FORMAT, "chain": comparison.chain, "remark": comparison.remark}
+    return {**about, "recordings": entries}
 
 
 def comparisons_json(comparisons: Sequence[Comparison]) -> dict[str, Any]:
@@ -148,7 +150,9 @@ def latency_table(measurement: Measurement) -> ResultTable:
         columns = dict([*columns.items()][::2])
     title = f"End-to-end latency of {analysis.chain.spec} [ms]"
     table = ResultTable(title, [*words(""), *figures(*columns)], measurement.left_out.text)
-    for title, cells in _rows([*columns.values()]).items():
+    for name, cells in _rows([*columns.values()]).items():
+        # Without a plan no output is due at any time: its period is what there is to compare with.
+        title = "longer than the period" if name == LATE[0] and measurement.plan is None else name
         table.add(title, *cells, detail=title in ("median", "99th percentile"))
     return table
 
@@ -211,10 +215,13 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
     remarks = [
         f"{m.recording.path.name}: {m.left_out.text}" for m in measurements if m.left_out.text
     ]
+    if comparison.remark:
+        remarks.append(comparison.remark)
     planned = [m.plan for m in measurements if m.plan is not None]
     if planned:
         remarks.append(
-            f"planned: slots {slots_ms(*publish_slots(planned[-1]))}; {expected_text(planned[-1])}"
+            f"planned: slots {slots_ms(*publish_slots(planned[-1]))};"
+            f" {expected_jitter_text(planned[-1])}"
         )
     table.caption = "\n".join(remarks) or None
     return table
@@ -230,23 +237,61 @@ def expected_text(plan: Plan) -> str:
     average = f", average {milliseconds(seen.mean_ns)}" if len(seen.leave_ns) > 1 else ""
     if average and plan.evidence.interference_ns:  # as far as other chains delay it
         average += f" to {milliseconds(predicted.mean_ns)}"
-    return f"outputs leave at {places}{average}; expected jitter {milliseconds(seen.jitter_ns, 1)}"
+    return f"outputs leave at {places}{average}"
+
+
+def expected_jitter_text(plan: Plan) -> str:
+    """What :func:`expected_text` says, and the jitter that is expected of it: within each band."""
+    seen, slots = expected(plan), publish_slots(plan)
+    if seen is None:
+        return expected_text(plan)
+    if len(slots) == 1 or plan.modes is not None:
+        return f"{expected_text(plan)}; expected jitter {milliseconds(seen.jitter_ns, 1)}"
+    within = (jitter_within_band(plan, slot, last=slot == slots[-1]) for slot in slots)
+    jitters = ", ".join(milliseconds(one, 1) for one in within)
+    return f"{expected_text(plan)}; jitter within bands at most {jitters}"
 
 
 def verdict(one: Measurement) -> tuple[bool | None, str]:
     """Whether a recording has what its plan promised (None: nothing to judge), in a sentence."""
-    judged, statistics, name = one.prediction, one.analysis.statistics, one.recording.path.name
+    judged, name = one.prediction, one.recording.path.name
     if judged is None or one.plan is None:
         return None, f"{name}: no plan was in force, so nothing was promised"
-    aside = f"; without {statistics.disturbed} of {statistics.count} cycles, disturbed by the"
-    aside = f"{aside} machine" if statistics.disturbed else ""
+    effect = stall_effect(one)
+    aside = "" if effect is None else f"; {effect}"
     if judged.broken:
         return False, f"{name}: promise broken: {'; '.join(judged.broken)}{aside}"
     if judged.mean.measured_ns is None:
         return None, f"{name}: no undisturbed cycle to judge the promise by{aside}"
-    of_all, jitter = judged.late_of_all, f"jitter {ms(judged.jitter.measured_ns)} ms"
-    late = "" if of_all is None else f", {of_all} of {judged.cycles} outputs late"
-    return True, f"{name}: promise met: {jitter}{late} ({expected_text(one.plan)}){aside}"
+    met = f"{name}: promise met: {judged.jitter_text}; {judged.outputs.text}"
+    return True, f"{met} ({expected_text(one.plan)}){aside}"
+
+
+def stall_effect(one: Measurement) -> str | None:
+    """What stalls of the machine did to a chain's figures at publication, and what these are
+    without the cycles that they disturbed; None where no stall was seen.
+    """
+    every, calm = one.analysis.statistics, one.analysis.undisturbed
+    if not one.longest_stall_ns:
+        return None
+    longest = duration_text(round(one.longest_stall_ns, -5) or one.longest_stall_ns)
+    said = f"stalls of the machine, {longest} at most, disturbed"
+    if not every.disturbed:
+        return f"{said} no cycle"
+    kinds = (("with these", every), ("without them", calm))
+    bands = 1 if one.plan is None else len(publish_slots(one.plan))
+    figures = "; ".join(f"{kind} {_brief(statistics, bands)}" for kind, statistics in kinds)
+    return f"{said} {every.disturbed} of {every.count} cycles: {figures}"
+
+
+def _brief(statistics: LatencyStatistics, bands: int) -> str:
+    """Jitter, spread and late outputs in a few words; of several bands the longest latency, since
+    what lies between bands is no jitter.
+    """
+    late = "" if statistics.late is None else f", {statistics.late} late"
+    if bands > 1:
+        return f"longest {ms(statistics.max_ns)} ms{late}"
+    return f"jitter {ms(statistics.jitter_ns)} ms, spread {ms(statistics.spread_ns)} ms{late}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
@@ -278,8 +323,9 @@ def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
 
 
 def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
-    """What a reader remembers, in one sentence: the jitter and the average before and after, and
-    whether they are as the plan predicted. Cycles are undisturbed ones, at publication."""
+    """What a reader remembers: the jitter and the average before and after, and whether they are
+    as the plan predicted, of undisturbed cycles, at publication; and what stalls did to the last.
+    """
     calm = [one.analysis.undisturbed for one in measurements]
     ends = [0, -1] if len(calm) > 1 else [0]
     jitter, average = (
@@ -287,26 +333,29 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
         for field in ("jitter_ns", "mean_ns")
     )
     said, judged = f"Jitter {jitter}; average {average}", measurements[-1].prediction
+    effect = stall_effect(measurements[-1])
+    aside = f" {effect[0].upper()}{effect[1:]}." if effect is not None else ""
     if judged is None:
-        return f"{said}."
+        return f"{said}.{aside}"
     if judged.broken:
-        return f"{said}; differs from the prediction: {'; '.join(judged.broken)}."
+        return f"{said}; differs from the prediction: {'; '.join(judged.broken)}.{aside}"
     holds = {one.holds for one in (judged.mean, judged.max, judged.jitter)}
     verdict = "not judged" if holds == {None} else "as predicted"
-    late = ABSENT if judged.late_of_all is None else judged.late_of_all
-    return f"{said}; {verdict}, {late} of {judged.cycles:,} late."
+    return f"{said}; {verdict}, {judged.outputs.text}.{aside}"
 
 
 def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ()) -> ResultTable:
     """One row per chain of an application, each recording's figures of undisturbed cycles."""
     names = names or [one.recording.path.name for one in comparisons[0].measurements]
     fields = {"jitter": "jitter_ns", "average": "mean_ns", "maximum": "max_ns"}
-    titles = [f"{title}\n{name}" for title in (*fields, "late of all") for name in names]
+    titles = [f"{title}\n{name}" for title in (*fields, "missed of all") for name in names]
     table = ResultTable("At publication [ms]", [*words("chain"), *figures(*titles)])
     for chain in comparisons:
         found = [one.analysis for one in chain.measurements]
         times = (getattr(one.undisturbed, field) for field in fields.values() for one in found)
-        table.add(chain.chain, *map(ms, times), *(one.statistics.late for one in found))
+        outputs = (outputs_due(one.analysis, one.plan) for one in chain.measurements)
+        missed = (ABSENT if one.late is None and not one.missed else one.missed for one in outputs)
+        table.add(chain.chain, *map(ms, times), *missed)
     return table
 
 
@@ -339,20 +388,19 @@ def prediction_table(judged: JudgedPrediction, name: str = "") -> ResultTable:
         )
     of_mode = "; shares of a mode: its outputs that were in time for its slot"
     late = of_mode if any(band.mode for band in judged.bands) else ""
-    late += "" if judged.late_of_all is None else f"; {late_text(judged)}"
+    late += "" if judged.outputs.late is None else f"; {late_text(judged)}"
     table.caption = (
-        "undisturbed cycles; predicted: outputs at the start … the end of their slots (a gate"
-        " publishes at the start, eq. 5 counts the end), averages with three standard errors, no"
-        f" band that may well be empty{late}"
+        "undisturbed cycles; ranges run from slot start to slot end: expect the start. Averages"
+        f" have room for chance{late}"
     )
     return table
 
 
 def late_text(judged: JudgedPrediction) -> str:
-    """How many outputs came late, no cycle left out."""
-    disturbed = (judged.late_of_all or 0) - judged.late
-    among = f", {disturbed} of them in disturbed cycles" if disturbed else ""
-    return f"of all {judged.cycles} outputs {judged.late_of_all} came late{among}"
+    """How many outputs that were due came late or never, no cycle left out."""
+    disturbed = (judged.outputs.late or 0) - judged.late
+    among = f", {disturbed} of the late ones in disturbed cycles" if disturbed else ""
+    return f"of all cycles: {judged.outputs.text}{among}"
 
 
 def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
@@ -368,7 +416,11 @@ def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
         "jitter_ns": plain(judged.jitter),
         "bands": [vars(band) for band in judged.bands],
         "late": judged.late,
-        "late_of_all": judged.late_of_all,
+        "late_of_all": judged.outputs.late,
+        "due": judged.outputs.due,
+        "absent": dict(judged.outputs.absent),
+        "missed": judged.outputs.missed,
+        "most_missed": judged.outputs.most_missed,
         "counted_from": judged.counted_from,
         "kept": not judged.broken if judged.broken or judged.mean.measured_ns is not None else None,
         "broken": list(judged.broken),
@@ -376,24 +428,30 @@ def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
 
 
 def breakdown_json(analysis: LatencyAnalysis) -> dict[str, Any]:
-    """The breakdown as plain data: ``hops``, and the two parts' shares of the mean latency."""
+    """The breakdown as plain data: ``hops``, and the parts' shares of the mean latency."""
     frame = hop_breakdown(analysis)
     shares = {f"{part}_share": share for part, share in part_shares(frame).items()}
     return {"hops": frame.to_dicts(), **shares}
 
 
 def breakdown_table(analysis: LatencyAnalysis) -> ResultTable:
-    """Every hop's communication and computation, and their shares of the mean latency."""
+    """Every hop's communication, computation and waiting, and their shares of the mean latency.
+
+    Where no message waits in a node, that has no columns.
+    """
     frame = hop_breakdown(analysis)
+    waits = frame["waiting_ns"].struct.field("max").fill_null(0).max()
+    shown = PARTS if waits else PARTS[:2]
     cycles = Column("cycles", footer=str(analysis.statistics.count), detail=True)
     columns = [Column("hop", words=True, footer="together"), cycles]
     for part, share in part_shares(frame).items():
-        columns += [Column(f"{part}\nmin", detail=True), *figures(f"{part}\nmean", "max")]
-        columns.append(Column("share", footer=percent(share)))
+        if part in shown:
+            columns += [Column(f"{part}\nmin", detail=True), *figures(f"{part}\nmean", "max")]
+            columns.append(Column("share", footer=percent(share)))
     table = ResultTable("Where it goes, hop by hop [ms]", columns)
     for row in frame.iter_rows(named=True):
         cells: list[str] = []
-        for part in PARTS:
+        for part in shown:
             cells += [*min_mean_max(row[f"{part}_ns"]), percent(row[f"{part}_share"])]
         table.add(f"{row['callback']} → {row['topic']}", row["count"], *cells)
     return table

@@ -16,7 +16,7 @@ from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
 from chainshaper.planning.plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
-from chainshaper.reporting.latency import expected_text
+from chainshaper.reporting.latency import expected_jitter_text
 from chainshaper.reporting.tables import (
     ABSENT,
     YES_NO,
@@ -44,7 +44,7 @@ from chainshaper.values.recording import (
     event_counts,
     lost_text,
 )
-from chainshaper.verify.measure import Measurement
+from chainshaper.verify.measure import PARTS, Measurement
 
 if TYPE_CHECKING:  # only their verbs import them
     from chainshaper.verify.budgets import Judged
@@ -61,7 +61,9 @@ SWEEP_FIGURES = {
     "band_jitter_ns": "jitter\nin a band",
     "late": "late",
     "incomplete": "no output",
+    "kept": "promise",
 }
+PROMISE = {True: "met", False: "broken", None: ABSENT}
 
 
 def contents_json(recording: Recording) -> dict[str, Any]:
@@ -110,8 +112,9 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
 
 
 def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
-    """Callback statistics as plain data: response and execution times in ns."""
-    columns = ("node", "kind", "topic", "period_ns", "pid", "tids", "count")
+    """Callback statistics as plain data: response and execution times in ns; ``pid`` is the last
+    of ``pids``, the processes of a node that was started again."""
+    columns = ("node", "kind", "topic", "period_ns", "pid", "pids", "tids", "count")
     return statistics.select(*columns, "response_ns", "execution_ns").to_dicts()
 
 
@@ -155,7 +158,7 @@ def _chain(graph: ApplicationGraph, chain: Chain) -> dict[str, Any]:
     return {
         "chain": chain.spec,
         "nodes": [callback.node for callback in path],
-        "callbacks": [callback.label for callback in path],
+        "callbacks": [graph.label(callback) for callback in path],
         "topics": list(chain.topics),
     }
 
@@ -373,8 +376,8 @@ def plan_table(plan: Plan) -> ResultTable:
             what = "publisher" if publishes else ", ".join(thread.callbacks)
             threads.append(f"{thread.node} ({what})" if what else thread.node)
         table.add(one.name, one.core, one.priority, slots_ms(*one.slots), ", ".join(threads))
-    offset = f", starting {milliseconds(plan.offset_ns)} late" if plan.offset_ns else ""
-    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_text(plan)}"
+    offset = f", offset {milliseconds(plan.offset_ns)}" if plan.offset_ns else ""
+    table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_jitter_text(plan)}"
     return table
 
 
@@ -493,6 +496,10 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             if one.shares:
                 others = max(1.0 - one.early - sum(one.shares), 0.0)
                 title += f", before the first: {percent(one.early)}, outside: {percent(others)}"
+        if one.kept is not None:
+            met = "met" if one.kept else "broken"
+            title += f"; promise {met} over the hour: {one.outputs.text},"
+            title += f" {one.outputs.most_missed} at most"
         names = ("cycles", "min", "p50", "p99", "max", "jitter", "late", "incomplete")
         table = ResultTable(title, [*words("last [ms]"), *figures(*names)], one.problem)
         for span, own in one.spans.items():
@@ -501,13 +508,15 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
             table.add(span, own.count, *times, own.late, own.incomplete)
         tables.append(table)
         if one.hops:
-            hops = ResultTable("", [*words("node", "topic"), *figures("waits", "computes")])
+            hops = ResultTable("", [*words("node", "topic"), *figures(*PARTS)])
             for hop in one.hops:
-                hops.add(hop.node, hop.topic, ms(hop.communication_ns), ms(hop.computation_ns))
+                hops.add(hop.node, hop.topic, *(ms(getattr(hop, f"{part}_ns")) for part in PARTS))
             tables.append(hops)
     lost = f"; {seen.lost} events lost" if seen.lost else ""
     if unclear := sum(one.counted["unclear"] for one in seen.chains):
         lost += f"; {unclear} cycles unclear: the clock was set"
+    if unused := sum(one.counted["not_used"] for one in seen.chains):
+        lost += f"; {unused} messages not used: newer ones were stored"
     tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
     return tables
 
@@ -555,6 +564,7 @@ def sweep_table(frame: pl.DataFrame) -> ResultTable:
     names = [name.removesuffix("_ns") for name in (*axes, *SWEEP_FIGURES.values())]
     table = ResultTable("Simulated end-to-end latency [ms]", figures(*names))
     for row in frame.head(MOST_ROWS).to_dicts():
+        row["kept"] = PROMISE[row["kept"]]
         found = [ms(row[n]) if n.endswith("_ns") else row[n] for n in SWEEP_FIGURES]
         if row["error"] is not None:
             found = ["failed", *([""] * (len(found) - 1))]

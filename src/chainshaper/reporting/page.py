@@ -387,16 +387,22 @@ def latency_range(recordings: Sequence[dict[str, Any]]) -> tuple[float, float]:
     return 0 if low < 0.25 * high else low - air, high + air
 
 
+_OPACITY = {"communication": 0.35, "waiting": 0.15}
+
+
 def _hop_bars(parts: Sequence[_Part]) -> dict[str, Any]:
-    """Mean communication (pale) and computation (full) of every hop, a row per recording."""
+    """Mean communication (pale), computation (full) and waiting (palest) of every hop, a row per
+    recording."""
     rows, longest = [], 1.0
     for series, one in enumerate(parts):
         bars, at = [], 0.0
         breakdown = hop_breakdown(one.measurement.analysis)
         for number, hop in enumerate(breakdown.iter_rows(named=True)):
-            for part in (part for part in PARTS if hop[f"{part}_ns"] is not None):
-                mean, share = hop[f"{part}_ns"]["mean"], hop[f"{part}_share"]
-                opacity = 0.35 if part == "communication" else 0.8 if number % 2 else 1
+            for part in PARTS:
+                mean, share = (hop[f"{part}_ns"] or {}).get("mean"), hop[f"{part}_share"]
+                if not mean:
+                    continue
+                opacity = _OPACITY.get(part, 0.8 if number % 2 else 1)
                 text = f"{hop['callback']} → {hop['topic']}\n{part} {ms(mean)} ms, {share:.1%}"
                 bars.append((at, at + mean, f"series-{series % 4}", opacity, text))
                 at += mean

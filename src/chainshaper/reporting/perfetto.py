@@ -30,7 +30,7 @@ from chainshaper.values.application import trigger_text
 from chainshaper.values.errors import extra_library, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
-from chainshaper.verify.measure import Measurement
+from chainshaper.verify.measure import PARTS, Measurement
 
 ENDINGS = (".pftrace", ".perfetto-trace")
 
@@ -208,11 +208,12 @@ def _messages(flow: DataFlow) -> Iterator[tuple[Thread, Slice]]:
 
 
 def _chain_track(analysis: LatencyAnalysis) -> Track:
-    """Traversals, each with the computation of its hops inside; incomplete ones as instants."""
+    """Traversals, each with its hops inside, from start to publication; incomplete ones as
+    instants."""
     path, hops = analysis.graph.path(analysis.chain), defaultdict[int, list[Slice]](list)
     for row in analysis.hops.drop_nulls("publish").sort("traversal", "hop").iter_rows(named=True):
         name = f"{path[row['hop']].node} → {row['topic']}"
-        arguments = {"communication_ns": row["communication_ns"], "via": row["via"]}
+        arguments = {f"{part}_ns": row[f"{part}_ns"] for part in PARTS} | {"via": row["via"]}
         hops[row["traversal"]].append(Slice(row["start"], row["publish"], name, arguments))
     families = []
     for row in analysis.traversals.iter_rows(named=True):

@@ -188,7 +188,7 @@ def timeline_data(
         .sort("traversal", "hop")
         .select("traversal", "hop", "row", *times)
     )
-    labels = {callback.id: callback.label for callback in analysis.graph.callbacks}
+    labels = {one.id: analysis.graph.label(one) for one in analysis.graph.callbacks}
     slices = (
         _inside(timeline.slices, windows)
         .join(threads, on=["pid", "tid"], maintain_order="left")

@@ -43,7 +43,7 @@ class Tracer(Protocol):
     """A way of recording events, made for one run.
 
         start() ─► the application runs; failure() is asked now and then ─► stop() ─► remove()
-                                                                                ─► recording()
+                                                               ─► recording() ─► written()
 
     It gets an empty folder on the disk of the recording, which becomes its `trace/`; the
     application's command (empty: it runs already), and the processes to attach to (empty: those
@@ -67,3 +67,6 @@ class Tracer(Protocol):
 
     def recording(self) -> tuple[EventTables, RecordingInfo]:
         """The events, and what they tell, after `stop` and `remove`. Raises OperationError."""
+
+    def written(self) -> None:
+        """The recording is on disk: remove what says no more than its tables do."""

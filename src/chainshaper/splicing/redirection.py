@@ -289,9 +289,12 @@ def launch_description(
     )
     every: list[Any] = [within, actions.OpaqueFunction(function=_begin, args=[redirects])]
     for name, value in environment.items():
-        others = os.environ.get(name, "") if name == "LD_PRELOAD" else ""
-        whole = f"{value}:{others}" if others else value
-        every.append(actions.SetEnvironmentVariable(name, whole))
+        words = [value]
+        if name == "LD_PRELOAD":  # the first library is asked first
+            words = [value, os.environ.get(name, "")]
+        elif name == "ASAN_OPTIONS":  # the last word counts
+            words = [os.environ.get(name, ""), value]
+        every.append(actions.SetEnvironmentVariable(name, ":".join(filter(None, words))))
     every += [(Node if "package" in one else actions.ExecuteProcess)(**one) for one in processes]
     for file in files:
         description = AnyLaunchDescriptionSource(file).get_launch_description(LaunchContext())

@@ -15,6 +15,7 @@ from pydantic import TypeAdapter
 
 from chainshaper.gate.decision import DROPPED
 from chainshaper.gate.handover import MOVING, STANDING_BY, VERSION, Page, page_folders
+from chainshaper.linux.processes import run_users, user_name
 from chainshaper.linux.threads import innermost_id, parents, read_proc, status_field
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
@@ -27,7 +28,8 @@ _PAGE = re.compile(rf"/(?:chainshaper/outputs|chainshaper-\d+)/[^/]+\.v{VERSION}
 
 @dataclass(frozen=True)
 class ShapedOutput:
-    """An output with a shaping node, as it is now; it counts since the machine has booted.
+    """An output with a shaping node, as it is now. It counts since the launch of the shaping node
+    began, which may have started that again; ``messages_in_all`` since the machine has booted.
 
     ``state`` is ``bypassed`` or ``silent`` while no shaping node is in force, and ``no standby``
     when one is, but nothing would stand in for it: a gate ``in process`` ends with its publisher.
@@ -46,6 +48,7 @@ class ShapedOutput:
     late: int  # of both: behind the last slot that they were due in
     moved_ns: int  # its slots follow the latencies, and are by so much not where the plan has them
     page: str
+    user: int  # whose page it is: nobody else's says anything of this user's outputs
 
 
 def find_outputs(folders: Iterable[str] | None = None) -> tuple[ShapedOutput, ...]:
@@ -92,19 +95,23 @@ def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
 
 def output_text(output: ShapedOutput) -> str:
     """The state of an output in a line, with what the gate has counted."""
-    shaped = f"{output.topic} is shaped by process {output.shaping_node}"
+    topic = output.topic
+    if output.user not in run_users():  # any user may have a page that names any topic
+        topic = f"{topic} of user {user_name(output.user)}"
+    shaped = f"{topic} is shaped by process {output.shaping_node}"
     since_ns = 0 if output.since_ns is None else time.monotonic_ns() - output.since_ns
     gone = f"for {duration_text(since_ns // 1_000_000 * 1_000_000)}, {output.messages} messages"
     text = {
         "shaped": shaped,
         "in process": f"{shaped}, which publishes it",
         "no standby": f"{shaped}, but has no standby: it falls silent when that ends",
-        "bypassed": f"{output.topic} is bypassed {gone} go around its shaping node",
-        "silent": f"{output.topic} is silent {gone} were not published",
+        "bypassed": f"{topic} is bypassed {gone} go around its shaping node",
+        "silent": f"{topic} is silent {gone} were not published",
     }[output.state]
     lost = "".join(f", {count} {why}" for why, count in output.lost.items())
     if output.published or lost:
-        text += f"; so far {output.published} messages published, {output.late} late{lost}"
+        published = f"{output.published} messages published, {output.late} late{lost}"
+        text += f"; in this run so far {published}"
     if output.moved_ns:
         sign = "-" if output.moved_ns < 0 else "+"
         text += f"; its slots are moved by {sign}{duration_text(abs(output.moved_ns))}"
@@ -117,13 +124,19 @@ def ask_phase(topic: str, pids: Collection[int], phase_ns: int) -> None:
     Raises OperationError: none of these processes publishes the output, or several do.
     """
     with closing(_page_of(topic, pids)) as page:
-        page.put("asked_phase_ns", phase_ns)
-        page.put("phases_asked", page["phases_asked"] + 1)
+        page["asked_phase_ns"] = phase_ns
+        page["phases_asked"] += 1
 
 
 def _page_of(topic: str, pids: Collection[int]) -> Page:
-    of_topic = [one for one in find_outputs() if one.topic == topic and one.shaping_node]
-    found = [one for one in of_topic if not pids or one.shaping_node in pids]
+    """The page of an output that one of these processes publishes; of any of ours, without them."""
+    of_topic = [output for output in find_outputs() if output.topic == topic]
+    found = [
+        output
+        for output in of_topic
+        if (output.shaping_node in pids if pids else output.user in run_users())
+        and output.shaping_node
+    ]
     if len(found) != 1:
         raise OperationError(
             f"slots of {topic} cannot follow: {len(found) or 'no'} gates publish it now that show"
@@ -143,7 +156,7 @@ class FollowedOutput:
     def __init__(self, topic: str, pids: Collection[int] = ()) -> None:
         self._page = _page_of(topic, pids)
         if not self._page.is_locked(MOVING):  # by how much a run before moved them is over
-            self._page.put("moved_from_ns", 0)
+            self._page["moved_from_ns"] = 0
         if not self._page.lock(MOVING):
             self._page.close()
             raise OperationError(
@@ -169,9 +182,9 @@ class FollowedOutput:
 
     def move(self, by_ns: int, from_ns: int) -> None:
         """Have slots be by so much not where the gate has them, in cycles from an instant on."""
-        self._page.put("moved_from_ns", 0)
-        self._page.put("moved_ns", by_ns)
-        self._page.put("moved_from_ns", from_ns)
+        self._page["moved_from_ns"] = 0
+        self._page["moved_ns"] = by_ns
+        self._page["moved_from_ns"] = from_ns
 
     def close(self) -> None:
         """The slots go back to where the gate has them."""
@@ -190,6 +203,7 @@ def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
     standby = page["standby"] if page.is_locked(STANDING_BY) else 0
     holder, standby = pid_of.get(holder, holder), pid_of.get(standby, standby)
     holder = holder if _is_of(holder, page.owner) else 0
+    standby = standby if _is_of(standby, page.owner) else 0
     if not holder and not standby:
         return []
     since = page["bypassing_since_ns"] if standby else 0
@@ -214,5 +228,6 @@ def _looked_at(page: Page, pid_of: Mapping[int, int]) -> list[ShapedOutput]:
             late=page["late"],
             moved_ns=page["moved_ns"] if page["moved_from_ns"] and page.is_locked(MOVING) else 0,
             page=page.path,
+            user=page.owner,
         )
     ]

@@ -27,7 +27,7 @@ from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
 from chainshaper.sources.preload import compile_library, in_cache
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.files import write_whole
 from chainshaper.values.plan_choices import STANDBY, NodeKind
 
@@ -535,11 +535,10 @@ def build_package(folder: Path) -> Path:
         cwd=folder,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
-        text=True,
         check=False,
     )
     if build.returncode:
-        end = "\n".join(build.stdout.splitlines()[-20:])
+        end = "\n".join(text_of(build.stdout).splitlines()[-20:])
         raise OperationError(
             f"{folder}: `colcon build` failed with exit code {build.returncode}; all it said is in "
             f"{folder / 'log' / 'latest_build'}. It ended with:\n{end}"

@@ -22,7 +22,7 @@ from chainshaper.splicing import redirection
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import ShapingProcess
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.files import folder_beside, open_to_all
+from chainshaper.values.files import folder_beside, open_to_all, rename_output, write_whole
 from chainshaper.values.yaml_file import read_text
 
 MANIFEST = "splice.json"
@@ -275,12 +275,12 @@ def new_folder(
     try:
         with folder_beside(folder) as made:
             partial = Path(made)
-            shutil.copyfile(redirection.__file__, partial / "redirection.py")
+            write_whole(partial / "redirection.py", [Path(redirection.__file__).read_bytes()])
             yield partial
             (partial / LOGS).mkdir()
             manifest = {"throttled": throttled, "copies": dict(copies), "files": _hashes(partial)}
             text = json.dumps({"format": _FORMAT, **manifest}, indent=2) + "\n"
-            (partial / MANIFEST).write_text(text, encoding="utf-8")
+            write_whole(partial / MANIFEST, [text.encode()])
             open_to_all(partial)
             if _manifest(folder) != manifest or _hashes(folder) != manifest["files"]:
                 _replace(folder, partial)
@@ -291,20 +291,20 @@ def new_folder(
 def _replace(folder: Path, new: Path) -> None:
     """Put a new folder in the place of an older one of ours, which comes back if that fails."""
     if not folder.exists():
-        new.rename(folder)
+        rename_output(new, folder)
         return
     aside = _moved_aside(folder)
     try:
-        new.rename(folder)
+        rename_output(new, folder)
     except OSError:
-        aside.rename(folder)
+        rename_output(aside, folder)
         raise
     shutil.rmtree(aside, ignore_errors=True)
 
 
 def _moved_aside(folder: Path) -> Path:
     aside = Path(tempfile.mkdtemp(prefix=f".{folder.name}.older-", dir=folder.parent))
-    return folder.rename(aside)
+    return rename_output(folder, aside)
 
 
 def undo_splice(folder: str | Path) -> None:

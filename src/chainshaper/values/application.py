@@ -29,10 +29,20 @@ def trigger_text(topic: str | None, period_ns: int | None) -> str:
 
 @dataclass(frozen=True)
 class Node:
-    """A ROS 2 node: a name in a process. ``name`` includes the namespace (``/front/filter``)."""
+    """A ROS 2 node: a name in a process. ``name`` includes the namespace (``/front/filter``).
+
+    A node that was started again has its last process in ``pid``, and those before that in
+    ``earlier_pids``.
+    """
 
     name: str
     pid: int
+    earlier_pids: tuple[int, ...] = ()
+
+    @property
+    def processes(self) -> tuple[int, ...]:
+        """All of its processes, in order."""
+        return (*self.earlier_pids, self.pid)
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,7 @@ class Callback:
 
     ``id`` numbers the callbacks of one graph from 0 and is the key that analysis tables use;
     ``handle`` is its address in the traced process, which other processes may use as well.
+    ``earlier_pids`` are the processes before ``pid`` of a node that was started again.
     """
 
     id: int
@@ -54,6 +65,12 @@ class Callback:
     publishes: tuple[str, ...] = ()  # topics written by its instances (and, synchronised, for it)
     passes_on: tuple[str, ...] = ()  # those of `publishes` that another callback writes for it
     in_turns: tuple[str, ...] = ()  # those that it or another writes, whichever has the last input
+    earlier_pids: tuple[int, ...] = ()
+
+    @property
+    def processes(self) -> tuple[int, ...]:
+        """All processes in which it ran, in order."""
+        return (*self.earlier_pids, self.pid)
 
     @property
     def trigger(self) -> str | None:
@@ -89,6 +106,17 @@ class ApplicationGraph:
     @property
     def topics(self) -> tuple[str, ...]:
         return tuple(sorted(self.publishers.keys() | self.subscribers.keys()))
+
+    def label(self, callback: Callback) -> str:
+        """The callback's label, with its process where two nodes of its name ran at once."""
+        named = self.node_text(callback)
+        return f"{named}{callback.label.removeprefix(callback.node)}"
+
+    def node_text(self, callback: Callback) -> str:
+        """The callback's node as a way point: ``/talker``, of two at once ``/talker@4711``."""
+        namesakes = {one.pid for one in self.callbacks if one.node == callback.node}
+        namesakes |= {one.pid for one in self.nodes if one.name == callback.node}
+        return f"{callback.node}@{callback.pid}" if len(namesakes) > 1 else callback.node
 
     def path(self, chain: "Chain") -> list[Callback]:
         """The callbacks of a chain."""

@@ -6,6 +6,10 @@ Characters in text of others (traces, names of hosts, topics, files) rewrite a t
 the user's place, turn the direction of reading around, are not seen, or end an XML file. They are
 shown as Python writes them (``\\x1b``). Whatever shows text passes it through here, all of it and
 last; JSON escapes by itself.
+
+Names that the kernel gives (of programs, files, mount points, cgroups, arguments) are bytes, and
+need not be UTF-8. What is opened again keeps them exactly (`os.fsdecode`); what is only shown or
+stored is :func:`text_of` them, which is Unicode always.
 """
 
 import html
@@ -59,9 +63,35 @@ _UNSAFE = re.compile(
 )
 
 
+_NO_CHARACTER = re.compile("[\ud800-\udfff]")
+
+
 def shown(text: str, but: str = "") -> str:
     """The text with every character escaped that does more than be seen, ``but`` these."""
-    return _UNSAFE.sub(lambda found: found[0] if found[0] in but else ascii(found[0])[1:-1], text)
+    return _UNSAFE.sub(lambda found: found[0] if found[0] in but else _escaped(found[0]), text)
+
+
+def _escaped(character: str) -> str:
+    byte = ord(character) - 0xDC00  # as `os.fsdecode` keeps a byte that is no UTF-8
+    return f"\\x{byte:02x}" if 0x80 <= byte <= 0xFF else ascii(character)[1:-1]
+
+
+def text_of(content: bytes) -> str:
+    """Bytes of others as text, to be shown or stored: what is no UTF-8 is escaped (``\\xfc``)."""
+    return content.decode(errors="backslashreplace")
+
+
+def storable(value: Any) -> Any:
+    """Plain data with every text escaped that no file in UTF-8 can hold, as :func:`text_of` has it:
+    arguments and paths that `os.fsdecode` made, names in JSON of others.
+    """
+    if isinstance(value, str):
+        return _NO_CHARACTER.sub(lambda found: _escaped(found[0]), value)
+    if isinstance(value, dict):
+        return {storable(key): storable(entry) for key, entry in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [storable(entry) for entry in value]
+    return value
 
 
 def escape(text: str) -> str:

@@ -95,6 +95,12 @@ FIELDS = _typed({
     "dds_bind_addr_to_stamp": "addr source_stamp",
     "dispatch_subscription_callback": "message callback source_stamp",
     "rmw_implementation": "rmw_impl",
+    # CARET's own about messages within a process, before there were ring buffers (its first version
+    # had the shorter name): `rclcpp_intra_publish` hands a message over, which may be copied, and
+    # the dispatch gives it, or its copy, to the callback.
+    "message_construct": "original_message constructed_message",
+    "dispatch_intra_process_subscription_callback": "message callback",
+    "dispatch_intra_process": "message callback",
     # Intra-process communication: messages travel through ring buffers, not through DDS.
     "rclcpp_construct_ring_buffer": "buffer capacity",
     "rclcpp_buffer_to_ipb": "buffer ipb",

@@ -3,11 +3,17 @@
 Only files that root and the user of this process alone can change may run, as ssh asks of its keys.
 A folder above may be writable by others where its sticky bit prevents them from replacing what is
 in it, as in /tmp.
+
+What we write may be asked for in a folder of another user (`sudo chainshaper record`), who may put
+a link where a file of ours will be, or a folder of ours was. So all that is written is opened here:
+links of other users are not followed, and nothing is written into that was there and is not ours.
 """
 
+import errno
 import grp
 import os
 import pwd
+import secrets
 import stat
 import tempfile
 from collections.abc import Iterable
@@ -67,17 +73,107 @@ def _is_own_group(gid: int, uid: int) -> bool:
     return own and {*group.gr_mem} <= {user.pw_name}
 
 
+_LONGEST_FILE = 512 << 20
+_FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+
+
+def open_regular(path: Path) -> int:
+    """Open a file that a process of others has named. Raises OSError: no ordinary one."""
+    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        raise OSError(f"{path} is no ordinary file")
+    return descriptor
+
+
+def read_regular(path: Path, longest: int = _LONGEST_FILE) -> bytes:
+    """The content of such a file. Raises OSError: also if it is longer."""
+    with os.fdopen(open_regular(path), "rb") as file:
+        content = file.read(longest + 1)
+    if len(content) > longest:
+        raise OSError(f"{path} has more than {longest} bytes")
+    return content
+
+
+_MOST_LINKS = 40  # as many as the kernel follows
+
+
+def open_folder(folder: Path) -> int:
+    """Open a folder that something is to be written into; only links of root and of our user lead
+    there. Raises InputError: another user's does. OSError: there is no such folder.
+    """
+    links, parts = 0, [*reversed(folder.absolute().parts)]
+    opened = [os.open(parts.pop(), _FOLDER)]
+    try:
+        while parts:
+            part = parts.pop()
+            flags = os.O_PATH | os.O_NOFOLLOW | os.O_CLOEXEC
+            opened.append(os.open(part, flags, dir_fd=opened[-1]))
+            state = os.fstat(opened[-1])
+            if not stat.S_ISLNK(state.st_mode):
+                continue
+            if state.st_uid not in (0, os.geteuid()):
+                raise InputError(
+                    f"{folder}: {part} is a link of {_user(state.st_uid)}, and links of other users"
+                    " are not followed where we write: name what it leads to"
+                )
+            if (links := links + 1) > _MOST_LINKS:
+                raise OSError(errno.ELOOP, os.strerror(errno.ELOOP))
+            target = Path(os.readlink("", dir_fd=opened[-1]))
+            opened.append(os.open("/", _FOLDER) if target.is_absolute() else os.dup(opened[-2]))
+            parts += reversed([one for one in target.parts if one != "/"])
+        return os.open(".", _FOLDER, dir_fd=opened[-1])
+    finally:
+        for descriptor in opened:
+            os.close(descriptor)
+
+
+def open_output(path: Path, flags: int = os.O_WRONLY | os.O_EXCL, mode: int = 0o666) -> int:
+    """Open a file to write into, a new one unless the ``flags`` of `open` say otherwise.
+
+    Raises InputError: what is there is a link, no ordinary file, or not ours alone, and nothing of
+    it is touched; or as :func:`open_folder`. OSError: as `open`.
+    """
+    folder = open_folder(path.absolute().parent)
+    flags |= os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
+    try:
+        try:
+            return os.open(path.name, flags | os.O_CREAT | os.O_EXCL, mode, dir_fd=folder)
+        except FileExistsError:
+            if flags & os.O_EXCL:
+                raise
+        descriptor = os.open(path.name, flags & ~os.O_TRUNC, dir_fd=folder)
+    except OSError as error:
+        if error.errno != errno.ELOOP:
+            raise
+        raise InputError(f"{path} is a link, and not written through: remove it") from None
+    finally:
+        os.close(folder)
+    state = os.fstat(descriptor)
+    if not stat.S_ISREG(state.st_mode) or state.st_uid != os.geteuid() or state.st_nlink > 1:
+        os.close(descriptor)
+        raise InputError(
+            f"{path} is not a file of {_user(os.geteuid())}'s alone, so nothing is written into it:"
+            " name another, or remove it"
+        )
+    if flags & os.O_TRUNC:
+        os.ftruncate(descriptor, 0)
+    return descriptor
+
+
 def free_place(path: Path, taken: bool) -> Path:
     """The path, if it is not ``taken`` and its folder is there; asked before long work begins.
 
-    Raises InputError: it is taken, or its folder does not exist.
+    Raises InputError: it is taken, its folder does not exist, or another user's link leads there.
     """
-    if taken:
+    if taken or path.is_symlink():
         raise InputError(
             f"{path} exists already and is not overwritten: name another, or remove it"
         )
     if not (folder := path.absolute().parent).is_dir():
         raise InputError(f"{folder}: no such folder to write {path.name} into")
+    with suppress(OSError):  # no permission, which is said when it is written
+        os.close(open_folder(folder))
     return path
 
 
@@ -95,24 +191,30 @@ def new_file(path: str | Path, endings: tuple[str, ...] = ()) -> Path:
 def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
     """Write beside the final place, then rename.
 
-    Raises OperationError: it cannot be written; nothing is left behind.
+    Raises OperationError: it cannot be written; nothing is left behind. InputError: as
+    :func:`open_folder`.
     """
-    partial: Path | None = None
+    name = f".{path.name}.partial-{secrets.token_hex(4)}"
+    folder: int | None = None
     try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name}.partial-", dir=path.absolute().parent)
-        partial = Path(name)
-        with os.fdopen(handle, "wb") as stream:
+        folder = open_folder(path.absolute().parent)  # it stays the same, whatever is renamed
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+        with os.fdopen(os.open(name, flags, 0o600, dir_fd=folder), "wb") as stream:
             stream.writelines(parts)
             stream.flush()
             os.fsync(stream.fileno())
-            os.fchmod(stream.fileno(), 0o644)  # the name may be a link of a folder's owner by now
-        partial.rename(path)
+            os.fchmod(stream.fileno(), 0o644)
+        os.rename(name, path.name, src_dir_fd=folder, dst_dir_fd=folder)
     except BaseException as error:  # Ctrl-C among them
-        if partial is not None:
-            partial.unlink(missing_ok=True)
+        if folder is not None:
+            with suppress(OSError):  # it was not made, or it is in its place
+                os.unlink(name, dir_fd=folder)
         if not isinstance(error, OSError):
             raise
         raise OperationError(f"{path}: the file cannot be written: {error.strerror}") from error
+    finally:
+        if folder is not None:
+            os.close(folder)
     return path
 
 
@@ -120,6 +222,17 @@ def folder_beside(path: Path) -> "tempfile.TemporaryDirectory[str]":
     """A new folder to fill, and to rename to ``path``; if it is not, it is gone at the end."""
     name, parent = f".{path.name}.partial-", path.absolute().parent
     return tempfile.TemporaryDirectory(prefix=name, dir=parent, ignore_cleanup_errors=True)
+
+
+def rename_output(made: Path, path: Path) -> Path:
+    """Put what we have made where it is to be. Raises: as :func:`open_folder`; OSError."""
+    before, folder = open_folder(made.parent), open_folder(path.absolute().parent)
+    try:
+        os.rename(made.name, path.name, src_dir_fd=before, dst_dir_fd=folder)
+    finally:
+        os.close(before)
+        os.close(folder)
+    return path
 
 
 def open_to_all(folder: Path) -> None:

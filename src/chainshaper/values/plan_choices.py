@@ -78,8 +78,8 @@ class Wishes:
         "Plan from latencies up to this percentile, such as 99.5; longer ones will be late."
         " Default: all.", MARGIN, "P")] = None
     overrun_probability: Annotated[float | None, Option(
-        "Share of all cycles that may be late, such as 0.01; below 0.001 it is derived from"
-        " the tail of the latencies.", MARGIN, "P")] = None
+        "Share of outputs that may be late, such as 0.01; where the sample is too small to show"
+        " it, a bound on the tail of the latencies is planned.", MARGIN, "P")] = None
     ideal_machine: Annotated[bool, Option(
         "Leave out cycles that the machine disturbed: for one that does not stall.", MARGIN,
     )] = False
@@ -93,7 +93,7 @@ class Wishes:
         "Most cycles in one band: 0.4 or 40%.", BANDS, "SHARE")] = None
     minimise: Annotated[Goal, Option("Objective.", BANDS)] = "mean"
     mean_at_most_ns: Annotated[int | None, Option(
-        "The average that --minimise may cost.", BANDS)] = None
+        "Accept no average above this.", BANDS)] = None
     least_gain: Annotated[float, Option(
         "With --bands auto: what another band must take off the average.", BANDS, "SHARE")] = 0.02
     seed: Annotated[int, Option("For pso, random and the derived margin.", least=0)] = 0
@@ -103,7 +103,7 @@ class Wishes:
         " their own. Default: those on which it was recorded.",
         "More of the graph", "CORES")] = None
     first_slot_ns: Annotated[int | None, Option(
-        "A server of its own for the chain's first node, this long.", "More of the graph")] = None
+        "Reserve this long for the chain's first node alone.", "More of the graph")] = None
     anchor: Annotated[Anchor, Option(
         "What slots count from: the message's stamp, or the cycle.")] = "stamp"
     overrun: Annotated[Overrun | None, Option(
@@ -133,8 +133,8 @@ class Wishes:
         " publication, such as 500us, whatever the transport takes; their executors wait"
         " meanwhile. Default: as it comes.", least=1)] = None
     equal_priorities: Annotated[EqualPriorities, Option(
-        "Servers of one priority on a core: their slots stay apart; or, with one priority for all"
-        " (eq. 3), they take turns.")] = "apart"
+        "apart: slots of servers of one priority on a core never overlap; round-robin: all servers"
+        " share one priority and alternate (eq. 3).")] = "apart"
     slot_ends: Annotated[SlotEnds, Option(
         "A server whose slot ends while a callback runs: it stays open until that is done; or it"
         " closes, as the paper's time-driven servers do, and the callback goes on in its next"

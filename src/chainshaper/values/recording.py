@@ -17,9 +17,16 @@ from typing import Annotated, Any, Literal, TypeAlias
 import polars as pl
 from pydantic import BaseModel, Field
 
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError, storable
 from chainshaper.values.events import EventTables, as_table, column_problems
-from chainshaper.values.files import folder_beside, free_place, open_to_all
+from chainshaper.values.files import (
+    folder_beside,
+    free_place,
+    open_output,
+    open_to_all,
+    rename_output,
+    write_whole,
+)
 from chainshaper.values.yaml_file import wrong_values_refused
 
 INFO_FILE = "recording.json"
@@ -271,9 +278,11 @@ def write_recording(
                     file = _next_part(partial / f"{name}.parquet", checksums)
                     checksums[str(file.relative_to(partial))] = _write_table(file, frame)
             info = info.model_copy(update={"checksums": checksums})
-            (partial / INFO_FILE).write_text(info.model_dump_json(indent=2) + "\n")
+            values = storable(info.model_dump(mode="json"))
+            text = json.dumps(values, indent=2, ensure_ascii=False) + "\n"
+            write_whole(partial / INFO_FILE, [text.encode()])
             open_to_all(partial)
-            partial.rename(path)
+            rename_output(partial, path)
     except (OSError, pl.exceptions.PolarsError) as error:
         raise OperationError(f"{path}: the recording cannot be written: {error}") from error
     return open_recording(path)
@@ -293,7 +302,7 @@ def _write_table(file: Path, frame: pl.DataFrame) -> str:
     """Write a file; its checksum."""
     content = io.BytesIO()  # written directly, Polars reports a full disk as a wrong file
     frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
-    with file.open("xb") as stream:
+    with os.fdopen(open_output(file), "wb") as stream:
         stream.write(content.getbuffer())
         stream.flush()
         os.fsync(stream.fileno())

@@ -15,17 +15,17 @@ alone is broken, and says so. ``missing`` is the share of outputs that were late
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 from xml.etree import ElementTree
 
 import polars as pl
 import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
-from chainshaper.analysis import DataFlow, data_flow
+from chainshaper.analysis import data_flow
+from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.latency import (
     PERCENTILES,
-    LatencyAnalysis,
     LatencyStatistics,
     Longest,
     latency_statistics,
@@ -39,6 +39,7 @@ from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, Part, PositiveDuration, read_model
 from chainshaper.verify.measure import PARTS, chain_of, hop_breakdown, measure_latency
+from chainshaper.verify.promises import OutputsDue, outputs_due, undisturbed_outputs_due
 
 if TYPE_CHECKING:
     from chainshaper.verify.slowdowns import Compared
@@ -78,6 +79,7 @@ class HopBudget(Part):
     topic: str
     communication_ns: PositiveDuration | None = None
     computation_ns: PositiveDuration | None = None
+    waiting_ns: PositiveDuration | None = None
 
 
 class ChainBudget(Part):
@@ -164,23 +166,25 @@ def save_budget(budget: Budget, path: str | Path) -> Path:
 def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float = ROOM) -> Budget:
     """What was measured, and ``room`` beyond it, as limits for chains, hops and callbacks.
 
-    Without ``chains``, of the chain that the recording names. Raises InputError: no such chain.
+    Without ``chains``, of the chain that it names, or the only one in it. Raises InputError: no
+    such chain.
     """
 
     def limit(ns: float | None) -> int | None:
         return None if ns is None else -int(-ns * (1 + room) // GRAIN_NS) * GRAIN_NS or None
 
     of_chains, flow = [], data_flow(recording.events, recording.info.clock_offset_ns)
-    for chain in chains or [chain_of(recording, None)]:
+    for chain in chains or [chain_of(recording, None, flow)]:
         analysis = measure_latency(recording, chain, flow=flow).analysis
+        refuse_contradicted(flow.contradictions, analysis.chain.callbacks, recording.path)
         figures = analysis.statistics
         wanted: tuple[Percentile, ...] = ("50", "99")
         percentiles = {which: limit(figures.percentiles_ns.get(which)) for which in wanted}
         hops = tuple(
-            HopBudget(topic=topic, communication_ns=limit(waits), computation_ns=limit(computes))
-            for topic, (waits, computes) in _longest_parts(hop_breakdown(analysis)).items()
+            HopBudget(topic=topic, **{f"{part}_ns": limit(most) for part, most in parts.items()})
+            for topic, parts in _longest_parts(hop_breakdown(analysis)).items()
         )
-        missing = _missing(analysis.traversals, _under_way_from(flow, analysis)) or 0.0
+        missing = outputs_due(analysis).share or 0.0
         of_chains.append(
             ChainBudget(
                 chain=chain,
@@ -216,9 +220,8 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))
         because = _from_where(hops, parts) or "no cycle was complete"
-        cycles, open_ns = analysis.traversals, _under_way_from(flow, analysis)
-        calm = _missing(cycles.filter(~pl.col("disturbed")), open_ns)
-        every = _chain_limits(chain, analysis.statistics, _missing(cycles, open_ns))
+        calm = undisturbed_outputs_due(analysis).share
+        every = _chain_limits(chain, analysis.statistics, outputs_due(analysis).share)
         undisturbed = _chain_limits(chain, analysis.undisturbed, calm)
         for limit, (_, _, at_rest) in zip(every, undisturbed, strict=True):
             one = Judged(name, chain.chain, *limit, at_rest)
@@ -269,12 +272,13 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
         if stopped and chain.missing is not None and now.counted["complete"]:
             found.append(Judged("now", chain.chain, "missing", chain.missing, 1.0, because=stopped))
             chain = chain.model_copy(update={"missing": None})  # noqa: PLW2901
-        if every := minute.count + minute.incomplete:
-            missing = ((minute.late or 0) + minute.incomplete) / every
+        missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).share
+        if missing is not None:
             why = None if minute.count else "no cycle was complete"
             limits = _chain_limits(chain, minute, missing)
             found += [Judged("now", chain.chain, *one, because=why) for one in limits]
-            found += _judged_hops("now", chain, {one.topic: one.longest_ns for one in now.hops})
+            longest = {one.topic: dict(zip(PARTS, one.longest_ns, strict=True)) for one in now.hops}
+            found += _judged_hops("now", chain, longest)
     times = {(one.node, one.starts): one.longest_ns for one in seen.callbacks}
     running = [one for one in budget.callbacks if (one.node, one.starts) in times]
     found += _judged_callbacks("now", running, times)
@@ -310,40 +314,22 @@ def _chain_limits(
         yield "missing", chain.missing, missing
 
 
-def _under_way_from(flow: DataFlow, analysis: LatencyAnalysis) -> int:
-    """Cycles that began behind this instant may have been under way as the recording ended."""
-    end: Any = flow.instances["start"].max() or 0
-    return int(end) - (analysis.statistics.max_ns or 0)
-
-
-def _missing(traversals: pl.DataFrame, under_way_from_ns: int) -> float | None:
-    """The share of outputs that were late or never came; those are not missing that were under way
-    at the end, or of lifecycle nodes that were not active.
-    """
-    over = traversals.filter(
-        pl.col("complete") | (pl.col("start") <= under_way_from_ns),
-        pl.col("reason").ne_missing("inactive"),
-    )
-    if not over.height:
-        return None
-    gone = over.select((~pl.col("complete") | pl.col("late").fill_null(False)).sum()).item()
-    return float(gone) / over.height
-
-
-def _longest_parts(parts: pl.DataFrame) -> dict[str, Longest]:
-    """The longest communication and computation of each hop, by its topic."""
+def _longest_parts(parts: pl.DataFrame) -> dict[str, dict[str, float | None]]:
+    """The longest communication, computation and waiting of each hop, by its topic."""
     most = (pl.col(f"{part}_ns").struct.field("max").alias(part) for part in PARTS)
-    rows = parts.select("topic", *most).iter_rows()
-    return {topic: (waits, computes) for topic, waits, computes in rows}
+    rows = parts.select("topic", *most).iter_rows(named=True)
+    return {row["topic"]: {part: row[part] for part in PARTS} for row in rows}
 
 
-def _judged_hops(name: str, chain: ChainBudget, longest: Mapping[str, Longest]) -> Iterator[Judged]:
-    """The limits of hops; ``longest`` are communication and computation by topic."""
+def _judged_hops(
+    name: str, chain: ChainBudget, longest: Mapping[str, Mapping[str, float | None]]
+) -> Iterator[Judged]:
+    """The limits of hops; ``longest`` are the parts of each by its topic."""
     for hop in chain.hops:
-        limits = zip(PARTS, (hop.communication_ns, hop.computation_ns), strict=True)
-        named = {f"{part} of {hop.topic}": limit for part, limit in limits}
-        why = "the chain has no such hop here"
-        yield from _judged(name, chain.chain, named, longest.get(hop.topic), why)
+        named = {f"{part} of {hop.topic}": getattr(hop, f"{part}_ns") for part in PARTS}
+        times = longest.get(hop.topic)
+        found = None if times is None else tuple(times[part] for part in PARTS)
+        yield from _judged(name, chain.chain, named, found, "the chain has no such hop here")
 
 
 def _judged_callbacks(
@@ -358,10 +344,14 @@ def _judged_callbacks(
 
 
 def _judged(
-    name: str, where: str, limits: Mapping[str, int | None], times: Longest | None, why: str
+    name: str,
+    where: str,
+    limits: Mapping[str, int | None],
+    times: Sequence[float | None] | None,
+    why: str,
 ) -> Iterator[Judged]:
-    """Those of two limits that there are, beside the times; ``why`` one of these is not known."""
-    for (what, limit), most in zip(limits.items(), times or (None, None), strict=True):
+    """Those of the limits that there are, beside the times; ``why`` one of these is not known."""
+    for (what, limit), most in zip(limits.items(), times or [None] * len(limits), strict=True):
         if limit is not None:
             yield Judged(name, where, what, limit, most, because=why if most is None else None)
 
@@ -374,9 +364,15 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
         return f"from {worst.text.partition(': ')[2]}"
     if not parts["count"].sum():
         return None
-    longest = parts.sort("computation_share", descending=True, nulls_last=True).row(0, named=True)
-    mean = duration_text(round(longest["computation_ns"]["mean"]))
-    return f"its longest hop is {longest['node']} ({mean} on average to {longest['topic']})"
+    means = [
+        (row[f"{part}_ns"]["mean"], part, row)
+        for row in parts.iter_rows(named=True)
+        for part in ("computation", "waiting")
+        if row[f"{part}_ns"] is not None
+    ]
+    mean, part, longest = max(means, key=lambda one: one[0])
+    took = f"{duration_text(round(mean))} of {part} on average"
+    return f"its longest hop is {longest['node']} ({took} to {longest['topic']})"
 
 
 def junit_report(judged: "Sequence[Judged | Compared]") -> str:

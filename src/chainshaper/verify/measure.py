@@ -2,9 +2,11 @@
 
 :func:`hop_breakdown` says where the latency goes. A hop is a callback of the chain. Its
 *communication* is the time from the publication before it to its own start: transport, and waiting
-for its executor. Its *computation* is the time from its start to its publication: execution,
-pre-emption, and waiting for another callback of the node that publishes for it (a synchroniser).
-Over a complete traversal the two add up to the latency, so mean shares add up to one.
+for its executor. Its *computation* is the time from its start to its publication: execution and
+pre-emption; without its *waiting*: for another callback of the node that publishes for it (a
+synchroniser that waits for its other input, a timer that publishes what was stored for it), in a
+gate for its slot, or for the thread of an asynchronous publisher. Over a complete traversal the
+three add up to the latency, so mean shares add up to one.
 """
 
 from collections.abc import Callable, Sequence
@@ -85,6 +87,11 @@ class Measurement:
     prediction: JudgedPrediction | None
     left_out: LeftOut
 
+    @property
+    def period_ns(self) -> int | None:
+        """The period of the timer that starts the chain; None: no timer does."""
+        return _period_of(self.analysis)
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -93,23 +100,48 @@ class Comparison:
     chain: str
     measurements: tuple[Measurement, ...]
 
+    @property
+    def remark(self) -> str | None:
+        """What makes its recordings hard to compare: other periods; None: nothing does."""
+        periods = {one.recording.path.name: one.period_ns for one in self.measurements}
+        if len({*periods.values()} - {None}) < 2:
+            return None
+        found = ", ".join(
+            f"every {duration_text(period)} in {name}" for name, period in periods.items() if period
+        )
+        return f"{self.chain} starts {found}: these are different applications"
 
-def chain_of(recording: Recording, chain: str | None) -> str:
-    """The chain that was asked for, or the one that the recording itself names.
 
-    Raises InputError: neither names one.
+class SeveralChainsError(InputError):
+    """No chain was named, and the recording has several, or none."""
+
+
+def chain_of(recording: Recording, chain: str | None, flow: DataFlow | None = None) -> str:
+    """The chain that was asked for, that the recording itself names, or the only one in it.
+
+    ``flow`` is the recording's data flow, where that has been resolved already. Raises
+    SeveralChainsError: none was asked for or named, and it has several, or none.
     """
     named = chain or recording.info.chain
     if named is not None:
         return named
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = flow or data_flow(recording.events, recording.info.clock_offset_ns)
     found = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
+    if found.complete and len(found.chains) == 1:
+        return found.chains[0].spec
     known = " or ".join(f"--chain {one.spec}" for one in found.chains)
     more = "" if found.complete else ", or others (`chainshaper chains`)"
-    raise InputError(
+    raise SeveralChainsError(
         f"{recording.path} names no chain of interest: "
         + (f"add {known}{more}" if known else "and no chain is in it, see `chainshaper graph`")
     )
+
+
+def taken_chain(recording: Recording, chain: str | None, spec: str) -> tuple[str, ...]:
+    """A note that ``spec`` was taken since it is the only chain; none where one was named."""
+    if chain is not None or recording.info.chain is not None:
+        return ()
+    return (f"no --chain was given: {spec} is the only chain in {recording.path}.",)
 
 
 def measure_latency(
@@ -155,12 +187,16 @@ def _measured(
         recording = replace(recording, events=events.happened(recording.events, *spell))
     measurements = []
     for chain in chains:
-        begun = _in_front(chain_of(recording, chain), joint)
+        spec = chain_of(recording, chain, flow)
+        begun = _in_front(spec, joint)
         found = analyse_latency(flow, begun, due=due, between=spell)
-        analysis = replace(found, notes=(*info.notes, *found.notes))
+        notes = (*taken_chain(recording, chain, spec), *info.notes, *found.notes)
+        analysis = replace(found, notes=notes)
         output = analysis.chain.topics[-1]
         own = None if joint is None else plan_of_chain(joint, output)
         planned_for = own is not None and own.chain.output in (None, output)
+        if own is not None and planned_for:
+            _refuse_other_period(own, analysis, recording)
         decided = gate_releases(recording, own, analysis)
         measurements.append(
             Measurement(
@@ -177,6 +213,22 @@ def _measured(
             )
         )
     return measurements
+
+
+def _period_of(analysis: LatencyAnalysis) -> int | None:
+    return analysis.graph.callbacks[analysis.chain.callbacks[0]].period_ns
+
+
+def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recording) -> None:
+    """Refuse to judge by a plan whose cycle is not the chain's period, or several of them (a source
+    may be faster than the cycle)."""
+    period = _period_of(analysis)
+    if period is not None and plan.cycle_ns % period:
+        raise InputError(
+            f"{recording.path}: {analysis.chain.spec} starts every {duration_text(period)} there,"
+            f" and the plan's cycle is {duration_text(plan.cycle_ns)}: name the plan that was in"
+            " force, or plan again"
+        )
 
 
 def _in_front(chain: str, plan: ApplicationPlan | None) -> str:
@@ -246,15 +298,15 @@ def compare_chains(
     return tuple(Comparison(own[0].analysis.chain.spec, own) for own in zip(*columns, strict=True))
 
 
-PARTS = ("communication", "computation")
+PARTS = ("communication", "computation", "waiting")
 
 
 def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
-    """Communication and computation of every hop of a chain, over its complete traversals.
+    """Communication, computation and waiting of every hop of a chain, over complete traversals.
 
     One row per hop: ``hop`` (from 0), ``callback_id``, ``node``, ``callback`` (a short text),
     ``topic`` (that it publishes), ``count``, ``by_sibling`` (how often another callback of the
-    node published for it), and for both parts ``…_ns``, a struct ``{min, mean, max}`` in ns (null
+    node published for it), and for all parts ``…_ns``, a struct ``{min, mean, max}`` in ns (null
     without traversals, and for the first hop's communication), and ``…_share`` of the mean latency.
     """
     path = analysis.graph.path(analysis.chain)
@@ -272,7 +324,7 @@ def hop_breakdown(analysis: LatencyAnalysis) -> pl.DataFrame:
             "hop": range(len(path)),
             "callback_id": analysis.chain.callbacks,
             "node": [callback.node for callback in path],
-            "callback": [callback.label for callback in path],
+            "callback": [analysis.graph.label(callback) for callback in path],
             "topic": analysis.chain.topics,
         },
         schema_overrides={"hop": pl.UInt8, "callback_id": pl.UInt32},

@@ -23,6 +23,7 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis
 from chainshaper.analysis.messages import with_overrun
 from chainshaper.analysis.objects import named_nodes
+from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output, slots_of_latency
@@ -109,15 +110,19 @@ class Outcome:
 
 
 def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outcome]:
-    """What became of the outputs that overran, per policy that was applied to them."""
+    """What became of the outputs that overran, per policy that was applied to them; those that a
+    standby dealt with did not overrun.
+    """
     decided = analysis.decided.select("traversal", "overrun")
+    decided = decided.filter(~pl.col("overrun").is_in([*_WITHOUT_NODE]).fill_null(False))
     cycles = analysis.traversals.join(decided, on="traversal", how="left", maintain_order="left")
     missed = pl.col("late").fill_null(False) | (pl.col("reason") == "discarded").fill_null(False)
     policy = pl.col("overrun")
     if plan is not None and not decided.height and any(publisher_servers(plan)):
         missed |= (pl.col("place_ns") >= slots_of_latency(plan)[-1][1]).fill_null(False)
         policy = pl.when(missed).then(pl.lit(plan.overrun))
-    cut = pl.col("reason").is_in(["not taken", "not sent", "still running"]).fill_null(False)
+    unknown = ["not taken", "not sent", "still running", *OWES_NO_OUTPUT]
+    cut = pl.col("reason").is_in(unknown).fill_null(False)
     hit = pl.when(~cut).then(missed | ~pl.col("complete"))
     cycles = cycles.select("complete", policy=policy, next_hit=hit.shift(-1))
     rows = cycles.drop_nulls("policy").group_by("policy", maintain_order=True)

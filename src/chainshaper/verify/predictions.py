@@ -17,7 +17,6 @@ A verdict is found from the range and the figure as they are printed. A range ha
 finite samples may differ by, and no band is expected that so few outputs may well not have come in.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -27,11 +26,17 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
 from chainshaper.analysis.disturbance import Due
 from chainshaper.planning import Plan, publish_slots
-from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected, slots_of_latency
+from chainshaper.planning.overruns import (
+    GATE_NS,
+    STOPPED_THREAD_NS,
+    cycles_until_output,
+    expected,
+    slots_of_latency,
+)
 from chainshaper.planning.plan import SHORTEST_SLOT_NS, Slot, publisher_servers, server_of
 from chainshaper.values.durations import milliseconds
+from chainshaper.verify.promises import STANDARD_ERRORS, OutputsDue, outputs_due
 
-STANDARD_ERRORS = 3  # beyond so many, an average is not what was predicted
 MISSING = 0.003  # a band that is empty with no more than this probability is expected
 
 
@@ -65,8 +70,9 @@ class JudgedFigure:
 class BandHeld:
     """One latency band, over undisturbed cycles whose output came in the cycle it was due.
 
-    ``inside`` counts outputs that left while the slot was open. With modes it is that of ``mode``:
-    ``late`` counts the mode's outputs behind its slot, the shares are those of its others.
+    ``inside`` counts outputs that left while the slot was open. ``jitter_at_most_ns`` is what a
+    band beside others promises (None: nothing). With modes it is that of ``mode``: ``late`` counts
+    the mode's outputs behind its slot, the shares are those of its others.
     """
 
     slot_start_ns: int
@@ -81,6 +87,14 @@ class BandHeld:
     jitter_ns: int | None
     mode: str | None = None
     late: int = 0
+    jitter_at_most_ns: int | None = None
+
+    @property
+    def wide(self) -> bool:
+        """Whether its outputs are farther apart than the band promises."""
+        if self.jitter_ns is None or self.jitter_at_most_ns is None:
+            return False
+        return self.jitter_ns > self.jitter_at_most_ns
 
 
 @dataclass(frozen=True)
@@ -88,9 +102,8 @@ class JudgedPrediction:
     """A plan's prediction beside the measurement, over undisturbed cycles.
 
     The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
-    outputs that missed their last slot; they are in the figures, not in the bands. ``late_of_all``
-    counts those of all ``cycles`` (None: not known), of which ``most_late`` were promised.
-    Policies without slots have no ``bands``.
+    outputs that missed their last slot; they are in the figures, not in the bands. ``outputs`` has
+    all that were due, in whatever cycle. Policies without slots have no ``bands``.
     """
 
     mean: JudgedFigure
@@ -98,10 +111,8 @@ class JudgedPrediction:
     jitter: JudgedFigure
     bands: tuple[BandHeld, ...]
     late: int
-    late_of_all: int | None
-    cycles: int
+    outputs: OutputsDue
     counted_from: Literal["chain", "cycle"]
-    most_late: int
 
     @property
     def broken(self) -> tuple[str, ...]:
@@ -112,10 +123,30 @@ class JudgedPrediction:
             for name, one in named.items()
             if one.worse and one.measured_ns is not None
         ]
-        if (self.late_of_all or 0) > self.most_late:
-            most = f"{self.most_late} at most" if self.most_late else "none"
-            broken.append(f"{self.late_of_all} of {self.cycles} outputs late, {most} expected")
+        broken += [
+            f"jitter of band {number} {milliseconds(one.jitter_ns)} ms,"
+            f" not {milliseconds(one.jitter_at_most_ns)} ms at most"
+            for number, one in enumerate(self.bands, start=1)
+            if one.wide and one.jitter_ns is not None and one.jitter_at_most_ns is not None
+        ]
+        if self.outputs.kept is False:
+            most = f"{self.outputs.most_missed} at most" if self.outputs.most_missed else "none"
+            broken.append(f"{self.outputs.text}, {most} expected")
         return tuple(broken)
+
+    @property
+    def jitter_text(self) -> str:
+        """The jitter beside its bound; of several bands that within each."""
+        inside = [one for one in self.bands if one.jitter_at_most_ns is not None]
+        if not inside:
+            jitter, most = self.jitter.measured_ns, self.jitter.to_ns
+            measured = "not known" if jitter is None else f"{milliseconds(jitter)} ms"
+            return f"jitter {measured}, at most {milliseconds(most)} ms"
+        measured = ", ".join(
+            "no output" if one.jitter_ns is None else milliseconds(one.jitter_ns) for one in inside
+        )
+        bounds = dict.fromkeys(milliseconds(one.jitter_at_most_ns or 0) for one in inside)
+        return f"jitter within bands {measured} ms, at most {', '.join(bounds)} ms"
 
 
 def due_of(plan: Plan) -> tuple[Due, ...]:
@@ -160,7 +191,11 @@ def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
         known = shares if expected(plan) is not None else [None] * len(slots)
         for number, (slot, share) in enumerate(zip(slots, known, strict=True)):
             own = in_time.filter(slot=number)
-            bands.append(_band(slot, share, own, in_time.height))
+            found = _band(slot, share, own, in_time.height)
+            if len(slots) > 1 and expected(plan) is not None:
+                most = jitter_within_band(plan, slot, last=slot == slots[-1])
+                found = replace(found, jitter_at_most_ns=most)
+            bands.append(found)
     else:
         for mode, band in plan.modes.bands.items():
             own = outputs.filter(mode=mode)
@@ -169,19 +204,14 @@ def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
             found = _band(slots[band - 1], share, own.filter(~pl.col("late")), own.height)
             bands.append(replace(found, mode=mode, late=int(own["late"].sum())))
     mean, longest, jitter = _figures(plan, slots, latency_statistics(outputs["judged_ns"]))
-    # So many may be late by the plan's margin, as far as chance goes.
-    count, share = analysis.statistics.count, plan.margin.overrun_probability or 0.0
-    most_late = math.floor(count * share + STANDARD_ERRORS * math.sqrt(count * share))
     return JudgedPrediction(
         mean=mean,
         max=longest,
         jitter=jitter,
         bands=tuple(bands),
         late=int(outputs["late"].sum()),
-        late_of_all=analysis.statistics.late,
-        cycles=count,
+        outputs=outputs_due(analysis, plan),
         counted_from="cycle" if from_cycle else "chain",
-        most_late=most_late,
     )
 
 
@@ -233,6 +263,17 @@ def _figures(
         figure(longest, "max_ns", lowest_max),
         figure(jitter, "jitter_ns", lowest_jitter, publishing),
     )
+
+
+def jitter_within_band(plan: Plan, slot: Slot, *, last: bool) -> int:
+    """How far apart the outputs of one of several bands may be: as wide as its slot, into which
+    they come at any time. Into the last one all that are in time come before it opens.
+    """
+    apart = STOPPED_THREAD_NS if any(publisher_servers(plan)) else GATE_NS
+    length = slot[1] - slot[0]
+    if last or plan.into_open_slot == "next-slot":
+        length = min(length, SHORTEST_SLOT_NS)
+    return length + apart
 
 
 def _weighted(shares: Sequence[float], values: Sequence[float]) -> float:

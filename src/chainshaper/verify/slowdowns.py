@@ -245,8 +245,8 @@ def _doubts(compared: Sequence[Compared], fewest: int) -> Iterator[str]:
     if worst.resolution > MUCH:
         least = min(one.resolution for one in compared)
         yield (
-            f"slowdowns from {least:.1%} on, at {worst.where} from {worst.resolution:.1%} on, are"
-            " found in most comparisons: more recordings of each side, or longer ones, find less"
+            f"detects slowdowns above {least:.1%}, at {worst.where} above {worst.resolution:.1%}:"
+            " record more, or longer, to detect smaller ones"
         )
 
 

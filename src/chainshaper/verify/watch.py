@@ -29,7 +29,6 @@ from chainshaper.analysis import (
     find_chain,
     graph_of,
     traverse,
-    with_restarts,
 )
 from chainshaper.analysis.disturbance import Due, with_punctuality
 from chainshaper.analysis.latency import (
@@ -39,8 +38,9 @@ from chainshaper.analysis.latency import (
     longest_times,
 )
 from chainshaper.analysis.objects import Objects, resolve_objects
+from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.gate.decision import clock_offset
-from chainshaper.planning import ApplicationPlan
+from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import (
@@ -60,6 +60,7 @@ from chainshaper.values.events import EventTables
 from chainshaper.values.recording import InForceInfo, Recording, refuse_existing, write_recording
 from chainshaper.verify.measure import PARTS
 from chainshaper.verify.predictions import due_of
+from chainshaper.verify.promises import OutputsDue
 
 SECOND = 1_000_000_000
 SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
@@ -74,14 +75,15 @@ _AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave 
 @dataclass(frozen=True)
 class Hop:
     """A callback of the chain: its mean shares of the latency over the last minute (ns), and in
-    ``longest_ns`` the longest communication and computation.
+    ``longest_ns`` the longest of each, in the order of :data:`~.measure.PARTS`.
     """
 
     node: str
     topic: str
     communication_ns: float
     computation_ns: float
-    longest_ns: tuple[int, int]
+    waiting_ns: float
+    longest_ns: tuple[int | None, ...]
 
 
 @dataclass(frozen=True)
@@ -103,8 +105,11 @@ class ChainNow:
     left within each of the plan's slots, over the hour (empty: without a plan), ``early`` those
     before the first slot; ``promised_ns`` is the end of the last slot, which is ``moved_ns`` behind
     the plan's; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
-    ``incomplete``, and ``unclear``, whose messages no event before Iron tells apart while
-    CLOCK_REALTIME is set. ``problem`` says why nothing goes through the chain.
+    ``incomplete``, ``unclear``, whose messages no event before Iron tells apart while
+    CLOCK_REALTIME is set, and ``not_used``: older than the message that the chain's timer or
+    synchroniser used, so no output is missing. ``kept`` says whether the plan's promise was kept
+    over the hour, as ``outputs`` has it (None: no plan, or no cycle). ``problem`` says why nothing
+    goes through the chain.
     """
 
     chain: str
@@ -117,6 +122,8 @@ class ChainNow:
     moved_ns: int
     counted: Mapping[str, int]
     problem: str | None
+    outputs: OutputsDue
+    kept: bool | None
 
 
 @dataclass(frozen=True)
@@ -144,7 +151,7 @@ class Seen:
         statuses = []
         for one in self.chains:
             minute = one.spans["minute"]
-            missing = (minute.late or 0) + minute.incomplete
+            missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).missed
             level, text = 2, one.problem or "no output in the last minute"
             if minute.count:
                 level = int(missing > 0)
@@ -177,7 +184,7 @@ class _Chain:
     names: list[tuple[str, str]] = field(default_factory=list)  # node and topic of each hop
     first: Callback | None = None  # where cycles began when the chain was seen last
     counted: Counter[str] = field(
-        default_factory=lambda: Counter(complete=0, late=0, incomplete=0, unclear=0)
+        default_factory=lambda: Counter(complete=0, late=0, incomplete=0, unclear=0, not_used=0)
     )
     problem: str | None = None
 
@@ -193,7 +200,7 @@ class _Chain:
         self.counted["late"] += int(traversals["late"].sum() or 0)
         own = hops.join(traversals.filter("complete"), on="traversal", how="semi")
         if own.height:
-            shares = pl.col("communication_ns", "computation_ns")
+            shares = pl.col([f"{part}_ns" for part in PARTS])
             most = shares.max().name.prefix("longest_")
             figures = own.group_by("hop").agg(shares.sum(), most, count=pl.len())
             self.hops.append((now_ns, figures))
@@ -277,6 +284,11 @@ class Watch:
     def _due(self, output: str) -> Due | None:
         return next((due for due in self.due if due.output in (None, output)), None)
 
+    def _plan_of(self, output: str) -> Plan | None:
+        """The plan whose promise is about a chain with this output."""
+        plans = () if self.plan is None else self.plan.chains
+        return next((one for one in plans if one.chain.output in (None, output)), None)
+
     def _slots(self, output: str) -> tuple[tuple[int, int], ...]:
         due = self._due(output) or Due(0)
         delay = due.cycles * due.cycle_ns
@@ -330,10 +342,12 @@ class Watch:
         over = now - self.longest_ns
         since = now - 2 * self.longest_ns - (over - self._over_ns)
         tables = self._tables(since)
-        flow = data_flow(tables, self._clock_offset_ns, self._objects(tables, since))
-        if ended := self._ended():
-            flow = with_restarts(flow, ended)
-        moved = {one.topic: one.moved_ns for one in find_outputs()} if self.plan else {}
+        objects, ended = self._objects(tables, since), self._ended()
+        flow = data_flow(tables, self._clock_offset_ns, objects, ended=ended)
+        moved = dict[str, int]()
+        if self.plan:  # a page of another user says nothing of the outputs that are watched
+            watched = (output for output in find_outputs() if output.user in self.users)
+            moved = {output.topic: output.moved_ns for output in watched}
         # Where publications carry no stamp, the clock's offset says which one was taken.
         stampless = flow.publications["source_timestamp"].null_count() > 0
         clear_ns = self._stepped_ns if stampless else 0
@@ -343,8 +357,11 @@ class Watch:
             _forget(one.hops, now - SPANS["minute"])
             if (found := self._judged(one, flow, graph)) is not None:
                 judged, hops = found
-                # A lifecycle node that is not active owes no output.
-                new = judged.filter(within, pl.col("reason").ne_missing("inactive"))
+                begun = judged.filter(within)
+                # A lifecycle node that is not active owes no output, nor does an older message.
+                idle = pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False)
+                new = begun.filter(~idle)
+                one.counted["not_used"] += begun.filter(reason="not used").height
                 new = new.with_columns(pl.col("place_ns") - moved.get(one.output, 0))
                 one.take_over(clear := new.filter(pl.col("start") > clear_ns), hops, now)
                 one.counted["unclear"] += new.height - clear.height
@@ -406,9 +423,12 @@ class Watch:
         begun = one.cycles["start"].filter(one.cycles["start"] > over_ns - SPANS["minute"])
         shares, early = one.shares()
         lasted = begun[-1] - begun[0] if len(begun) > 1 else 0
+        spans = {name: one.statistics(over_ns - span) for name, span in SPANS.items()}
+        hour, plan = spans["hour"], self._plan_of(one.output)
+        outputs = OutputsDue.of(hour.count, hour.late, hour.incomplete, plan)
         return ChainNow(
             chain=one.text,
-            spans={name: one.statistics(over_ns - span) for name, span in SPANS.items()},
+            spans=spans,
             rate_hz=(len(begun) - 1) * SECOND / lasted if lasted else 0.0,
             hops=tuple(_hops(one)),
             shares=shares,
@@ -417,6 +437,8 @@ class Watch:
             moved_ns=moved_ns,
             counted=dict(one.counted),
             problem=one.problem,
+            outputs=outputs,
+            kept=outputs.kept,
         )
 
     @property
@@ -489,10 +511,11 @@ def _hops(one: _Chain) -> Iterator[Hop]:
         return
     figures = pl.concat([frame for _, frame in one.hops]).group_by("hop")
     sums = figures.agg(pl.exclude("^longest_.*$").sum(), pl.col("^longest_.*$").max()).sort("hop")
-    for number, communication, computation, count, *longest in sums.iter_rows():
-        node, topic = one.names[number]
-        most = (longest[0], longest[1])
-        yield Hop(node, topic, communication / count, computation / count, most)
+    for row in sums.iter_rows(named=True):
+        communication, computation, waiting = (row[f"{part}_ns"] / row["count"] for part in PARTS)
+        longest = tuple(row[f"longest_{part}_ns"] for part in PARTS)
+        node, topic = one.names[row["hop"]]
+        yield Hop(node, topic, communication, computation, waiting, longest)
 
 
 def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[CallbackNow]:
@@ -580,8 +603,7 @@ def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
                     yield "chain.latency", ns / SECOND, {**chain, "span": span, "statistic": which}
         for hop in one.hops:
             about = {**chain, "node": hop.node, "topic": hop.topic}
-            means = (hop.communication_ns, hop.computation_ns)
-            for part, mean in zip(PARTS, means, strict=True):
-                yield "hop.time", mean / SECOND, {**about, "part": part}
+            for part in PARTS:
+                yield "hop.time", getattr(hop, f"{part}_ns") / SECOND, {**about, "part": part}
         for outcome, count in one.counted.items():
             yield "chain.cycles", count, {**chain, "outcome": outcome}

@@ -142,10 +142,7 @@ class Executor:
         try:
             self._spin(*self._begin.get())
         except BaseException as error:  # a thread would end alone, and its group stay busy
-            said = error.code if isinstance(error, SystemExit) else traceback.format_exc()
-            sys.stderr.write(f"{said}\n")
-            sys.stderr.flush()
-            os._exit(1)
+            _end_process(error.code if isinstance(error, SystemExit) else traceback.format_exc())
 
     def _spin(self, stop_ns: int, last_timer_ns: int) -> None:
         while (entity := self._next(stop_ns, last_timer_ns)) is not None:
@@ -283,6 +280,13 @@ class AsynchronousWriter:
             return None
 
 
+def _end_process(said: object) -> None:
+    """End this process from a thread of it, with a reason for whoever started it."""
+    sys.stderr.write(f"{said}\n")
+    sys.stderr.flush()
+    os._exit(1)
+
+
 def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
     """Start the one thread that sends for all asynchronous writers of this process.
 
@@ -295,7 +299,13 @@ def start_publisher_thread() -> "queue.SimpleQueue[AsynchronousWriter]":
         while True:
             waiting.get().send_next()
 
-    threading.Thread(target=send, daemon=True).start()
+    def send_or_end() -> None:
+        try:
+            send()
+        except BaseException:  # a thread would end alone, and nothing be sent any more
+            _end_process(traceback.format_exc())
+
+    threading.Thread(target=send_or_end, daemon=True).start()
     return waiting
 
 

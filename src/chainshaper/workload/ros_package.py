@@ -13,7 +13,13 @@ from pathlib import Path
 from typing import Any
 
 from chainshaper.values.errors import InputError, OperationError, escape
-from chainshaper.values.files import folder_beside, free_place, open_to_all, write_whole
+from chainshaper.values.files import (
+    folder_beside,
+    free_place,
+    open_to_all,
+    rename_output,
+    write_whole,
+)
 from chainshaper.workload.description import (
     Application,
     CallbackDescription,
@@ -60,7 +66,7 @@ def generate_package(application: Application, folder: str | Path) -> list[Path]
                 path.parent.mkdir(exist_ok=True)
                 write_whole(path, [text.encode()])
             open_to_all(Path(partial))
-            Path(partial).rename(folder)
+            rename_output(Path(partial), folder)
     except OSError as error:
         raise OperationError(f"{folder}: cannot be written: {error.strerror}") from error
     return [folder / name for name in files]

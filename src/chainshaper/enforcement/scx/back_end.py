@@ -42,8 +42,8 @@ from chainshaper.linux.scheduling import (
     set_thread_name,
     stop_garbage_collection,
 )
-from chainshaper.linux.threads import POLICIES, RESET_ON_FORK, status_field
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.linux.threads import POLICIES, RESET_ON_FORK, read_proc, status_field
+from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 
 POLICY = Path(__file__).with_name("policy") / "table.bpf.o"
 SCHED_EXT = Path("/sys/kernel/sched_ext")
@@ -104,9 +104,9 @@ def is_realtime_kernel() -> bool:
 def scheduler_in_force() -> str | None:
     """The name of the sched_ext scheduler that is loaded, None when there is none."""
     try:
-        if (SCHED_EXT / "state").read_text().strip() == "disabled":
+        if read_proc(SCHED_EXT / "state").strip() == b"disabled":
             return None
-        return (SCHED_EXT / "root" / "ops").read_text().strip()
+        return text_of(read_proc(SCHED_EXT / "root" / "ops")).strip()
     except OSError:
         return None
 
@@ -396,7 +396,16 @@ class ScxServers(BackEnd):
             raise OperationError(f"thread {tid} gets no server: {error.strerror}") from error
 
     def _watch(self) -> None:
-        """Fail open when a kicker stops: an idle core would never notice by itself."""
+        """Fail open when a kicker stops, or watching does: an idle core would never notice."""
+        try:
+            self._watch_kickers()
+        except Exception as error:  # a thread that ends in silence watches no more
+            with self._lock:
+                why = f"watching the kickers has failed ({type(error).__name__}: {error})"
+                self._failure = self._failure or f"{why}; {_FREELY}"
+                self._end()
+
+    def _watch_kickers(self) -> None:
         while not self._released.wait(_WATCH_S):
             with self._lock:
                 for core, kicker in self._kickers.items():

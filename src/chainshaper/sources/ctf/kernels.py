@@ -10,7 +10,15 @@ import numpy as np
 
 from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf.interpreter import ZERO, advance_clock, afforded, execute, move_batch
-from chainshaper.values.compiled.memory import compiled, get, load_word, put, store_long, store_word
+from chainshaper.values.compiled.memory import (
+    compiled,
+    get,
+    load_byte,
+    load_word,
+    put,
+    store_long,
+    store_word,
+)
 
 
 @compiled(inline=True)
@@ -153,6 +161,35 @@ def read_header(machine, stream, start, mapped, end, position, regs):
 
 
 @compiled(inline=True)
+def believed(machine, stream, packet, start, end, position, read, regs):
+    """The position behind an event's header, or a failure where no tracer wrote such an event.
+
+    It happened while its packet was open, in a process; and what a disk never got reads as zeros.
+    """
+    now = get(get(machine, tb.M_STATE), tb.X_CLOCK)
+    if now < get(packet, tb.P_EARLIEST) or now > get(packet, tb.P_LATEST):
+        return np.int64(tb.OTHER_TIME)
+    align = get(stream, tb.S_PROCESS_ALIGN)
+    if align != 0:
+        begin, last = (read + align - 1) & -align, (end >> 3) - 8
+        process = (begin + get(stream, tb.S_PROCESS)) >> 3
+        thread = (begin + get(stream, tb.S_THREAD)) >> 3
+        if (process <= last and load_word(start + process) & tb.LOW == tb.U0) or (
+            thread <= last and load_word(start + thread) & tb.LOW == tb.U0
+        ):
+            return np.int64(tb.NO_PROCESS)
+    elif get(regs, tb.R_ID) == 0 and get(stream, tb.S_ALIGN) != 0:
+        align = get(stream, tb.S_ALIGN)
+        at = ((position + align - 1) & -align) >> 3
+        stop = (read >> 3) + tb.ZEROS
+        while at < stop <= end >> 3 and load_byte(start + at) == tb.U0:
+            at += 1
+        if at == stop:
+            return np.int64(tb.ALL_ZEROS)
+    return read
+
+
+@compiled(inline=True)
 def step_over(machine, row, start, mapped, end, position, regs):
     """The position behind an event's contexts and payload, or a failure."""
     align = get(row, tb.E_ALIGN)
@@ -217,6 +254,8 @@ def run_events(machine, regs, base, size, packets, first, last, counts, events):
         while 0 <= read < end:
             position, before = read, get(state, tb.X_CLOCK)
             read, event = read_header(machine, stream, start, mapped, end, position, regs)
+            if counting and read >= 0:
+                read = believed(machine, stream, packet, start, end, position, read, regs)
             if read < 0:
                 break
             row = get(machine, tb.M_EVENTS) + event * tb.E_ROW

@@ -42,21 +42,26 @@ STATE_WORDS = X_STACK + 16
 
 # Packets, in order of the file: BYTE its offset there, END the end of the content and ERROR_AT in
 # bits from the packet's start, STREAM the row of its class; from INSTANCE to CPU -1 where unknown;
-# BEGIN and LAST in clock cycles.
+# BEGIN and LAST in clock cycles, as the packet says; EARLIEST and LATEST are what its events' times
+# can be.
 (
     P_BYTE, P_END, P_STREAM, P_INSTANCE, P_BEGIN, P_LAST, P_SEQUENCE, P_DISCARDED, P_CPU,
-    P_ERROR, P_ERROR_AT, P_BYTES, PACKET_COLUMNS,
-) = range(13)
+    P_ERROR, P_ERROR_AT, P_BYTES, P_EARLIEST, P_LATEST, PACKET_COLUMNS,
+) = range(15)
+ALWAYS = (-(1 << 63), (1 << 63) - 1)
+"""EARLIEST and LATEST of a packet that says no times."""
 
 # Stream classes of all folders: operations (first, end) of packet HEADER, packet CONTEXT and EVENT
 # header; LTTng's event headers in one load, ALIGN 0 where the header is another; event ids in the
 # table of ids, a dense part, then pairs; bit n of KNOWN: register n is read in header or context;
-# the COST of a packet.
+# the COST of a packet; where an event's 32 bits of the process and the thread lie behind its header
+# (ALIGN, PROCESS and THREAD, in bits; ALIGN 0 where that is not known, or the trace is a kernel's).
 (
     S_ID, S_HEADER, S_HEADER_STOP, S_CONTEXT, S_CONTEXT_STOP, S_EVENT, S_EVENT_STOP,
     S_ALIGN, S_ID_BITS, S_SHIFT, S_CLOCK_BITS, S_ID_FIRST, S_ID_DENSE, S_ID_PAIRS, S_DEFAULT,
-    S_FREQUENCY, S_KNOWN, S_UUID_LOW, S_UUID_HIGH, S_COST, STREAM_COLUMNS,
-) = range(21)
+    S_FREQUENCY, S_KNOWN, S_UUID_LOW, S_UUID_HIGH, S_COST, S_PROCESS_ALIGN, S_PROCESS,
+    S_THREAD, STREAM_COLUMNS,
+) = range(24)
 
 # Event classes of all stream classes: operations (first, end) of context and payload; ALIGN and
 # SIZE where these are one constant step, else 0, and MOVED 1 where they only move what they read;
@@ -95,14 +100,16 @@ BUDGET = 64
 
 An operation costs 1, a byte of a column as well: fields of no bits could else fill the memory.
 """
+ZEROS = 32
+"""So many bytes of zeros from an event's header on are no event."""
 ENDLESS = 1 << 40
 """More elements than any packet has, even of no bits; times what one costs it is still a number."""
 
 # Why a run ended early.
 (
-    OVER_BUDGET, FULL_TABLE, FULL_DICTIONARY, UNKNOWN_EVENT, UNTERMINATED, BAD_LENGTH, NO_OPTION,
-    TRUNCATED,
-) = range(-8, 0)
+    ALL_ZEROS, NO_PROCESS, OTHER_TIME, OVER_BUDGET, FULL_TABLE, FULL_DICTIONARY, UNKNOWN_EVENT,
+    UNTERMINATED, BAD_LENGTH, NO_OPTION, TRUNCATED,
+) = range(-11, 0)
 
 # How a scan for packets ended, and what was wrong where.
 DONE, FULL, BAD_MAGIC, BAD_UUID, BAD_STREAM, BAD_SIZE, BAD_HEADER, CUT, COSTLY = range(9)
@@ -485,6 +492,7 @@ def _add_stream(
         except ValueError:
             raise LayoutError(f"trace uuid {trace.uuid!r} is none") from None
     has_cpu, kernel = bool(row[S_KNOWN] >> R_CPU & 1), trace.env.get("domain") == "kernel"
+    row[S_PROCESS_ALIGN : S_THREAD + 1] = [0, 0, 0] if kernel else _places_of_process(stream)
     ids = {}
     for event in stream.events.values():
         ids[event.id] = len(layout.events)
@@ -505,6 +513,29 @@ def _add_stream(
             alike.append(own)
     row[S_ID_FIRST : S_DEFAULT + 1] = _id_table(layout, ids)
     layout.streams.append(row)
+
+
+def _places_of_process(stream: tsdl.StreamClass) -> list[int]:
+    """The alignment of what follows an event's header, and the bits of ``vpid`` and ``vtid`` in it.
+
+    All are 0 where these are not both of 32 bits at a constant place.
+    """
+    position, context = 0, stream.event_context or tsdl.StructType()
+    places: dict[str, int] = {}
+    for name, kind in context.fields:
+        position += -position % tsdl.alignment(kind)
+        match kind:
+            case tsdl.IntegerType(size=size):
+                if size == 32 and kind.align >= 8:
+                    places[tsdl.field_name(name)] = position
+                position += size
+            case tsdl.ArrayType(tsdl.IntegerType(size, align), int(count)) if size % align == 0:
+                position += count * size
+            case _:
+                break
+    if {"vpid", "vtid"} <= places.keys():
+        return [context.align, places["vpid"], places["vtid"]]
+    return [0, 0, 0]
 
 
 def _columns(

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf import tsdl
+from chainshaper.sources.ctf.copies import CtfStream
 from chainshaper.sources.ctf.layout import Layout, Table, lay_out
-from chainshaper.sources.ctf.trace import CtfStream, CtfTrace, MappedFile, Scratch
+from chainshaper.sources.ctf.trace import CtfTrace, MappedFile, Scratch
 from chainshaper.values.compiled import kernel
 
 _run_events = kernel("chainshaper.sources.ctf.kernels", "run_events")
@@ -29,11 +30,14 @@ _LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
 _MOST_WARNINGS = 20
 _FAILURES = {
+    tb.OTHER_TIME: "an event outside the time that its packet says it was open",
+    tb.NO_PROCESS: "an event of process or thread 0: there are zeros instead of what was recorded",
+    tb.ALL_ZEROS: "zeros instead of events",
     tb.TRUNCATED: "an event reaches past the end of its packet's content",
     tb.NO_OPTION: "a variant's tag names none of its options",
     tb.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
     tb.UNTERMINATED: "a string does not end within its packet",
-    tb.UNKNOWN_EVENT: "an event id that the metadata does not declare",
+    tb.UNKNOWN_EVENT: "an event id that the metadata does not declare: perhaps it ends too early",
     tb.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory than its size"
     f" warrants ({tb.BUDGET} times)",
 }
@@ -41,12 +45,13 @@ _Progress = Callable[[float], None]
 
 
 class Events(dict[str, pl.DataFrame]):
-    """Frames by event name; ``warnings`` say what could not be read.
+    """Frames by event name; ``warnings`` say what cannot be read, of so many packets ``damaged``.
 
     ``counts`` are of all events in the streams that were read, zeros included.
     """
 
     warnings: tuple[str, ...] = ()
+    damaged: int = 0
     counts: dict[str, int]
 
 
@@ -119,6 +124,7 @@ def read_events(
         folder = trace.folders[0].path
         raise tsdl.CtfError(folder, None, reason, "read its folders one by one") from None
     events.warnings = tuple(_warnings(files))
+    events.damaged = sum(int((file.packets[:, tb.P_ERROR] < 0).sum()) for file in files)
     events.counts = dict.fromkeys(trace.event_names, 0)
     for file in files:
         for event, number in zip(layout.events, file.counts.tolist(), strict=False):

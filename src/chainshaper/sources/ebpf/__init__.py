@@ -27,12 +27,13 @@ from chainshaper.linux.processes import descendants, run_users, user_name, user_
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents, read_proc, read_stat, status_field
 from chainshaper.sources.ebpf import trace_points as tp
-from chainshaper.sources.ebpf.functions import callback_functions, open_regular
+from chainshaper.sources.ebpf.functions import callback_functions
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
 from chainshaper.sources.system import info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
+from chainshaper.values.files import open_output, open_regular, write_whole
 from chainshaper.values.recording import RecordingInfo
 
 _ATTACHED = "__BPFTRACE_NOTIFY_PROBES_ATTACHED"
@@ -95,11 +96,16 @@ class EbpfTracer:
         ours = Path(f"/proc/{os.getpid()}/fd")
         points = [replace(one, file=ours / str(self._open[one.file])) for one in self._points]
         limits = {"traced": self._traced(), "users": self._users}
-        self._script.write_text(tp.bpftrace_script(points, attached=self._attached, **limits))
+        write_whole(
+            self._script,
+            [tp.bpftrace_script(points, attached=self._attached, **limits).encode()],
+        )
         self._clock_offset_ns, self._ahead_ns = clock_offset(), _boot_time_ahead()
-        with self._events.open("wb") as printed, self._said.open("wb") as said:
-            printed.write(tp.HEADER.encode())
-            printed.flush()
+        write_whole(self._said, [])
+        write_whole(self._events, [tp.HEADER.encode()])
+        flags = os.O_WRONLY | os.O_APPEND
+        outputs = [os.fdopen(open_output(f, flags), "ab") for f in (self._events, self._said)]
+        with outputs[0] as printed, outputs[1] as said:
             self._bpftrace = subprocess.Popen(
                 ["bpftrace", "-B", "full", str(self._script)],
                 env={**_SETTINGS, **tool_environment()},
@@ -180,6 +186,9 @@ class EbpfTracer:
         facts: dict[str, Any] = {"rmw": printed.rmw, "notes": tuple(notes)}
         facts |= {"clock_offset_ns": self._clock_offset_ns, "pid_namespace": _FIRST_PID_NAMESPACE}
         return tables, info_of("ebpf", tables, versions, commands, lost, **facts)
+
+    def written(self) -> None:
+        """What was traced stays beside the tables."""
 
     def _libraries(self) -> tuple[tp.TracingLibrary, ...]:
         libraries = self._mapped() if self._attached else tp.installed_libraries(os.environ)

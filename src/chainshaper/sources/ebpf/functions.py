@@ -13,7 +13,6 @@ Upstream: elf(5); Itanium C++ ABI, 2.5.2 and 2.9.5; libstdc++, `bits/std_functio
 
 import ctypes
 import os
-import stat
 import struct
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
@@ -23,8 +22,9 @@ from pathlib import Path
 
 from chainshaper.linux.processes import Region, region_at, regions_in
 from chainshaper.linux.threads import read_proc
+from chainshaper.values.errors import text_of
+from chainshaper.values.files import read_regular
 
-_LONGEST_FILE = 512 << 20
 _SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
 _NO_ELF = (OSError, LookupError, struct.error, ValueError)
 _TIMERS = ("rclcpp::WallTimer<", "rclcpp::GenericTimer<")
@@ -32,24 +32,6 @@ _INVOKER = "_ZNSt17_Function_handlerI"
 _BEFORE, _BEHIND = 64, 16
 """Words before and behind a callback's address that are looked at."""
 _SHORTEST_NAME, _LONGEST_NAME = 3, 16_384
-
-
-def open_regular(path: Path) -> int:
-    """Open a file that a process of the application has named. Raises OSError: no ordinary one."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        raise OSError(f"{path} is no ordinary file")
-    return descriptor
-
-
-def read_regular(path: Path, longest: int = _LONGEST_FILE) -> bytes:
-    """The content of such a file. Raises OSError: also if it is longer."""
-    with os.fdopen(open_regular(path), "rb") as file:
-        content = file.read(longest + 1)
-    if len(content) > longest:
-        raise OSError(f"{path} has more than {longest} bytes")
-    return content
 
 
 def exported_functions(path: Path) -> frozenset[str]:
@@ -93,7 +75,7 @@ def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, s
             name, info, _, section, address = struct.unpack_from(layout, content, at)
             if info & 0xF == _FUNCTION and section:  # of section 0: imported, not defined
                 begin = sections[names][4] + name
-                yield address, content[begin : content.index(b"\0", begin)].decode()
+                yield address, text_of(content[begin : content.index(b"\0", begin)])
 
 
 def mapped_regions(pid: int) -> Iterator[Region]:
@@ -187,7 +169,7 @@ def demangled(name: bytes) -> str | None:
         return None
     library.__cxa_demangle.restype = ctypes.c_void_p
     text = library.__cxa_demangle(name, None, None, None)
-    found = ctypes.string_at(text).decode(errors="replace") if text else None
+    found = text_of(ctypes.string_at(text)) if text else None
     libc.free(ctypes.c_void_p(text))
     return found
 

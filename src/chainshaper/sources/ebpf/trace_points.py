@@ -37,9 +37,10 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.sources.ebpf.functions import exported_functions, mapped_regions, read_regular
+from chainshaper.sources.ebpf.functions import exported_functions, mapped_regions
 from chainshaper.values import events
-from chainshaper.values.errors import InputError
+from chainshaper.values.errors import InputError, text_of
+from chainshaper.values.files import read_regular
 
 FUNCTION_PREFIX = "ros_trace_"
 LIBRARY = "libtracetools.so"
@@ -413,7 +414,7 @@ def _texts(lines: pl.DataFrame) -> pl.DataFrame:
             parts[thread] = before + part.tobytes()[0 if line else skipped :]
     texts = ((thread, *part.partition(b"\0")) for thread, part in parts.items())
     return pl.DataFrame(
-        [(*thread, text.decode(errors="replace"), not end) for thread, text, end, _ in texts],
+        [(*thread, text_of(text), not end) for thread, text, end, _ in texts],
         schema={**dict.fromkeys(key[:3], pl.Int64), "text": pl.String, "cut": pl.Boolean},
         orient="row",
     )

@@ -37,6 +37,7 @@ from chainshaper.linux.threads import parents, read_proc
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
+from chainshaper.values.files import open_output
 from chainshaper.values.recording import RecordingInfo
 
 EVENTS = "ros2:*,ros2_caret:*,dds:*"
@@ -200,6 +201,9 @@ class LttngSession:
             notes.append(f"{lost} events were lost: buffers were too small. {remedy}")
         return tables, info.model_copy(update={"notes": tuple(notes)})
 
+    def written(self) -> None:
+        """What was traced stays beside the tables."""
+
     def _apart(self) -> dict[str, Any]:
         """How commands run: in a session of their own, since Ctrl-C is ours to react to."""
         return {"env": self._environment, "stdin": subprocess.DEVNULL, "start_new_session": True}
@@ -248,7 +252,7 @@ class LttngSession:
         for version in range(5, 20):  # applications look for one with their ABI's version
             (sockets / f"lttng-ust-sock-{version}").symlink_to("applications")
         applications = f"--apps-sock={sockets / 'applications'}"
-        with said.open("wb") as log:
+        with os.fdopen(open_output(said), "wb") as log:
             self.daemon = subprocess.Popen(
                 [*self._inside, "lttng-sessiond", "--quiet", applications],
                 stdout=log,

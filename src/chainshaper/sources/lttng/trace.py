@@ -6,9 +6,10 @@ no cast brings right, becomes a column of nulls; a note says so unless a distrib
 
 Tables are decoded in groups that are used together: a pass over a trace costs nearly the same for
 one table as for twenty. Containers number their processes independently: folders of several hosts
-are read host by host, and of one host (`--network host` has its name) path by path; where two use
-the same number, the later one's are moved (:data:`NEXT_HOST`). CARET emits the events of an
-application's start again when tracing begins; ``init_timestamp`` says when they really happened.
+are read host by host, and of one host (`--network host` has its name) path by path, but for paths
+of one session; where two use the same number, the later one's are moved (:data:`NEXT_HOST`). CARET
+emits the events of an application's start again when tracing begins; ``init_timestamp`` says when
+they really happened.
 """
 
 from collections import Counter
@@ -22,6 +23,13 @@ import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, Events, open_trace, read_events
 from chainshaper.sources.ctf import tsdl as ctf
+from chainshaper.sources.lttng.sessions import (
+    CARET_INIT,
+    Place,
+    one_session,
+    refuse_same_events,
+    table_name,
+)
 from chainshaper.sources.system import (
     NEXT_HOST,
     distribution_of,
@@ -37,8 +45,6 @@ from chainshaper.values.recording import Recording, RecordingInfo
 Progress: TypeAlias = Callable[[float, str], None]
 """Gets the share of the work that is done, from 0 to 1, and what is being done."""
 
-_CARET_INIT = "caret_init"
-"""An event that is read with the creation, but is no table of ours."""
 _EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))
 _SWITCHES = frozenset(("sched_switch",))
 _UPPER_LAYERS = frozenset(("rclcpp_publish", "rcl_publish", "rcl_take", "rclcpp_take"))
@@ -71,9 +77,13 @@ def open_lttng_trace(
                 f"{folder.path} was taken by another clock than {first.path} (another machine or "
                 "boot): their times cannot be compared; give the folders of one recording"
             )
+    refuse_same_events(trace)
     tables = TraceTables(_by_host(trace, paths), progress, overview)
     creation, hosts = tables.creation(), {_fact(folder, "hostname") for folder in trace.folders}
     kernels = (_fact(folder, "kernel_release") for folder in trace.folders)
+    lost = {"discarded_events": trace.discarded_events, "lost_packets": trace.lost_packets}
+    if damaged := trace.damaged_places + tables.damaged:
+        lost["damaged_packets"] = damaged
     info = RecordingInfo(
         source="lttng",
         host=", ".join(sorted(host for host in hosts if host)),
@@ -82,7 +92,7 @@ def open_lttng_trace(
         rmw=rmw_of_gids(creation) or rmw_of_threads(tables.thread_names()),
         clock_offset_ns=trace.clock_offset_ns,
         processes=processes_of(creation, tables.commands()),
-        lost={"discarded_events": trace.discarded_events, "lost_packets": trace.lost_packets},
+        lost=lost,
         notes=(*trace.warnings, *tables.notes()),
     )
     return Recording(Path(paths[0]), info, tables)
@@ -95,7 +105,8 @@ def _fact(folder: ctf.TraceClass, name: str) -> str:
 class TraceTables(Mapping[str, pl.DataFrame]):
     """The event tables of an open trace that happened, decoded at first use.
 
-    ``counts`` are the events per full name, provider included; ``fields`` what is declared of each.
+    ``counts`` are the events per full name, provider included; ``fields`` what is declared of each;
+    so many packets are ``damaged``.
     """
 
     def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress, overview: bool) -> None:
@@ -109,17 +120,18 @@ class TraceTables(Mapping[str, pl.DataFrame]):
                 self._sources.setdefault(name, []).append(full_name)
         self.counts = Counter[str]()
         self.warnings: tuple[str, ...] = ()
+        self.damaged = 0
         self._names: dict[int, str] = {}
         self._anonymous = 0
         self._pids: set[int] = set()
         self._moved: dict[str, int] = {}
         # Where numbers may collide, those of all hosts have to be seen first.
         everything = not overview or len(self._hosts) > 1
-        self._decode(CREATION | {_CARET_INIT} | (_MESSAGES if everything else frozenset()))
+        self._decode(CREATION | {CARET_INIT} | (_MESSAGES if everything else frozenset()))
 
     def creation(self) -> events.EventTables:
         """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""
-        return {n: t for n, t in self._read.items() if n in CREATION or n == _CARET_INIT}
+        return {n: t for n, t in self._read.items() if n in CREATION or n == CARET_INIT}
 
     def commands(self) -> dict[int, str]:
         """Process → what its main thread is called, for all that created objects, or else ran."""
@@ -218,6 +230,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         """Count all events; move numbers that another host has, too."""
         self.counts.update(found.counts)
         self.warnings += found.warnings
+        self.damaged += found.damaged
         self._moved[host] = 0
         if len(self._hosts) > 1:
             known = [frame for frame in found.values() if frame.schema["pid"].is_integer()]
@@ -238,10 +251,12 @@ class TraceTables(Mapping[str, pl.DataFrame]):
 def _by_host(trace: CtfTrace, paths: Sequence[str | Path]) -> dict[str, CtfTrace]:
     """The trace in parts, one per traced host, or path of one; the first has foreign kernels'."""
     kernel = [folder.env.get("domain") == "kernel" for folder in trace.folders]
-    places = [
+    places: list[Place] = [
         (_fact(folder, "hostname"), next(p for p in paths if folder.path.is_relative_to(p)))
         for folder in trace.folders
     ]
+    session = one_session(trace, places)
+    places = [session.get(place, place) for place in places]
     user = {place for place, of_kernel in zip(places, kernel, strict=True) if not of_kernel}
     several = Counter(host for host, _ in user)
     hosts = [
@@ -269,14 +284,6 @@ def _process_names(frames: Mapping[str, pl.DataFrame]) -> dict[int, str]:
                 if pid == tid or pid not in names:
                     names[pid] = str(name)
     return names
-
-
-def table_name(event: str) -> str | None:
-    """The table that an event belongs to: ``ros2:callback_start`` → ``callback_start``."""
-    provider, _, name = event.rpartition(":")
-    known = name in events.FIELDS or name == _CARET_INIT
-    providers = ("",) if name == "sched_switch" else ("ros2", "ros2_caret")
-    return name if known and provider in providers else None
 
 
 def _declared_fields(trace: CtfTrace) -> dict[str, dict[str, ctf.Type]]:

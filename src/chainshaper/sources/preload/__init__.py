@@ -3,6 +3,10 @@
 `preload.c` is that library. It sends us the memory of its process with the process's first event;
 that of a process that runs already is in `/proc`. A thread reads all memories ten times a second,
 also what a process wrote that was killed in between.
+
+A process writes into its memory whatever it likes, by a mistake as well. So every record is checked
+before it is used; the first that the library cannot have written is the last that is looked at of
+that process, whose events from there on are counted as lost.
 """
 
 import fcntl
@@ -15,6 +19,7 @@ import re
 import secrets
 import shutil
 import socket
+import stat
 import struct
 import subprocess
 import tempfile
@@ -42,9 +47,9 @@ from chainshaper.sources.ebpf.trace_points import (
 )
 from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
-from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.events import EventTables
-from chainshaper.values.files import own_cache, why_distrusted
+from chainshaper.values.files import open_output, own_cache, why_distrusted
 from chainshaper.values.recording import RecordingInfo
 
 SOURCE = Path(__file__).with_name("preload.c")
@@ -67,8 +72,14 @@ _RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
 _MAGIC, _FORMAT = 0x63687368, 2
 _TEXT, _LIBRARY, _FIRST_EVENT = 1, 2, 3
 _TEXT_BYTES, _PLACES = 40, 16
-_LARGEST = 1 << 30
+_RINGS, _RING_RECORDS, _OBJECT_RECORDS = 64, 1 << 14, 1 << 15  # of this format, no others
+_OF_OBJECTS = _HEADER.itemsize + _RINGS * _RING.itemsize
+_OF_RECORDS = _OF_OBJECTS + _OBJECT_RECORDS * RECORD.itemsize
+_SIZE = _OF_RECORDS + _RINGS * _RING_RECORDS * RECORD.itemsize
 _F_GET_SEALS, _F_SEAL_SHRINK = 1034, 2  # linux/fcntl.h
+_LONGEST_TEXT = 4096  # `LONGEST_TEXT` in preload.c
+_MOST_WRITTEN = 1 << 40  # records between two looks: a week of as many as one core can write
+_LARGEST_ID = 1 << 22  # of processes and threads: linux/threads.h, PID_MAX_LIMIT
 _THREAD_TIME = 2  # the value of callback_start and callback_end that is no argument
 _CALL: dict[str, tuple[int, Literal["number", "gid"]]] = {  # where the values of a CALL are
     **{"rmw_client_handle": (0, "number"), "rmw_service_handle": (0, "number")},
@@ -85,8 +96,26 @@ def event_names() -> tuple[str, ...]:
     return tuple(_NAME.findall(SOURCE.read_text()))
 
 
+@functools.cache
+def _events_of_rings() -> NDArray[np.bool_]:
+    """By the number of an event, whether rings have it: what happens, not what is created."""
+    known = np.zeros(1 << 16, bool)
+    for number, name in enumerate(event_names(), _FIRST_EVENT):
+        known[number] = name not in events.CREATION
+    return known
+
+
+@functools.cache
+def _events_of_objects() -> NDArray[np.bool_]:
+    """The same of what is created; 0 is an event that is being written."""
+    known = ~_events_of_rings()
+    known[_FIRST_EVENT + len(event_names()) :] = False
+    return known
+
+
 class TracedProcess:
-    """The memory of one process; ``lost`` counts what was overwritten.
+    """The memory of one process; ``lost`` counts what was overwritten, and what is not used since
+    there is ``damage``: why, as half a sentence.
 
     Nothing is locked: a reader copies what is new in a ring, then looks again how much has been
     written, and counts as lost what may have been overwritten meanwhile. ``pid`` is the process's
@@ -96,32 +125,40 @@ class TracedProcess:
     """
 
     def __init__(self, descriptor: int, pid: int = 0) -> None:
-        size, seals = os.fstat(descriptor).st_size, 0
+        seals = 0
         with suppress(OSError):  # no memfd
             seals = fcntl.fcntl(descriptor, _F_GET_SEALS)
-        if not seals & _F_SEAL_SHRINK or not _HEADER.itemsize <= size <= _LARGEST:
+        size = os.fstat(descriptor).st_size
+        if not seals & _F_SEAL_SHRINK or size < _HEADER.itemsize:
             raise InputError("what was sent is no memory of a traced process")
+        header = np.frombuffer(os.pread(descriptor, _HEADER.itemsize, 0), _HEADER)
+        magic, form, self.inner_pid, *counts = header[0].tolist()[: len(_COUNTS)]
+        # Whatever a process says, no more is read than a memory of this version has.
+        known = [_RINGS, _RING_RECORDS, _OBJECT_RECORDS]
+        if (magic, form, counts) != (_MAGIC, _FORMAT, known) or size != _SIZE:
+            raise InputError("what was sent is the memory of another version of chainshaper")
         memory = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
         self.header: NDArray[Any] = np.frombuffer(memory, _HEADER, 1)
-        magic, form, self.inner_pid, rings, records, objects, *_ = self.header[0].tolist()
-        of_objects = _HEADER.itemsize + rings * _RING.itemsize
-        of_records = of_objects + objects * RECORD.itemsize
-        is_short = not records or size < of_records + rings * records * RECORD.itemsize
-        if (magic, form) != (_MAGIC, _FORMAT) or is_short:
-            raise InputError("what was sent is the memory of another version of chainshaper")
         self.pid = pid or self.inner_pid
+        if not (0 < self.pid <= _LARGEST_ID and 0 < self.inner_pid <= _LARGEST_ID):
+            raise InputError(f"what was sent says that it is of process {self.inner_pid}")
+        self.damage: str | None = None
         self._tids: dict[int, int] = {}
-        self._rings = np.frombuffer(memory, _RING, rings, _HEADER.itemsize)
-        self._objects = np.frombuffer(memory, RECORD, objects, of_objects)
-        self._records = np.frombuffer(memory, RECORD, rings * records, of_records)
-        self._records = self._records.reshape(rings, records)
-        self._read = np.zeros(rings, np.uint64)
+        self._rings = np.frombuffer(memory, _RING, _RINGS, _HEADER.itemsize)
+        self._objects = np.frombuffer(memory, RECORD, _OBJECT_RECORDS, _OF_OBJECTS)
+        records = np.frombuffer(memory, RECORD, _RINGS * _RING_RECORDS, _OF_RECORDS)
+        self._records = records.reshape(_RINGS, _RING_RECORDS)
+        self._read = np.zeros(_RINGS, np.uint64)
         self.lost = 0
 
     @property
     def dropped(self) -> int:
         """Events for which the process itself had no room."""
-        return int(self.header["dropped"][0])
+        dropped = int(self.header["dropped"][0])
+        if dropped >= _MOST_WRITTEN:
+            self._damaged(f"it says that it had no room for {dropped} events")
+            return 1
+        return dropped
 
     def new_records(self) -> list[NDArray[Any]]:
         """What came into the rings since the last time, each ring's in the order of writing."""
@@ -129,8 +166,13 @@ class TracedProcess:
         for number in np.flatnonzero(self._rings["written"] != self._read):
             ring, read = self._records[number], int(self._read[number])
             written = int(self._rings["written"][number])
-            if not read <= written < 1 << 62:  # the node has written where it should not
+            if not read <= written < read + _MOST_WRITTEN:
+                self._damaged(f"it says that it has written {written - read} events at once")
+                self._read[number] = written
                 self.lost += 1
+                continue
+            if self.damage is not None:
+                self.lost += written - read
                 self._read[number] = written
                 continue
             oldest = max(read, written - ring.size)
@@ -141,8 +183,29 @@ class TracedProcess:
             self.lost += min(whole, written) - read
             self._read[number] = written
             if whole < written:
-                found.append(self._numbered(copied[whole - oldest :]))
+                records = copied[whole - oldest :]
+                good = self._good(records, _events_of_rings())
+                self.lost += records.size - good
+                if good:
+                    found.append(self._numbered(records[:good]))
         return found
+
+    def _good(self, records: NDArray[Any], known: NDArray[np.bool_]) -> int:
+        """How many records stand before the first that the library cannot have written."""
+        times, tids, numbers = records["time"], records["tid"], records["event"]
+        good = (times >= 0) & (times <= time.monotonic_ns()) & known[numbers]
+        good &= (tids > 0) & (tids <= _LARGEST_ID)
+        good |= known[0] & (numbers == 0)
+        if good.all():
+            return records.size
+        at = int(np.argmin(good))
+        self._damaged(
+            f"it has a record of event {numbers[at]} in thread {tids[at]} at {times[at]} ns"
+        )
+        return at
+
+    def _damaged(self, why: str) -> None:
+        self.damage = self.damage or why
 
     def _numbered(self, records: NDArray[Any]) -> NDArray[Any]:
         """Records with the numbers that their threads have here, as long as they run."""
@@ -162,22 +225,31 @@ class TracedProcess:
         """
         asked = min(int(self.header["objects"][0]), self._objects.size)
         records = self._objects[:asked].copy()
-        own = np.flatnonzero(records["event"] > _TEXT)
+        records = records[: self._good(records, _events_of_objects())]
+        lengths, places = np.divmod(records["values"][:, 0], np.uint64(_PLACES))
+        is_text = records["event"] == _TEXT
+        if (long := is_text & (lengths > _LONGEST_TEXT)).any():
+            good = int(long.argmax())
+            self._damaged(f"it has a text of {lengths[good]} bytes")
+            records, is_text = records[:good], is_text[:good]
+        created = np.flatnonzero(~is_text)
         texts: dict[int, dict[int, bytes]] = {}
-        for at in np.flatnonzero(records["event"] == _TEXT):
-            length, place = divmod(int(records["values"][at, 0]), _PLACES)
-            said = texts.setdefault(int(np.searchsorted(own, at)) - 1, {})
+        for at in np.flatnonzero(is_text):
+            said = texts.setdefault(int(np.searchsorted(created, at)) - 1, {})
+            place, length = int(places[at]), int(lengths[at])
             said[place] = (said.get(place, b"") + records["values"][at, 1:].tobytes())[:length]
-        return self._numbered(records[own]), {
-            number: {place: text.decode(errors="replace") for place, text in said.items()}
-            for number, said in texts.items()
+        whole = np.flatnonzero(records["event"][created])  # the others' texts are theirs as well
+        return self._numbered(records[created[whole]]), {
+            number: {place: text_of(text) for place, text in texts.get(behind, {}).items()}
+            for number, behind in enumerate(whole.tolist())
         }
 
 
 def creation_tables(process: TracedProcess) -> tuple[dict[str, pl.DataFrame], TracingLibrary]:
     """The tables of what a process has created, and the tracing library behind ours."""
     objects, texts = process.objects()
-    path = next((texts[int(n)][0] for n in np.flatnonzero(objects["event"] == _LIBRARY)), "")
+    libraries = (texts.get(int(n), {}) for n in np.flatnonzero(objects["event"] == _LIBRARY))
+    path = next((one.get(0, "") for one in libraries), "").partition("\0")[0]
     library = TracingLibrary(Path(path), frozenset(), version_of(Path(path)))
     pids = np.full(objects.size, process.pid, np.int32)
     return _tables(objects, pids, texts, library, events.CREATION), library
@@ -263,9 +335,9 @@ def compile_library(
         )
     library = library.absolute()
     command, environment = [path, "-o", str(library), *words], tool_environment()
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, env=environment, capture_output=True, check=False)
     if done.returncode:
-        last = "; ".join(done.stderr.splitlines()[-2:])
+        last = "; ".join(text_of(done.stderr).splitlines()[-2:])
         raise PlatformError(f"{path} cannot compile {library.name}: {last}; see `{path} -v`")
     return library
 
@@ -311,11 +383,25 @@ def preloading(library: Path) -> str:
     return ":".join([str(library), *(one for one in before if one and one != str(library))])
 
 
+SANITIZER, ANY_ORDER = "ASAN_OPTIONS", "verify_asan_link_order=0"
+"""A node built with AddressSanitizer refuses to start behind any library in `LD_PRELOAD`, unless
+this variable tells it not to look at the order of libraries. The last word of it counts."""
+
+
+def in_front(library: Path) -> dict[str, str]:
+    """The variables that put a library in front of ROS 2 in all that is started with them.
+
+    Raises PlatformError: as :func:`preloading`.
+    """
+    options = filter(None, [os.environ.get(SANITIZER, ""), ANY_ORDER])
+    return {"LD_PRELOAD": preloading(library), SANITIZER: ":".join(options)}
+
+
 NO_PROCESS = (
     "no process of these users runs with the library in front: set what `chainshaper watch "
     "--environment` prints before the application is started, or name its user (--user)"
 )
-_MEMORY = re.compile(r"/memfd:chainshaper-trace\b")
+_MEMORY = re.compile(rb"/memfd:chainshaper-trace\b")
 
 
 def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
@@ -325,14 +411,33 @@ def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[i
         with suppress(OSError):  # it has ended, or may not be looked into
             if Path(f"/proc/{pid}").stat().st_uid not in users:
                 continue
-            own = innermost_id(read_proc(f"/proc/{pid}/status"))
+            inner_pid = innermost_id(read_proc(f"/proc/{pid}/status"))
             for descriptor in Path(f"/proc/{pid}/fd").iterdir():
-                if _MEMORY.match(str(descriptor.readlink())):
-                    with suppress(InputError), descriptor.open("rb") as file:
-                        memory = TracedProcess(file.fileno(), pid)
-                        if memory.inner_pid == own:  # else it is one that reads it, as we do
-                            yield pid, memory
-                            break
+                with suppress(OSError):  # it is closed meanwhile, or may not be opened
+                    memory = _memory_of(descriptor, pid)
+                    # Another process's memory is open in one that reads it, as we do.
+                    if memory is not None and memory.inner_pid == inner_pid:
+                        yield pid, memory
+                        break
+
+
+def _memory_of(descriptor: Path, pid: int) -> TracedProcess | None:
+    """The memory behind an open file of a process, in `/proc`; None: it is another kind of file.
+
+    Anything may have the name of a memory, and opening a pipe or a device may wait for ever or do
+    something: so the file is looked at before it is opened for reading. Raises OSError.
+    """
+    if not _MEMORY.match(os.fsencode(descriptor.readlink())):
+        return None
+    place = os.open(descriptor, os.O_PATH | os.O_CLOEXEC)
+    try:
+        if not stat.S_ISREG(os.fstat(place).st_mode):
+            return None
+        with Path(f"/proc/self/fd/{place}").open("rb") as file, suppress(InputError):
+            return TracedProcess(file.fileno(), pid)
+    finally:
+        os.close(place)
+    return None
 
 
 class PreloadTracer:
@@ -354,6 +459,7 @@ class PreloadTracer:
         self._clock_offset_ns = 0
         self._processes: list[TracedProcess] = []
         self._names: dict[int, str] = {}
+        self._refused: list[str] = []
         self._found: set[int] = set()  # attached to, by the ids that they have here
         self._searched_ns = 0
 
@@ -375,7 +481,7 @@ class PreloadTracer:
         self._socket.listen(128)
         self._socket.settimeout(_BETWEEN_LOOKS_S)
         self._reader.start()
-        return {"LD_PRELOAD": preloading(library), VARIABLE: name}
+        return {**in_front(library), VARIABLE: name}
 
     def failure(self) -> str | None:
         return self._failure
@@ -401,7 +507,6 @@ class PreloadTracer:
         for place, process in enumerate(self._processes):
             file = self._file(place)
             records = np.fromfile(file, RECORD) if file.exists() else np.empty(0, RECORD)
-            file.unlink(missing_ok=True)  # the tables have all of it
             created, library = creation_tables(process)
             pids = np.full(records.size, process.pid, np.int32)
             versions.append(library.version)
@@ -409,11 +514,23 @@ class PreloadTracer:
         tables = joined_tables(parts)
         lost = sum(process.lost + process.dropped for process in self._processes)
         notes = [f"{self._failure}."] if self._failure else []
+        notes += self._refused
+        for process in self._processes:
+            if process.damage is not None:
+                name = self._names.get(process.pid, "unknown")
+                notes.append(
+                    f"process {process.pid} ({name}): from where {process.damage}, which the"
+                    " library never writes, its events are left out and counted as lost."
+                )
         if lost:
             notes.append(f"{lost} events were lost: recording did not run often enough for them.")
         facts = {"clock_offset_ns": self._clock_offset_ns, "notes": tuple(notes)}
         facts |= {"pid_namespace": own_pid_namespace()}
         return tables, info_of("preload", tables, versions, self._names, lost, **facts)
+
+    def written(self) -> None:
+        for place in range(len(self._processes)):
+            self._file(place).unlink(missing_ok=True)  # the tables have all of it
 
     def _file(self, place: int) -> Path:
         return self._folder / f"process_{place}.records"
@@ -429,11 +546,14 @@ class PreloadTracer:
             self._read_all()
         except OSError as error:
             self._failure = f"events can no longer be written down ({error.strerror})"
+        except Exception as error:
+            self._failure = f"reading events has failed ({type(error).__name__}: {error})"
 
     def _welcome(self) -> None:
         """Take the memories that were sent, for as long as it is until the next look."""
+        until = time.monotonic() + _BETWEEN_LOOKS_S  # whoever else connects all the time
         with suppress(TimeoutError):
-            while not self._over.is_set():
+            while not self._over.is_set() and time.monotonic() < until:
                 peer, _ = self._socket.accept()
                 with peer:
                     self._take_memory(peer)
@@ -453,22 +573,28 @@ class PreloadTracer:
         """The memory of one process, which runs as one of the users that are recorded."""
         credentials = peer.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size)
         pid, user, _ = _CREDENTIALS.unpack(credentials)
+        if user not in self._users:
+            return
         peer.settimeout(_BETWEEN_LOOKS_S)
         try:
             _, descriptors, _, _ = socket.recv_fds(peer, 64, 1)
         except OSError:
             return
         for descriptor in descriptors:
-            with suppress(InputError):
-                if user in self._users:
-                    process = TracedProcess(descriptor, pid)
-                    self._processes.append(process)
-                    with suppress(OSError):
-                        self._names[process.pid] = Path(f"/proc/{pid}/comm").read_text().strip()
+            try:
+                process = TracedProcess(descriptor, pid)
+            except (InputError, OSError) as error:
+                self._refused.append(f"nothing of process {pid} is recorded: {error}.")
+            else:
+                self._processes.append(process)
+                with suppress(OSError):
+                    name = text_of(read_proc(f"/proc/{pid}/comm").removesuffix(b"\n"))
+                    self._names[process.pid] = name
             os.close(descriptor)
 
     def _read_all(self) -> None:
         for place, process in enumerate(self._processes):
             if parts := process.new_records():
-                with self._file(place).open("ab") as file:
+                flags = os.O_WRONLY | os.O_APPEND
+                with os.fdopen(open_output(self._file(place), flags), "ab") as file:
                     file.writelines(part.tobytes() for part in parts)

@@ -12,6 +12,15 @@
 //   first event, and gives it back as it ends. `written` counts: who reads sees what it has missed.
 // * Nothing waits, nothing is allocated behind a thread's first event. What finds no room is counted.
 //
+// We are a guest in the robot's process: whatever fails here, the node goes on as without us.
+//
+// * A thread never waits for another: where two make the memory at once, the second one's is thrown
+//   away. (Waiting would stop a SCHED_FIFO thread, and with it the ordinary one that it waits for.)
+// * Memory is claimed before it is written: where the kernel has none left, a write would be a SIGBUS.
+// * A limit on file sizes (`ulimit -f`) would send SIGXFSZ for our memory: it is blocked meanwhile.
+// * A child of fork() has a memory of its own, or none, however it was made; and a descriptor is closed
+//   only while it is still ours, since a node may close all numbers and use them again.
+//
 // Times are ns of CLOCK_MONOTONIC, values a function's arguments as they are in registers (of a bool
 // the lowest byte counts). Calls of services have trace points from Kilted on only: we see them as
 // librcl calls rmw.
@@ -25,6 +34,7 @@
 #include <fcntl.h>
 #include <pthread.h>
 #include <sched.h>
+#include <signal.h>
 #include <stdatomic.h>
 #include <stdbool.h>
 #include <stddef.h>
@@ -33,6 +43,7 @@
 #include <string.h>
 #include <sys/mman.h>
 #include <sys/socket.h>
+#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <sys/un.h>
 #include <time.h>
@@ -73,13 +84,23 @@ struct memory {
 _Static_assert(sizeof(struct record) == 64 && sizeof(struct ring) == 64, "a cache line each");
 
 static _Atomic(struct memory *) memory;
-static _Atomic int state;  // 0: none yet, 1: being made, 2: there, 3: cannot be had
+static _Atomic bool refused;  // the memory cannot be had: no event of this process is traced
 static int descriptor = -1;
+static struct stat identity;  // of the file behind it
 static pthread_key_t at_end;
+static bool has_key;
+// A page that the kernel empties in a child of fork(): 1 while the memory is this process's own.
+static volatile uint32_t *memory_is_ours = &(volatile uint32_t){1};
 struct rseq_area {  // struct rseq of <linux/rseq.h>, which older headers have not
   uint32_t cpu_id_start, cpu_id;
   volatile uint64_t section;
 };
+#ifndef MADV_POPULATE_WRITE
+#define MADV_POPULATE_WRITE 23  // Linux 5.14
+#endif
+#ifndef MADV_WIPEONFORK
+#define MADV_WIPEONFORK 18
+#endif
 static __thread struct {
   struct ring *ring;
   struct record *records;
@@ -120,13 +141,13 @@ static struct {
   uint32_t version, flags;
   uint64_t start, size, abort;
 } no_section __attribute__((aligned(32)));
-static ptrdiff_t rseq_offset;  // from the thread's pointer; 0: without
+static _Atomic ptrdiff_t rseq_offset;  // from the thread's pointer; 0: without
 
-static struct rseq_area *rseq_of_thread(void) {
+static struct rseq_area *rseq_at(ptrdiff_t offset) {
   char *thread;
   THREAD_POINTER(thread);
-  struct rseq_area *found = (struct rseq_area *)(void *)(thread + rseq_offset);
-  return thread && rseq_offset && (int32_t)found->cpu_id >= 0 ? found : NULL;
+  struct rseq_area *area = (struct rseq_area *)(void *)(thread + offset);
+  return thread && offset && (int32_t)area->cpu_id >= 0 ? area : NULL;
 }
 
 static void find_rseq(void) {
@@ -134,13 +155,14 @@ static void find_rseq(void) {
   const unsigned *size = dlsym(RTLD_DEFAULT, "__rseq_size");
   no_section.start = (uintptr_t)nowhere;
   no_section.abort = (uintptr_t)&nowhere[1];
-  rseq_offset = offset && size && *size ? *offset : 0;
-  struct rseq_area *rseq = rseq_of_thread();
+  ptrdiff_t usable = offset && size && *size ? *offset : 0;
+  struct rseq_area *rseq = rseq_at(usable);
   for (int try = 0; rseq && try < 3; try++) {
     rseq->section = (uintptr_t)&no_section;
     nanosleep(&(struct timespec){0, 1}, NULL);
-    if (rseq->section) rseq_offset = 0;
+    if (rseq->section) usable = 0;
   }
+  rseq_offset = usable;  // at once: another thread may be here too, and finds the same
 }
 
 static uint64_t thread_time(uint64_t time) {
@@ -168,7 +190,8 @@ static void send_memory(const char *name) {
   struct sockaddr_un address = {.sun_family = AF_UNIX};
   size_t length = strlen(name);
   int peer = socket(AF_UNIX, SOCK_SEQPACKET | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
-  if (peer < 0 || length >= sizeof address.sun_path) return;
+  if (peer < 0) return;
+  if (length >= sizeof address.sun_path) length = sizeof address.sun_path - 1;  // nothing listens there
   memcpy(address.sun_path + 1, name, length);  // in no file system: nothing of it is left behind
   socklen_t size = (socklen_t)(offsetof(struct sockaddr_un, sun_path) + 1 + length);
   if (connect(peer, (struct sockaddr *)&address, size) == 0) {
@@ -194,78 +217,141 @@ static void *next_one(const char *name) {
 
 static void append(uint16_t event, const uint64_t *values, unsigned texts);
 
-static bool make_memory(void) {
-  descriptor = memfd_create(NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING);
-  if (descriptor < 0 || ftruncate(descriptor, sizeof(struct memory))) return false;
-  struct memory *made =
-    mmap(NULL, sizeof(struct memory), PROT_READ | PROT_WRITE, MAP_SHARED, descriptor, 0);
-  if (made == MAP_FAILED) return false;
+// Have the kernel give the pages of an area now, so that writing to it later cannot fail; false: it
+// has none left. Before Linux 5.14 it cannot be asked: there the pages come as they are written.
+static bool claim(void *area, size_t size) {
+  return madvise(area, size, MADV_POPULATE_WRITE) == 0 || errno == EINVAL;
+}
+
+// A memory file of that size. A limit on the size of files holds for it too, and sends SIGXFSZ, which
+// would end the node: that signal is blocked here and taken back.
+static int new_file(size_t size) {
+  sigset_t too_large, before, pending;
+  sigemptyset(&too_large);
+  sigaddset(&too_large, SIGXFSZ);
+  if (pthread_sigmask(SIG_BLOCK, &too_large, &before)) return -1;
+  sigpending(&pending);
+  int file = memfd_create(NAME, MFD_CLOEXEC | MFD_ALLOW_SEALING);
+  bool failed = file >= 0 && ftruncate(file, (off_t)size);
+  if (failed && errno == EFBIG && !sigismember(&pending, SIGXFSZ))
+    while (sigtimedwait(&too_large, NULL, &(struct timespec){0, 0}) < 0 && errno == EINTR) continue;
+  pthread_sigmask(SIG_SETMASK, &before, NULL);
   // It stays as long as it is: who has it mapped elsewhere relies on that.
-  if (fcntl(descriptor, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL)) return false;
+  failed = failed || (file >= 0 && fcntl(file, F_ADD_SEALS, F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL));
+  if (!failed) return file;
+  close(file);
+  return -1;
+}
+
+static struct memory *mapped(int file) {
+  void *area = mmap(NULL, sizeof(struct memory), PROT_READ | PROT_WRITE, MAP_SHARED, file, 0);
+  if (area == MAP_FAILED) return NULL;
+  if (claim(area, offsetof(struct memory, records))) return area;
+  munmap(area, sizeof(struct memory));
+  return NULL;
+}
+
+static void begin(struct memory *made) {
   made->format = FORMAT;
   made->pid = (uint32_t)getpid();
   made->rings = RINGS;
   made->ring_records = RING_RECORDS;
   made->object_records = OBJECT_RECORDS;
   made->magic = 0x63687368;
-  memory = made;
-  return true;
+}
+
+// Close the memory's descriptor, unless the node has closed it and the number is another file's now.
+static void close_file(void) {
+  struct stat now_there;
+  bool is_ours = descriptor >= 0 && fstat(descriptor, &now_there) == 0 &&
+                 now_there.st_dev == identity.st_dev && now_there.st_ino == identity.st_ino;
+  if (is_ours) close(descriptor);
+  descriptor = -1;
 }
 
 // As a thread ends. What it emits behind this gets a ring anew, and gives it back again.
 static void give_back(void *ring) {
   own.ring = NULL;
-  ((struct ring *)ring)->taken = 0;
+  if (*memory_is_ours) ((struct ring *)ring)->taken = 0;
 }
 
 // A child of fork() has its parent's memory mapped, and gets its own at its first event.
 static void in_child(void) {
-  if (descriptor >= 0) close(descriptor);
+  *memory_is_ours = 1;
+  close_file();
   if (memory) munmap(memory, sizeof(struct memory));
-  descriptor = -1;
   memory = NULL;
-  state = 0;
-  pthread_setspecific(at_end, NULL);
+  refused = false;
+  if (has_key) pthread_setspecific(at_end, NULL);
   memset(&own, 0, sizeof own);
 }
 
-static bool is_ready(void) {
-  int none = 0, before = errno;
-  if (state == 2) return true;
-  if (atomic_compare_exchange_strong(&state, &none, 1)) {
-    static bool once;
-    if (!once && (pthread_key_create(&at_end, give_back) || pthread_atfork(NULL, NULL, in_child)))
-      state = 3;
-    if (!once) find_rseq();
-    once = true;
-    if (state == 1) state = make_memory() ? 2 : 3;
-    if (state == 2) {
-      Dl_info behind;
-      void *function = next_one("ros_trace_callback_start");
-      own.tid = (uint32_t)syscall(SYS_gettid);
-      if (function && dladdr(function, &behind) && behind.dli_fname)
-        append(LIBRARY, (uint64_t[6]){(uintptr_t)behind.dli_fname}, 1);
-      const char *reader = getenv("CHAINSHAPER_TRACE");
-      if (reader) send_memory(reader);
-    }
+// As the library is loaded. Children of which fork() does not tell (a bare system call, `_Fork`) find
+// at their first event that the kernel has emptied a page of theirs.
+__attribute__((constructor)) static void prepare(void) {
+  has_key = pthread_key_create(&at_end, give_back) == 0;
+  long size = sysconf(_SC_PAGESIZE);
+  uint32_t *page = mmap(NULL, (size_t)size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+  if (page == MAP_FAILED) return;
+  *page = 1;
+  if (madvise(page, (size_t)size, MADV_WIPEONFORK) == 0) memory_is_ours = page;
+  pthread_atfork(NULL, NULL, in_child);
+}
+
+// Make the memory of this process, and say where it is; false: it cannot be had.
+static bool make_memory(void) {
+  int file = new_file(sizeof(struct memory));
+  struct memory *made = file < 0 ? NULL : mapped(file), *none = NULL;
+  if (made) {
+    find_rseq();
+    begin(made);
   }
-  while (state == 1) sched_yield();  // at a process's first event only
+  if (!made || !atomic_compare_exchange_strong(&memory, &none, made)) {
+    if (made) munmap(made, sizeof(struct memory));
+    if (file >= 0) close(file);
+    refused = !memory;
+    return memory;  // another thread was faster, or there is none
+  }
+  fstat(file, &identity);
+  descriptor = file;
+  Dl_info behind;
+  void *function = next_one("ros_trace_callback_start");
+  own.tid = (uint32_t)syscall(SYS_gettid);
+  if (function && dladdr(function, &behind) && behind.dli_fname)
+    append(LIBRARY, (uint64_t[6]){(uintptr_t)behind.dli_fname}, 1);
+  const char *reader = getenv("CHAINSHAPER_TRACE");
+  if (reader) send_memory(reader);
+  return true;
+}
+
+static bool is_ready(void) {
+  if (__builtin_expect(!*memory_is_ours, 0)) in_child();
+  if (memory) return true;
+  if (refused) return false;
+  int before = errno;
+  bool made = make_memory();
   errno = before;
-  return state == 2;
+  return made;
 }
 
 static bool has_ring(void) {
-  if (own.ring) return true;
   if (!is_ready()) return false;
   own.tid = (uint32_t)syscall(SYS_gettid);
-  own.rseq = rseq_of_thread();
+  own.rseq = rseq_at(rseq_offset);
   struct memory *all = memory;
   for (unsigned number = 0; number < RINGS; number++) {
     uint32_t none = 0;
     if (!atomic_compare_exchange_strong(&all->ring[number].taken, &none, 1)) continue;
+    int before = errno;
+    bool has_room = claim(all->records[number], sizeof all->records[number]);
+    errno = before;
+    if (!has_room) {
+      all->ring[number].taken = 0;
+      break;
+    }
     own.records = all->records[number];
     own.ring = &all->ring[number];
-    pthread_setspecific(at_end, own.ring);
+    if (has_key) pthread_setspecific(at_end, own.ring);
     return true;
   }
   atomic_fetch_add(&all->dropped, 1);
@@ -275,7 +361,8 @@ static bool has_ring(void) {
 // `time` 0: now.
 static inline __attribute__((always_inline)) void write_record(
   uint16_t event, uint64_t time, unsigned count, const uint64_t *values, bool timed) {
-  if (__builtin_expect(!own.ring, 0) && !has_ring()) return;
+  bool is_known = own.ring && *memory_is_ours;
+  if (__builtin_expect(!is_known, 0) && !has_ring()) return;
   uint64_t number = atomic_load_explicit(&own.ring->written, memory_order_relaxed);
   struct record *record = &own.records[number & (RING_RECORDS - 1)];
   // Who sees any of this record sees the count of those before, and that its room is taken again.

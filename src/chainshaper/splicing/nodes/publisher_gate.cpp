@@ -9,10 +9,12 @@
 // Tracers see what they would see of a shaping node (`node`): the node of the application publishes
 // on `input`, our thread takes that, as a callback of `node`, and publishes it on `output`.
 
+#include <link.h>
 #include <pthread.h>
 #include <semaphore.h>
 
 #include <memory>
+#include <new>
 #include <thread>
 
 #include "chainshaper_shaping/gate_log.hpp"
@@ -133,12 +135,14 @@ public:
         settings_(std::move(settings)),
         node_(node),
         shaper_(gate_of(settings_.parameters, depth), settings_.parameters.spin_ns) {
+    const FileSizeSignalBlocked blocked;
     shaper_.look = [this] { look(); };
     show();
     const auto & parameters = settings_.parameters;
     if (!parameters.log.empty() && !log_.open_file(parameters.log, parameters.log_bytes))
       say("no log is written to %s: %s", parameters.log.c_str(), std::strerror(errno));
     sem_init(&more_, 0, 0);
+    const SignalsBlocked inherited;
     thread_ = std::thread([this] { run(); });
   }
 
@@ -172,19 +176,23 @@ public:
 
   const void * input_handle() const { return &input_handle_; }
 
-  // In the thread that publishes; it waits for nothing. `fill` serializes the message. rmw's code.
+  // In the thread that publishes; it waits for nothing. `fill` serializes the message. rmw's code;
+  // none: the message is not taken, so that it is to be published at once.
   template <typename Fill>
-  int take(const void * ros_message, Fill fill) {
-    auto message = std::make_unique<Serialized>();
+  std::optional<int> take(const void * ros_message, Fill fill) {
+    if (failed_at_all_) return std::nullopt;
+    Message message(new (std::nothrow) Serialized);
+    if (!message) return std::nullopt;
     // Where the event has no stamp, a message's publication is the last one before its stamp.
     if (is_humble()) emit_write(&rmw_input_, ros_message, 0);
     message->stamp = next_stamp();
     if (!is_humble()) emit_write(&rmw_input_, ros_message, message->stamp);
     if (const int failed = fill(message->bytes)) return failed;
-    Serialized * const own = message.release();
-    own->next = arrived_.load(std::memory_order_relaxed);
-    while (!arrived_.compare_exchange_weak(own->next, own)) continue;
+    Serialized * const newest = message.release();
+    newest->next = arrived_.load(std::memory_order_relaxed);
+    while (!arrived_.compare_exchange_weak(newest->next, newest)) continue;
     sem_post(&more_);
+    if (failed_at_all_) publish_arrived();  // meanwhile
     return 0;
   }
 
@@ -236,7 +244,28 @@ private:
       }
     } catch (const Over &) {
       return;
+    } catch (const std::exception & error) {
+      failed_at_all_ = true;
+      say("%s: its gate has failed (%s): all that is published leaves at once from now on",
+          settings_.output.c_str(), error.what());
+      publish_all();
     }
+  }
+
+  // What waits leaves at once, in its order.
+  void publish_all() {
+    for (const auto & waiting : shaper_.queue.waiting)
+      if (waiting.message) publish(*waiting.message);
+    shaper_.queue.waiting.clear();
+    publish_arrived();
+  }
+
+  void publish_arrived() {
+    std::vector<Message> newest_first;
+    for (auto * message = arrived_.exchange(nullptr); message != nullptr; message = message->next)
+      newest_first.emplace_back(message);
+    for (auto message = newest_first.rbegin(); message != newest_first.rend(); ++message)
+      publish(**message);
   }
 
   void look() {
@@ -305,6 +334,7 @@ private:
   std::atomic<Serialized *> arrived_{nullptr};  // the newest first
   std::atomic<std::int64_t> stamp_{0};
   std::atomic<bool> over_{false};
+  std::atomic<bool> failed_at_all_{false};  // the gate's thread has ended by an error
   bool failed_{false};
   sem_t more_{};
   std::optional<Turn> turn_;
@@ -358,6 +388,51 @@ void shape(const RmwNode * node, const RmwPublisher * publisher, const void * ty
   }
 }
 
+// As the C library of 2.35 and later has it in <dlfcn.h>.
+struct FoundObject {
+  unsigned long long flags;  // NOLINT - the C library's
+  void * start;
+  void * end;
+  struct link_map * library;
+  void * others[16];
+};
+
+// What making a mutex needs of the loader. It is asked as we are loaded: later it may have locks taken
+// for whose end a thread must not wait that makes a mutex.
+struct Loader {
+  decltype(&pthread_mutex_init) mutex_init{
+      reinterpret_cast<decltype(&pthread_mutex_init)>(dlsym(RTLD_NEXT, "pthread_mutex_init"))};
+  int (*find_object)(void *, FoundObject *){
+      reinterpret_cast<int (*)(void *, FoundObject *)>(dlsym(RTLD_DEFAULT, "_dl_find_object"))};
+};
+
+const Loader & loader() {
+  static const Loader known;
+  return known;
+}
+
+[[maybe_unused]] const Loader & at_loading = loader();
+
+// The file of the library that has code at an address; "": not known.
+const char * library_of(void * address) {
+  FoundObject object{};
+  if (loader().find_object != nullptr) {  // takes no lock
+    const bool is_known = loader().find_object(address, &object) == 0;
+    return is_known && object.library->l_name != nullptr ? object.library->l_name : "";
+  }
+  Dl_info library{};
+  const bool is_known = dladdr(address, &library) != 0 && library.dli_fname != nullptr;
+  return is_known ? library.dli_fname : "";
+}
+
+bool is_of_middleware(void * address) {
+  static constexpr std::array<const char *, 6> libraries{
+      "/libddsc.so", "/libfastrtps.so", "/libfastdds.so", "/librmw_", "/libzenohc.so", "/libnddsc"};
+  const char * const name = library_of(address);
+  return std::any_of(libraries.begin(), libraries.end(),
+                     [=](const char * part) { return std::strstr(name, part) != nullptr; });
+}
+
 }  // namespace
 
 EXPORTED RmwPublisher * rmw_create_publisher(const RmwNode * node, const void * type_support,
@@ -377,17 +452,19 @@ EXPORTED int rmw_destroy_publisher(RmwNode * node, RmwPublisher * publisher) {
 }
 
 EXPORTED int rmw_publish(const RmwPublisher * publisher, const void * message, void * allocation) {
-  if (Output * const output = output_of(publisher))
-    return output->take(message, [&](Bytes & bytes) {
+  if (Output * const output = output_of(publisher)) {
+    const auto code = output->take(message, [&](Bytes & bytes) {
       return RMW(rmw_serialize)(message, output->type_support, &bytes);
     });
+    if (code) return *code;
+  }
   return RMW(rmw_publish)(publisher, message, allocation);
 }
 
 EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, const Bytes * message,
                                             void * allocation) {
-  if (Output * const output = output_of(publisher))
-    return output->take(message, [&](Bytes & bytes) {
+  if (Output * const output = output_of(publisher)) {
+    const auto code = output->take(message, [&](Bytes & bytes) {
       bytes.buffer = static_cast<std::uint8_t *>(
           bytes.allocator.allocate(message->length, bytes.allocator.state));
       if (bytes.buffer == nullptr) return 10;  // RMW_RET_BAD_ALLOC
@@ -395,6 +472,8 @@ EXPORTED int rmw_publish_serialized_message(const RmwPublisher * publisher, cons
       bytes.length = bytes.capacity = message->length;
       return 0;
     });
+    if (code) return *code;
+  }
   return RMW(rmw_publish_serialized_message)(publisher, message, allocation);
 }
 
@@ -438,9 +517,12 @@ EXPORTED void ros_trace_rcl_publish(const void * handle, const void * message) {
 // it, as does the kernel for what is `PTHREAD_PRIO_INHERIT`: else an ordinary thread of the process
 // which loses its core within DDS keeps the chain's threads and the gate's waiting until it has one
 // again. Each call into Cyclone DDS takes a mutex that all threads share (`dds_handle_pin`).
+//
+// Only mutexes that the middleware makes are changed. One with priority inheritance may be unlocked by
+// the thread only that has locked it, which a robot's own code need not keep to.
 EXPORTED int pthread_mutex_init(pthread_mutex_t * mutex, const pthread_mutexattr_t * given) {
-  static const auto init =
-      reinterpret_cast<decltype(&pthread_mutex_init)>(dlsym(RTLD_NEXT, "pthread_mutex_init"));
+  const auto init = loader().mutex_init;
+  if (!is_of_middleware(__builtin_return_address(0))) return init(mutex, given);
   pthread_mutexattr_t attributes;
   int protocol = PTHREAD_PRIO_NONE;
   if (given != nullptr) {

@@ -67,7 +67,11 @@ EXPORTED void * rmw_create_subscription(const RmwNode * node, const void * type_
                                         const void * options) {
   void * const subscription =
       RMW(rmw_create_subscription)(node, type_support, topic, qos, options);
-  remember(subscription, node, topic);
+  try {
+    remember(subscription, node, topic);
+  } catch (const std::exception & error) {
+    say("%s is handed on at once: %s", topic, error.what());
+  }
   return subscription;
 }
 

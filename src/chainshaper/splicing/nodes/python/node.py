@@ -307,7 +307,8 @@ def publish_function(publisher: Any) -> Callable[[bytes], None]:
 #
 # A process of its own writes the file, so that neither a slow disk nor a full one can delay the
 # gate: that only puts a line into a pipe, and goes on without it where the pipe is full. What is in
-# the pipe is written although the gate is killed. Missing rows show by their numbers.
+# the pipe is written although the gate is killed. Missing rows show by their numbers. Whoever has
+# the folder may put a link in the file's place: it is not followed.
 
 LOG_HEADER = f"{','.join(LOG_COLUMNS)}\n".encode()
 
@@ -323,7 +324,10 @@ def _write_rows(path: str, header: bytes, most_bytes: int) -> None:
 
     def append(text: bytes) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC
-        with os.fdopen(os.open(path, flags, 0o644), "ab", 0) as file:
+        with os.fdopen(os.open(path, flags | os.O_NOFOLLOW, 0o644), "ab", 0) as file:
+            state = os.fstat(file.fileno())
+            if state.st_nlink > 1 or state.st_uid != os.geteuid():
+                raise OSError  # somebody else's was put in its place
             size = file.tell()
             if size <= len(header) or size + len(text) <= most_bytes // 2:
                 whole = text if size else header + text
@@ -365,7 +369,10 @@ class GateLog:
     def _start_writer(self, path: str, most_bytes: int) -> None:
         flags = os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC | os.O_NONBLOCK
         try:
-            with os.fdopen(os.open(path, flags, 0o644), "ab", 0) as file:
+            with os.fdopen(os.open(path, flags | os.O_NOFOLLOW, 0o644), "ab", 0) as file:
+                state = os.fstat(file.fileno())
+                if state.st_nlink > 1 or state.st_uid != os.geteuid():
+                    raise PermissionError(0, "it is not a file of this user's alone")
                 file.write(b"" if file.tell() else LOG_HEADER)
         except OSError as error:
             self._logger.warning(f"no log is written to {path}: {error.strerror}")

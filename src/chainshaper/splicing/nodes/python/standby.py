@@ -59,7 +59,7 @@ def diagnostics_of(node: Node, standby: Standby, shaping_node: str) -> None:
             count = page["bypassed"] - page["bypassed_before"]
             text = f"{word} for {seconds:.1f} s, {count} messages"
         values = {"output": page.topic, "shaping node": shaping_node, "starts": page["starts"]}
-        values["messages without it"] = page["bypassed"]
+        values["messages without it since boot"] = page["bypassed"]
         pairs = [messages.KeyValue(key=key, value=str(value)) for key, value in values.items()]
         about = {"name": f"chainshaper: {page.topic}", "message": text, "hardware_id": ""}
         status = messages.DiagnosticStatus(level=bytes([level]), values=pairs, **about)

@@ -440,6 +440,7 @@ private:
 
   void run() {
     unloaded = &unloaded_;
+    const FileSizeSignalBlocked blocked;  // the container is the robot's
     pthread_setname_np(pthread_self(), gate_thread_name(node_->get_name()).c_str());
     try {
       auto turn = turn_of(*node_);
@@ -471,6 +472,7 @@ RCLCPP_COMPONENTS_REGISTER_NODE(CHAINSHAPER_COMPONENT::ShapingNode)
 #else
 
 int main(int argc, char ** argv) {
+  std::signal(SIGXFSZ, SIG_IGN);  // a log that may grow no further (`ulimit -f`) is no reason to end
   std::optional<Shaping> shaping;
   return run(argc, argv, "chainshaper_shaping", [&](rclcpp::Node & node) -> std::function<bool()> {
     auto turn = turn_of(node);

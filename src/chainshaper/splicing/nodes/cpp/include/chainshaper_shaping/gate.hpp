@@ -19,6 +19,7 @@
 #include <stdexcept>
 #include <utility>
 
+#include "guest.hpp"
 #include "schema.hpp"
 
 namespace chainshaper {
@@ -55,6 +56,7 @@ struct Gate {
   Entry into_open_slot{Entry::at_once};
 
   bool may_move(std::int64_t by_ns) const {
+    if (by_ns < -cycle_ns || by_ns > cycle_ns) return false;  // also what a sum could not hold
     return slots.front().start + by_ns >= 0 && slots.back().end + by_ns <= cycle_ns;
   }
 
@@ -428,10 +430,6 @@ public:
   Shaper(const Shaper &) = delete;
   Shaper & operator=(const Shaper &) = delete;
 
-  ~Shaper() {
-    if (schedstat_ >= 0) close(schedstat_);
-  }
-
   void set_phase(std::int64_t phase_ns, std::int64_t now_ns) {
     next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
   }
@@ -553,12 +551,12 @@ private:
   std::int64_t others_ran_ns() {
     const auto thread = static_cast<pid_t>(syscall(SYS_gettid));
     if (thread != thread_) {  // the file is bound to who opened it
-      if (schedstat_ >= 0) close(schedstat_);
-      schedstat_ = open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC);
+      schedstat_ = File(open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC));
       thread_ = thread;
     }
     char text[128];
-    const auto size = schedstat_ < 0 ? -1 : pread(schedstat_, text, sizeof(text) - 1, 0);
+    const auto size =
+        schedstat_.is_open() ? pread(schedstat_.number(), text, sizeof(text) - 1, 0) : -1;
     if (size <= 0) return monotonic_ns();
     text[size] = '\0';
     char * second = nullptr;
@@ -571,7 +569,7 @@ private:
   std::int64_t looked_ns_{0};
   std::int64_t waited_ns_{0};
   std::int64_t turn_ns_{0};
-  int schedstat_{-1};
+  File schedstat_;
   pid_t thread_{-1};
   std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which
 };

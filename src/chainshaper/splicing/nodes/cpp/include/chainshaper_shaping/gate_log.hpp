@@ -5,22 +5,82 @@
 
 #include <pthread.h>
 #include <sched.h>
+#include <semaphore.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
+#include <atomic>
 #include <cstdio>
 #include <cstring>
+#include <memory>
+#include <string_view>
 #include <thread>
 
 #include "gate.hpp"
+#include "guest.hpp"
 
 namespace chainshaper {
+
+// Lines on their way from the gate's thread, which never waits, to the one that writes them. (A pipe
+// would do it too, but a process that closes all descriptors and uses the numbers again would get our
+// lines in files of its own.)
+class LineQueue {
+public:
+  LineQueue() { sem_init(&more_, 0, 0); }
+
+  LineQueue(const LineQueue &) = delete;
+  LineQueue & operator=(const LineQueue &) = delete;
+
+  ~LineQueue() { sem_destroy(&more_); }
+
+  // False: there is no room for the line.
+  bool put(std::string_view line) {
+    const auto begin = put_.load(std::memory_order_relaxed);
+    if (line.size() > room - (begin - taken_.load(std::memory_order_acquire))) return false;
+    for (std::size_t place = 0; place < line.size(); ++place)
+      (*bytes_)[(begin + place) % room] = line[place];
+    put_.store(begin + line.size(), std::memory_order_release);
+    sem_post(&more_);
+    return true;
+  }
+
+  // No line comes any more.
+  void end() {
+    ended_ = true;
+    sem_post(&more_);
+  }
+
+  // Wait for lines and take some of them, one at least; false: there are none, and none come any more.
+  // Each line has its own post of the semaphore, so that those that are left are taken the next time.
+  bool take(std::string & lines) {
+    while (sem_wait(&more_) != 0) continue;  // a signal ended the wait early
+    const bool is_last = ended_;
+    const auto begin = taken_.load(std::memory_order_relaxed);
+    const auto end = put_.load(std::memory_order_acquire);
+    auto place = begin;
+    const auto is_enough = [&] { return lines.size() > at_once && lines.back() == '\n'; };
+    while (place != end && !is_enough()) lines += (*bytes_)[place++ % room];
+    taken_.store(place, std::memory_order_release);
+    return begin != end || !is_last;
+  }
+
+private:
+  static constexpr std::size_t room = 1 << 20;
+  static constexpr std::size_t at_once = 4096;  // bytes: a file's bound holds for what is added, too
+
+  std::unique_ptr<std::array<char, room>> bytes_{std::make_unique<std::array<char, room>>()};
+  std::atomic<std::size_t> put_{0};    // bytes so far
+  std::atomic<std::size_t> taken_{0};  // of these
+  std::atomic<bool> ended_{false};
+  sem_t more_{};
+};
 
 class GateLog {
 public:
   ~GateLog() {
     if (!writer_.joinable()) return;
-    close(ends_[1]);
+    waiting_.end();
     writer_.join();
-    close(ends_[0]);
   }
 
   // Lines are added to a file that is there; false (and errno): it cannot be written now. The file
@@ -28,13 +88,11 @@ public:
   bool open_file(const std::string & path, std::int64_t most_bytes) {
     path_ = path;
     most_bytes_ = most_bytes;
+    const FileSizeSignalBlocked blocked;
     const bool opened = append("");
     const int because = errno;
-    if (pipe2(ends_, O_CLOEXEC) == 0) {
-      fcntl(ends_[1], F_SETFL, O_NONBLOCK);
-      fcntl(ends_[1], F_SETPIPE_SZ, 1 << 20);  // more than a user may have is refused
-      writer_ = std::thread([this] { write_lines(); });
-    }
+    const SignalsBlocked inherited;
+    writer_ = std::thread([this] { write_lines(); });
     errno = because;
     return opened;
   }
@@ -54,8 +112,7 @@ public:
         release.mode ? gate.modes[*release.mode].c_str() : "", published_ns, stalled_ns,
         word(dropped_names, release.dropped), waiting.lost, rows, release.moved_ns);
     line_.back() = '\n';  // in place of the last comma
-    if (::write(ends_[1], line_.data(), line_.size()) != static_cast<ssize_t>(line_.size()))
-      ++unlogged;
+    if (!waiting_.put(line_)) ++unlogged;
   }
 
   std::string losses() const {
@@ -77,25 +134,28 @@ public:
 private:
   void write_lines() {
     pthread_setname_np(pthread_self(), "gate_log");
-    std::string lines;
-    std::array<char, 4096> received;
-    for (;;) {
-      const auto size = read(ends_[0], received.data(), received.size());
-      if (size == 0 || (size < 0 && errno != EINTR)) return;
-      lines.append(received.data(), static_cast<std::size_t>(std::max<ssize_t>(0, size)));
-      const auto whole = lines.rfind('\n') + 1;
-      append(lines.substr(0, whole));
-      lines.erase(0, whole);
-    }
+    for (std::string lines; waiting_.take(lines); lines.clear())
+      if (!lines.empty()) append(lines);
   }
 
   // Adds whole lines only; what cannot be written is missing. A file that would have more than half
   // of `most_bytes_` becomes `….1`; one that has been removed is made anew. Whether it is there.
   bool append(const std::string & lines) {
-    const int file =
-        open(path_.c_str(), O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK, 0644);
+    // A link that another user has put there is not followed, nor anything but a file written to.
+    const int flags = O_WRONLY | O_CREAT | O_APPEND | O_CLOEXEC | O_NONBLOCK | O_NOFOLLOW;
+    const int file = open(path_.c_str(), flags, 0644);
     if (file < 0) return false;
+    struct stat state{};
+    if (fstat(file, &state) != 0 || state.st_nlink > 1 || state.st_uid != geteuid()) {
+      close(file);  // somebody else's was put in its place
+      errno = EPERM;
+      return false;
+    }
     const std::int64_t before = lseek(file, 0, SEEK_END);
+    if (before < 0) {
+      close(file);
+      return false;
+    }
     const auto header = static_cast<std::int64_t>(std::strlen(schema::log_header));
     if (before > header && before + static_cast<std::int64_t>(lines.size()) > most_bytes_ / 2 &&
         std::rename(path_.c_str(), (path_ + ".1").c_str()) == 0) {
@@ -135,7 +195,7 @@ private:
 
   std::string path_;
   std::int64_t most_bytes_{0};
-  int ends_[2]{-1, -1};
+  LineQueue waiting_;
   std::thread writer_;
   std::string line_;
 };

@@ -5,58 +5,46 @@
 #pragma once
 
 #include <signal.h>
-#include <sys/mman.h>
 #include <sys/stat.h>
 
+#include <array>
 #include <cmath>
 #include <cstring>
 #include <memory>
 
 #include "gate.hpp"
+#include "guest.hpp"
 
 namespace chainshaper {
 
+// The file is read and written, never mapped: a process that maps a file which another one cuts, or for
+// which the disk has no room, is ended by SIGBUS. What is not there reads as 0.
 class Page {
 public:
   // Throws where there is none and it is not to be made, or where it is not ours.
   Page(const std::string & folder, const std::string & name, const std::string & topic, bool make)
       : path_(folder + "/" + name) {
     const int flags = O_RDWR | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK | (make ? O_CREAT : 0);
-    file_ = open(path_.c_str(), flags, 0600);
-    std::string problem = file_ < 0 ? std::strerror(errno) : "not a file of this user";
-    struct stat found{};
-    if (file_ >= 0 && fstat(file_, &found) == 0 && S_ISREG(found.st_mode) &&
-        found.st_uid == geteuid()) {
-      // Memory that a full file system does not have later would be a SIGBUS.
-      errno = posix_fallocate(file_, 0, size);
-      if (errno == 0) memory_ = mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_SHARED, file_, 0);
-      problem = std::strerror(errno);
-    }
-    if (memory_ == MAP_FAILED) {
-      if (file_ >= 0) close(file_);
-      throw std::runtime_error(path_ + ": " + problem);
-    }
-    inode_ = found.st_ino;
-    auto * const text = static_cast<char *>(memory_) + 8 * schema::topic;
-    std::memset(text, 0, schema::topic_bytes);
-    std::memcpy(text, topic.data(), std::min<std::size_t>(topic.size(), schema::topic_bytes));
-  }
-
-  Page(const Page &) = delete;
-  Page & operator=(const Page &) = delete;
-
-  // Gives up what is locked, too.
-  ~Page() {
-    munmap(memory_, size);
-    close(file_);
+    file_ = File(open(path_.c_str(), flags, 0600));
+    if (!file_.is_open()) throw std::runtime_error(path_ + ": " + std::strerror(errno));
+    if (!S_ISREG(file_.identity().st_mode) || file_.identity().st_uid != geteuid())
+      throw std::runtime_error(path_ + ": not a file of this user");
+    // One for which there is no room is of no use to others.
+    if (const int refused = posix_fallocate(file_.number(), 0, size))
+      throw std::runtime_error(path_ + ": " + std::strerror(refused));
+    std::array<char, schema::topic_bytes> text{};
+    std::memcpy(text.data(), topic.data(), std::min<std::size_t>(topic.size(), text.size()));
+    write_at(8 * schema::topic, text.data(), text.size());
   }
 
   std::int64_t get(std::size_t place) const {
-    return __atomic_load_n(static_cast<const std::int64_t *>(memory_) + place, __ATOMIC_SEQ_CST);
+    std::int64_t value = 0;
+    read_at(place, &value, 1);
+    return value;
   }
 
   void set(std::size_t place, std::int64_t value) {
-    __atomic_store_n(static_cast<std::int64_t *>(memory_) + place, value, __ATOMIC_SEQ_CST);
+    write_at(8 * static_cast<off_t>(place), &value, sizeof(value));
   }
 
   void add(std::size_t place, std::int64_t more = 1) { set(place, get(place) + more); }
@@ -64,30 +52,31 @@ public:
   // Take a byte of the file, if no process has it; see whether another one has it.
   bool lock(off_t byte) {
     struct flock wanted = region(byte);
-    return fcntl(file_, F_OFD_SETLK, &wanted) == 0;
+    return file_.is_open() && fcntl(file_.number(), F_OFD_SETLK, &wanted) == 0;
   }
 
   bool is_locked(off_t byte) const {
     struct flock asked = region(byte);
-    return fcntl(file_, F_OFD_GETLK, &asked) == 0 && asked.l_type != F_UNLCK;
+    return file_.is_open() && fcntl(file_.number(), F_OFD_GETLK, &asked) == 0 &&
+           asked.l_type != F_UNLCK;
   }
 
-  bool is_current() const {
-    struct stat found{};
-    return stat(path_.c_str(), &found) == 0 && found.st_ino == inode_;
-  }
+  // Whether others find this page whole, and this process has it still.
+  bool is_current() const { return file_.is_open() && file_.is_at(path_, size); }
 
   void note(std::size_t count, std::int64_t ring, std::int64_t value) {
-    const auto number = get(count);
-    set(static_cast<std::size_t>(ring + number % schema::ring), value);
-    set(count, number + 1);
+    // A page may say anything, if it was damaged: a place is always in its ring.
+    const auto number = static_cast<std::uint64_t>(get(count));
+    const auto place = static_cast<std::int64_t>(number % std::uint64_t{schema::ring});
+    set(static_cast<std::size_t>(ring + place), value);
+    set(count, static_cast<std::int64_t>(number + 1));
   }
 
   std::vector<std::int64_t> noted(std::size_t ring) const {
-    std::vector<std::int64_t> found(schema::ring);
-    for (auto & one : found) one = get(ring++);
-    std::sort(found.begin(), found.end());
-    return found;
+    std::vector<std::int64_t> numbers(schema::ring);
+    read_at(ring, numbers.data(), numbers.size());
+    std::sort(numbers.begin(), numbers.end());
+    return numbers;
   }
 
 private:
@@ -95,10 +84,20 @@ private:
 
   static struct flock region(off_t byte) { return {F_WRLCK, SEEK_SET, byte, 1, 0}; }
 
+  void read_at(std::size_t place, std::int64_t * numbers, std::size_t count) const {
+    const auto at = 8 * static_cast<off_t>(place);
+    if (!file_.is_open() || pread(file_.number(), numbers, 8 * count, at) < 0)
+      std::fill(numbers, numbers + count, 0);
+  }
+
+  // What cannot be written is missing: shaping goes on.
+  void write_at(off_t at, const void * content, std::size_t bytes) {
+    if (file_.is_open()) [[maybe_unused]]
+      const auto written = pwrite(file_.number(), content, bytes, at);
+  }
+
   std::string path_;
-  int file_;
-  void * memory_{MAP_FAILED};
-  ino_t inode_{};
+  File file_;
 };
 
 // Where pages are, the best place first: of root, of a login session, of any user.
@@ -162,7 +161,7 @@ public:
   std::int64_t failed_before() const { return page_->get(Field::failed_starts) - 1; }
 
   double wait_s() const {
-    const auto failed = failed_before() - schema::back_off_after;
+    const auto failed = std::min<std::int64_t>(failed_before() - schema::back_off_after, 10);
     return failed < 0 ? 0.0 : std::min(10.0, std::ldexp(0.5, static_cast<int>(failed)));
   }
 
@@ -271,6 +270,11 @@ private:
     if (parent != page->get(Field::parent) || idle_ns > schema::at_once_ns) {
       page->set(Field::mode, 0);  // another launch's
       page->set(Field::phase_known, 0);
+      if (!page->is_locked(schema::publishing)) {  // by a node of another launch, whose counts they are
+        page->set(Field::starts, 0);
+        for (std::size_t count = Field::published; count <= Field::late; ++count)
+          page->set(count, 0);
+      }
     }
     page->set(Field::parent, parent);
     page->set(Field::in_process, in_process_ ? 1 : 0);

@@ -62,9 +62,9 @@ public:
         rehearsal_(node.create_generic_publisher(  // of all shaping nodes; an underscore hides it
             "/_chainshaper_rehearsal", "std_msgs/msg/Empty", rclcpp::QoS(1))),
         empty_(serialized_empty.size()),
-        to_itself_(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0)),
-        latency_(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC)) {
-    if (latency_ < 0)
+        to_itself_(File(socket(AF_INET, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0))),
+        latency_(File(open("/dev/cpu_dma_latency", O_WRONLY | O_CLOEXEC))) {
+    if (!latency_.is_open())
       RCLCPP_WARN(node.get_logger(),
                   "/dev/cpu_dma_latency: %s: idle cores sleep, and deliver less "
                   "regularly; run as root, or give the user the right to write it",
@@ -78,14 +78,10 @@ public:
     address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
     socklen_t length = sizeof(address);
     auto * const general = reinterpret_cast<sockaddr *>(&address);
-    connected_ = bind(to_itself_, general, length) == 0 &&
-                 getsockname(to_itself_, general, &length) == 0 &&
-                 connect(to_itself_, general, length) == 0;
-  }
-
-  ~Readiness() {
-    for (const int file : {to_itself_, latency_})
-      if (file >= 0) close(file);
+    const int number = to_itself_.number();
+    connected_ = bind(number, general, length) == 0 &&
+                 getsockname(number, general, &length) == 0 &&
+                 connect(number, general, length) == 0;
   }
 
   void get_ready(std::int64_t release_ns) {
@@ -94,19 +90,19 @@ public:
     for (int time = 0; time < 2; ++time) {  // the second finds in order what the first has loaded
       if (monotonic_ns() > release_ns - rehearsal_ns) return;
       rehearsal_->publish(empty_);
-      if (connected_) {
+      if (connected_ && to_itself_.is_open()) {
         std::array<std::uint8_t, serialized_empty.size()> back;
         [[maybe_unused]] auto bytes =
-            send(to_itself_, serialized_empty.data(), serialized_empty.size(), 0);
-        bytes = recv(to_itself_, back.data(), back.size(), 0);
+            send(to_itself_.number(), serialized_empty.data(), serialized_empty.size(), 0);
+        bytes = recv(to_itself_.number(), back.data(), back.size(), 0);
       }
     }
   }
 
   // How fast cores wake up (us); -1: they may sleep, as if nothing had been asked for.
   void ask_for(std::int32_t latency_us = -1) const {
-    if (latency_ >= 0) [[maybe_unused]]
-      const auto written = write(latency_, &latency_us, sizeof(latency_us));
+    if (latency_.is_open()) [[maybe_unused]]
+      const auto written = write(latency_.number(), &latency_us, sizeof(latency_us));
   }
 
 private:
@@ -118,9 +114,9 @@ private:
   std::optional<ClearCore> delivery_core_;
   rclcpp::GenericPublisher::SharedPtr rehearsal_;
   rclcpp::SerializedMessage empty_;
-  int to_itself_;
+  File to_itself_;
   bool connected_ = false;
-  int latency_;
+  File latency_;
 };
 
 }  // namespace chainshaper

@@ -1,0 +1,95 @@
+"""Ends of callback instances that events of the same thread disprove.
+
+Where the end of one instance and the start of the next are both lost, the first start and the last
+end look like one long instance. What the thread did in between tells: an executor takes up work
+only when no callback runs. It takes the next message for the same callback, or it looks, or waits,
+for work. A callback that spins an executor itself does the same, but as its habit: what hardly any
+of its other instances did is not.
+"""
+
+from dataclasses import dataclass
+
+import polars as pl
+
+from chainshaper.analysis.matching import first_after
+from chainshaper.values import events
+
+LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
+"""The events of an executor that looks for work."""
+
+HABIT = 0.2
+"""A callback in which an executor looks for work in more than this share of its instances spins one
+itself."""
+MOST_TAKEN = 0.5
+"""A callback in which its own next message is taken in more than this share does that itself."""
+_OFTEN = 0.5  # of a callback's usual distance of starts: two instances and a gap are longer
+_LONGER = 1.5  # times its usual response time
+_NO_TIME = pl.lit(None, dtype=pl.Int64)
+_NONE = pl.Series([], dtype=pl.UInt32)
+
+
+@dataclass(frozen=True)
+class LostEnds:
+    """Callback instances, without the ends that cannot be theirs.
+
+    ``instances`` has the column ``until`` as well: by when an instance without an end had ended
+    (null: not known). ``by_take`` are the numbers of those of which the next take for the same
+    callback tells, ``by_wait`` of those of which only the executor's search for work does.
+    """
+
+    instances: pl.DataFrame
+    by_take: pl.Series
+    by_wait: pl.Series
+
+
+def without_disproved_ends(
+    tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame
+) -> LostEnds:
+    """Look for ends that the thread's other events disprove, and leave them out.
+
+    The executor's events are asked only where an instance is suspiciously long, or has no end: as
+    a rule no other step needs them.
+    """
+    thread, key = ["pid", "tid"], ["tid", "callback_id"]
+    own = taken.filter(~pl.col("intra_process")).drop_nulls("callback_id")
+    own = own.select(*key, took="time")
+    rows = first_after(instances, own, key, "start", "took", strictly=True)
+    if not _suspicious(rows):
+        return LostEnds(instances.with_columns(until=_NO_TIME), _NONE, _NONE)
+    looks = pl.concat(events.table(tables, name).select(*thread, looked="time") for name in LOOKS)
+    rows = first_after(rows, looks.sort("looked"), thread, "start", "looked", strictly=True)
+    took, looked = (pl.col(n) < pl.col("end") for n in ("took", "looked"))
+    closed = pl.col("end").count()
+    takes_inside = (took.sum() <= MOST_TAKEN * closed).over("callback_id")
+    looks_inside = (looked.sum() <= HABIT * closed).over("callback_id")
+    by_take = (took & takes_inside).fill_null(False)
+    by_wait = (looked & looks_inside & ~by_take).fill_null(False)
+    until = pl.min_horizontal(
+        pl.when(takes_inside).then("took"), pl.when(looks_inside).then("looked")
+    )
+    rows = rows.sort("instance").with_columns(by_take=by_take, by_wait=by_wait, until=until)
+    lost = pl.col("by_take") | pl.col("by_wait")
+    left = rows.with_columns(pl.when(~lost).then(n).alias(n) for n in ("end", "execution_ns"))
+    left = left.with_columns(pl.when(pl.col("end").is_null()).then("until"))
+    by_take_rows, by_wait_rows = (rows.filter(n)["instance"] for n in ("by_take", "by_wait"))
+    return LostEnds(left.select(*instances.columns, "until"), by_take_rows, by_wait_rows)
+
+
+def _suspicious(rows: pl.DataFrame) -> bool:
+    """Whether an instance may be two: the next take lies inside it, or it is longer than usual, and
+    nearly as long as starts are apart, or another one began on its thread though it has no end."""
+    if (rows["took"] < rows["end"]).any():
+        return True
+    if rows["end"].null_count():
+        last = pl.col("start").max().over("pid", "tid")
+        if rows.select((pl.col("end").is_null() & (pl.col("start") < last)).any()).item():
+            return True
+    start, lasted = pl.col("start"), pl.col("end") - pl.col("start")
+    apart = (start.max() - start.min()) / (pl.len() - 1)
+    figures = rows.lazy().group_by("callback_id").agg(longest=lasted.max(), apart=apart)
+    long = figures.filter(pl.col("longest") > _OFTEN * pl.col("apart")).collect()
+    if long.is_empty():
+        return False
+    usual = rows.lazy().join(long.lazy(), on="callback_id").group_by("callback_id")
+    longer = usual.agg(pl.col("longest").first() > _LONGER * lasted.median())
+    return bool(longer.select(pl.col("longest").any()).collect().item())

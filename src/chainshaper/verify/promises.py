@@ -1,0 +1,129 @@
+"""What became of the outputs that were due, and whether a plan's promise about them was kept.
+
+A plan promises that of the outputs that are due a share at most comes later than its slot. One that
+never comes is not in time either, whatever the reason: discarded, lost on the way, never published,
+or its chain did not begin. So all of them count; what is judged elsewhere (in comparisons, sweeps,
+watches and budgets) is judged by this.
+"""
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import polars as pl
+
+from chainshaper.analysis import LatencyAnalysis
+from chainshaper.planning import Plan
+from chainshaper.planning.plan import Evidence
+
+STANDARD_ERRORS = 3  # beyond so many, a figure is not what was predicted
+NOT_PUBLISHED, NOT_BEGUN, NEVER_CAME = "not published", "not begun", "never came"
+
+
+@dataclass(frozen=True)
+class OutputsDue:
+    """How many outputs were ``due``, and what became of them.
+
+    ``late`` came behind the slot or cycle they were due in (None: nothing says when they were),
+    ``absent`` never came, by reason. ``usual`` of the absent ones were not published by the
+    application, as often as in the recording that was planned from. ``promised`` is the share that
+    the plan says may be missed, at most (None: no plan was in force).
+    """
+
+    due: int
+    late: int | None
+    absent: Mapping[str, int] = field(default_factory=dict)
+    usual: int = 0
+    promised: float | None = None
+
+    @classmethod
+    def of(
+        cls, count: int, late: int | None, incomplete: int, plan: Plan | None = None
+    ) -> "OutputsDue":
+        """Of so many outputs that came, and so many that did not, for no known reason."""
+        absent, due, usual = {NEVER_CAME: incomplete} if incomplete else {}, count + incomplete, 0
+        if plan is not None:
+            usual = _usual(plan.evidence, plan.evidence.incomplete, due, incomplete)
+        return cls(due, late, absent, usual, None if plan is None else promised_by(plan))
+
+    @property
+    def missed(self) -> int:
+        """Outputs that were late or never came, but for the usual ones."""
+        return (self.late or 0) + sum(self.absent.values()) - self.usual
+
+    @property
+    def share(self) -> float | None:
+        """The share of outputs that were missed; None where none was due."""
+        return self.missed / self.due if self.due else None
+
+    @property
+    def most_missed(self) -> int | None:
+        """So many may be missed as promised, as far as chance goes."""
+        if self.promised is None:
+            return None
+        return _by_chance(self.due, self.promised)
+
+    @property
+    def kept(self) -> bool | None:
+        """Whether the promise was kept; None: there was none, or nothing was due."""
+        if self.most_missed is None or not self.due:
+            return None
+        return self.missed <= self.most_missed
+
+    @property
+    def text(self) -> str:
+        """``875 of 1000 outputs missed (875 discarded)``, ``0 of 320 outputs late``."""
+        if not self.absent:
+            return f"{self.late or 0} of {self.due} outputs late"
+        parts = [f"{self.late} late"] if self.late else []
+        parts += [f"{count} {reason}" for reason, count in self.absent.items()]
+        usual = f", {self.usual} of these as before the plan" if self.usual else ""
+        return f"{self.missed} of {self.due} outputs missed ({', '.join(parts)}{usual})"
+
+
+def _by_chance(count: int, share: float) -> int:
+    """How many of so many may be hit where this share is, as far as chance goes."""
+    mean = count * share
+    return math.floor(mean + STANDARD_ERRORS * math.sqrt(mean))
+
+
+def promised_by(plan: Plan) -> float:
+    """The share of outputs that a plan says may be missed, at most."""
+    return plan.margin.overrun_probability or 0.0
+
+
+def _usual(evidence: Evidence, before: int, due: int, absent: int) -> int:
+    """How many of the ``absent`` are so as often as ``before``, in what was planned from."""
+    planned_from = evidence.samples + evidence.disturbed + evidence.incomplete
+    return min(absent, _by_chance(due, before / planned_from)) if before else 0
+
+
+def outputs_due(analysis: LatencyAnalysis, plan: Plan | None = None) -> OutputsDue:
+    """What became of the outputs of a chain that were due, under a plan if one was in force."""
+    return _counted(analysis.traversals, analysis.not_begun, plan)
+
+
+def undisturbed_outputs_due(analysis: LatencyAnalysis) -> OutputsDue:
+    """The same without the cycles that the machine disturbed."""
+    return _counted(analysis.traversals.filter(~pl.col("disturbed")), analysis.not_begun, None)
+
+
+def _counted(traversals: pl.DataFrame, not_begun: int, plan: Plan | None) -> OutputsDue:
+    due = traversals.filter("was_due")
+    gone = due.filter(~pl.col("complete"))
+    absent = Counter[str](gone["reason"].cast(pl.String)) if gone.height else Counter[str]()
+    if not_begun:
+        absent[NOT_BEGUN] = not_begun
+    known = due["late"].count() or not due.filter("complete").height
+    count, usual = due.height + not_begun, 0
+    if plan is not None:
+        before = plan.evidence.unpublished
+        usual = _usual(plan.evidence, before, count, absent[NOT_PUBLISHED])
+    return OutputsDue(
+        due=count,
+        late=int(due["late"].sum() or 0) if known else None,
+        absent={reason: number for reason, number in absent.items() if number},
+        usual=usual,
+        promised=None if plan is None else promised_by(plan),
+    )
