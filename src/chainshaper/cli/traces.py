@@ -38,12 +38,13 @@ def describe(
 
     `chainshaper simulate` and `run` take it; edit it as you like.
     """
-    from chainshaper.flow.exploration import application_file
+    from chainshaper.flow.describing import application_file
     from chainshaper.values.files import new_file, write_whole
 
     new_file(output, opt.DESCRIPTIONS)
     with out.opened("describe", trace) as (recording, _):
-        text = application_file(recording, chain)
+        text, notes = application_file(recording, chain)
+        out.notes(notes)
     out.show_line(write_whole(output, [text.encode()]))
 
 

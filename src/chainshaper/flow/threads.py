@@ -317,6 +317,11 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
             f"the back end {back_end} sets priorities only, and chains whose cycles start at"
             " offsets have to be stopped until then: choose freezer or scx"
         )
+    if not gates(back_end) and any(chain.slot_ends == "closed" for chain in plan.chains):
+        raise InputError(
+            f"the back end {back_end} sets priorities only, and the plan's servers close at their"
+            " slots' ends (slot_ends: closed): choose freezer, scx or litmus (--backend freezer)"
+        )
     if plan.takes_turns and back_end == "scx":
         raise InputError(
             "equal_priorities: round-robin, but under the back end scx servers of one priority run"

@@ -131,7 +131,8 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         reason = f"--fallback {request.fallback} is for a shaping node that is a process"
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
     plan = shaping.with_executors(plan, [one.executors for one in (profile, *sinks)])
-    plan = shaping.with_turns(plans.revised(plan, modes=modes), request.equal_priorities)
+    plan = plans.revised(plan, modes=modes, slot_ends=request.slot_ends)
+    plan = shaping.with_turns(plan, request.equal_priorities)
     (plan,) = with_receivers_placed([plan], [profile])
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
 

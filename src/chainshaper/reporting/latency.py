@@ -99,6 +99,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "stalls_watched": measurement.longest_stall_ns is not None,
         "longest_stall_ns": measurement.longest_stall_ns,
         "in_force": None if info.in_force is None else info.in_force.model_dump(),
+        "slot_ends": None if measurement.plan is None else measurement.plan.slot_ends,
         "left_out": asdict(measurement.left_out),
         "realtime": info.realtime,
         "lost": info.lost,
