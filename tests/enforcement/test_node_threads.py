@@ -628,7 +628,7 @@ def test_how_a_process_publishes_is_looked_up_before_its_publisher_is_gated(
             process = known(read_process(actor.pid))
             found = allocate([process])
             server_members(plan, found)
-            return check_publishers(plan, found, Recording(tmp_path, info, {}))
+            return check_publishers(plan, found, [Recording(tmp_path, info, {})])
 
         # What sends again for synchronous writers is no asynchronous publisher.
         with pytest.raises(OperationError, match="RMW_FASTRTPS_PUBLICATION_MODE is ASYNCHRONOUS"):

@@ -96,6 +96,7 @@ def test_a_container_loads_the_shaping_node_and_nothing_is_copied(
     running = subprocess.Popen(
         ["env", "ros2", "launch", str(file), *arguments, "chainshaper_within:=8"],
         env=environment,
+        stdin=subprocess.DEVNULL,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -104,7 +105,7 @@ def test_a_container_loads_the_shaping_node_and_nothing_is_copied(
     try:
         said, _ = running.communicate(timeout=12)
     except subprocess.TimeoutExpired:
-        os.killpg(running.pid, signal.SIGINT)
+        running.send_signal(signal.SIGINT)  # without a terminal, launch signals its nodes itself
         said, _ = running.communicate(timeout=20)
     assert "/points of /filter is redirected: /points_tmp" in said
     # At times launch itself loses the child that it waits for, and says so.

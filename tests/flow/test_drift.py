@@ -108,7 +108,7 @@ def run_of(
     if slots is not None:
         server = plan.servers[0].model_copy(update={"slots": slots})
         plan = plan.model_copy(update={"servers": (server,), "cycle_ns": 100 * MS})
-    here: Any = SimpleNamespace(path=folder / "j", strangers=None, **seen)
+    here: Any = SimpleNamespace(path=folder / "j", strangers=None, **{"threads": (), **seen})
     joint = whole(plan)
     run = _Run(joint, open_until_done(joint), Choice(back_end, ""), here, (), frozenset(), Event())
     run.waits_ns, run.found, run.anchor_ns = [*waits_ns], here, 50 * MS

@@ -3,11 +3,12 @@
 import os
 import pwd
 import re
+import shlex
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from unittest import mock
 
@@ -247,6 +248,77 @@ def test_what_a_command_leaves_behind_in_its_group_is_ended_too() -> None:
     assert _group(process.pid)
     end_command(process, patience_s=0.5)  # a background job of a shell ignores SIGINT
     assert not _group(process.pid)
+
+
+NODE = (
+    "import signal, sys, time\n"
+    "def end(*_):\n"
+    "    signal.signal(signal.SIGINT, signal.SIG_DFL)\n"  # as rclcpp and rclpy do
+    "    time.sleep(1)\n"
+    "    sys.exit(0)\n"
+    "signal.signal(signal.SIGINT, end)\n"
+    "print('ready', flush=True)\n"
+    "time.sleep(60)\n"
+)
+LAUNCHER = f"""
+import signal, subprocess, sys, time
+nodes = [subprocess.Popen([sys.executable, '-c', {NODE!r}], stdout=-1) for _ in range(3)]
+for node in nodes:
+    node.stdout.readline()
+forwards = '--noninteractive' in sys.argv or not sys.stdin.isatty()  # as `ros2 launch` does
+def end(*_):
+    time.sleep(0.3)  # it is an event like others
+    for node in nodes if forwards else ():
+        node.send_signal(signal.SIGINT)
+signal.signal(signal.SIGINT, end)
+print('ready', flush=True)
+print([node.wait() for node in nodes], flush=True)
+"""
+"""Launches three nodes, which take a second to shut down, and says how these ended."""
+
+
+@pytest.fixture
+def terminal() -> Iterator[None]:
+    """Our input is a terminal, and so is that of what we start."""
+    outer, inner = os.openpty()
+    before = os.dup(0)
+    os.dup2(inner, 0)
+    yield
+    os.dup2(before, 0)
+    for descriptor in (outer, inner, before):
+        os.close(descriptor)
+
+
+def ends_of_nodes(command: list[str]) -> str:
+    """How the nodes of a launcher ended, by its own words, when the command was ended."""
+    reading, writing = os.pipe()
+    process = start_command(command, stdout=writing)
+    os.close(writing)
+    with os.fdopen(reading) as said:
+        assert said.readline() == "ready\n"
+        end_command(process)
+        return said.readline()
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        [sys.executable, "-c", LAUNCHER],
+        ["bash", "-c", f"{shlex.join([sys.executable, '-c', LAUNCHER])}; echo after"],
+        ["sh", "-c", f"{shlex.join([sys.executable, '-c', LAUNCHER])}; echo after"],
+    ],
+    ids=["a launcher", "a script of bash", "a script of dash"],
+)
+def test_without_a_terminal_nodes_get_the_signal_from_their_launcher_alone(
+    command: list[str],
+) -> None:
+    assert ends_of_nodes(command) == "[0, 0, 0]\n"
+
+
+@pytest.mark.parametrize("words", [[], ["--noninteractive"]])
+@pytest.mark.usefixtures("terminal")
+def test_in_a_terminal_nodes_get_one_signal_whoever_sends_it(words: list[str]) -> None:
+    assert ends_of_nodes([sys.executable, "-c", LAUNCHER, *words]) == "[0, 0, 0]\n"
 
 
 def test_the_environment_is_ours_and_what_is_added(tmp_path: Path) -> None:

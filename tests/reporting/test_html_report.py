@@ -27,7 +27,7 @@ from chainshaper import (
     save_plan,
     write_report,
 )
-from chainshaper.reporting.latency import headline
+from chainshaper.reporting.latency import headline, verdict
 from chainshaper.reporting.page import (
     distinct_names,
     latency_histogram,
@@ -217,7 +217,7 @@ def test_the_headline_says_as_predicted_only_of_what_was_judged_and_broke_no_pro
     judged = known_value(measured.prediction)
     figures = ("mean", "max", "jitter")
     said = "Jitter 0.000 ms (known); average 30.020 ms (known)"
-    for changes, verdict in (
+    for changes, judgement in (
         ({}, "as predicted, 0 of 3 outputs late"),
         (
             {name: replace(getattr(judged, name), holds=None) for name in figures},
@@ -229,7 +229,44 @@ def test_the_headline_says_as_predicted_only_of_what_was_judged_and_broke_no_pro
         ),
     ):
         one = replace(measured, prediction=replace(judged, **changes))
-        assert headline(["known"], [one]) == f"{said}; {verdict}."
+        stall = "Stalls of the machine, 2 ms at most, disturbed no cycle."
+        assert headline(["known"], [one]) == f"{said}; {judgement}. {stall}"
+
+
+@pytest.mark.parametrize(
+    ("overran", "late_at_all"),
+    [((1,), "1 of 4 outputs late, none expected"), ((), None)],
+)
+def test_one_line_says_what_a_stall_did_and_what_remains_without_it(
+    overran: tuple[int, ...], late_at_all: str | None, tmp_path: Path
+) -> None:
+    """Core 1 stands for 21.5 ms while /second computes in cycle 1, whose output is let go at once
+    as it comes, 31 ms behind the start: 0.98 ms behind all others. Of 4 latencies, of which one
+    differs by d, p99.5 is 0.985 d above the others (linear between the two nearest).
+    """
+    known = known_run(tmp_path / "known", 4, overran=overran)
+    (stall,) = known.events["machine_stall"].to_dicts()
+    stalls = pl.DataFrame([stall | {"duration": 21_500_000}], known.events["machine_stall"].schema)
+    measured = measure_latency(replace(known, events={**known.events, "machine_stall": stalls}))
+    what = "stalls of the machine, 21.5 ms at most, disturbed 1 of 4 cycles"
+    remains = "without them jitter 0.000 ms, spread 0.000 ms, 0 late"
+    met, said = verdict(measured)
+    if late_at_all is None:
+        hit = "with these jitter 0.000 ms, spread 0.000 ms, 0 late"
+        assert met
+        assert said.startswith("known: promise met: jitter 0.000 ms")
+    else:
+        hit = "with these jitter 0.980 ms, spread 0.965 ms, 1 late"
+        assert not met
+        assert said.startswith(f"known: promise broken: {late_at_all}")
+    assert said.endswith(f"; {what}: {hit}; {remains}")
+    assert "\n" not in said
+    assert headline(["known"], [measured]).endswith(f" S{what[1:]}: {hit}; {remains}.")
+
+
+def test_where_no_stall_was_looked_for_none_is_named(tmp_path: Path) -> None:
+    unwatched = measure_latency(known_run(tmp_path / "known", stall_meter=None))
+    assert "stall" not in verdict(unwatched)[1]
 
 
 def test_where_the_machine_was_not_watched_no_cycle_is_called_undisturbed(tmp_path: Path) -> None:

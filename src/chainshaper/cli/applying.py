@@ -38,7 +38,7 @@ def threads(
 
     pid = int(where) if where is not None and where.isdecimal() else None
     plan = None if where is None or pid is not None else cs.load_application_plan(where)
-    known = opt.recording_of(recording, plan)
+    known = opt.recording_of(recording)
     found = cs.find_threads(plan if pid is None else pid, known, users=user or ())
     if out.present(json, threads_json(found), threads_table(found)):
         out.notes(found.notes)
@@ -62,7 +62,8 @@ def apply(
     ),
     recording: Path | None = opt.option(
         "--recording REC",
-        "Of these very processes, or of an earlier run: it tells which threads execute what.",
+        "Of these very processes, or of an earlier run: it tells which threads execute what. "
+        "Default: the plan's own, where it exists.",
     ),
     wait: int | None = opt.option(
         "--wait DURATION",
@@ -191,11 +192,15 @@ def release(
         "--crashed", "Only of runs that have crashed: plans in force stay so.", False
     ),
 ) -> None:
-    """End plans in force, and put back what crashed runs have left changed."""
+    """End plans in force, and put back what crashed runs have left changed.
+
+    What was being written into the current folder when its run was killed is removed as well.
+    """
     from chainshaper.enforcement.freezer import groups_of, run_of
     from chainshaper.enforcement.scheduling_memory import look_alikes
     from chainshaper.enforcement.undoing import release_strays
     from chainshaper.linux.runs import find_journals
+    from chainshaper.values.leftovers import clear_leftovers
 
     runs = find_journals()
     chosen = [journal for journal in runs if run in (None, journal.name)]
@@ -217,10 +222,13 @@ def release(
     for folder in strays:
         out.show_line(f"{folder}, of a run whose journal is gone: its threads run again")
     problems += left
-    out.notes(strangers)
+    removed, stays = clear_leftovers(Path.cwd()) if run is None else ([], [])
+    for line in removed:
+        out.show_line(line)
+    out.notes([*strangers, *stays])
     if problems:
         raise OperationError("; ".join(problems))
-    if not chosen and not strays:
+    if not chosen and not strays and not removed and not stays:
         out.show_line("no plan is in force, and nothing was left behind")
 
 

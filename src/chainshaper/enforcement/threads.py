@@ -53,6 +53,7 @@ from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
 IN_ORDER = "its executors are known by the order in which it started its threads, as when recorded"
+NOT_RECOGNISED = "not running, or not recognised: "
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
@@ -455,6 +456,24 @@ def waiting_receivers(plan: ApplicationPlan, wanted: Iterable[WantedScheduling])
     nodes = ", ".join(sorted({node for one in ours for node in one.thread.nodes}))
     reason = "have cores with servers, since all cores have some, and wait for other chains' slots"
     return [f"callbacks of {nodes} {reason}: leave a core without, or plan with --no-receivers"]
+
+
+def absent_receivers(nodes: Iterable[ShapingNode], running: Collection[str]) -> str | None:
+    """A line about receivers of outputs that are not among the nodes that run."""
+    absent = [
+        f"{receiver}, which receives {node.output}"
+        for node in nodes
+        for receiver in node.receivers
+        if receiver not in running
+    ]
+    if not absent:
+        return None
+    named = ", ".join(dict.fromkeys(absent))
+    return (
+        f"{NOT_RECOGNISED}{named}: callbacks there keep their priority and cores, and may wait for"
+        " the chain. Where a node runs, but no command line names it (as in a container), name a"
+        " recording of it (--recording)"
+    )
 
 
 def first_planned(chain: Plan) -> PlannedThread | None:

@@ -92,8 +92,9 @@ def apply_plan(
     else none). ``phase_ns`` is where in a cycle the first chain's timer expires, on CLOCK_MONOTONIC
     (None: those of all chains are measured). With ``adapt`` slots follow the latencies, to no later
     end than ``max_latency_ns`` (None: as the plan says). ``recording`` is one of the very
-    processes, or of an earlier run; ``users`` are as for :func:`.find_threads`. ``watch`` gets the
-    state every second; ``folder`` is where runs stand (default: `/run/chainshaper`).
+    processes, or of an earlier run (None: those that the plan names); ``users`` are as for
+    :func:`.find_threads`. ``watch`` gets the state every second; ``folder`` is where runs stand
+    (default: `/run/chainshaper`).
 
     Raises InputError: no such user, or the plan cannot be carried out. PlatformError: the machine
     lacks a core or the back end, or we a privilege. OperationError: another run governs a core or
@@ -111,10 +112,11 @@ def apply_plan(
     nodes = {thread.node for server in given.servers for thread in server.threads}
     nodes.update(receiver for node in given.shaping_nodes for receiver in node.receivers)
     # Looked up once: that takes longer than looking at processes.
-    recorded = () if recording is None else threads.recorded_processes(recording)[0]
+    recordings, unread = threads.evidence_of(given, recording)
+    recorded, unread = threads.recorded_in(recordings, unread)
     cores, stop = {server.core for server in given.servers}, stop or threading.Event()
     journal = undoing.claim_run(cores, nodes, folder, lambda: _go_on(stop))
-    run = _Run(given, given, choice, journal, recorded, taken, stop)
+    run = _Run(given, given, choice, journal, recorded, taken, stop, unread)
     try:
         run.guardians = Guardians(journal)
         if command:
@@ -122,7 +124,7 @@ def apply_plan(
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
         run.guardians.await_ready(run.go_on)
         threads.refuse_simulated(given, run.found)
-        said = threads.check_publishers(given, run.found, recording)
+        said = threads.check_publishers(given, run.found, recordings)
         said += allocation.waiting_receivers(given, run.schedule())
         run.begin_state(command, plan_path)
         run.note(*said, *(one for one in run.found.notes if one.endswith(allocation.IN_ORDER)))
@@ -159,6 +161,7 @@ class _Run:
     recorded: tuple[allocation.RecordedProcess, ...]
     users: frozenset[int]
     stop: threading.Event
+    unread: tuple[str, ...] = ()  # recordings that say nothing of this machine, or cannot be read
     guardians: Guardians | None = None
     command: subprocess.Popen[bytes] | None = None
     servers: BackEnd | None = None
@@ -265,6 +268,7 @@ class _Run:
             notes=tuple(note for one in self.plan.chains for note in publication_warnings(one)),
         )
         self.name_strangers(self.found)
+        self.name_absent(self.found)
 
     def find_anchor(self, phase_ns: int | None, progress: Callable[[float, str], None]) -> None:
         """Measure where chains begin, and see from when on their slots count."""
@@ -531,6 +535,7 @@ class _Run:
                     " the thread that started it, and is left so"
                 )
         self.name_strangers(now)
+        self.name_absent(now)
         gone, servers_now = {one.thread.tid for one in ended}, self.state.servers
         left = {one.name: tuple(t for t in one.threads if t not in gone) for one in servers_now}
         self.show_servers(threads=left)
@@ -607,6 +612,14 @@ class _Run:
         if found.strangers is not None:
             said = [one for one in self.state.notes if one.startswith(allocation.LEFT_ALONE)]
             self.note(found.strangers, instead=said)
+
+    def name_absent(self, found: Allocation) -> None:
+        """One line about receivers that do not run, or are not recognised, for as long as so."""
+        running = {node for one in found.threads for node in one.nodes}
+        absent = allocation.absent_receivers(self.plan.shaping_nodes, running)
+        said = [one for one in self.state.notes if one.startswith(allocation.NOT_RECOGNISED)]
+        reasons = "".join(f"; {reason}" for reason in self.unread)
+        self.note(*filter(None, [absent and absent + reasons]), instead=said)
 
     def put_back(self) -> None:
         """Everything as it was: first let all threads go, then end our command, then the rest."""

@@ -19,7 +19,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, data_flow, executors
+from chainshaper.analysis import (
+    DataFlow,
+    LatencyAnalysis,
+    analyse_latency,
+    executors,
+    recorded_flow,
+)
 from chainshaper.analysis.contradictions import refuse_contradicted, shown_periods
 from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
@@ -74,7 +80,7 @@ def profile_chains(
     if since_ns or until_ns is not None:
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     analyses = [analyse_latency(flow, chain_of(recording, chain, flow)) for chain in chains]
     stages = [graph_stages(one.graph, one.chain) for one in analyses]
     planned = {number for own in stages for stage in own for number in stage.members}
@@ -89,7 +95,7 @@ def profile_chains(
     if others := ", ".join(mode_recordings.keys() - modes.bands.keys()):
         raise InputError(f"{others}: none of the modes {', '.join(modes.bands)}: correct it")
     # Announcements are counted from the first one on, also where that is left out.
-    announced = data_flow(all_events, recording.info.clock_offset_ns) if since_ns else flow
+    announced = recorded_flow(replace(recording, events=all_events)) if since_ns else flow
     for number, analysis in enumerate(analyses):
         apart: dict[str, Profile] = {}
         for mode, place in mode_recordings.items():

@@ -43,7 +43,13 @@ from chainshaper.planning.plan import (
     shaping_nodes,
 )
 from chainshaper.planning.request import simulated_stamps
-from chainshaper.values.errors import InputError, OperationError, text_of
+from chainshaper.values.errors import (
+    ChainshaperError,
+    InputError,
+    OperationError,
+    shown,
+    text_of,
+)
 from chainshaper.values.files import read_regular
 
 if TYPE_CHECKING:
@@ -57,16 +63,17 @@ def find_threads(
     where: int | Plan | ApplicationPlan | None = None,
     recording: "Recording | None" = None,
     *,
-    recorded: Sequence[RecordedProcess] = (),
+    recorded: Sequence[RecordedProcess] | None = None,
     users: Collection[str | int] = (),
 ) -> Allocation:
     """Find the threads of an application and what each of them does.
 
     ``where`` is a process, which stands for its descendants too; a plan, for the nodes of its
-    servers; or None for all that looks like an application of ROS 2 or DDS. ``recording`` is one
-    of the processes that still run; who looks often gives what it says, ``recorded``, instead. Only
-    processes of ``users`` (names or numbers; default: who launched us, and root) are nodes; a
-    process that is asked for is, whoever runs it.
+    servers and its receivers; or None for all that looks like an application of ROS 2 or DDS.
+    ``recording`` is one of the processes that still run, or of an earlier run (default: those that
+    the plan names); who looks often gives what it says, ``recorded``, instead. Only processes of
+    ``users`` (names or numbers; default: who launched us, and root) are nodes; a process that is
+    asked for is, whoever runs it.
 
     Raises InputError: there is no such process, or no such user.
     """
@@ -74,8 +81,8 @@ def find_threads(
     plan = None if where is None or isinstance(where, int) else whole(where)
     shaping, servers = ((), ()) if plan is None else (plan.shaping_nodes, plan.servers)
     notes, strangers = tuple[str, ...](), None
-    if recording is not None:
-        recorded, notes = recorded_processes(recording)
+    if recorded is None:
+        recorded, notes = recorded_in(*evidence_of(plan, recording))
     if isinstance(where, int):
         parent_of = {process.pid: process.parent for process in processes}
         if where not in parent_of:
@@ -99,6 +106,7 @@ def find_threads(
         seen = f"is not running, or cannot be recognised; running: {', '.join(there) or 'no node'}"
         missing = [(node, server) for node, server in planned.items() if node not in there]
         notes += tuple(f"node {node} of server {server} {seen}" for node, server in missing)
+        notes += tuple(filter(None, [allocation.absent_receivers(shaping, there)]))
         if plan is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
     found = allocation.with_gates(allocate(chosen, recorded, processes, taken), shaping)
@@ -106,6 +114,41 @@ def find_threads(
         notes += ("none of these processes is in the recording: they were started after it",)
     notes += found.notes + (() if strangers is None else (strangers,))
     return replace(found, notes=notes, strangers=strangers)
+
+
+def evidence_of(
+    plan: ApplicationPlan | None, recording: "Recording | None" = None
+) -> tuple[tuple["Recording", ...], tuple[str, ...]]:
+    """The recordings that say which thread of an application does what: ``recording``, or else
+    those that the plan names; and which of these cannot be read, in sentences.
+    """
+    if recording is not None:
+        return (recording,), ()
+    from chainshaper.sources import open_source  # only who has a recording pays for this
+
+    recordings, notes = list["Recording"](), list[str]()
+    chains = () if plan is None else plan.chains
+    for path in dict.fromkeys(one.evidence.recording for one in chains if one.evidence.recording):
+        if not Path(path).is_dir():
+            notes.append(f"the plan's recording {shown(path)} is not here")
+            continue
+        try:
+            recordings.append(open_source(path))
+        except ChainshaperError as error:
+            notes.append(f"the plan's recording cannot be read: {error}")
+    return tuple(recordings), tuple(notes)
+
+
+def recorded_in(
+    recordings: Iterable["Recording"], notes: Iterable[str] = ()
+) -> tuple[tuple[RecordedProcess, ...], tuple[str, ...]]:
+    """The processes of several recordings, and behind ``notes`` what says nothing of them here."""
+    found, said = list[RecordedProcess](), list(notes)
+    for recording in recordings:
+        processes, why_not = recorded_processes(recording)
+        found += processes
+        said += why_not
+    return tuple(found), tuple(said)
 
 
 def recorded_processes(
@@ -178,19 +221,20 @@ def _follows_clock(pid: int) -> bool:
 
 
 def check_publishers(
-    plan: ApplicationPlan, found: Allocation, recording: "Recording | None" = None
+    plan: ApplicationPlan, found: Allocation, recordings: Iterable["Recording"] = ()
 ) -> list[str]:
     """What a person must know where a plan gates publishers' threads (design 1): whether processes
-    publish so. The recording knows their writers. Raises InputError: as :func:`.check_publication`.
+    publish so. Recordings know their writers. Raises InputError: as :func:`.check_publication`.
     """
     gating = [chain for chain in plan.chains if any(publisher_servers(chain))]
-    if not gating or recording is None:
+    endpoints = dict.fromkeys(one for recording in recordings for one in recording.info.endpoints)
+    if not gating or not endpoints:
         return []
     process = {node: one.thread.pid for one in found.threads for node in one.nodes}
     modes = {pid: _asynchronous(pid) for pid in set(process.values())}
     writers = [
         Writer(one.node, one.topic, one.depth, modes[pid].get(one.topic, modes[pid].get("")), pid)
-        for one in recording.info.endpoints
+        for one in endpoints
         if one.kind == "publisher" and (pid := process.get(one.node)) is not None
     ]
     known = [c for c in gating if any(one.node == c.chain.publisher for one in writers)]
@@ -272,6 +316,11 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
         raise InputError(
             f"the back end {back_end} sets priorities only, and chains whose cycles start at"
             " offsets have to be stopped until then: choose freezer or scx"
+        )
+    if not gates(back_end) and any(chain.slot_ends == "closed" for chain in plan.chains):
+        raise InputError(
+            f"the back end {back_end} sets priorities only, and the plan's servers close at their"
+            " slots' ends (slot_ends: closed): choose freezer, scx or litmus (--backend freezer)"
         )
     if plan.takes_turns and back_end == "scx":
         raise InputError(

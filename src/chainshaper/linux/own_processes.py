@@ -5,7 +5,10 @@ Python is isolated (``-I``), and gets back our package, and behind all other fol
 libraries that it needs, if root and we alone can change them.
 
 All have sessions of their own: Ctrl-C reaches us alone. The user's command, such as `ros2 launch
-…`, ends by SIGINT to its whole process group, then by SIGTERM, then by SIGKILL.
+…`, is asked to end by a SIGINT that reaches each of its processes once: a node that gets a second
+one while it shuts down is killed by it. A command in a terminal expects that the terminal signals
+the whole process group; any other hands the signal on by itself. What does not end gets SIGINT,
+SIGTERM and then SIGKILL, the whole group at once.
 """
 
 import contextlib
@@ -17,13 +20,13 @@ import site
 import subprocess
 import sys
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from chainshaper.linux.scheduling import signalled_with_parent
-from chainshaper.linux.threads import all_stats, open_process
+from chainshaper.linux.threads import all_stats, open_process, read_proc
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import why_distrusted
 
@@ -32,6 +35,8 @@ LIBRARIES = ("cyclonedds", "llvmlite", "numba", "numpy", "polars", "pydantic", "
 
 PATIENCE_S = 15.0
 """`ros2 launch` itself gives its nodes 5 s after SIGINT, and 5 s after SIGTERM."""
+
+_ORPHANS_S = 1.0  # what a command that has ended leaves behind may be about to end as well
 
 _LOOK_S = 0.05
 _PACKAGE = Path(__file__).resolve().parents[1]
@@ -126,14 +131,72 @@ def _as_from_a_terminal(parent: int) -> None:
 
 
 def end_command(started: subprocess.Popen[bytes], patience_s: float = PATIENCE_S) -> None:
-    """End the command and its process group; ``patience_s`` is waited between the signals."""
+    """End the command and its process group; ``patience_s`` is waited between the signals.
+
+    The first SIGINT goes where the command expects it (see above); all later ones to the group.
+    """
+    if started.poll() is None and not _relies_on_terminal(started):
+        for pidfd in _asked_first(started):
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(pidfd, signal.SIGINT)
+            os.close(pidfd)
+        _await_end(started, patience_s, orphans_s=min(patience_s, _ORPHANS_S))
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         if _over(started):
             return
         _signal_group(started, number)
-        deadline = time.monotonic() + patience_s
-        while not _over(started) and time.monotonic() < deadline:
-            time.sleep(_LOOK_S)
+        _await_end(started, patience_s)
+
+
+def _relies_on_terminal(started: subprocess.Popen[bytes]) -> bool:
+    """Whether the command leaves it to its terminal to signal the processes that it has started, as
+    `ros2 launch` does where its input is one, unless it is told that it has none.
+    """
+    words = started.args if isinstance(started.args, Sequence) else ()
+    return os.isatty(0) and not {"--noninteractive", "-n"}.intersection(map(str, words))
+
+
+def _asked_first(started: subprocess.Popen[bytes]) -> list[int]:
+    """The command as a pidfd. Where it does nothing but wait for another process, as a shell
+    script does, that one too, and so on: who waits hands no signal on.
+    """
+    pidfds, pid = list[int](), started.pid
+    pidfd: int | None = os.pidfd_open(pid)
+    while pidfd is not None:
+        pidfds.append(pidfd)
+        child = _waited_for(pid, started.pid)
+        if child is None:
+            break
+        pid, pidfd = child[0], open_process(*child)
+    return pidfds
+
+
+def _waited_for(pid: int, group: int) -> tuple[int, int] | None:
+    """The id and start of the only child of a process that is blocked until a child ends, None
+    where it is not.
+    """
+    try:
+        if read_proc(f"/proc/{pid}/wchan") != b"do_wait":
+            return None
+    except OSError:
+        return None
+    children = [
+        (child, int(fields[19])) for child, fields in _running_in(group) if int(fields[1]) == pid
+    ]
+    return children[0] if len(children) == 1 else None
+
+
+def _await_end(
+    started: subprocess.Popen[bytes], patience_s: float, orphans_s: float | None = None
+) -> None:
+    """Wait until the command and its group have ended, or for ``patience_s``; where the command
+    has ended, for ``orphans_s`` only, if that is given.
+    """
+    deadline = time.monotonic() + patience_s
+    while not _over(started) and time.monotonic() < deadline:
+        if orphans_s is not None and started.poll() is not None:
+            deadline, orphans_s = min(deadline, time.monotonic() + orphans_s), None
+        time.sleep(_LOOK_S)
 
 
 def _signal_group(started: subprocess.Popen[bytes], number: int) -> None:
@@ -156,10 +219,14 @@ def _signal_group(started: subprocess.Popen[bytes], number: int) -> None:
 
 def _over(started: subprocess.Popen[bytes]) -> bool:
     """Whether it has ended, and no process of its group runs any more (zombies do not)."""
-    if started.poll() is None:
-        return False
-    running = (fields for _, fields in all_stats() if fields[0] not in (b"Z", b"X"))
-    return all(int(group) != started.pid for _, _, group, *_ in running)
+    return started.poll() is not None and not any(_running_in(started.pid))
+
+
+def _running_in(group: int) -> Iterator[tuple[int, list[bytes]]]:
+    """The processes of a group with their fields of /proc/PID/stat, but zombies."""
+    for pid, fields in all_stats():
+        if fields[0] not in (b"Z", b"X") and int(fields[2]) == group:
+            yield pid, fields
 
 
 def end_in_words(code: int) -> str:

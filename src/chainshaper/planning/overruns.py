@@ -89,7 +89,10 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     Servers of callbacks stay open too, but for one in which chains begin: a callback that was
     stopped would take its next slot, and every output would be late until two short executions met.
     A server of a whole chain that shapes nothing is there for what runs beside it: it is closed.
+    So are all servers of a plan whose ``slot_ends`` are closed.
     """
+    if plan.slot_ends == "closed":
+        return plan
     end_ns = plan.cycle_ns - closed_ns
     longer: dict[str, Sequence[Slot]] = {}
     if plan.policy == "pipelined" and plan.overrun == "publish":

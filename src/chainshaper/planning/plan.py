@@ -20,7 +20,13 @@ from pydantic import AfterValidator, Field, model_validator
 
 from chainshaper.gate.decision import Anchor, IntoOpenSlot, Late, Messages, Overrun
 from chainshaper.values.durations import duration_text, format_duration, parse_duration
-from chainshaper.values.plan_choices import EqualPriorities, Fallback, Policy, ShapingThread
+from chainshaper.values.plan_choices import (
+    EqualPriorities,
+    Fallback,
+    Policy,
+    ShapingThread,
+    SlotEnds,
+)
 from chainshaper.values.yaml_file import (
     Duration,
     FullName,
@@ -329,7 +335,7 @@ class Plan(Part):
 
     ``cycle_ns`` is a whole multiple of the chain's period; cycles start ``offset_ns`` after the
     instant from which those of all chains count. For ``anchor`` to ``messages`` see
-    :mod:`chainshaper.gate.decision`, for the next three :mod:`chainshaper.values.plan_choices`.
+    :mod:`chainshaper.gate.decision`, for the next four :mod:`chainshaper.values.plan_choices`.
     ``shaping_node`` serves the chain's output, unless the publisher's own thread is gated;
     ``further_shaping_nodes`` serve other sinks, or topics inside a chain (LET per callback).
     """
@@ -348,6 +354,7 @@ class Plan(Part):
     fallback: Fallback = "bypass"
     shaping_thread: ShapingThread = "free"
     equal_priorities: EqualPriorities = "apart"
+    slot_ends: SlotEnds = "open-until-done"
     servers: Annotated[tuple[Server, ...], Field(min_length=1)]
     shaping_node: ShapingNode | None = None
     further_shaping_nodes: tuple[ShapingNode, ...] = ()

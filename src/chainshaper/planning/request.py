@@ -131,7 +131,8 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         reason = f"--fallback {request.fallback} is for a shaping node that is a process"
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
     plan = shaping.with_executors(plan, [one.executors for one in (profile, *sinks)])
-    plan = shaping.with_turns(plans.revised(plan, modes=modes), request.equal_priorities)
+    plan = plans.revised(plan, modes=modes, slot_ends=request.slot_ends)
+    plan = shaping.with_turns(plan, request.equal_priorities)
     (plan,) = with_receivers_placed([plan], [profile])
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
 
@@ -467,44 +468,63 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
             epsilon_ns=request.epsilon_ns, overrun_probability=late, independent_cycles=clustered
         )
     covered = profile.latencies_ns if request.ideal_machine else every
-    least = margins.least_epsilon_ns(request.publication)
     # No margin covers cycles for a slot that stands elsewhere, or those that have been left out.
     covers = request.policy not in OWN_SLOTS or request.policy == "pipelined"
-    if request.percentile is not None:
-        covers = False
+    covers &= request.percentile is None
     if probability is not None and covers:
-        margin = margins.derive_margin(
-            covered, probability, request.seed, longest_ns=longest, least_ns=least
-        )
-        if not request.ideal_machine:
-            return margin
-        in_time = longest + margin.epsilon_ns - least
-        late = margins.late_share(every, in_time, independent)
-        beyond = np.any(every > in_time)
-        return margin.model_copy(update={"overrun_probability": late}) if beyond else margin
+        return _asked_margin(covered, profile, request, probability, independent)
     stalls = max(0, _covering(covered, profile, request) - longest) if covers else 0
-    # Of the latencies themselves: what the least margin adds is the way to the shaping node, and
-    # how many cycles end within it is an accident of the sample.
-    late = margins.late_share(every, longest + stalls, independent)
-    usual = margins.OVERRUN_PROBABILITY
-    if covers and covered is every and independent >= margins.cycles_needed(usual):
-        # Which of the longest covers the usual share was fixed before they were seen.
-        rank = margins.covering_rank(independent, usual)
-        if longest + stalls >= np.sort(every)[-rank]:
-            fewer = int(np.count_nonzero(every > longest)) if stalls == 0 else rank - 1
-            surely = margins.most_probable(fewer, independent, margins.WELL_COVERED)
-            late = min(usual, surely)
+    all_covered = covers and not request.ideal_machine
+    late = _late_by_default(every, longest, stalls, independent, all_covered=all_covered)
     if probability is not None and late > probability:
         reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
         remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"
         raise OperationError(f"{reason}: {remedy}. Leave out --overrun-probability")
     return Margin(
-        epsilon_ns=least + stalls,
+        epsilon_ns=margins.least_epsilon_ns(request.publication) + stalls,
         source="measured",
         overrun_probability=late,
         stalls_ns=stalls,
         independent_cycles=clustered,
     )
+
+
+def _asked_margin(
+    covered: NDArray[np.int64],
+    profile: Profile,
+    request: PlanRequest,
+    probability: float,
+    independent: int,
+) -> Margin:
+    """The margin for a share of late outputs that was asked for, of the cycles that are covered;
+    where others are late besides, with the share of all."""
+    longest, least = profile.longest_ns, margins.least_epsilon_ns(request.publication)
+    margin = margins.derive_margin(
+        covered, probability, request.seed, longest_ns=longest, least_ns=least
+    )
+    in_time = longest + margin.epsilon_ns - least
+    if not request.ideal_machine or not np.any(profile.every > in_time):
+        return margin
+    late = margins.late_share(profile.every, in_time, independent)
+    return margin.model_copy(update={"overrun_probability": late})
+
+
+def _late_by_default(
+    every: NDArray[np.int64], longest: int, stalls: int, independent: int, *, all_covered: bool
+) -> float:
+    """The share of outputs that will be late where the least margin is behind ``longest + stalls``.
+
+    It is counted from the latencies themselves: what the least margin adds is the way to the
+    shaping node, and how many cycles end within it is an accident of the sample. Where the usual
+    share is covered, that is promised, or what is smaller by a confidence that leaves no doubt.
+    """
+    usual = margins.OVERRUN_PROBABILITY
+    if all_covered and independent >= margins.cycles_needed(usual):
+        rank = margins.covering_rank(independent, usual)  # fixed before the sample was seen
+        if longest + stalls >= np.sort(every)[-rank]:
+            beyond = rank - 1 if stalls else int(np.count_nonzero(every > longest))
+            return min(usual, margins.most_probable(beyond, independent, margins.WELL_COVERED))
+    return margins.late_share(every, longest + stalls, independent)
 
 
 def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:

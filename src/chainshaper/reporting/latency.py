@@ -24,7 +24,7 @@ from chainshaper.reporting.tables import (
     slots_ms,
     words,
 )
-from chainshaper.values.durations import milliseconds
+from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.verify.measure import PARTS, Comparison, Measurement, hop_breakdown, part_shares
 from chainshaper.verify.overruns import (
     dropped_text,
@@ -99,6 +99,7 @@ def latency_json(measurement: Measurement, *, instances: bool = False) -> dict[s
         "stalls_watched": measurement.longest_stall_ns is not None,
         "longest_stall_ns": measurement.longest_stall_ns,
         "in_force": None if info.in_force is None else info.in_force.model_dump(),
+        "slot_ends": None if measurement.plan is None else measurement.plan.slot_ends,
         "left_out": asdict(measurement.left_out),
         "realtime": info.realtime,
         "lost": info.lost,
@@ -256,7 +257,8 @@ def verdict(one: Measurement) -> tuple[bool | None, str]:
     judged, name = one.prediction, one.recording.path.name
     if judged is None or one.plan is None:
         return None, f"{name}: no plan was in force, so nothing was promised"
-    aside = _machine_text(one)
+    effect = stall_effect(one)
+    aside = "" if effect is None else f"; {effect}"
     if judged.broken:
         return False, f"{name}: promise broken: {'; '.join(judged.broken)}{aside}"
     if judged.mean.measured_ns is None:
@@ -268,13 +270,31 @@ def verdict(one: Measurement) -> tuple[bool | None, str]:
     return True, f"{met} ({expected_text(one.plan)}){aside}"
 
 
-def _machine_text(one: Measurement) -> str:
-    """What the machine did to a recording's cycles, as the end of its verdict."""
-    statistics = one.analysis.statistics
-    if not statistics.disturbed:
-        return ""
-    of_all = f"{statistics.disturbed} of {statistics.count} cycles"
-    return f"; latencies without {of_all}, disturbed by the machine"
+def stall_effect(one: Measurement) -> str | None:
+    """What stalls of the machine did to a chain's figures at publication, and what these are
+    without the cycles that they disturbed; None where no stall was seen.
+    """
+    every, calm = one.analysis.statistics, one.analysis.undisturbed
+    if not one.longest_stall_ns:
+        return None
+    longest = duration_text(round(one.longest_stall_ns, -5) or one.longest_stall_ns)
+    said = f"stalls of the machine, {longest} at most, disturbed"
+    if not every.disturbed:
+        return f"{said} no cycle"
+    kinds = (("with these", every), ("without them", calm))
+    bands = 1 if one.plan is None else len(publish_slots(one.plan))
+    figures = "; ".join(f"{kind} {_brief(statistics, bands)}" for kind, statistics in kinds)
+    return f"{said} {every.disturbed} of {every.count} cycles: {figures}"
+
+
+def _brief(statistics: LatencyStatistics, bands: int) -> str:
+    """Jitter, spread and late outputs in a few words; of several bands the longest latency, since
+    what lies between bands is no jitter.
+    """
+    late = "" if statistics.late is None else f", {statistics.late} late"
+    if bands > 1:
+        return f"longest {ms(statistics.max_ns)} ms{late}"
+    return f"jitter {ms(statistics.jitter_ns)} ms, spread {ms(statistics.spread_ns)} ms{late}"
 
 
 def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
@@ -306,8 +326,9 @@ def _counts(measurements: Sequence[Measurement]) -> dict[str, list[str]]:
 
 
 def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
-    """What a reader remembers, in one sentence: the jitter and the average before and after, and
-    whether they are as the plan predicted. Cycles are undisturbed ones, at publication."""
+    """What a reader remembers: the jitter and the average before and after, and whether they are
+    as the plan predicted, of undisturbed cycles, at publication; and what stalls did to the last.
+    """
     calm = [one.analysis.undisturbed for one in measurements]
     ends = [0, -1] if len(calm) > 1 else [0]
     jitter, average = (
@@ -315,13 +336,15 @@ def headline(names: Sequence[str], measurements: Sequence[Measurement]) -> str:
         for field in ("jitter_ns", "mean_ns")
     )
     said, judged = f"Jitter {jitter}; average {average}", measurements[-1].prediction
+    effect = stall_effect(measurements[-1])
+    aside = f" {effect[0].upper()}{effect[1:]}." if effect is not None else ""
     if judged is None:
-        return f"{said}."
+        return f"{said}.{aside}"
     if judged.broken:
-        return f"{said}; differs from the prediction: {'; '.join(judged.broken)}."
+        return f"{said}; differs from the prediction: {'; '.join(judged.broken)}.{aside}"
     holds = {one.holds for one in (judged.mean, judged.max, judged.jitter)}
     verdict = "not judged" if holds == {None} else "as predicted"
-    return f"{said}; {verdict}, {judged.outputs.text}."
+    return f"{said}; {verdict}, {judged.outputs.text}.{aside}"
 
 
 def overview_table(comparisons: Sequence[Comparison], names: Sequence[str] = ()) -> ResultTable:

@@ -289,7 +289,7 @@ def condition_table(
     columns = []
     for one, *others in recordings:
         info, plans = one.recording.info, [m.plan for m in (one, *others) if m.plan is not None]
-        in_force = "\n".join(f"{p.policy}, for {p.chain.spec or 'a chain'}" for p in plans)
+        in_force = "\n".join(map(_in_force, plans))
         columns.append(
             {
                 "folder": str(one.recording.path),
@@ -312,6 +312,13 @@ def condition_table(
     for title in columns[0]:
         table.add(title, *(own[title] or UNKNOWN for own in columns))
     return table
+
+
+def _in_force(plan: Plan) -> str:
+    """A plan in one line, with what its servers do at their slots' ends."""
+    closing = "servers closed behind their slots" if plan.slot_ends == "closed" else ""
+    parts = [part for part in (plan.policy, closing) if part]
+    return f"{', '.join(parts)}, for {plan.chain.spec or 'a chain'}"
 
 
 def _begun(measurement: Measurement) -> str:

@@ -120,8 +120,8 @@ def _placed(application: Application, joint: ApplicationPlan) -> Application:
         if (server := server_of.get(node_name(name))) is not None:
             own = application.scheduling_of(name)
             rank = max(1, own.priority - (server.priority - best))
-            if (own.core, own.priority) != (server.core, rank):
-                placed = {"core": server.core, "priority": rank}
+            if (own.core, own.priority, node.bound) != (server.core, rank, True):
+                placed = {"core": server.core, "priority": rank, "bound": True}
                 nodes[name] = node.model_copy(update=placed)
         elif (place := joint.receivers_at.get(node_name(name))) is not None:
             gates = (one.fifo_priority for one in joint.shaping_nodes)
