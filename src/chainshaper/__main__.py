@@ -1,9 +1,9 @@
 """``python -m chainshaper`` is the same as ``chainshaper``: it imports from no current folder."""
 
-import signal
+import _signal  # type: ignore[import-not-found]  # `signal` loads other modules, during which Ctrl-C would end in a traceback
 
-if signal.getsignal(signal.SIGINT) == signal.default_int_handler:
-    signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C while modules load ends us at once
+if _signal.getsignal(_signal.SIGINT) == _signal.default_int_handler:
+    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)  # Ctrl-C while modules load ends us at once
 
 import contextlib
 import os

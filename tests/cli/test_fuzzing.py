@@ -229,8 +229,54 @@ def axes(chance: random.Random, folder: Path, recording: Recording) -> Arguments
             "--workers", "1")  # fmt: skip
 
 
+def latencies(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """Bare latencies: durations in lines, or what `numpy.save` wrote."""
+    sample = np.array([59_000_000 + 1000 * n for n in range(100)])
+    file = folder / chance.choice(["latencies.npy", "latencies.txt"])
+    if file.suffix == ".npy":
+        np.save(file, sample)
+        if chance.random() < 0.5:  # its header is at the beginning
+            data = file.read_bytes()
+            file.write_bytes(data[:128])
+            _damaged_bytes(chance, file)
+            file.write_bytes(file.read_bytes() + data[128:])
+        else:
+            _damaged_bytes(chance, file)
+    else:
+        _write_damaged(chance, file, "\n".join(f"{one}ns" for one in sample.tolist()))
+    return ("plan", "--latencies", file, "--period", "100ms")
+
+
+BUDGET = """format: 1
+chains:
+- {chain: /t1../t3, maximum: 50ms, percentiles: {'99': 40ms}, jitter: 9ms, missing: 0.01}
+callbacks:
+- {node: /first, starts: every 20ms, response: 5ms}
+"""
+CARET = """path_name_aliases:
+- {path_name: all, callbacks: [/first/timer_callback_0, /second/subscription_callback_0]}
+nodes:
+- node_name: /first
+  callbacks: [{callback_name: timer_callback_0, type: timer_callback, period_ns: 20000000}]
+  publishes: [{topic_name: /t1, callback_name: timer_callback_0}]
+- node_name: /second
+  callbacks: [{callback_name: subscription_callback_0, topic_name: /t1}]
+  publishes: [{topic_name: /t2, callback_name: UNDEFINED}]
+"""
+
+
+def limits_and_paths(chance: random.Random, folder: Path, recording: Recording) -> Arguments:
+    """A budget, or a CARET architecture file."""
+    if chance.random() < 0.5:
+        file = _write_damaged(chance, folder / "budget.yaml", BUDGET)
+        return ("check", recording.path, "--budget", file)
+    file = _write_damaged(chance, folder / "architecture.yaml", CARET)
+    return ("latency", recording.path, "--chains", file)
+
+
 KINDS: tuple[Callable[..., Arguments], ...] = (
     bytes_of_tables, columns_of_tables, facts_of_recordings, traces, applications, plans, axes,
+    latencies, limits_and_paths,
 )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ from chainshaper import load_plan, measure_latency
 from chainshaper.cli import output
 from chainshaper.cli.app import VERBS
 from chainshaper.flow import doctor
-from chainshaper.flow.exploration import application_file
+from chainshaper.flow.describing import application_file
 from chainshaper.planning import Plan, save_plan
 from chainshaper.reporting.tables import ResultTable, figures, words
 from chainshaper.values.durations import parse_duration
@@ -226,22 +226,26 @@ def test_an_application_is_described_from_scratch_and_from_a_recording(tmp_path:
     assert called("simulate", copy, "-o", again).code == 0
     one, two = json_of("latency", first), json_of("latency", again)
     assert one["chain"] == two["chain"]
-    assert two["mean_ns"] == pytest.approx(one["mean_ns"], rel=0.1)
+    assert two["mean_ns"] == pytest.approx(one["mean_ns"], rel=0.02)
+    assert two["max_ns"] == pytest.approx(one["max_ns"], rel=0.05)
     assert called("--version").out.startswith("chainshaper 0.")
 
 
-def test_an_execution_that_came_once_is_no_twentieth_of_all(tmp_path: Path) -> None:
-    """One of 200 executions of 4 ms took 40 ms: the mean is 4.18 ms."""
+def test_an_execution_that_came_once_is_in_a_description_as_often(tmp_path: Path) -> None:
+    """One of 200 executions of 4 ms took 40 ms: the mean is 4.18 ms, the longest 40."""
     text = small_chain_text().replace(
         "execution: {uniform: [1ms, 4ms]}", f"execution: {{samples: [{'4ms, ' * 199}40ms]}}"
     )
     (tmp_path / "app.yaml").write_text(text)
     simulated = cs.simulate(cs.load_application(tmp_path / "app.yaml"), tmp_path / "r", cycles=400)
-    described = yaml.safe_load(application_file(simulated))
+    described = yaml.safe_load(application_file(simulated)[0])
     for name in ("first", "second", "third"):
         (callback,) = described["nodes"][name]["callbacks"]
-        samples = map(parse_duration, callback["execution"]["samples"])
-        assert all(4_000_000 <= sample < 5_000_000 for sample in samples)
+        times = list(map(parse_duration, callback["execution"]["sequence"]))
+        usual = [time for time in times if time < 5_000_000]
+        assert len(usual) > 0.97 * len(times)
+        assert all(time >= 4_000_000 for time in usual)
+        assert all(40_000_000 <= time < 42_000_000 for time in times if time not in usual)
 
 
 def test_names_stay_whole_in_a_narrow_terminal() -> None:

@@ -372,3 +372,20 @@ def test_servers_of_one_priority_overlap_only_where_they_take_turns() -> None:
     refuse_unfit(whole(plan), "freezer")
     with pytest.raises(InputError, match=r"under the back end scx .* \(--backend freezer\)"):
         refuse_unfit(whole(plan), "scx")
+
+
+def test_closed_servers_are_open_in_their_slots_only(tmp_path: Path) -> None:
+    """As the paper's; what only sets priorities cannot close them."""
+    closed = plan_chain(PROFILE, PlanRequest(slot_ends="closed", epsilon_ns=MS))
+    open_for_long = plan_chain(PROFILE, PlanRequest(epsilon_ns=MS))
+    assert closed.servers == open_for_long.servers
+    assert open_in_ms(closed, "chain") == [(0, 21)]
+    assert open_in_ms(open_for_long, "chain") == [(0, 50)]
+    both, _ = plan_application([PROFILE], PlanRequest(slot_ends="closed", epsilon_ns=MS))
+    assert [chain.slot_ends for chain in both.chains] == ["closed"]
+    save_plan(closed, tmp_path / "closed.yaml")
+    assert load_plan(tmp_path / "closed.yaml") == closed
+    for back_end in ("freezer", "scx", "litmus"):
+        refuse_unfit(whole(closed), back_end)
+    with pytest.raises(InputError, match=r"back end fifo sets priorities only.*closed"):
+        refuse_unfit(whole(closed), "fifo")

@@ -13,6 +13,7 @@ from chainshaper.analysis import data_flow
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import Server, Thread
 from chainshaper.values import events
+from chainshaper.values.durations import parse_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 
@@ -65,7 +66,15 @@ def test_a_schedule_is_the_one_worked_out_by_hand(tmp_path: Path, case: dict[str
         turns = case.get("equal_priorities", "apart")
         offset_ms = case.get("offset_ms", 0)
         chain = case.get("chain", next(iter(case["nodes"])))
-        governed = plan(*servers, chain=chain, offset_ms=offset_ms, equal_priorities=turns)
+        governed = plan(
+            *servers,
+            chain=chain,
+            cycle_ms=parse_duration(case["nodes"][chain]["callbacks"][0]["timer"]) // MS,
+            offset_ms=offset_ms,
+            equal_priorities=turns,
+            policy=case.get("policy", "server-per-chain"),
+            slot_ends=case.get("slot_ends", "open-until-done"),
+        )
     recording = simulated(tmp_path, described(case), governed, case.get("cycles", 1))
     if "callbacks" in case:
         assert callbacks(recording) == [tuple(each) for each in case["callbacks"]]

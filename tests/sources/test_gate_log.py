@@ -100,3 +100,18 @@ def test_gates_of_one_process_count_their_rows_for_themselves(tmp_path: Path) ->
     ]
     (note,) = notes
     assert note.startswith("1 rows of shaping nodes' logs could not be written")
+
+
+@pytest.mark.parametrize("again", ["link", "same file", "copy"])
+def test_a_log_and_its_older_part_that_are_one_file_count_once(log: Path, again: str) -> None:
+    log.write_text(HEADER + LATE + EARLY)
+    before = log.with_name("gate.csv.1")
+    if again == "link":
+        before.symlink_to(log)
+    elif again == "same file":
+        before.hardlink_to(log)
+    else:
+        before.write_text(log.read_text())
+    assert read_gate_log(log).height == 2
+    tables, _ = with_gate_logs({}, [log, log], 0, 10_000)
+    assert tables["gate_release"].height == 2

@@ -250,6 +250,14 @@ def test_a_set_is_the_oldest_message_of_every_input() -> None:
     assert synchroniser.add(1, "b3") == ()
 
 
+def test_a_triggered_set_is_the_newest_message_of_the_other_inputs() -> None:
+    synchroniser = Synchroniser[str]([2, 2], trigger=1)
+    assert synchroniser.add(1, "b1") == ()  # without another one it is gone
+    assert [synchroniser.add(0, message) for message in ("a1", "a2", "a3")] == [(), (), ()]
+    assert synchroniser.add(1, "b2") == ("a3", "b2")
+    assert synchroniser.add(1, "b3") == ("a3", "b3"), "the newest is kept"
+
+
 SLOT = (22 * MS, 32 * MS)  # behind the longest latency of the small chain
 
 

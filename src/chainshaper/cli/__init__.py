@@ -2,6 +2,7 @@
 stderr. Exit codes: 0 done, 1 the operation failed, 2 wrong use or input, 3 the platform cannot.
 """
 
+import codecs
 import ctypes
 import errno
 import io
@@ -33,6 +34,17 @@ _FRUGAL = {
     "OPENBLAS_NUM_THREADS": "1",
     "_RJEM_MALLOC_CONF": "background_thread:false",  # of the allocator in Polars
 }
+_PLAIN = {
+    "→": "->",
+    "←": "<-",
+    "–": "-",
+    "−": "-",
+    "…": "...",
+    "µ": "u",
+    "μ": "u",
+    "×": "x",
+    "≤": "<=",
+}
 _handlers: list[Any] = []  # ctypes forgets a callback that nothing refers to
 
 
@@ -41,10 +53,8 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
     from chainshaper.cli.output import say
     from chainshaper.values.errors import ChainshaperError, shown
 
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) == signal.SIG_DFL:  # under nohup it stays ignored
-            signal.signal(number, _end_in_order)
     _prepare_output_and_memory()
+    _interrupted.clear()
     words = list(sys.argv[1:] if arguments is None else arguments)
     own = words[: words.index("--")] if "--" in words else words  # behind it is a COMMAND
 
@@ -55,8 +65,10 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
         sys.exit(code)
 
     try:
-        if signal.getsignal(signal.SIGINT) == signal.SIG_DFL:  # as chainshaper.__main__ has it
-            signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            # As chainshaper.__main__ has it for Ctrl-C; what is ignored under nohup stays so.
+            if signal.getsignal(number) == signal.SIG_DFL:
+                signal.signal(number, _end_in_order)
         from chainshaper.cli.app import USAGE_ERROR, Abort, app
 
         try:
@@ -70,8 +82,6 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
             sys.exit(1)
     except ChainshaperError as error:
         fail(str(error), error.exit_code)
-    except KeyboardInterrupt:
-        sys.exit(130)
     except PermissionError as error:
         remedy = "name a place that you may read and write, or change its permissions"
         fail(f"{error.filename}: permission denied: {remedy}", 2)
@@ -81,14 +91,24 @@ def main(arguments: list[str] | None = None, name: str = "chainshaper") -> None:
             raise
         fail(f"this needs {lacks}, which is not installed: pip install 'chainshaper[analysis]'", 3)
     except BaseException as error:  # a panic of Polars is no Exception
+        # Libraries that are not Python make an error of their own of Ctrl-C.
+        if isinstance(error, KeyboardInterrupt) or (
+            _interrupted and not isinstance(error, SystemExit)
+        ):
+            sys.exit(130)
         message = _exhausted(error)
         if message is None:
             raise
         fail(message, 1)
 
 
+_interrupted: list[int] = []
+"""The signals that have asked us to end."""
+
+
 def _end_in_order(number: int, frame: FrameType | None) -> None:  # noqa: ARG001 - a signal handler
-    """SIGTERM, or a lost terminal, ends us as Ctrl-C does: through every `finally`."""
+    """Ctrl-C, SIGTERM and a lost terminal end us alike: through every `finally`."""
+    _interrupted.append(number)
     raise KeyboardInterrupt
 
 
@@ -112,14 +132,25 @@ def _exhausted(error: BaseException | None) -> str | None:
     return None
 
 
+def _readable(error: UnicodeError) -> tuple[str | bytes, int]:
+    """What a terminal without some character gets instead (LC_ALL=C): one alike, or its escape."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    wrong = error.object[error.start : error.end]
+    plain = (_PLAIN.get(one) or one.encode("ascii", "backslashreplace").decode() for one in wrong)
+    return "".join(plain), error.end
+
+
 def _prepare_output_and_memory() -> None:
     """Where memory is limited (`ulimit -v`), let a library's abort end us with a message.
 
     Libraries start as few threads as they can there: each one costs address space, Polars waits for
     ever for one that it cannot start, and its allocator tries to start one for ever.
     """
-    if isinstance(sys.stdout, io.TextIOWrapper):
-        sys.stdout.reconfigure(errors="replace")  # an ASCII terminal gets "?" for µ
+    codecs.register_error("readable", _readable)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="readable")
     if resource.getrlimit(resource.RLIMIT_AS)[0] == resource.RLIM_INFINITY:
         return
     for name, value in _FRUGAL.items():

@@ -4,6 +4,7 @@ A verb's module is imported when the verb is called: `chainshaper --help` has to
 Help is written without Rich, which takes longer to import than most verbs take to run.
 """
 
+import sys
 from importlib import import_module
 from importlib.metadata import version
 from typing import Any
@@ -34,8 +35,24 @@ VERBS = {verb: module for module, verbs in _MODULES for verb in verbs.split()}
 _SETTINGS = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 
+def _as_shown(text: str) -> str:
+    """What standard output can show of a text: Typer writes UTF-8 where the locale is ASCII."""
+    encoding = sys.stdout.encoding or "utf-8"
+    return text.encode(encoding, sys.stdout.errors or "replace").decode(encoding)
+
+
+class _PlainGroup(TyperGroup):
+    """All verbs, whose help every terminal can show."""
+
+    def get_help(self, ctx: Any) -> str:
+        return _as_shown(super().get_help(ctx))
+
+
 class _PlainCommand(TyperCommand):
     """A command whose help has a section for each panel."""
+
+    def get_help(self, ctx: Any) -> str:
+        return _as_shown(super().get_help(ctx))
 
     def collect_usage_pieces(self, ctx: Any) -> list[str]:
         return [
@@ -88,7 +105,7 @@ def _options(
     """Options without a verb: Typer adds those that install shell completion."""
 
 
-app = TyperGroup(
+app = _PlainGroup(
     name="chainshaper",
     help="Constant end-to-end latency for ROS 2 computation chains, without touching their code.",
     commands={verb: _Verb(verb) for verb in VERBS},

@@ -192,11 +192,15 @@ def release(
         "--crashed", "Only of runs that have crashed: plans in force stay so.", False
     ),
 ) -> None:
-    """End plans in force, and put back what crashed runs have left changed."""
+    """End plans in force, and put back what crashed runs have left changed.
+
+    What was being written into the current folder when its run was killed is removed as well.
+    """
     from chainshaper.enforcement.freezer import groups_of, run_of
     from chainshaper.enforcement.scheduling_memory import look_alikes
     from chainshaper.enforcement.undoing import release_strays
     from chainshaper.linux.runs import find_journals
+    from chainshaper.values.leftovers import clear_leftovers
 
     runs = find_journals()
     chosen = [journal for journal in runs if run in (None, journal.name)]
@@ -218,10 +222,13 @@ def release(
     for folder in strays:
         out.show_line(f"{folder}, of a run whose journal is gone: its threads run again")
     problems += left
-    out.notes(strangers)
+    removed, stays = clear_leftovers(Path.cwd()) if run is None else ([], [])
+    for line in removed:
+        out.show_line(line)
+    out.notes([*strangers, *stays])
     if problems:
         raise OperationError("; ".join(problems))
-    if not chosen and not strays:
+    if not chosen and not strays and not removed and not stays:
         out.show_line("no plan is in force, and nothing was left behind")
 
 

@@ -258,8 +258,8 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     topic, colon, listed = text.partition(":")
     if not colon:
         raise InputError(
-            f"--modes {text}: modes need a topic that announces them: write TOPIC:MODE,MODE, such"
-            " as /driving_mode:city,highway"
+            f"--modes {text}: write the topic that announces the modes, and each mode once, such as"
+            " /driving_mode:city,highway"
         )
     pairs = [pair.partition("=") for pair in listed.split(",")]
     bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}

@@ -38,12 +38,13 @@ def describe(
 
     `chainshaper simulate` and `run` take it; edit it as you like.
     """
-    from chainshaper.flow.exploration import application_file
+    from chainshaper.flow.describing import application_file
     from chainshaper.values.files import new_file, write_whole
 
     new_file(output, opt.DESCRIPTIONS)
     with out.opened("describe", trace) as (recording, _):
-        text = application_file(recording, chain)
+        text, notes = application_file(recording, chain)
+        out.notes(notes)
     out.show_line(write_whole(output, [text.encode()]))
 
 
@@ -85,16 +86,19 @@ def graph(
 
 def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
+    from chainshaper.analysis import recorded_flow
     from chainshaper.reporting import overviews
 
     with out.opened("callbacks", trace) as (recording, _):
-        flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
+        flow = recorded_flow(recording)
         found = cs.callback_statistics(flow)
     if out.present(json, overviews.callback_rows(found), overviews.callback_table(found)):
         out.show_line(out.lost_events(recording))
         out.notes((*recording.info.notes, *flow.notes))
-    elif any(recording.info.lost.values()):  # the array has no place for it
-        out.notes([out.lost_events(recording)])
+    else:  # the array has no place for them
+        out.notes(one.note for one in flow.contradictions)
+        if any(recording.info.lost.values()):
+            out.notes([out.lost_events(recording)])
 
 
 def chains(
@@ -112,11 +116,11 @@ def chains(
 
     The heaviest chain has the largest sum of its callbacks' mean response times.
     """
-    from chainshaper.analysis import graph_of
+    from chainshaper.analysis import graph_of, recorded_flow
     from chainshaper.reporting import overviews
 
     with out.opened("chains", trace) as (recording, report):
-        flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
+        flow = recorded_flow(recording)
         report(0.9, "searching chains")
         application, found = graph_of(flow), cs.list_chains(flow, start, end, limit)
     remarks = [*recording.info.notes, *flow.notes]

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 from chainshaper import planning
-from chainshaper.analysis import ChainEnumeration, data_flow, graph_of
+from chainshaper.analysis import ChainEnumeration, graph_of, recorded_flow
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import launch_splicing
 from chainshaper.flow.apply import START_NS, apply_plan
@@ -263,7 +263,7 @@ def _with_types(recordings: Sequence[Recording], plan: ApplicationPlan) -> Recor
 
 def _chosen(first: Recording, choose: Choose | None) -> str:
     """The chain that is meant, of those that were recorded."""
-    flow = data_flow(first.events, first.info.clock_offset_ns)
+    flow = recorded_flow(first)
     found = list_chains(flow)
     if not found.chains:
         what = "no chain was seen: do its callbacks publish, and do others take that?"

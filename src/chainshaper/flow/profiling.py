@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
 
-from chainshaper.analysis import data_flow, find_chain, graph_of
+from chainshaper.analysis import find_chain, graph_of, recorded_flow
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
@@ -126,7 +126,7 @@ def check_profiling(cores: Sequence[int] | None) -> Sequence[int]:
 
 def chain_nodes(recording: Recording, *chains: str) -> tuple[str, ...]:
     """The nodes of recorded chains, each in order, then those of the branches that it waits for."""
-    graph = graph_of(data_flow(recording.events, recording.info.clock_offset_ns))
+    graph = graph_of(recorded_flow(recording))
     found = ((one, graph_stages(graph, one)) for one in (find_chain(graph, c) for c in chains))
     return tuple(dict.fromkeys(node for own in found for node in taking_part(graph, *own)))
 

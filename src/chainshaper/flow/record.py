@@ -43,6 +43,7 @@ from chainshaper.values import recording as recordings
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
 from chainshaper.values.files import open_to_all, rename_output
+from chainshaper.values.leftovers import claimed, leftover_text, leftovers
 from chainshaper.values.recording import EndpointInfo, Recording, ThreadInfo
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
@@ -132,8 +133,12 @@ def record_command(
     if command:
         check_command(command)
     parent = output.absolute().parent
+    for left in leftovers(parent, output.name):
+        progress(0.0, leftover_text(left))
+    held = ExitStack()
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".{output.name}.tracing-", dir=parent))
+        held.enter_context(claimed(folder))
     except OSError as error:
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
@@ -163,6 +168,7 @@ def record_command(
             rename_output(folder, recording.path / TRACE_FOLDER)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+        held.close()
     return Recorded(recording, run.exit_code)
 
 

@@ -187,7 +187,7 @@ def throttle_fraction() -> float:
     """Share of a core that SCHED_FIFO may use before the kernel stops it; 1.0 is no limit."""
     try:
         runtime, period = (
-            int(Path(_THROTTLE.format(n)).read_text()) for n in ("runtime", "period")
+            int(Path(_THROTTLE.format(n)).read_bytes()) for n in ("runtime", "period")
         )
     except (OSError, ValueError):
         return 1.0

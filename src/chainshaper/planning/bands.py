@@ -521,7 +521,7 @@ def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
     current folder, unless a configuration says otherwise.
     """
     state, configured = np.random.get_state(), os.environ.get("LOG_CFG")
-    with tempfile.NamedTemporaryFile("w", suffix=".yaml") as configuration:
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as configuration:
         configuration.write("version: 1\nincremental: true\n")
         configuration.flush()
         os.environ["LOG_CFG"] = configuration.name

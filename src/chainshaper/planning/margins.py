@@ -33,6 +33,7 @@ follow them: on stationary input a move is the rare exception, however long that
 """
 
 import math
+import warnings
 from collections import deque
 from dataclasses import dataclass, field
 from functools import cache
@@ -94,7 +95,7 @@ def read_latencies(path: str | Path) -> _Latencies:
     path = Path(path)
     bare = path.suffix == ".npy"
     try:
-        latencies = check_latencies(np.load(path, allow_pickle=False) if bare else _lines(path))
+        latencies = check_latencies(_array(path) if bare else _lines(path))
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except (ValueError, EOFError) as error:
@@ -108,6 +109,20 @@ def read_latencies(path: str | Path) -> _Latencies:
     if not latencies.any():
         raise InputError(f"{path}: every latency is 0 ms: check the unit, and what was measured")
     return latencies
+
+
+def _array(path: Path) -> object:
+    """What `numpy.save` wrote. Raises OSError; ValueError: it is damaged, or something else."""
+    try:
+        with path.open("rb") as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # about headers that Python 2 wrote
+            return np.lib.format.read_array(file, allow_pickle=False)
+    except (OSError, ValueError):
+        raise
+    except (
+        Exception
+    ) as error:  # its header is Python, and a damaged one may raise all that Python can
+        raise ValueError(f"its header is damaged: {error or type(error).__name__}") from error
 
 
 def _lines(path: Path) -> _Latencies:

@@ -89,7 +89,10 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
     Servers of callbacks stay open too, but for one in which chains begin: a callback that was
     stopped would take its next slot, and every output would be late until two short executions met.
     A server of a whole chain that shapes nothing is there for what runs beside it: it is closed.
+    So are all servers of a plan whose ``slot_ends`` are closed.
     """
+    if plan.slot_ends == "closed":
+        return plan
     end_ns = plan.cycle_ns - closed_ns
     longer: dict[str, Sequence[Slot]] = {}
     if plan.policy == "pipelined" and plan.overrun == "publish":
@@ -282,7 +285,10 @@ def plan_warnings(*chains: Plan) -> list[str]:
     found = []
     for plan in chains:
         name = f"{plan.chain.spec or plan.chain.output}: " if chains[1:] else ""
-        about = chain(_about_stages(plan), _about_late_outputs(plan), _about_evidence(plan))
+        about = chain(
+            *(_about_stages(plan), _about_late_outputs(plan), _about_evidence(plan)),
+            _about_receivers(plan),
+        )
         found += [f"{name}{warning}" for warning in (*about, *publication_warnings(plan))]
     return found
 
@@ -358,6 +364,15 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
         said = f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their"
         yield f"{said} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."
+
+
+def _about_receivers(plan: Plan) -> Iterator[str]:
+    """Who receives an output without a place in the plan."""
+    node = plan.shaping_node
+    if node is not None and node.receivers and node.receivers_at is None:
+        said = f"{', '.join(node.receivers)}, which get {node.output}, run below all servers, and"
+        said += " when their callbacks start is not promised: the plan has no room for them, or the"
+        yield f"{said} recording does not say how long they take. A core without servers helps."
 
 
 def modes_with_one_slot(plan: Plan) -> Iterator[tuple[tuple[str, ...], Slot]]:

@@ -27,6 +27,7 @@ _HEADER = """\
 """
 
 _UNLESS_OTHERWISE = {"offset_ns", "into_open_slot", "shaping_thread", "equal_priorities"}
+_UNLESS_OTHERWISE |= {"slot_ends"}
 _UNLESS_OTHERWISE |= {"further_shaping_nodes"}  # these are not written while they are as usual
 _SECTION_COMMENTS = {
     "evidence": "the measurements behind the plan",
@@ -40,9 +41,12 @@ _SECTION_COMMENTS = {
     "shaping_thread": "shaping nodes' threads run in their servers' slots only; free: their gates"
     " alone time them",
     "equal_priorities": "servers of one core and priority take turns; apart: they never overlap",
+    "slot_ends": "closed: a callback that is not done when its slot ends goes on in the next one;\n"
+    "# open-until-done: its server stays open for it",
     "servers": "a thread runs only in its server's slots; a smaller priority is better, and of\n"
     "# its threads the first is the most urgent",
-    "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
+    "shaping_node": "republishes the output in its slots; those that receive it have\n"
+    "# SCHED_FIFO above the servers of chains, for so long in a cycle; or, without a place, below",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
     "adaptation": "how slots follow the latencies (apply --adapt): later when so many times the"
     " promised share\n# of a window is late, earlier for this gain after so many cycles",

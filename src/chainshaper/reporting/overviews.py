@@ -289,7 +289,7 @@ def condition_table(
     columns = []
     for one, *others in recordings:
         info, plans = one.recording.info, [m.plan for m in (one, *others) if m.plan is not None]
-        in_force = "\n".join(f"{p.policy}, for {p.chain.spec or 'a chain'}" for p in plans)
+        in_force = "\n".join(map(_in_force, plans))
         columns.append(
             {
                 "folder": str(one.recording.path),
@@ -312,6 +312,13 @@ def condition_table(
     for title in columns[0]:
         table.add(title, *(own[title] or UNKNOWN for own in columns))
     return table
+
+
+def _in_force(plan: Plan) -> str:
+    """A plan in one line, with what its servers do at their slots' ends."""
+    closing = "servers closed behind their slots" if plan.slot_ends == "closed" else ""
+    parts = [part for part in (plan.policy, closing) if part]
+    return f"{', '.join(parts)}, for {plan.chain.spec or 'a chain'}"
 
 
 def _begun(measurement: Measurement) -> str:
@@ -371,7 +378,19 @@ def plan_table(plan: Plan) -> ResultTable:
         table.add(one.name, one.core, one.priority, slots_ms(*one.slots), ", ".join(threads))
     offset = f", offset {milliseconds(plan.offset_ns)}" if plan.offset_ns else ""
     table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_jitter_text(plan)}"
+    if (received := receivers_text(plan)) is not None:
+        table.caption += f"\n{received}"
     return table
+
+
+def receivers_text(plan: Plan) -> str | None:
+    """What a plan promises for those that receive its output, and where they run."""
+    node, promised = plan.shaping_node, plan.predicted.receivers
+    if node is None or node.receivers_at is None or promised is None:
+        return None
+    said = f"{', '.join(node.receivers)} on core {node.receivers_at.core}: callbacks start by"
+    said += f" {milliseconds(promised.max_ns)}, jitter"
+    return f"{said} {milliseconds(promised.jitter_ns)} at most"
 
 
 def bands_table(plan: Plan) -> ResultTable:

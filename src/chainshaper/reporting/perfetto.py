@@ -23,7 +23,7 @@ from typing import TypeAlias
 
 import polars as pl
 
-from chainshaper.analysis import DataFlow, LatencyAnalysis, data_flow, graph_of
+from chainshaper.analysis import DataFlow, LatencyAnalysis, graph_of, recorded_flow
 from chainshaper.reporting.timeline import Timeline, timeline_of
 from chainshaper.values import events
 from chainshaper.values.application import trigger_text
@@ -90,7 +90,7 @@ def export_perfetto(source: Recording | Measurement, path: str | Path) -> Path:
     recording = source.recording if isinstance(source, Measurement) else source
     if isinstance(source, Measurement):
         analysis, plan = source.analysis, source.plan
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     timeline = timeline_of(recording, flow, analysis, plan)
     tracks = _thread_tracks(recording, flow, timeline)
     if analysis is not None:
@@ -121,7 +121,7 @@ def export_mcap(source: Recording | Measurement, path: str | Path) -> Path:
     path = new_file(path, (".mcap",))
     writing = extra_library("mcap.writer", "writing MCAP", "mcap")
     recording = source.recording if isinstance(source, Measurement) else source
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     about = {one.id: one for one in graph_of(flow).callbacks}
     rows: list[tuple[int, int, str, dict[str, Value | float]]] = []
     took = flow.instances.drop_nulls("end").select("callback_id", "start", "end", "execution_ns")

@@ -12,7 +12,7 @@ import numpy as np
 from chainshaper.analysis.chains import find_chain
 from chainshaper.gate.decision import CHANGES
 from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Server, Thread
+from chainshaper.planning.plan import ReceiverPlace, Server, Thread
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, Int64s, M, P, R, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
@@ -25,7 +25,7 @@ from chainshaper.workload.description import (
     node_name,
 )
 from chainshaper.workload.event_log import WORDS
-from chainshaper.workload.execution import BLOCK, blocks
+from chainshaper.workload.execution import BLOCK, FIRST_AFTER, blocks
 from chainshaper.workload.live import Timing
 
 FIRST_PID, FIRST_TID = 1000, 100_000  # of processes, and of executors' threads but the first
@@ -37,6 +37,7 @@ STATIC_ORDER = ("subscription", "timer", "client", "service")
 AHEAD = 16 * BLOCK  # values of every stream that are drawn beforehand
 FIRST_COST = 1 << 20
 """Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
+FIRST_DELIVERY = 1 << 21  # and deliveries from here, by publishing node, callback and input
 LOG_ROWS = 1 << 17
 POOL = 4096  # messages under way, besides those in histories
 BEST_EFFORT = 1000
@@ -77,14 +78,15 @@ class Process(NamedTuple):
 class System:
     """An application with everything that runs in it, numbered as in the engine's array.
 
-    ``servers`` are by thread. ``chain`` has its callbacks by entity; it is empty where it is not
-    followed.
+    ``servers`` are by thread, and ``receivers`` of outputs, which are in none, with their places.
+    ``chain`` has its callbacks by entity; it is empty where it is not followed.
     """
 
     application: Application
     processes: tuple[Process, ...]
     threads: tuple[ThreadInfo, ...]
     servers: Mapping[int, Server]
+    receivers: Mapping[int, ReceiverPlace]
     cores: tuple[int, ...]
     entities: tuple[Entity, ...]
     publishers: tuple[Publisher, ...]
@@ -123,8 +125,10 @@ def build_system(
     threads = list(_threads(application, processes, publishers))
     servers = {} if plan is None else _servers(plan, threads)
     cores = sorted({thread.cores[0] for thread in threads})
-    for number, server in servers.items():
-        threads[number] = threads[number].model_copy(update={"cores": (server.core,)})
+    receivers = {} if plan is None else _receivers(plan, threads, servers)
+    homes = {number: one.core for number, one in (servers | receivers).items()}
+    for number, core in homes.items():
+        threads[number] = threads[number].model_copy(update={"cores": (core,)})
     chain = Chain(application.chain, (), ())
     if follow_chain:
         chain = find_chain(_graph(processes, entities, publishers), application.chain)
@@ -133,7 +137,8 @@ def build_system(
         processes=processes,
         threads=tuple(threads),
         servers=servers,
-        cores=tuple(dict.fromkeys([*cores, *(server.core for server in servers.values())])),
+        receivers=receivers,
+        cores=tuple(dict.fromkeys([*cores, *homes.values()])),
         entities=tuple(entities),
         publishers=tuple(publishers),
         chain=chain,
@@ -205,6 +210,19 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
                 )
             found |= dict.fromkeys(numbers[thread], server)
     return found
+
+
+def _receivers(
+    plan: ApplicationPlan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
+) -> dict[int, ReceiverPlace]:
+    """The place of each thread that receives an output, and is in no server."""
+    place_of = plan.receivers_at
+    return {
+        number: place
+        for number, one in enumerate(threads)
+        if number not in servers and one.role == "executor"
+        if (place := place_of.get(one.node or "")) is not None
+    }
 
 
 def _graph(
@@ -398,7 +416,8 @@ class Machine:
                 continue
             ranked = [server for server in plan.servers if server in governed.values()]
             ranked.sort(key=lambda server: server.priority)
-            self._rank(plan, governed, ranked)
+            receiving = {n: one for n, one in system.receivers.items() if one.core == core}
+            self._rank(plan, governed, ranked, receiving)
             table = _slot_table(plan, ranked)
             first, end = rows.put([number for pair in table for number in pair])
             # The run starts anywhere in a cycle.
@@ -412,19 +431,34 @@ class Machine:
             rows[place + C.BOUNDARY] = timing.start_ns - elapsed + until
 
     def _rank(
-        self, plan: ApplicationPlan, governed: dict[int, Server], ranked: list[Server]
+        self,
+        plan: ApplicationPlan,
+        governed: dict[int, Server],
+        ranked: list[Server],
+        receiving: dict[int, ReceiverPlace],
     ) -> None:
-        """Server and rank of the threads that are ``governed`` on a core."""
+        """Server and rank of the threads that are ``governed`` on a core: by the priority of the
+        server and, within one, in the plan's order, as `server_priorities` has them live; and the
+        rank of those ``receiving`` an output, behind all of their priority.
+        """
         order = plan.most_urgent_first
-        places = {node: place for place, node in enumerate(order)}
+        place_of = {node: place for place, node in enumerate(order)}
+        named = {
+            number: place_of.get(self._system.threads[number].node, len(order))
+            for number in governed
+        }
+        taken = {
+            server.name: sorted({named[n] for n, one in governed.items() if one is server})
+            for server in ranked
+        }
         urgency = {
-            number: (
-                server.priority if plan.takes_turns else ranked.index(server),
-                places.get(self._system.threads[number].node, len(order)),
-            )
+            number: (server.priority, taken[server.name].index(named[number]))
             for number, server in governed.items()
         }
-        urgent = sorted(set(urgency.values()))
+        behind = {number: (one.priority, len(governed)) for number, one in receiving.items()}
+        urgent = sorted({*urgency.values(), *behind.values()})
+        for number, key in behind.items():
+            self._rows[self._threads[number] + T.RANK] = urgent.index(key) - len(urgent)
         for number, server in governed.items():
             rank = urgent.index(urgency[number]) - len(urgent)
             if server.best_effort:  # under the fair class, behind all real-time threads
@@ -470,6 +504,7 @@ class Machine:
         rows, system, timing = self._rows, self._system, self._timing
         # What the entities of a callback share, and the callbacks of a group.
         executions: dict[tuple[int, int], int] = {}
+        afterwards: dict[tuple[int, int], int] = {}
         bodies: dict[tuple[int, int], int] = {}
         groups: dict[tuple[int, str], int] = {}
         for number, (row, entity) in enumerate(zip(self._entities, system.entities, strict=True)):
@@ -479,18 +514,19 @@ class Machine:
             if callback not in executions:
                 stream = self._streams.add(described.execution, process.node, entity.index)
                 executions[callback] = stream
+                if described.afterwards is not None:
+                    times, number_of = described.afterwards, FIRST_AFTER + entity.index
+                    afterwards[callback] = self._streams.add(times, process.node, number_of)
             body = at.COMPUTE
             if gate is not None:
                 body = at.MODE_LISTENER if entity.listens else at.GATE
                 if callback not in bodies:
                     bodies[callback] = _add_gate(rows, system, described, timing)
             elif described.synchronises:
-                body, inputs = at.SYNCHRONISE, len(described.synchronises)
+                body = at.SYNCHRONISE
                 if callback not in bodies:
-                    bodies[callback] = rows.add(inputs, I.COLUMNS).start
-                first, depth = bodies[callback], system.depth(entity.topic or "")
-                own = {I.ON_CHAIN: on_chain, I.DEPTH: depth, I.END: first + inputs * I.COLUMNS}
-                rows.set(first + entity.number * I.COLUMNS, own)
+                    bodies[callback] = rows.add(len(described.synchronises), I.COLUMNS).start
+                self._fill_input(entity, bodies[callback], on_chain)
             group = system.application.nodes[process.key].exclusive_group(described)
             if group is not None and (entity.process, group) not in groups:
                 groups[entity.process, group] = rows.put([0])[0]
@@ -500,6 +536,7 @@ class Machine:
             rows.set(row, {E.KIND: KINDS.index(entity.kind), E.INPUT: entity.number, E.BODY: body})
             rows.set(row, {E.BODY_ROW: bodies.get(callback, NONE), E.LIFESPAN: NONE})
             rows[row + E.EXECUTION] = executions[callback]
+            rows[row + E.AFTERWARDS] = afterwards.get(callback, NONE)
             if publishers := [self._publishers[one] for one in entity.publishers]:
                 end = publishers[-1] + P.COLUMNS
                 rows.set(row, {E.PUBLISHERS: publishers[0], E.PUBLISHERS_END: end})
@@ -515,20 +552,30 @@ class Machine:
                 rows[row + E.DEPTH] = topic.depth if gate is None or entity.listens else gate.depth
                 rows[row + E.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
 
+    def _fill_input(self, entity: Entity, first: int, on_chain: bool) -> None:
+        """The input of a synchroniser, whose inputs stand from ``first`` on, that an entity is."""
+        topics, triggered_by = entity.described.synchronises, entity.described.triggered_by
+        trigger, depth = NONE, self._system.depth(entity.topic or "")
+        if triggered_by is not None:
+            trigger, depth = first + topics.index(triggered_by) * I.COLUMNS, 1
+        own = {I.ON_CHAIN: on_chain, I.DEPTH: depth, I.END: first + len(topics) * I.COLUMNS}
+        self._rows.set(first + entity.number * I.COLUMNS, own | {I.TRIGGER: trigger})
+
     def _fill_publishers(self) -> None:
         rows, system = self._rows, self._system
         owner = {one: entity for entity in system.entities for one in entity.publishers}
         last = system.chain.callbacks[-1:]
         reading: dict[str | None, list[int]] = {}
-        for place, entity in zip(self._entities, system.entities, strict=True):
-            reading.setdefault(entity.topic, []).append(place)
+        for number, entity in enumerate(system.entities):
+            reading.setdefault(entity.topic, []).append(number)
         for number, publisher in enumerate(system.publishers):
             row = self._publishers[number]
             topic = system.application.topic(publisher.topic)
             reached = reading.get(publisher.topic, [])
             readers = rows.add(len(reached), R.COLUMNS)
-            for reader, place in zip(readers, reached, strict=True):
-                rows[reader + R.ENTITY] = place
+            for reader, read_by in zip(readers, reached, strict=True):
+                rows[reader + R.ENTITY] = self._entities[read_by]
+                rows[reader + R.DELIVERY] = self._delivery(system.entities[read_by], publisher)
             announces = owner[number].described.announces
             modes, _ = rows.put([system.modes.index(mode) for mode in announces])
             ends = any(number in system.entities[one].publishers for one in last)
@@ -538,6 +585,15 @@ class Machine:
             rows[row + P.ASYNCHRONOUS] = publisher.asynchronous
             rows[row + P.LIFESPAN] = NONE if topic.lifespan_ns is None else topic.lifespan_ns
             rows[row + P.ENDS_CHAIN] = ends and publisher.topic == system.chain.topics[-1]
+
+    def _delivery(self, reader: Entity, publisher: Publisher) -> int:
+        """The stream of a reader's own times of delivery from a publisher; NONE: it has none."""
+        process = self._system.processes[reader.process]
+        described = self._system.application.simulation.deliveries.get(process.key, {})
+        if publisher.topic not in described:
+            return NONE
+        number = FIRST_DELIVERY + (publisher.process << 32) + (reader.index << 16) + reader.number
+        return self._streams.add(described[publisher.topic], process.node, number)
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:

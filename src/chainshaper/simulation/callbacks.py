@@ -229,7 +229,10 @@ def send(m, thread, message):
         own = new_message(m)
         copy(m, message + M.PUBLISHER, own + M.PUBLISHER, M.COLUMNS - M.PUBLISHER)
         m[own + M.ENTITY] = m[reader + R.ENTITY]
-        arrival = max(now + draw(m, m[thread + T.DELIVERY]), m[reader + R.LAST])
+        delivery = m[reader + R.DELIVERY]
+        if delivery == NONE:
+            delivery = m[thread + T.DELIVERY]
+        arrival = max(now + draw(m, delivery), m[reader + R.LAST])
         m[reader + R.LAST] = arrival
         if arrival == now:
             deliver(m, own)
@@ -291,9 +294,14 @@ def begin_body(m, thread):
 
 @compiled()
 def go_on_publishing(m, thread):
-    """Publish on the next topic, or end the callback."""
-    publisher = m[thread + T.PUBLICATION]
-    if publisher == m[m[thread + T.ENTITY] + E.PUBLISHERS_END]:
+    """Publish on the next topic, or compute what comes behind them, or end the callback."""
+    publisher, entity = m[thread + T.PUBLICATION], m[thread + T.ENTITY]
+    if publisher == m[entity + E.PUBLISHERS_END] and m[entity + E.AFTERWARDS] != NONE:
+        m[thread + T.PUBLICATION] += 1  # so that it ends when this is done
+        afterwards = draw(m, m[entity + E.AFTERWARDS])
+        m[thread + T.LEFT] = afterwards + afterwards * m[X.AWAY] // 1_000_000
+        return True
+    if publisher >= m[entity + E.PUBLISHERS_END]:
         return _end(m, thread)
     m[thread + T.PUBLICATION] += P.COLUMNS
     publish(m, thread, publisher)
@@ -312,7 +320,8 @@ def _end(m, thread):
 def _complete(m, thread):
     """Add the message to its synchroniser's input; whether that completes a set.
 
-    It has the oldest message of every input, and the stamp of the first one's.
+    It has the oldest message of every input, and the stamp of the first one's; where one input
+    triggers, the newest of the others, which stay for its next message.
     """
     entity = m[thread + T.ENTITY]
     first = m[entity + E.BODY_ROW]
@@ -321,12 +330,21 @@ def _complete(m, thread):
     message = new_message(m)
     copy(m, thread + T.SOURCE, message + M.SOURCE, at.CARRIED)
     put_newest(m, mine + I.HEAD, message)
+    trigger = m[first + I.TRIGGER]
+    if trigger not in (NONE, mine):
+        return False
     for source in range(first, end, I.COLUMNS):
         if m[source + I.WAITING] == 0:
+            if trigger == mine:
+                free_message(m, take_oldest(m, mine + I.HEAD))
             return False
     m[thread + T.START] = NONE
     for source in range(first, end, I.COLUMNS):
         message = take_oldest(m, source + I.HEAD)
+        if trigger not in (NONE, source):
+            kept = new_message(m)
+            copy(m, message + M.SOURCE, kept + M.SOURCE, at.CARRIED)
+            put_newest(m, source + I.HEAD, kept)
         if source == first:
             m[thread + T.ORIGIN] = m[message + M.ORIGIN]
         if m[source + I.ON_CHAIN] == 1:

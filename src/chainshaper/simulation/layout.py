@@ -50,12 +50,14 @@ SEND, SENT, RECEIVE, RECEIVED = range(7, 11)
 
 # Entities: what an executor waits for. BODY_ROW is that of the gate, or of the synchroniser's first
 # input, INPUT which of its inputs it is. GROUP is where stands whether its mutually exclusive group
-# is busy, NONE if its executor has one thread, or the group is reentrant. From HEAD on: its history
-# (Q). READY: in the snapshot.
+# is busy, NONE if its executor has one thread, or the group is reentrant. AFTERWARDS is NONE where
+# the callback ends with its last publication. From HEAD on: its history (Q). READY: in the
+# snapshot.
 E = IntEnum(
     "E",
-    "CALLBACK HANDLE RMW_HANDLE THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION PUBLISHERS"
-    " PUBLISHERS_END LIFESPAN STARTS_CHAIN ON_CHAIN HEAD TAIL WAITING DEPTH DUE READY COLUMNS",
+    "CALLBACK HANDLE RMW_HANDLE THREAD GROUP KIND BODY BODY_ROW INPUT PERIOD EXECUTION AFTERWARDS"
+    " PUBLISHERS PUBLISHERS_END LIFESPAN STARTS_CHAIN ON_CHAIN HEAD TAIL WAITING DEPTH DUE READY"
+    " COLUMNS",
     start=0,
 )
 
@@ -70,8 +72,9 @@ P = IntEnum(
     start=0,
 )
 
-R = IntEnum("R", "ENTITY LAST COLUMNS", start=0)
-"""Readers: an entity, and the time of the last delivery to it from this publisher."""
+R = IntEnum("R", "ENTITY LAST DELIVERY COLUMNS", start=0)
+"""Readers: an entity, the time of the last delivery to it from this publisher, and how long
+deliveries take (NONE: as all of the sending thread's)."""
 
 # Gates. SLOTS are pairs of start and end, BANDS has one per mode, NONE for those that the gate does
 # not know (DEFAULT is NONE where it knows none), CHANGES is a ring of pairs: time, mode. MOVES are
@@ -94,8 +97,9 @@ ALL_IN_ORDER, NEWEST, FIRST = range(3)
 REPLACED, SURPLUS, OVERFLOWED, DISCARDED = range(4)
 """Policies and reasons, as :data:`chainshaper.workload.event_log.WORDS` numbers them."""
 
-I = IntEnum("I", "ON_CHAIN END HEAD TAIL WAITING DEPTH COLUMNS", start=0)  # noqa: E741 - an input
-"""Inputs of a synchroniser; END is where the last one ends."""
+I = IntEnum("I", "ON_CHAIN TRIGGER END HEAD TAIL WAITING DEPTH COLUMNS", start=0)  # noqa: E741 - an input
+"""Inputs of a synchroniser; END is where the last one ends. TRIGGER is the row of the one whose
+messages complete sets, with the newest of the others; NONE: the last one to come does."""
 
 Q = IntEnum("Q", "HEAD TAIL WAITING DEPTH", start=0)
 """A queue of messages, which M.NEXT links; those of threads have no DEPTH."""

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis import data_flow
+from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.plan import Plan, publisher_servers
@@ -263,7 +263,7 @@ def with_recorded_times(
     not.
     """
     recording = recording if isinstance(recording, Recording) else open_source(recording)
-    times = _computing_times(data_flow(recording.events, recording.info.clock_offset_ns))
+    times = _computing_times(recorded_flow(recording))
     nodes = {}
     for key, node in application.nodes.items():
         name = node_name(key)

@@ -24,7 +24,8 @@ def read_gate_log(path: str | Path) -> pl.DataFrame:
     file, or it is no shaping node's log.
     """
     path = Path(path)
-    table = pl.concat(map(_read_part, _parts(path) or [path]))
+    # Rows have numbers: two alike are one row, in a log and a copy of it.
+    table = pl.concat(map(_read_part, _parts(path) or [path])).unique(maintain_order=True)
     return table.with_columns(gate=pl.lit(path.stem)).sort("time", maintain_order=True)
 
 
@@ -89,7 +90,8 @@ def with_gate_logs(
     ]
     if not there:
         return tables, tuple(notes)
-    releases = pl.concat([read_gate_log(log) for log in there]).sort("time", maintain_order=True)
+    releases = pl.concat([read_gate_log(log) for log in dict.fromkeys(there)])
+    releases = releases.sort("time", maintain_order=True)
     removed, unwritten = rows_missing(releases)
     rows = "rows of shaping nodes' logs"
     if removed:

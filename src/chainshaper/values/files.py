@@ -16,11 +16,12 @@ import pwd
 import secrets
 import stat
 import tempfile
-from collections.abc import Iterable
-from contextlib import suppress
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.leftovers import claimed
 
 
 def why_distrusted(path: str | Path) -> str | None:
@@ -218,10 +219,13 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
     return path
 
 
-def folder_beside(path: Path) -> "tempfile.TemporaryDirectory[str]":
+@contextmanager
+def folder_beside(path: Path) -> Iterator[str]:
     """A new folder to fill, and to rename to ``path``; if it is not, it is gone at the end."""
     name, parent = f".{path.name}.partial-", path.absolute().parent
-    return tempfile.TemporaryDirectory(prefix=name, dir=parent, ignore_cleanup_errors=True)
+    new = tempfile.TemporaryDirectory(prefix=name, dir=parent, ignore_cleanup_errors=True)
+    with new as made, claimed(Path(made)):
+        yield made
 
 
 def rename_output(made: Path, path: Path) -> Path:

@@ -28,6 +28,9 @@ ShapingThread: TypeAlias = Literal["free", "in-slots"]
 """Whether a shaping node's thread is timed by its gate alone, or runs in its server's slots."""
 EqualPriorities: TypeAlias = Literal["apart", "round-robin"]
 """What servers of one core and one priority do: their slots are apart, or they take turns."""
+SlotEnds: TypeAlias = Literal["open-until-done", "closed"]
+"""What servers do at their slots' ends while their callbacks still run: they stay open until these
+are done, for as long as the cycle has room; or they close, as the paper's do."""
 NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
 """How a shaping node is made (:mod:`chainshaper.splicing.shaping_process`)."""
 Solver: TypeAlias = Literal["exact", "pso", "random"]
@@ -132,6 +135,10 @@ class Wishes:
     equal_priorities: Annotated[EqualPriorities, Option(
         "apart: slots of servers of one priority on a core never overlap; round-robin: all servers"
         " share one priority and alternate (eq. 3).")] = "apart"
+    slot_ends: Annotated[SlotEnds, Option(
+        "A server whose slot ends while a callback runs: it stays open until that is done; or it"
+        " closes, as the paper's time-driven servers do, and the callback goes on in its next"
+        " slot.")] = "open-until-done"
     best_effort: Annotated[tuple[str, ...], Option(
         "A node outside the chain that runs when none of its servers does, in a server that is"
         " open all the time (may be repeated).", "More of the graph", "NODE")] = ()

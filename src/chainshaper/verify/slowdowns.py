@@ -33,7 +33,7 @@ import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
-from chainshaper.analysis import data_flow
+from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.disturbance import stalled_after
 from chainshaper.analysis.latency import named_callbacks
 from chainshaper.linux.computing import computed
@@ -151,7 +151,7 @@ def _read(
 
 def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None = None) -> Sample:
     """What counts of a recording, and of the ``chains`` that it has (none: its own)."""
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     named = named_callbacks(flow).select("callback_id", "node", "starts")
     names = {number: (node, starts) for number, node, starts in named.iter_rows()}
     ended = flow.instances.filter(pl.col("callback_id").is_in([*names]) & ~pl.col("assumed"))

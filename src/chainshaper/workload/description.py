@@ -53,7 +53,8 @@ class ExecutionTime(Part):
     ``within``. ``samples`` are drawn in stretches of ``block`` consecutive ones (1: independently).
     Callbacks with as many samples and the same block draw the same stretches, so that what was
     measured together stays together (the moving block bootstrap of Künsch, 1989, with the circular
-    end of Politis and Romano, 1992).
+    end of Politis and Romano, 1992). A ``sequence`` is gone through in its order, again and again:
+    what was recorded happens again.
     """
 
     constant_ns: Duration | None = None
@@ -62,12 +63,14 @@ class ExecutionTime(Part):
     within_ns: Pair | None = None
     samples_ns: Annotated[tuple[Duration, ...], Field(min_length=1)] | None = None
     block: Annotated[int, Field(ge=1, le=LONGEST_BLOCK)] = 1
+    sequence_ns: Annotated[tuple[Duration, ...], Field(min_length=1)] | None = None
 
     @model_validator(mode="after")
     def _one_distribution(self) -> "ExecutionTime":
-        given = [self.constant_ns, self.uniform_ns, self.normal_ns, self.samples_ns]
-        if given.count(None) != 3:
-            raise wrong_value("give exactly one of constant, uniform, normal, samples")
+        given: list[object] = [self.constant_ns, self.uniform_ns, self.normal_ns]
+        given += [self.samples_ns, self.sequence_ns]
+        if given.count(None) != len(given) - 1:
+            raise wrong_value("give exactly one of constant, uniform, normal, samples, sequence")
         if self.block > 1 and self.samples_ns is None:
             raise wrong_value("a block is a stretch of `samples`: remove it", "block")
         if (self.normal_ns is None) != (self.within_ns is None):
@@ -93,7 +96,8 @@ class SimulationDescription(Part):
     begins, ``publish`` of a message, by its executor or its publisher thread, ``receive`` of a
     message by a DDS thread (None: these compete with no thread), ``context_switch`` for the thread
     switched to, ``preemption`` for one that is resumed. ``delivery`` is how long a message is under
-    way, ``quantum`` how long turns last where the plan has round robin, ``interrupts`` the share of
+    way, ``deliveries`` the same to single nodes by topic,
+    ``quantum`` how long turns last where the plan has round robin, ``interrupts`` the share of
     a core's time that interrupts and the stall meter take from callbacks (it counts as their CPU
     time), ``drift`` how much faster the clocks of nodes are (ppm of a period).
 
@@ -105,6 +109,7 @@ class SimulationDescription(Part):
     take: ExecutionTime = ExecutionTime(constant_ns=42_000)
     publish: ExecutionTime = ExecutionTime(constant_ns=95_000)
     delivery: ExecutionTime = ExecutionTime(constant_ns=30_000)
+    deliveries: dict[str, dict[FullName, ExecutionTime]] = Field(default_factory=dict)
     receive: ExecutionTime | None = None
     context_switch_ns: Duration = 0
     preemption_ns: Duration = 0
@@ -178,8 +183,9 @@ class CallbackDescription(Part):
 
     ``timer_ns`` is a timer's period, ``phase_ns`` delays its first expiry after the common start.
     A callback that ``synchronises`` inputs executes and publishes when a message of each has come,
-    with the stamp of the first input's. Executors look at the ``kind`` service and client behind
-    subscriptions of topics.
+    with the stamp of the first input's; one that is ``triggered_by`` one of them, at each of its
+    messages, with the newest of the others. ``afterwards`` is CPU time behind the publications.
+    Executors look at the ``kind`` service and client behind subscriptions of topics.
 
     With a ``gate`` it executes nothing and forwards what it received. One that ``announces`` modes
     publishes their names in turn, each as a ``std_msgs/String``. One that ``computes`` calls a
@@ -191,8 +197,10 @@ class CallbackDescription(Part):
     phase_ns: Duration = 0
     subscription: FullName | None = None
     synchronises: tuple[FullName, ...] = ()
+    triggered_by: FullName | None = None
     kind: Literal["subscription", "service", "client"] = "subscription"
     execution: ExecutionTime = ExecutionTime(constant_ns=0)
+    afterwards: ExecutionTime | None = None
     computes: str | None = None
     publishes: tuple[FullName, ...] = ()
     announces: tuple[str, ...] = ()
@@ -218,6 +226,8 @@ class CallbackDescription(Part):
             )
         if len(self.synchronises) == 1 or len(set(self.synchronises)) < len(self.synchronises):
             raise wrong_value("name two topics at least, each of them once", "synchronises")
+        if self.triggered_by not in (None, *self.synchronises):
+            raise wrong_value("write one of the topics that it `synchronises`", "triggered_by")
         if self.phase_ns and self.timer_ns is None:
             reason = "a phase is a timer's delay after the common start: remove it"
             raise wrong_value(reason, "phase")
@@ -226,8 +236,9 @@ class CallbackDescription(Part):
         if self.computes is not None:
             if not _FUNCTION.fullmatch(self.computes):
                 raise wrong_value("write MODULE:FUNCTION, such as robot.nodes:filter", "computes")
-            if {"execution", "gate", "announces"} & self.model_fields_set:
-                reason = "a callback that computes has no execution, gate or announces: keep one"
+            if {"execution", "afterwards", "gate", "announces"} & self.model_fields_set:
+                reason = "a callback that computes has no execution, afterwards, gate or announces:"
+                reason += " keep one"
                 raise wrong_value(reason, "computes")
         if self.announces and len(self.publishes) != 1:
             raise wrong_value("modes are announced on exactly one topic", "announces")
@@ -237,15 +248,18 @@ class CallbackDescription(Part):
 class NodeDescription(Part):
     """A node in a process of its own.
 
-    ``core``, ``priority`` and ``dds_priority`` override ``scheduling``. A multi-threaded executor
-    has ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a callback
-    group, callbacks run one at a time, or, where it is reentrant, whenever a thread is free.
+    ``core``, ``priority`` and ``dds_priority`` override ``scheduling``. One that is not ``bound``
+    to its core runs, live, on any; in a simulation its core is where it runs. A multi-threaded
+    executor has ``threads``, which stay on the ``cores`` in turn, or all on the one core: of a
+    callback group, callbacks run one at a time, or, where it is reentrant, whenever a thread is
+    free.
     """
 
     callbacks: tuple[CallbackDescription, ...] = Field(min_length=1)
     core: Core | None = None
     priority: Priority | None = None
     dds_priority: Priority | None = None
+    bound: bool = True
     executor: Literal["single_threaded", "multi_threaded"] = "single_threaded"
     threads: int = Field(default=1, ge=1, le=MOST_THREADS)
     cores: tuple[Core, ...] = ()
@@ -343,10 +357,23 @@ class Application(Part):
             reason = "the topics form a cycle, in which messages would circle for ever: "
             reason += f"{' → '.join(error.args[1])}; break it at one of these topics"
             raise wrong_value(reason, "nodes") from error
-        for node in self.simulation.drift:
-            if node not in self.nodes:
-                raise wrong_value("no such node: remove it", "simulation", "drift", node)
+        self._check_simulation()
         return self
+
+    def _check_simulation(self) -> None:
+        described = self.simulation
+        for key, named in (("drift", [*described.drift]), ("deliveries", [*described.deliveries])):
+            for node in named:
+                if node not in self.nodes:
+                    raise wrong_value("no such node: remove it", "simulation", key, node)
+        for node, topics in described.deliveries.items():
+            read = {topic for one in self.nodes[node].callbacks for topic in one.subscriptions}
+            for topic in topics:
+                if topic not in read:
+                    reason = f"the node does not subscribe to it, but to {', '.join(sorted(read))}:"
+                    raise wrong_value(
+                        f"{reason} remove it", "simulation", "deliveries", node, topic
+                    )
 
     def _refuse_unpublished(
         self, callback: CallbackDescription, published: set[str], where: tuple[str | int, ...]
@@ -393,8 +420,9 @@ class Application(Part):
         return dds if own is None else Scheduling(core=dds.core, priority=own)
 
     def cores(self) -> dict[int, str]:
-        """Every core the application uses, with who asks for it."""
-        executors = {core: f"node {node}" for node in self.nodes for core in self.cores_of(node)}
+        """Every core that threads of the application are bound to, with who asks for it."""
+        bound = [name for name, node in self.nodes.items() if node.bound]
+        executors = {core: f"node {name}" for name in bound for core in self.cores_of(name)}
         return {self.scheduling.dds.core: "scheduling.dds", **executors}
 
 

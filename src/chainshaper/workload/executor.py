@@ -202,14 +202,24 @@ Input = TypeVar("Input")
 
 
 class Synchroniser(Generic[Input]):
-    """The messages that wait for their set, at most ``depths[i]`` of input i (the newest)."""
+    """The messages that wait for their set, at most ``depths[i]`` of input i (the newest).
 
-    def __init__(self, depths: Sequence[int]) -> None:
+    With a ``trigger``, the number of an input, each of its messages makes a set with the newest of
+    the others, which are kept; without these it is gone.
+    """
+
+    def __init__(self, depths: Sequence[int], trigger: int | None = None) -> None:
         self._waiting: list[deque[Input]] = [deque(maxlen=depth) for depth in depths]
+        self._trigger = trigger
 
     def add(self, number: int, message: Input) -> tuple[Input, ...]:
         """A message of an input; the set that is complete now, or nothing."""
         self._waiting[number].append(message)
+        if self._trigger is not None:
+            complete = number == self._trigger and all(self._waiting)
+            newest = tuple(waiting[-1] for waiting in self._waiting) if complete else ()
+            self._waiting[self._trigger].clear()
+            return newest
         if not all(self._waiting):
             return ()
         return tuple(waiting.popleft() for waiting in self._waiting)

@@ -21,7 +21,13 @@ import polars as pl
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import LIBRARIES
 from chainshaper.linux.runs import Governed, governing, in_force_throughout
-from chainshaper.linux.scheduling import Scheduling, apply_scheduling, check_cores, may_use_fifo
+from chainshaper.linux.scheduling import (
+    Scheduling,
+    apply_scheduling,
+    available_cores,
+    check_cores,
+    may_use_fifo,
+)
 from chainshaper.linux.threads import Thread, foreign_realtime_processes, list_threads
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
@@ -299,7 +305,11 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
             elif thread.role == "publisher":
                 # Below the executor: it shares the writer's lock with it, and may spin on it.
                 core, priority = executor.core, max(1, executor.priority - 1)
-            apply_scheduling(thread, Scheduling(priority if realtime else None, cores=(core,)))
+            cores_of_thread: tuple[int, ...] = (core,)
+            if thread.role in ("executor", "publisher") and not application.nodes[name].bound:
+                cores_of_thread = tuple(available_cores())
+            wanted = Scheduling(priority if realtime else None, cores=cores_of_thread)
+            apply_scheduling(thread, wanted)
 
 
 def _watch(
@@ -432,9 +442,10 @@ def _read_log(name: str, child: Child, application: Application) -> ProcessLog:
     answer = child.hear()
     rows = child.hear_bytes(answer["bytes"])
     core, *others = {*application.cores_of(name)}
+    unbound = not application.nodes[name].bound
     modes = [cb.gate.modes for cb in application.nodes[name].callbacks if cb.gate is not None]
     names = tuple(modes[0].bands) if modes and modes[0] is not None else ()
-    known = None if others else core
+    known = None if others or unbound else core
     return ProcessLog(child.pid, known, rows, tuple(answer["objects"]), names)
 
 

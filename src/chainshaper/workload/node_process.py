@@ -22,7 +22,7 @@ from chainshaper.gate.handover import Turn
 from chainshaper.linux import scheduling
 from chainshaper.workload import dds, executor, launcher
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
-from chainshaper.workload.execution import ExecutionTimes
+from chainshaper.workload.execution import FIRST_AFTER, ExecutionTimes, spend
 
 NEVER_S = 1e6
 Body: TypeAlias = Callable[[dds.Message], None]
@@ -83,19 +83,22 @@ class NodeProcess:
             return
         publishers = [self._publisher(topic) for topic in callback["publishes"]]
         work = self._work(index, callback, publishers)
+        rest = self._rest(index, callback)
         if callback["synchronises"]:
             topics = callback["synchronises"]
             depths = [self.spec["topics"][topic]["depth"] for topic in topics]
-            synchroniser = executor.Synchroniser[dds.Message](depths)
+            trigger = callback["triggered_by"]
+            place = None if trigger is None else topics.index(trigger)
+            synchroniser = executor.Synchroniser[dds.Message](depths, place)
             for number, topic in enumerate(topics):
                 # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
                 handle = self.log.callback(f"message_filters::{symbol}.{number}")
                 complete = partial(synchroniser.add, number)
-                body = self._working_body(handle, work, publishers, complete)
+                body = self._working_body(handle, work, publishers, rest, complete)
                 self._subscribe(handle, topic, body, callback["group"])
             return
         handle = self.log.callback(symbol)
-        body = self._working_body(handle, work, publishers)
+        body = self._working_body(handle, work, publishers, rest)
         if topic is not None:
             self._subscribe(handle, topic, body, callback["group"])
             return
@@ -115,6 +118,16 @@ class NodeProcess:
         announced = [dds.text_message(mode) for mode in callback["announces"]]
         templates, several = [one.template for one in publishers], self.spec["threads"] > 1
         return executor.spending(times, templates, announced, beside_others=several)
+
+    def _rest(self, index: int, callback: dict[str, Any]) -> Callable[[], None]:
+        """What the callback does when it has published: spend drawn times, if it has any."""
+        if callback["afterwards"] is None:
+            return lambda: None
+        own = (self.spec["seed"], self.spec["node"], FIRST_AFTER + index)
+        times = ExecutionTimes(callback["afterwards"], *own)
+        self.execution_times.append(times)
+        several = self.spec["threads"] > 1
+        return lambda: spend(times.next(), time.thread_time_ns(), beside_others=several)
 
     def _subscribe(self, handle: int, topic: str, body: Body, group: str | None = None) -> None:
         subscription, depth = self._subscription(topic), self.spec["topics"][topic]["depth"]
@@ -155,9 +168,10 @@ class NodeProcess:
         handle: int,
         work: executor.Work,
         publishers: Sequence[TracedPublisher],
+        rest: Callable[[], None],
         complete: Callable[[dds.Message], tuple[dds.Message, ...]] | None = None,
     ) -> Callable[..., None]:
-        """An ordinary callback: work, then publish.
+        """An ordinary callback: work, publish, and do the rest.
 
         With ``complete`` nothing is done until a message completes a set, for which it is then.
         """
@@ -170,6 +184,7 @@ class NodeProcess:
             if messages or complete is None:
                 for payload, publisher in zip(work(messages, wall, used), publishers, strict=False):
                     publisher.record(payload, *publisher.send(payload))
+                rest()
 
         return self._recorded(handle, body)
 

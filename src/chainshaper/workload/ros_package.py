@@ -115,6 +115,12 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
         "computes": callback.computes is not None
         and "a function in Python, which no node in C++ calls; describe its `execution` instead, "
         "such as the `samples` of a recording",
+        "afterwards": callback.afterwards is not None
+        and "work behind the publications, which generated nodes do not do; remove it, or add it to"
+        " `execution`",
+        "triggered_by": callback.triggered_by is not None
+        and "a set of one input's message and the newest of the others, for which message_filters"
+        " has no class; remove it",
         "kind": callback.kind != "subscription"
         and f"a {callback.kind}'s messages on a topic, which ROS 2 has not; remove `kind`",
         "subscription": not announced.isdisjoint(callback.inputs)
@@ -164,6 +170,7 @@ def _execution(own: ExecutionTime) -> str:
         "uniform": own.uniform_ns,
         "normal": own.normal_ns and (*own.normal_ns, *(own.within_ns or ())),
         "samples": own.samples_ns,
+        "sequence": own.sequence_ns,
     }
     kind, values = next((kind, many) for kind, many in distributions.items() if many is not None)
     return _list([f"Distribution::{kind}", _list(values), own.block])

@@ -194,3 +194,15 @@ def test_public_metadata_that_is_not_whole(name: str, what: str) -> None:
         said = refused(2, verb, field_trace("metadata_not_whole") / name)
         assert what in said
         assert all(text in said for text in REMEDIES)
+
+
+@pytest.mark.parametrize("offset", [1 << 63, 1 << 64, 10**30, -(1 << 64), (1 << 62) + 1])
+def test_clock_offsets_that_no_time_has_are_refused(tmp_path: Path, offset: int) -> None:
+    text = lttng_metadata({"e": {"n": "u32"}}, offset=offset)
+    (tmp_path / "metadata").write_text(text)
+    for verb in ("info", "callbacks"):
+        said = refused(2, verb, tmp_path)
+        assert "clock offset of" in said
+    most = lttng_metadata({"e": {"n": "u32"}}, offset=1 << 62)
+    write_trace(tmp_path / "most", most, {})
+    assert open_trace(tmp_path / "most").clock_offset_ns == 1 << 62

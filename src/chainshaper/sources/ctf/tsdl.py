@@ -601,6 +601,10 @@ def parse_tsdl(text: str) -> TraceClass:
     )
 
 
+_LARGEST_OFFSET_NS = 1 << 62
+"""Times and their offset together are still numbers of 64 bits."""
+
+
 def _clock(block: _Block) -> Clock:
     name, frequency = block.text("name"), block.number("freq", 1_000_000_000)
     if name is None:
@@ -609,6 +613,11 @@ def _clock(block: _Block) -> Clock:
         raise TsdlError(block.offset, f"clock frequency of {frequency} Hz; up to 10 GHz supported")
     seconds, cycles = block.number("offset_s"), block.number("offset")
     offset_ns = seconds * 1_000_000_000 + cycles * 1_000_000_000 // frequency
+    if abs(offset_ns) > _LARGEST_OFFSET_NS:
+        years = f"{abs(offset_ns) // (365 * 86_400 * 1_000_000_000)} years"
+        raise TsdlError(
+            block.offset, f"clock offset of {years} from the Epoch; up to 146 supported"
+        )
     return Clock(name, frequency, offset_ns, block.text("uuid"))
 
 

@@ -214,7 +214,9 @@ class LttngSession:
         options = {**self._apart(), "capture_output": True, "timeout": _ANSWER_S}
         what = f"`{shlex.join(('lttng', *arguments))}`"
         try:
-            run = subprocess.run(command, text=True, errors="replace", check=False, **options)
+            run = subprocess.run(
+                command, encoding="utf-8", errors="replace", check=False, **options
+            )
             if run.returncode == 0:
                 return ElementTree.fromstring(run.stdout)  # noqa: S314 - LTTng's own, no stranger's
         except (OSError, subprocess.TimeoutExpired) as error:

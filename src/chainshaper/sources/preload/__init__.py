@@ -93,7 +93,7 @@ _NAME = re.compile(r"^  (?:EVENT|CREATION|CALL)\((\w+)", re.MULTILINE)
 @functools.cache
 def event_names() -> tuple[str, ...]:
     """The events in the order of their numbers, as the library's source has them."""
-    return tuple(_NAME.findall(SOURCE.read_text()))
+    return tuple(_NAME.findall(SOURCE.read_text("utf-8")))
 
 
 @functools.cache
@@ -346,7 +346,7 @@ def installed_library() -> Path:
     """The package's library, or the cache's, built at first use. Raises: as :func:`in_cache`."""
     if (shipped := SOURCE.with_name(_FILE)).exists():
         return shipped
-    return in_cache(_FILE, [SOURCE.read_text()], build_library)
+    return in_cache(_FILE, [SOURCE.read_text("utf-8")], build_library)
 
 
 def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -> Path:

@@ -55,7 +55,7 @@ def node_named(name: str) -> "Iterator[tuple[Any, Any]]":
 def publish_diagnostics(descriptor: int) -> None:
     messages = importlib.import_module("diagnostic_msgs.msg")
     kind = messages.DiagnosticStatus
-    with node_named(WATCHER) as (_, node), open(descriptor) as lines:
+    with node_named(WATCHER) as (_, node), open(descriptor, encoding="utf-8") as lines:
         publisher = node.create_publisher(messages.DiagnosticArray, "/diagnostics", 10)
         for line in lines:
             array = messages.DiagnosticArray()

@@ -8,7 +8,7 @@
 #include <utility>
 #include <vector>
 
-enum class Distribution { constant, uniform, normal, samples };
+enum class Distribution { constant, uniform, normal, samples, sequence };
 
 struct Execution {
   Distribution distribution;
@@ -42,6 +42,8 @@ class ExecutionTimes {
         if (drawn_++ % execution_.block == 0) {
           place_ = std::uniform_int_distribution<std::size_t>{0, values.size() - 1}(random_);
         }
+        return values[place_++ % values.size()];
+      case Distribution::sequence:
         return values[place_++ % values.size()];
       default:
         return values[0];

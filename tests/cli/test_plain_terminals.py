@@ -1,0 +1,96 @@
+"""Locales without UTF-8 (LC_ALL=C), and signals that come before a verb has begun."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from command_line import Finished
+from field_traces import chain_tables, write_chain
+
+PLAIN = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONWARNDEFAULTENCODING": "1"}
+
+
+def in_plain_locale(*words: str | Path) -> Finished:
+    """A command where text is ASCII, and files are too unless it says otherwise."""
+    command = [sys.executable, "-m", "chainshaper", *map(str, words)]
+    run = subprocess.run(
+        command, env={**os.environ, **PLAIN}, capture_output=True, check=False, timeout=100
+    )
+    return Finished(run.returncode, run.stdout.decode("ascii"), run.stderr.decode("ascii"))
+
+
+def test_every_verb_reads_writes_and_prints_without_utf_8(tmp_path: Path) -> None:
+    trace = write_chain(tmp_path / "trace", chain_tables())
+    rec, app, plan, sim = (tmp_path / name for name in ("rec", "app.yaml", "plan.yaml", "sim"))
+    budget = tmp_path / "budget.yaml"
+    for words in (
+        ["info", trace], ["callbacks", trace], ["latency", trace], ["chains", trace],
+        ["convert", trace, "-o", rec], ["info", rec], ["graph", rec],
+        ["graph", rec, "-o", tmp_path / "graph.svg"], ["describe", rec, "-o", app],
+        ["plan", rec, "-o", plan], ["budget", rec, "-o", budget],
+        ["check", rec, "--budget", budget, "--markdown", tmp_path / "check.md"],
+        ["report", rec, "-o", tmp_path / "page.html"], ["compare", rec, rec],
+        ["export", rec, "--perfetto", "-o", tmp_path / "trace.pftrace"],
+        ["simulate", app, "-o", sim, "--cycles", "50"], ["latency", sim],
+        ["sweep", app, "--vary", "epsilon=1ms,2ms", "-o", tmp_path / "s.parquet", "--cycles", "50"],
+        ["generate", app, "-o", tmp_path / "package"], ["init", "-o", tmp_path / "new.yaml"],
+        ["--help"], ["plan", "--help"],
+    ):  # fmt: skip
+        done = in_plain_locale(*words)
+        assert done.code == 0, (words, done.err)
+        # What is opened without an encoding is said by Python itself.
+        ours = [line for line in done.err.splitlines() if "EncodingWarning" in line]
+        assert [line for line in ours if "/chainshaper/" in line] == []
+
+
+def test_what_a_terminal_cannot_show_is_written_with_what_it_can(tmp_path: Path) -> None:
+    trace = write_chain(tmp_path / "trace", chain_tables())
+    shown = in_plain_locale("latency", trace).out
+    assert "/detector <- /image -> /objects" in shown
+    said = in_plain_locale("latency", tmp_path / "Fräse").err
+    assert "no such file or folder" in said or "no such folder" in said
+    assert "Fr\\" in said
+
+
+def test_files_in_utf_8_are_read_as_such(tmp_path: Path) -> None:
+    file = tmp_path / "latencies.txt"
+    file.write_text("# gemessen an der Fräse, in µs\n59300µs\n61ms\n", encoding="utf-8")
+    done = in_plain_locale("plan", "--latencies", file, "--period", "100ms", "--json")
+    assert done.code in (0, 2)
+    assert "Traceback" not in done.err
+    text = (Path(__file__).parents[2] / "examples" / "synthetic_chain.yaml").read_text("utf-8")
+    (tmp_path / "app.yaml").write_text("# Fräse\n" + text, encoding="utf-8")
+    done = in_plain_locale(
+        "simulate", tmp_path / "app.yaml", "-o", tmp_path / "sim", "--cycles", "20"
+    )
+    assert done.code == 0, done.err
+
+
+@pytest.mark.parametrize("words", [
+    ["info", "TRACE"], ["plan", "TRACE"], ["report", "TRACE", "-o", "PAGE"],
+])  # fmt: skip
+def test_a_signal_at_any_instant_ends_a_verb_without_a_traceback(
+    tmp_path: Path, words: list[str]
+) -> None:
+    """But before Python runs our first line: that is the interpreter's own."""
+    trace = write_chain(tmp_path / "trace", chain_tables())
+    names = {"TRACE": str(trace), "PAGE": str(tmp_path / "page.html")}
+    command = [sys.executable, "-m", "chainshaper", *(names.get(word, word) for word in words)]
+    begun = time.monotonic()
+    subprocess.run(command, capture_output=True, check=False, timeout=100)
+    lasted = time.monotonic() - begun
+    for part in range(10):
+        number = (signal.SIGINT, signal.SIGTERM)[part % 2]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        time.sleep(lasted * (part + 0.5) / 10)
+        process.send_signal(number)
+        _, said = process.communicate(timeout=100)
+        if b"Traceback" in said:
+            assert b"chainshaper" not in said.partition(b"Traceback")[2], said.decode()
+            continue
+        assert process.returncode in (0, 2, 130, -number), (words, part, said)
+        (tmp_path / "page.html").unlink(missing_ok=True)
