@@ -1,6 +1,6 @@
 """Kill whatever runs, at any instant, among odd names and on full disks, and see what is left.
 
-    python tests/kill_campaign.py [--kills 20] [--seed 1] [--seconds 600] [--verb NAME]
+    python tests/kill_campaign.py [--kills 20] [--seed 1] [--seconds 600] [--verbs NAME…]
 
 Each case starts a verb, beside a node that a plan may govern, and kills or stops one or two of its
 processes at a random instant. Afterwards no thread may be frozen or real-time, no process, group or
@@ -283,7 +283,7 @@ def main() -> None:
     arguments.add_argument("--kills", type=int, default=20)
     arguments.add_argument("--seed", type=int, default=1)
     arguments.add_argument("--seconds", type=float, default=600.0, help="no case begins later")
-    arguments.add_argument("--verb", help="of one verb alone")
+    arguments.add_argument("--verbs", nargs="+", help="of these alone; apply alone is real-time")
     given = arguments.parse_args()
     if INSIDE not in os.environ:
         os.environ[INSIDE] = "1"
@@ -294,7 +294,7 @@ def main() -> None:
         mount(place, size)
     folder, sums, until = WORK / "inputs", Counter[str](), time.monotonic() + given.seconds
     prepare(folder)
-    names = [given.verb] if given.verb else sorted(verbs(folder))
+    names = given.verbs or sorted(verbs(folder))
     for seed in range(given.seed, given.seed + given.kills):
         if time.monotonic() > until:
             break

@@ -1,6 +1,7 @@
 """Ends that cannot be those of an instance: its own, and the next start, were lost."""
 
 import polars as pl
+import pytest
 from story import Callback, Publisher, Story
 
 from chainshaper.analysis import analyse_latency, callback_statistics, data_flow
@@ -72,16 +73,33 @@ def test_what_comes_behind_the_proof_was_not_published_by_the_instance() -> None
     assert latencies(story) == (19, 35, {"lost": 1})
 
 
-def test_a_timer_s_callback_too() -> None:
+@pytest.mark.parametrize("executes", [False, True])
+def test_a_timer_s_callback_too(executes: bool) -> None:
+    """That it is executed again proves it also where no event is known to be lost."""
     story = Story()
     timer, _ = story.source("/t", 2, "/x")
+    handle = story.rows["rcl_timer_init"][0]["timer_handle"]
     for time in range(100, 2001, 100):
+        if executes:
+            story.event("rclcpp_executor_execute", time - 1, 2, handle=handle)
         if time != 600:
             story.start(timer, time)
         if time != 500:
             story.end(timer, time + 30)
         waits(story, time + 40)
     assert longest(story, "/t") == (19, 1, 30)
+    if executes:
+        flow = data_flow(story.tables(), complete=True)
+        assert flow.instances.filter(pl.col("end").is_null()).height == 1
+
+
+def test_another_callback_of_the_thread_proves_it_too() -> None:
+    """No event of executors is there, but of a timer of the same thread."""
+    story = relayed(PAIR | {("take", 600)}, looks=False)
+    timer = story.timer(story.node("/timer", 2), 100)
+    for time in range(50, 2001, 100):
+        story.runs(timer, time, time + 10)
+    assert longest(story) == (19, 1, 30)
 
 
 def spinning(every: int) -> tuple[Story, Callback, Publisher]:

@@ -37,7 +37,7 @@ from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
 from chainshaper.planning.application_plan import ApplicationPlan, whole
-from chainshaper.planning.plan import Server, ShapingNode, revised
+from chainshaper.planning.plan import ReceiverPlace, Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.planning.shaping import let_per_chain, over_cores
 from chainshaper.values.errors import InputError, OperationError
@@ -382,6 +382,24 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
         assert not waiting_receivers(several, left_by_back_end("scx", found))
     alone = whole(revised(bare, shaping_node=GATE))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
+
+
+def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> None:
+    """87 and 86 for outputs, and 84 for the chain, with room for publishers in between."""
+    place = ReceiverPlace(core=1, priority=1, time_ns=MS)
+    chain = _server("chain", EXECUTOR_A, priority=2)
+    bare = _plan(chain, _server("output", GATE.thread, priority=1, start=1)).chains[0]
+    gate, sink = _node("/gate", 100, "executor"), _node("/sink", 300, "executor")
+    allocation = _allocation(gate, _node("/a", 200, "executor"), sink)
+    for core in (1, 2):
+        own = {"receivers": ("/sink",), "receivers_at": place.model_copy(update={"core": core})}
+        plan = whole(revised(bare, shaping_node=GATE.model_copy(update=own)))
+        wanted = plan_scheduling(plan, allocation, (0, 1, 2))
+        assert _text(wanted) == f"100:87@1 200:84@1 300:86@{core}"
+        assert 300 in _by_tid(left_by_back_end("scx", wanted)), "above the servers, as planned"
+        assert not waiting_receivers(plan, wanted)
+    missing = plan_scheduling(plan, allocation, (0, 1))
+    assert _by_tid(missing)[300] == Scheduling(86, (1,)), "there is no core 2"
 
 
 def test_a_gate_in_a_container_is_known_by_its_threads_name() -> None:

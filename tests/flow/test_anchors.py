@@ -10,8 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.flow.phase import Phase
-from chainshaper.flow.threads import LEAD_NS, placed
+from chainshaper.flow.threads import placed
 from chainshaper.planning.application_plan import ApplicationPlan, combined
+from chainshaper.planning.offsets import LEAD_NS
 from chainshaper.planning.plan import Plan, Server, Thread
 from chainshaper.values.errors import OperationError
 

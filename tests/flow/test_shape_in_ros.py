@@ -137,15 +137,29 @@ Attempt: TypeAlias = tuple[subprocess.CompletedProcess[str], Path]
 
 @pytest.fixture
 def attempt(program: Path, tmp_path: Path) -> Callable[..., Attempt]:
-    def attempt(nodes: list[str], verb: str, name: str, *words: str, **variables: str) -> Attempt:
+    def attempt(
+        nodes: list[str],
+        verb: str,
+        name: str,
+        *words: str,
+        launch_words: tuple[str, ...] = (),
+        **variables: str,
+    ) -> Attempt:
         known = {"MODES": "", "ASYNCHRONOUS": "{}", "ROS_DOMAIN_ID": str(100 + os.getpid() % 100)}
         environment = {**ros2_environment(), **known, **variables}
         folder = Path(os.environ.get("CHAINSHAPER_SHAPED", tmp_path)) / name
         file, text = tmp_path / "robot.launch.py", LAUNCH.replace("{nodes!r}", repr(nodes))
         file.write_text(text.replace("{program!r}", repr(str(program))))
         command = [sys.executable, "-m", "chainshaper", verb, "-o", str(folder), *words, "--json"]
-        command += ["--", "ros2", "launch", str(file)]
-        run = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+        command += ["--", "ros2", "launch", *launch_words, str(file)]
+        run = subprocess.run(
+            command,
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+        )
         return run, folder
 
     return attempt
@@ -159,6 +173,18 @@ def run(attempt: Callable[..., Attempt]) -> Callable[..., Result]:
         return json.loads(done.stdout), folder
 
     return run
+
+
+@pytest.mark.parametrize("words", [(), ("--noninteractive",)])
+def test_nodes_that_are_recorded_without_a_terminal_shut_down_in_order(
+    attempt: Callable[..., Attempt], words: tuple[str, ...]
+) -> None:
+    """Launch signals its nodes itself there: a second SIGINT would kill them, exit code -2."""
+    done, _ = attempt(PARKING, "record", "ended", "--duration", "3s", launch_words=words)
+    said = done.stdout + done.stderr
+    assert done.returncode == 0, said[-3000:]
+    assert "process has died" not in said
+    assert said.count("process has finished cleanly") == len(PARKING), said[-3000:]
 
 
 @pytest.mark.parametrize(

@@ -128,6 +128,8 @@ def test_threads_have_the_plans_order_unless_single_callbacks_were_measured(
 ) -> None:
     assert three.most_urgent_first == ("/first", "/second", "/gate_a", "/gate_b", "/third")
     assert [one.places for one in server_table(three).servers] == [2, 1, 1, 1]
+    stages = combined([revised(three.chains[0], policy="pipelined")])
+    assert stages.most_urgent_first == ("/gate_a", "/second", "/first"), "the older first"
     single = combined([revised(three.chains[0], policy="let-per-callback")])
     assert single.most_urgent_first == ("/first",)
     assert [one.places for one in server_table(single).servers] == [2, 1], "the others share one"

@@ -150,7 +150,7 @@ def test_chains_that_cannot_take_turns_run_at_priorities_of_their_own() -> None:
     with pytest.raises(OperationError, match="collide at every offset"):
         with_offsets(chains)
     again = [_shaped("a", 100, 60), _shaped("b", 50, 30)]
-    placed, remarks = place_chains(chains, at_once=lambda: again)
+    placed, remarks = place_chains(chains, at_once=lambda _: again)
     assert [[server.priority for server in plan.servers] for plan in placed] == [[3, 1], [2, 1]]
     assert ["only their publish slots do not overlap" in remark for remark in remarks] == [True]
     slots = [plan.offset_ns + plan.servers[1].slots[0][0] for plan in placed]
@@ -197,7 +197,7 @@ def test_chains_at_once_whose_delays_no_plan_has_are_refused() -> None:
         with pytest.raises(OperationError, match=reason):
             place_chains(plans)
     with pytest.raises(OperationError, match=r"share the executor of /filter, and so have to"):
-        place_chains(shared, at_once=lambda: shared)
+        place_chains(shared, at_once=lambda _: shared)
 
 
 def _shaped(name: str, cycle_ms: int, latency_ms: int) -> Plan:

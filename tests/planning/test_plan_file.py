@@ -73,7 +73,7 @@ def test_a_hand_edited_plan_is_read(tmp_path: Path) -> None:
     values = plan_json(plan)
     promised = {"mean_ns": 65_000_000, "max_ns": 65_000_000, "jitter_ns": 1_000_000}
     assert values["bands_ns"] == [65_000_000]
-    assert values["predicted"] == {**promised, "shares": [1.0], "modes": None}
+    assert values["predicted"] == {**promised, "shares": [1.0], "modes": None, "receivers": None}
     assert values["servers"][0]["slots"] == [[0, 64_000_000]]
     assert values["chain"]["period_ns"] == 100_000_000
 

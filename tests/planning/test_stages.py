@@ -1,7 +1,7 @@
 """Chains longer than their period: the shortest cut, against brute force and by hand; plans."""
 
-from collections.abc import Sequence
-from itertools import combinations, pairwise, product
+from collections.abc import Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -20,18 +20,11 @@ from chainshaper.planning.overruns import (
     open_until_done,
     plan_warnings,
 )
-from chainshaper.planning.pipeline import Longest, opened_early, shortest_cut
+from chainshaper.planning.pipeline import Work, opened_early, shortest_cut, work_of
 from chainshaper.planning.plan import publish_slots
 from chainshaper.planning.plan_file import dump_plan, load_plan
 from chainshaper.planning.request import cores_for
 from chainshaper.values.errors import InputError, OperationError
-
-
-def longest_of(rows: Sequence[Sequence[int]]) -> Longest:
-    count = len(rows[0])
-    return [
-        [max(sum(row[i:j]) for row in rows) for j in range(count + 1)] for i in range(count + 1)
-    ]
 
 
 def apart(slots: Sequence[tuple[int, int]], cycle: int) -> bool:
@@ -40,22 +33,57 @@ def apart(slots: Sequence[tuple[int, int]], cycle: int) -> bool:
     return len(taken) == len(set(taken))
 
 
-def brute_force(
-    longest: Longest, cuts: Sequence[int], margin: int, cycle: int, places: int
-) -> tuple[int, int, int] | None:
-    """The least (end, stages, cores): every cut, every core of each stage, every start."""
+def partitions(count: int) -> Iterator[list[list[int]]]:
+    """All ways to put so many units into stages."""
+    if not count:
+        yield []
+        return
+    for smaller in partitions(count - 1):
+        for k in range(len(smaller)):
+            yield [[*own, count - 1] if k == number else own for number, own in enumerate(smaller)]
+        yield [*smaller, [count - 1]]
+
+
+def in_order(stages: Sequence[Sequence[int]], after: Sequence[Sequence[int]]) -> list[int] | None:
+    """Stages, each behind those that it waits for; None: one waits for what waits for it."""
+    needs = [
+        {k for unit in own for b in after[unit] for k, o in enumerate(stages) if b in o} - {number}
+        for number, own in enumerate(stages)
+    ]
+    order: list[int] = []
+    while len(order) < len(stages):
+        ready = [k for k in range(len(stages)) if k not in order and needs[k] <= {*order}]
+        if not ready:
+            return None
+        order.append(ready[0])
+    return order
+
+
+def brute_force(work: Work, margin: int, cycle: int, places: int) -> tuple[int, int, int] | None:
+    """The least (end, stages, cores): all stages, every core of each, every start."""
     best = None
-    inner = cuts[1:-1]
-    for chosen in (c for n in range(len(inner) + 1) for c in combinations(inner, n)):
-        bounds = [cuts[0], *chosen, cuts[-1]]
-        lengths = [longest[i][j] for i, j in pairwise(bounds)]
-        for core_of in product(range(places), repeat=len(lengths)):
-            for waits in product(range(cycle), repeat=len(lengths) - 1):
-                starts = [0]
-                for wait, length in zip(waits, lengths, strict=False):
-                    starts.append(starts[-1] + length + wait)
-                found = starts[-1] + lengths[-1], len(lengths), len(set(core_of))
-                if best is not None and best <= found:
+    for stages in partitions(len(work.after)):
+        order = in_order(stages, work.after)
+        if order is None:
+            continue
+        lengths = [
+            max(sum(row[u] for u in own) for row in work.steps_ns.tolist()) for own in stages
+        ]
+        for core_of in product(range(places), repeat=len(stages)):
+            for waits in product(range(cycle), repeat=len(stages)):
+                starts = [0] * len(stages)
+                for k in order:
+                    before = [
+                        starts[n] + lengths[n]
+                        for n, own in enumerate(stages)
+                        if n != k and any(b in own for unit in stages[k] for b in work.after[unit])
+                    ]
+                    begins = [work.begins_ns[unit] for unit in stages[k]]
+                    starts[k] = max([*before, *begins]) + waits[k]
+                first = next(k for k, own in enumerate(stages) if work.first in own)
+                end = max(s + length for s, length in zip(starts, lengths, strict=True))
+                found = end, len(stages), len(set(core_of))
+                if starts[first] or (best is not None and best <= found):
                     continue
                 slots = [(s, s + w + margin) for s, w in zip(starts, lengths, strict=True)]
                 of_core = [
@@ -67,43 +95,64 @@ def brute_force(
     return best
 
 
-Problem = tuple[list[list[int]], list[int], int, int, int]
+Problem = tuple[Work, int, int, int]
 
 
 @st.composite
 def problems(draw: st.DrawFn) -> Problem:
+    """A chain, or a graph whose branches fork from it or begin by themselves, and join it."""
     count = draw(st.integers(1, 4))
     step = st.integers(1, 4)
     rows = draw(st.lists(st.lists(step, min_size=count, max_size=count), min_size=1, max_size=3))
-    cuts = [0, *(cut for cut in range(1, count) if draw(st.integers(0, 4))), count]
+    after: list[set[int]] = [{k - 1} if k else set() for k in range(count)]
+    if draw(st.booleans()):
+        after = [
+            draw(st.sets(st.integers(0, k - 1), max_size=2)) if k else set() for k in range(count)
+        ]
+    waited_for = set().union(*after)
+    after[-1] |= {k for k in range(count - 1) if k not in waited_for}  # the last waits for all
+    begins = [draw(st.integers(0, 2)) if k and not own else 0 for k, own in enumerate(after)]
+    nodes = [str(draw(st.sampled_from([k, k, k, max(0, k - 1)]))) for k in range(count)]
+    waits = [tuple(sorted(own)) for own in after]
+    work = work_of(nodes, waits, np.array(rows), begins)
     cycle, places = draw(st.integers(3, 6)), draw(st.integers(1, 3))
-    return rows, cuts, draw(st.integers(0, 1)), cycle, places
+    return work, draw(st.integers(0, 1)), cycle, places
 
 
 @settings(max_examples=300, deadline=None)
 @given(problems())
 def test_the_cut_is_the_shortest_there_is(problem: Problem) -> None:
-    rows, cuts, margin, cycle, places = problem
-    longest = longest_of(rows)
-    stages = shortest_cut(longest, cuts, margin, cycle, places)
-    shortest = brute_force(longest, cuts, margin, cycle, places)
+    work, margin, cycle, places = problem
+    stages = shortest_cut(work, margin, cycle, places)
+    shortest = brute_force(work, margin, cycle, places)
     if stages is None:
         assert shortest is None
         return
     used = len({stage.place for stage in stages})
-    assert (stages[-1].closes_ns - margin, len(stages), used) == shortest
-    assert (stages[0].first, stages[0].opens_ns, stages[-1].end) == (0, 0, cuts[-1])
-    for before, after in pairwise(stages):
-        assert before.end == after.first in cuts
-        assert before.closes_ns - margin <= after.opens_ns
+    ends = max(stage.closes_ns for stage in stages)
+    assert (ends - margin, len(stages), used) == shortest
+    assert sorted(unit for stage in stages for unit in stage.members) == [*range(len(work.after))]
+    home = {unit: stage for stage in stages for unit in stage.members}
+    assert home[work.first].opens_ns == 0
+    for unit, before in enumerate(work.after):
+        assert home[unit].opens_ns >= work.begins_ns[unit]
+        for one in before:
+            if home[one] is not home[unit]:
+                assert home[one].closes_ns - margin <= home[unit].opens_ns
 
-    opened = opened_early(stages, np.array(rows), margin, cycle)
-    assert sum(rows[0]) + margin <= opened[-1].closes_ns <= stages[-1].closes_ns
-    for row in rows:  # every instance is through each stage before its slot closes, but for ε
-        now = 0
-        for stage in opened:
-            now = max(now, stage.opens_ns) + sum(row[stage.first : stage.end])
+    opened = opened_early(stages, work, margin, cycle)
+    closed = max(stage.closes_ns for stage in opened)
+    assert int(work.finished_ns[0, -1]) + margin <= closed <= ends
+    for row in work.steps_ns:  # every instance is through each stage before its slot closes, but ε
+        over: dict[int, int] = {}
+        for number in in_order([one.members for one in opened], work.after) or ():
+            stage = opened[number]
+            inputs = [over.get(one, 0) for u in stage.members for one in work.after[u]] + [
+                work.begins_ns[u] for u in stage.members
+            ]
+            now = max(stage.opens_ns, *inputs) + sum(int(row[unit]) for unit in stage.members)
             assert now <= stage.closes_ns - margin
+            over |= dict.fromkeys(stage.members, now)
     for place, some in product(range(places), (stages, opened)):
         own = [s for s in some if s.place == place]
         slots = [slot for s in own for slot in in_cycle(s.opens_ns, s.closes_ns, cycle)]
@@ -218,5 +267,5 @@ def test_only_a_single_path_that_was_recorded_is_cut() -> None:
     with pytest.raises(InputError, match="plan from a recording"):
         plan_chain(Profile(np.array([80, 90]) * MS, 100 * MS), request)
     beside = [CallbackTimes(node, 1, 1, 1, 1) for node in ("/n1", "/rear", "/n2")]
-    with pytest.raises(InputError, match="waits for /rear beside it, which would begin"):
+    with pytest.raises(InputError, match="waits for /rear beside it, and what these took is not"):
         plan_chain(profile([[80, 80]], callbacks=tuple(beside)), request)

@@ -8,6 +8,7 @@ from schedules import MS, application
 from chainshaper import plan_recording, simulate
 from chainshaper.planning import PlanRequest
 from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.values.errors import InputError
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.predictions import judge_prediction
 from chainshaper.workload.description import Application
@@ -84,3 +85,88 @@ def test_a_recording_in_which_instances_piled_up_tells_the_same(tmp_path: Path) 
     analysis = measure_latency(shaped).analysis
     assert analysis.statistics.late == 0
     assert analysis.traversals["latency_ns"].unique().to_list() == [plan.predicted.max_ns - MS]
+
+
+VARIED = ["{uniform: [10ms, 60ms]}", *["{uniform: [10ms, 30ms]}"] * 3]
+"""The second stage, of three nodes, may get an instance while it works on the one before."""
+
+
+def test_the_older_instance_comes_first_in_a_stage(tmp_path: Path) -> None:
+    described = chain(VARIED, [1, 2, 2, 2])
+    profile = simulate(described, tmp_path / "profile", cycles=600)
+    plan = plan_recording(profile, request=PlanRequest(policy="pipelined"))
+    stages = [[thread.node for thread in server.threads] for server in plan.servers[:2]]
+    assert stages == [["/n0"], ["/n1", "/n2", "/n3"]]
+    shaped = simulate(described, tmp_path / "shaped", plan, cycles=2000)
+    figures = measure_latency(shaped).analysis.statistics
+    assert (plan.margin.overrun_probability or 1) <= 0.01
+    assert (figures.count, figures.incomplete, figures.late) == (2000, 0, 0)
+
+
+CAMERA_AND_LIDAR = """\
+chain: /points../filtered../fused../objects
+nodes:
+  lidar: {core: 1, callbacks: [{timer: 100ms, execution: {uniform: [20ms, 30ms]},
+    publishes: [/points]}]}
+  filter: {core: 1, callbacks: [{subscription: /points, execution: {uniform: [20ms, 40ms]},
+    publishes: [/filtered]}]}
+  camera: {core: 2, callbacks: [{timer: 100ms, phase: 7ms, execution: {uniform: [2ms, 5ms]},
+    publishes: [/image]}]}
+  detector: {core: 2, callbacks: [{subscription: /image, execution: {uniform: [40ms, 60ms]},
+    publishes: [/boxes]}]}
+  fusion: {core: CORE, callbacks: [{synchronises: [/filtered, /boxes],
+    execution: {uniform: [10ms, 20ms]}, publishes: [/fused]}]}
+  tracker: {core: CORE, callbacks: [{subscription: /fused, execution: {uniform: [20ms, 40ms]},
+    publishes: [/objects]}]}
+  actuator: {core: 9, callbacks: [{subscription: /objects}]}
+"""
+
+
+@pytest.mark.parametrize("cores", [None, (1, 2, 3), (1, 2)])
+def test_a_camera_and_a_lidar_are_joined_in_a_stage(
+    cores: tuple[int, ...] | None, tmp_path: Path
+) -> None:
+    """Up to 70 ms of the lidar beside 7 + 65 of the camera, and 60 behind both: 132 every 100."""
+    described = application(CAMERA_AND_LIDAR.replace("CORE", "3"))
+    profile = simulate(described, tmp_path / "profile", cycles=400)
+    plan = plan_recording(profile, request=PlanRequest(policy="pipelined", cores=cores))
+    assert 120 * MS < plan.evidence.max_latency_ns < 133 * MS, "on the longest way"
+    home = {thread.node: one for one in plan.servers for thread in one.threads}
+    assert home["/detector"] is not home["/fusion"], "60 and 20 and 40 ms are more than a cycle"
+    shaped = simulate(described, tmp_path / "shaped", plan, cycles=1000)
+    analysis = measure_latency(shaped).analysis
+    figures = analysis.statistics
+    assert (figures.count, figures.incomplete, figures.late) == (1000, 0, 0)
+    assert figures.jitter_ns == 0
+    assert judge_prediction(plan, analysis).broken == ()
+
+
+FORKED = """\
+chain: /image../left../joined
+nodes:
+  camera: {core: 1, callbacks: [{timer: 100ms, execution: {uniform: [20ms, 30ms]},
+    publishes: [/image]}]}
+  left: {core: 1, callbacks: [{subscription: /image, execution: {uniform: [20ms, 40ms]},
+    publishes: [/left]}]}
+  right: {core: 1, callbacks: [{subscription: /image, execution: {uniform: [30ms, 50ms]},
+    publishes: [/right]}]}
+  join: {core: 1, callbacks: [{synchronises: [/left, /right],
+    execution: {uniform: [20ms, 40ms]}, publishes: [/joined]}]}
+  actuator: {core: 9, callbacks: [{subscription: /joined}]}
+"""
+
+
+def test_branches_of_one_beginning_are_cut_although_they_piled_up(tmp_path: Path) -> None:
+    """160 ms on one core every 100; on two, a branch runs beside the other."""
+    described = application(FORKED, take={"constant": f"{TAKE}ns"})
+    profile = simulate(described, tmp_path / "profile", cycles=300)
+    plan = plan_recording(profile, request=PlanRequest(policy="pipelined", cores=(1, 2)))
+    assert 110 * MS < plan.evidence.max_latency_ns < 121 * MS, "30 + 50 + 40"
+    shaped = simulate(described, tmp_path / "shaped", plan, cycles=1000)
+    figures = measure_latency(shaped).analysis.statistics
+    assert (figures.count, figures.incomplete) == (1000, 0)
+    assert (figures.late or 0) <= 1000 * (plan.margin.overrun_probability or 0), "of 1 % at most"
+    described = application(CAMERA_AND_LIDAR.replace("CORE", "1"))
+    piled_up = simulate(described, tmp_path / "piled_up", cycles=50)
+    with pytest.raises(InputError, match="for what /camera begins, and how long after /lidar"):
+        plan_recording(piled_up, request=PlanRequest(policy="pipelined", cores=(1, 2)))

@@ -41,7 +41,7 @@ from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
 from chainshaper.verify.budgets import load_budget
-from chainshaper.verify.measure import measure_latency
+from chainshaper.verify.measure import PARTS, measure_latency
 from chainshaper.verify.promises import OutputsDue
 from chainshaper.verify.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 
@@ -468,7 +468,7 @@ def test_metrics_are_the_figures_that_are_shown() -> None:
     cycles = families["chainshaper_chain_cycles"]
     counted = {one.labels["outcome"]: one.value for one in cycles}
     assert counted == seen.chains[0].counted
-    assert len(families["chainshaper_hop_time_seconds"]) == 4
+    assert len(families["chainshaper_hop_time_seconds"]) == 2 * len(PARTS)
     request = ExportMetricsServiceRequest.FromString(Collector.received[-1])
     (metrics,) = request.resource_metrics[0].scope_metrics
     sent = {

@@ -17,6 +17,7 @@ from chainshaper.analysis.disturbance import disturbed as disturbed
 from chainshaper.analysis.flow import DataFlow as DataFlow
 from chainshaper.analysis.flow import callback_instances as callback_instances
 from chainshaper.analysis.flow import data_flow as data_flow
+from chainshaper.analysis.flow import recorded_flow as recorded_flow
 from chainshaper.analysis.graph import application_graph as application_graph
 from chainshaper.analysis.graph import graph_of as graph_of
 from chainshaper.analysis.latency import LatencyAnalysis as LatencyAnalysis

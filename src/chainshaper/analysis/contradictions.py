@@ -9,9 +9,10 @@
 * **A timer's callback starts at another period than declared**: the period that its starts show
   counts; where they are not regular, a plan is refused.
 * **A callback spans its executor's next take, or its search for work**: its end is left out; where
-  only the search for work says so, a plan is refused.
+  only the search for work says so, a plan is refused. Where no event was lost, it spins an executor
+  itself.
 * **A callback ran inside itself in one thread**: the outer instances have no end. A plan is
-  refused.
+  refused, but where events were lost, which looks alike.
 * **Events lie behind the end of their packet**: the decoder drops them, and the recording's own
   notes say so.
 
@@ -25,7 +26,7 @@ from dataclasses import dataclass
 import polars as pl
 
 from chainshaper.analysis.lost_ends import LostEnds
-from chainshaper.analysis.matching import latest_before
+from chainshaper.analysis.matching import first_after, latest_before
 from chainshaper.analysis.objects import Objects
 from chainshaper.analysis.periods import OtherPeriod, other_periods
 from chainshaper.analysis.unseen_takes import UnseenTakes
@@ -70,7 +71,7 @@ def contradictions(
         *(_without_takes(one) for one in unseen),
         *(_of_another_period(one) for one in other_periods(nodes, instances, taken)),
         *_longer_than_they_ran(nodes, ends),
-        *_inside_themselves(tables, nodes, instances),
+        *_inside_themselves(tables, nodes, ends),
     )
 
 
@@ -131,24 +132,24 @@ def _before_their_publication(
         worst, first = rows.select(pl.col("by").max(), pl.col("time").min()).row(0)
         yield Contradiction(
             frozenset({*rows["callback_id"].drop_nulls(), *rows["writer"].drop_nulls()}),
-            f"{node} took {rows.height} messages on {topic} up to {duration_text(worst)} before"
-            f" they were published, the first {clock_text(first)} in thread {rows['tid'][0]}: the"
-            " clocks of publisher and subscriber are not the same (two machines?), or events are"
-            " wrong; record both with one clock.",
+            f"{node} took messages on {topic} up to {duration_text(worst)} before they were"
+            f" published ({rows.height} of them, the first {clock_text(first)} in thread"
+            f" {rows['tid'][0]}): the clocks of publisher and subscriber are not the same (two"
+            " machines?), or events are wrong; record both with one clock.",
             refused=True,
         )
 
 
 def _without_takes(one: UnseenTakes) -> Contradiction:
     said = (
-        f"the callback of {one.node} for {one.topic} ran {one.runs} times, first"
-        f" {clock_text(one.first_ns)} in thread {one.tid}, without any event of a take (loaned"
-        " messages have none, nor have Foxy and plain Galactic)"
+        f"the callback of {one.node} for {one.topic} ran without any event of a take (instances:"
+        f" {one.runs}, the first {clock_text(one.first_ns)} in thread {one.tid}; loaned messages"
+        " have no such events, nor have Foxy and plain Galactic)"
     )
     if one.linked:
-        said += f": {one.linked} times it is certain which publication it got, by their times"
+        said += f": of {one.linked} it is certain which publication they got, by their times"
         if one.linked < one.runs:
-            said += "; the others are left out"
+            said += ", the others are left out"
         return Contradiction(frozenset({one.callback_id}), f"{said}.", refused=False)
     why = f"{one.publishers} publishers write the topic"
     if one.publishers == 1:
@@ -180,45 +181,38 @@ def _of_another_period(one: OtherPeriod) -> Contradiction:
 
 
 def _longer_than_they_ran(nodes: pl.DataFrame, ends: LostEnds) -> Iterator[Contradiction]:
+    lost = "their ends and the starts after them were lost, so they have no end"
+    if ends.complete:
+        doubt = "it spins an executor itself now and then, or losses were not counted; they count"
+        doubt += " with all that time"
+    else:
+        doubt = f"{lost} here, or it spins an executor itself now and then, and they are longer:"
+        doubt += " record again without losses"
     proofs = (
-        (ends.by_take, "its thread took the next message for it", False),
-        (ends.by_wait, "its executor looked for other work", True),
+        (ends.by_take, "took the next message for it, or executed it again", lost, False),
+        (ends.by_wait, "looked for other work, or did some", doubt, not ends.complete),
     )
-    for numbers, proof, refused in proofs:
+    for numbers, proof, said, refused in proofs:
         rows = ends.instances.filter(pl.col("instance").is_in(numbers.implode()))
-        for number, about, own in _by_callback(rows, nodes):
-            remedy = ": their ends and the starts after them were lost, so they have no end"
-            if refused:
-                remedy += " here, or it spins an executor itself now and then, and they are longer"
-                remedy += ": record again without losses"
-            yield Contradiction(
-                frozenset({number}),
-                f"{own.height} instances of {about} seemed to last on although {proof}, the first"
-                f" {clock_text(own['start'][0])} in thread {own['tid'][0]}{remedy}.",
-                refused,
-            )
+        for number, about, where in _by_callback(rows, nodes):
+            note = f"{about} seems to last on although its thread {proof} ({where}): {said}."
+            yield Contradiction(frozenset({number}), note, refused)
 
 
 def _inside_themselves(
-    tables: events.EventTables, nodes: pl.DataFrame, instances: pl.DataFrame
+    tables: events.EventTables, nodes: pl.DataFrame, ends: LostEnds
 ) -> Iterator[Contradiction]:
     """Instances without an end in which the same callback ran on the same thread, as an end of it
     that belongs to no other start tells."""
     thread, key = ["pid", "tid"], ["pid", "tid", "callback_id"]
+    instances = ends.instances
     if not instances["end"].null_count():
         return
     open_ones = instances.filter(pl.col("end").is_null() & ~pl.col("assumed"))
     numbers = open_ones["callback_id"].unique().implode()
     following = instances.filter(pl.col("callback_id").is_in(numbers)).select(*key, after="start")
-    last = following.group_by(key).agg(pl.col("after").max())
-    open_ones = open_ones.join(last, on=key).filter(pl.col("start") < pl.col("after"))
-    if open_ones.is_empty():
-        return
-    rows = (
-        open_ones.drop("after")
-        .join(following, on=key, how="left")
-        .filter(pl.col("after") > pl.col("start"))
-    )
+    rows = first_after(open_ones, following, key, "start", "after", strictly=True)
+    rows = rows.drop_nulls("after")
     if rows.is_empty():
         return
     handles = nodes.select("callback_id", callback="handle")
@@ -226,29 +220,28 @@ def _inside_themselves(
     closed = closed.join(handles, on="callback_id").select(*thread, "callback", "time")
     spare = events.table(tables, "callback_end").select("time", *thread, "callback")
     spare = spare.join(closed, on=[*thread, "callback", "time"], how="anti", maintain_order="left")
-    opened = rows.unique("instance", maintain_order=True).join(handles, on="callback_id")
+    opened = rows.join(handles, on="callback_id", maintain_order="left")
     opened = opened.select(*thread, "callback", "instance", "after", opened="start")
     hit = latest_before(spare, opened, [*thread, "callback"], "time", "opened")
     hit = hit.filter(pl.col("time") > pl.col("after"))
     rows = instances.filter(pl.col("instance").is_in(hit["instance"].drop_nulls().implode()))
-    for number, about, own in _by_callback(rows, nodes):
-        yield Contradiction(
-            frozenset({number}),
-            f"{own.height} instances of {about} ran inside another one of it in the same thread,"
-            f" the first {clock_text(own['start'][0])} in thread {own['tid'][0]}: how long the"
-            " outer ones took cannot be known.",
-            refused=True,
-        )
+    for number, about, where in _by_callback(rows, nodes):
+        said = "how long the outer ones took cannot be known"
+        if not ends.complete:
+            said += "; or the end of each, and the start of a later one, were lost"
+        note = f"{about} ran inside itself in one thread ({where}): {said}."
+        yield Contradiction(frozenset({number}), note, refused=ends.complete)
 
 
-def _by_callback(
-    rows: pl.DataFrame, nodes: pl.DataFrame
-) -> Iterator[tuple[int, str, pl.DataFrame]]:
-    """Callback, what it is in words, and its rows; not of what every node has for itself."""
+def _by_callback(rows: pl.DataFrame, nodes: pl.DataFrame) -> Iterator[tuple[int, str, str]]:
+    """Callback, what it is in words, and how many rows of it there are, and where the first one
+    is; not of what every node has for itself."""
     about = nodes.select("callback_id", "node", "kind", "topic", "period_ns")
     for (number,), own in rows.sort("start").group_by("callback_id", maintain_order=True):
         _, node, kind, topic, period = about.filter(callback_id=number).row(0)
         if topic in INTERNAL_TOPICS:
             continue
         trigger = f"for {topic}" if period is None else f"every {duration_text(period)}"
-        yield int(str(number)), f"the {kind} callback of {node} {trigger}", own
+        first, tid = own.select("start", "tid").row(0)
+        where = f"instances: {own.height}, the first {clock_text(first)} in thread {tid}"
+        yield int(str(number)), f"the {kind} callback of {node} {trigger}", where

@@ -41,6 +41,7 @@ from chainshaper.analysis.restarts import FOLLOWED, followed_processes
 from chainshaper.analysis.unseen_takes import with_unseen_takes
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
+from chainshaper.values.recording import Recording
 
 _ACTION = "/_action/"
 
@@ -78,18 +79,26 @@ class DataFlow:
     followed: pl.DataFrame = field(default_factory=FOLLOWED.to_frame)
 
 
+def recorded_flow(recording: Recording) -> DataFlow:
+    """Resolve a recording's events, with what it knows of the clocks and of lost events."""
+    info = recording.info
+    return data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
+
+
 def data_flow(
     tables: events.EventTables,
     clock_offset_ns: int = 0,
     objects: Objects | None = None,
     *,
     ended: Collection[int] | None = None,
+    complete: bool = False,
 ) -> DataFlow:
     """Resolve a recording's events.
 
     ``clock_offset_ns``, to add to event times for CLOCK_REALTIME, matters only before Jazzy.
     ``objects`` are the tables' own, where they have been resolved already. ``ended`` are the
-    processes that have ended, where that is known better than from events.
+    processes that have ended, where that is known better than from events. ``complete``: it is
+    known that no event was lost.
     """
     objects = objects or resolve_objects(tables)
     with ThreadPoolExecutor(max_workers=1) as beside:  # instances and messages meet only below
@@ -99,7 +108,7 @@ def data_flow(
         published = publications(tables, objects, sent)
         taken, stamped = link_takes(tables, taken, published, clock_offset_ns)
         instances = running.result()
-    ends = without_disproved_ends(tables, instances, taken)
+    ends = without_disproved_ends(tables, instances, taken, objects.callbacks, complete=complete)
     instances = ends.instances
     instances, taken = _with_assumed_readers(instances, taken, objects, tables)
     taken = _consumed(taken, instances)
@@ -153,8 +162,8 @@ def _notes(
     if missing := both.filter(pl.col("by_rcl") > 5 * pl.col("by_rmw"))["by_rcl"].sum():
         yield (
             f"{missing} messages were taken without an event of rmw (from Lyrical on"
-            " rmw_fastrtps_cpp has none for messages with a field uint8[]): chains cannot be"
-            " followed through them. `record --source preload` sees them."
+            " rmw_fastrtps_cpp has none for messages with a field uint8[]): chains are followed"
+            " through them only where a note says so. `record --source preload` sees them."
         )
 
 

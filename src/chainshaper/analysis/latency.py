@@ -1,7 +1,7 @@
 """The end-to-end latencies of one chain in a recording, figures about them and about callbacks."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -14,9 +14,10 @@ from chainshaper.analysis.disturbance import (
     disturbed,
     due_within,
     stalled_after,
+    timer_period,
     with_punctuality,
 )
-from chainshaper.analysis.flow import DataFlow, data_flow, timer_calls
+from chainshaper.analysis.flow import DataFlow, data_flow, recorded_flow, timer_calls
 from chainshaper.analysis.graph import graph_of
 from chainshaper.analysis.outputs_due import not_begun, with_outputs_due
 from chainshaper.analysis.traversals import reception, traverse
@@ -192,7 +193,7 @@ class LatencyAnalysis:
     ``subscriber`` and ``subscriber_undisturbed`` are the same of ``reception_ns`` (None: no node
     subscribes to the output). ``incomplete`` counts traversals without an end by reason, ``silent``
     instances of the first callback that began none, ``not_begun`` cycles of a plan in which it did
-    not run at all.
+    not run at all. ``period_ns`` is that of the timer that starts the chain (None: none does).
     """
 
     chain: Chain
@@ -208,6 +209,7 @@ class LatencyAnalysis:
     silent: int
     notes: tuple[str, ...]
     not_begun: int = 0
+    period_ns: int | None = None
 
     @property
     def decided(self) -> pl.DataFrame:
@@ -239,9 +241,11 @@ def analyse_latency(
     """
     notes: tuple[str, ...] = ()
     if isinstance(source, Recording):
-        notes, info = source.info.notes, source.info
-        clock_offset_ns = info.clock_offset_ns if clock_offset_ns is None else clock_offset_ns
-        source = source.events
+        notes = source.info.notes
+        if clock_offset_ns is not None:
+            info = source.info.model_copy(update={"clock_offset_ns": clock_offset_ns})
+            source = replace(source, info=info)
+        source = recorded_flow(source)
     flow = source if isinstance(source, DataFlow) else data_flow(source, clock_offset_ns or 0)
     graph = graph_of(flow)
     if isinstance(chain, str):
@@ -284,6 +288,7 @@ def analyse_latency(
         silent=found.silent,
         notes=(*notes, *flow.notes, *found.notes),
         not_begun=0 if own is None else not_begun(flow, chain, own, between),
+        period_ns=timer_period(flow, chain),
     )
 
 

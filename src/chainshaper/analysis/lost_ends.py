@@ -3,15 +3,15 @@
 Where the end of one instance and the start of the next are both lost, the first start and the last
 end look like one long instance. What the thread did in between tells: an executor takes up work
 only when no callback runs. It takes the next message for the same callback, or it looks, or waits,
-for work. A callback that spins an executor itself does the same, but as its habit: what hardly any
-of its other instances did is not.
+for work, or runs another callback. A callback that spins an executor itself does the same, but as
+its habit: what hardly any of its other instances did is not.
 """
 
 from dataclasses import dataclass
 
 import polars as pl
 
-from chainshaper.analysis.matching import first_after
+from chainshaper.analysis.matching import first_after, latest_before
 from chainshaper.values import events
 
 LOOKS = ("rclcpp_executor_get_next_ready", "rclcpp_executor_wait_for_work")
@@ -33,19 +33,29 @@ class LostEnds:
     """Callback instances, without the ends that cannot be theirs.
 
     ``instances`` has the column ``until`` as well: by when an instance without an end had ended
-    (null: not known). ``by_take`` are the numbers of those of which the next take for the same
-    callback tells, ``by_wait`` of those of which only the executor's search for work does.
+    (null: not known). ``by_take`` are the numbers of those that the thread's next take, or
+    execution, of the same callback disproves, ``by_wait`` of those that only its search for other
+    work does. If no event was lost (``complete``), the latter have their ends.
     """
 
     instances: pl.DataFrame
     by_take: pl.Series
     by_wait: pl.Series
+    complete: bool
 
 
 def without_disproved_ends(
-    tables: events.EventTables, instances: pl.DataFrame, taken: pl.DataFrame
+    tables: events.EventTables,
+    instances: pl.DataFrame,
+    taken: pl.DataFrame,
+    callbacks: pl.DataFrame,
+    *,
+    complete: bool,
 ) -> LostEnds:
     """Look for ends that the thread's other events disprove, and leave them out.
+
+    Where no event was lost (``complete``), an instance in which the thread looked for work did so
+    itself.
 
     The executor's events are asked only where an instance is suspiciously long, or has no end: as
     a rule no other step needs them.
@@ -55,9 +65,14 @@ def without_disproved_ends(
     own = own.select(*key, took="time")
     rows = first_after(instances, own, key, "start", "took", strictly=True)
     if not _suspicious(rows):
-        return LostEnds(instances.with_columns(until=_NO_TIME), _NONE, _NONE)
+        return LostEnds(instances.with_columns(until=_NO_TIME), _NONE, _NONE, complete)
+    own = pl.concat([own, _executions_of_timers(tables, callbacks)]).sort("took")
+    rows = first_after(rows.drop("took"), own, key, "start", "took", strictly=True)
     looks = pl.concat(events.table(tables, name).select(*thread, looked="time") for name in LOOKS)
     rows = first_after(rows, looks.sort("looked"), thread, "start", "looked", strictly=True)
+    # The next instance on the thread is of another callback, or this one has no end already.
+    following = pl.col("start").shift(-1).over(thread)
+    rows = rows.with_columns(looked=pl.min_horizontal("looked", following))
     took, looked = (pl.col(n) < pl.col("end") for n in ("took", "looked"))
     closed = pl.col("end").count()
     takes_inside = (took.sum() <= MOST_TAKEN * closed).over("callback_id")
@@ -68,11 +83,22 @@ def without_disproved_ends(
         pl.when(takes_inside).then("took"), pl.when(looks_inside).then("looked")
     )
     rows = rows.sort("instance").with_columns(by_take=by_take, by_wait=by_wait, until=until)
-    lost = pl.col("by_take") | pl.col("by_wait")
+    lost = pl.col("by_take") | (pl.col("by_wait") & ~pl.lit(complete))
     left = rows.with_columns(pl.when(~lost).then(n).alias(n) for n in ("end", "execution_ns"))
     left = left.with_columns(pl.when(pl.col("end").is_null()).then("until"))
     by_take_rows, by_wait_rows = (rows.filter(n)["instance"] for n in ("by_take", "by_wait"))
-    return LostEnds(left.select(*instances.columns, "until"), by_take_rows, by_wait_rows)
+    return LostEnds(left.select(*instances.columns, "until"), by_take_rows, by_wait_rows, complete)
+
+
+def _executions_of_timers(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFrame:
+    """``tid, callback_id, took``: when an executor took up a timer, of which there are no takes."""
+    added = events.table(tables, "rclcpp_timer_callback_added")
+    added = added.select("pid", "timer_handle", handle="callback", valid_from="time")
+    timers = callbacks.join(added, on=["pid", "handle", "valid_from"])
+    timers = timers.select("pid", "callback_id", "valid_from", handle="timer_handle")
+    executed = events.table(tables, "rclcpp_executor_execute")
+    executed = latest_before(executed, timers, ["pid", "handle"], "time", "valid_from")
+    return executed.drop_nulls("callback_id").select("tid", "callback_id", took="time")
 
 
 def _suspicious(rows: pl.DataFrame) -> bool:

@@ -104,7 +104,8 @@ def _gid_owners(
     created = first_after(created, clients, key, "time", "created")
     servers = objects.subscriptions.select(*_END, "topic")
     came = latest_before(found["rmw_take_request"], servers, key, "time", "created")
-    came = came.with_columns(at=pl.col("source_timestamp") - clock_offset_ns)
+    at = pl.min_horizontal(pl.col("source_timestamp") - clock_offset_ns, "time")
+    came = came.with_columns(at=at)  # the wall clock may be moved: it was sent before it was taken
     sent = found["rmw_send_request"].select("topic", "sequence_number", "client", sent="time")
     came = latest_before(came, sent, ["topic", "sequence_number"], "at", "sent")
     votes = came.group_by("client", "client_gid").len().sort("len", descending=True)

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis.disturbance import Due
+from chainshaper.analysis.disturbance import Due, timer_period
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT
 from chainshaper.values.application import Chain
@@ -74,8 +74,7 @@ def not_begun(
     Cycles in which its first callback ran and published nothing are not among them. Where a message
     begins the chain nothing was due without one.
     """
-    first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
-    if first["period_ns"].max() is None:
+    if timer_period(flow, chain) is None:
         return 0
     own = flow.instances.filter(pl.col("callback_id") == chain.callbacks[0])["start"].sort()
     since_ns, until_ns = between or (0, None)

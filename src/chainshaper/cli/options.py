@@ -258,8 +258,8 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
     topic, colon, listed = text.partition(":")
     if not colon:
         raise InputError(
-            f"--modes {text}: modes need a topic that announces them: write TOPIC:MODE,MODE, such"
-            " as /driving_mode:city,highway"
+            f"--modes {text}: write the topic that announces the modes, and each mode once, such as"
+            " /driving_mode:city,highway"
         )
     pairs = [pair.partition("=") for pair in listed.split(",")]
     bands = {mode: int(band) for mode, _, band in pairs if band.isdecimal()}
@@ -274,10 +274,12 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
 def recording_of(
     named: Path | None, plan: "cs.ApplicationPlan | None" = None
 ) -> "cs.Recording | None":
-    """The recording that an option names, or else the plan's own, where that is still there."""
-    own = None if plan is None else plan.chains[0].evidence.recording
-    if named is None and own and Path(own).is_dir():
-        named = Path(own)
+    """The recording that an option names, or else the first of the plan's own that is still there,
+    whichever chain it was made for.
+    """
+    chains = () if plan is None else plan.chains
+    own = (Path(path) for one in chains if (path := one.evidence.recording) is not None)
+    named = named or next((path for path in own if path.is_dir()), None)
     return None if named is None else cs.open_source(named)
 
 

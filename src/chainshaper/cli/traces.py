@@ -85,16 +85,19 @@ def graph(
 
 def callbacks(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
     """Show every callback of a recording or trace: kind, count, execution and response time."""
+    from chainshaper.analysis import recorded_flow
     from chainshaper.reporting import overviews
 
     with out.opened("callbacks", trace) as (recording, _):
-        flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
+        flow = recorded_flow(recording)
         found = cs.callback_statistics(flow)
     if out.present(json, overviews.callback_rows(found), overviews.callback_table(found)):
         out.show_line(out.lost_events(recording))
         out.notes((*recording.info.notes, *flow.notes))
-    elif any(recording.info.lost.values()):  # the array has no place for it
-        out.notes([out.lost_events(recording)])
+    else:  # the array has no place for them
+        out.notes(one.note for one in flow.contradictions)
+        if any(recording.info.lost.values()):
+            out.notes([out.lost_events(recording)])
 
 
 def chains(
@@ -112,11 +115,11 @@ def chains(
 
     The heaviest chain has the largest sum of its callbacks' mean response times.
     """
-    from chainshaper.analysis import graph_of
+    from chainshaper.analysis import graph_of, recorded_flow
     from chainshaper.reporting import overviews
 
     with out.opened("chains", trace) as (recording, report):
-        flow = cs.data_flow(recording.events, recording.info.clock_offset_ns)
+        flow = recorded_flow(recording)
         report(0.9, "searching chains")
         application, found = graph_of(flow), cs.list_chains(flow, start, end, limit)
     remarks = [*recording.info.notes, *flow.notes]

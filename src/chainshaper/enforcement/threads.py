@@ -16,8 +16,9 @@ the most urgent:
   one; where slots are made of what single callbacks took, all but the first do, as while that was
   measured (:attr:`~chainshaper.planning.application_plan.ApplicationPlan.most_urgent_first`). Turns
   (SCHED_RR), only if the plan wants them, end within a callback, which then waits for another;
-* who receives what a shaping node publishes, on the shaping node's core, or, of several chains,
-  whose servers keep that core busy, on the first core without servers;
+* who receives what a shaping node publishes: where the plan has a place for them, there, behind
+  the shaping nodes and above all others; else below all servers, on the shaping node's core, or, of
+  several chains, whose servers keep that core busy, on the first core without servers;
 * an asynchronous publisher, below every other thread of its process on its core: it spins on the
   writer's lock, and above them would never let them release it;
 * the thread by which Fast DDS sends what synchronous writers could not (`dds.asyn.N.0`), under the
@@ -47,7 +48,7 @@ from chainshaper.linux.processes import (
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole, gate_thread_name, is_of_zenoh
 from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Plan, Server, ShapingNode, shaping_nodes
+from chainshaper.planning.plan import Plan, ReceiverPlace, Server, ShapingNode, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
 
@@ -57,7 +58,7 @@ LEFT_ALONE = "left alone, since users run them whom this run does not name: "
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
 _BELOW = 1  # room for a publisher below a server's threads
-_RECEIVES = "receives the output"
+_RECEIVES, _RECEIVES_IN_PLACE = "receives the output", "receives the output, in its place"
 _MOST_NAMED = 5
 _COMM_LENGTH = 15  # the kernel cuts names of threads off behind this
 
@@ -440,6 +441,7 @@ def plan_scheduling(
         *(members, plan.servers, allocation, available_cores),
         order=plan.most_urgent_first,
         receivers=cores,
+        places=plan.receivers_at,
         take_turns=plan.takes_turns,
         clear={node.core for node in plan.shaping_nodes},
     )
@@ -507,6 +509,7 @@ def scheduling_around(
     *,
     order: Sequence[str] = (),
     receivers: Mapping[str, int] = MappingProxyType({}),
+    places: Mapping[str, ReceiverPlace] = MappingProxyType({}),
     take_turns: bool = False,
     clear: Collection[int] = (),
 ) -> tuple[WantedScheduling, ...]:
@@ -515,7 +518,8 @@ def scheduling_around(
     ``members`` are by server's name, within a server in the ``order`` of their nodes, the most
     urgent first; others come behind these, and share a priority. ``receivers`` are nodes that
     receive an output, and the core for their executors; one that is real-time already, on cores of
-    no server, stays as it is: its other callbacks were placed there. With ``take_turns``, servers
+    no server, stays as it is: its other callbacks were placed there. Some of them have ``places``
+    in the plan, with another priority, and core, if it is available. With ``take_turns``, servers
     of one priority share it by turns. DDS threads leave the cores of all servers or, where these
     are all that there are, those to be ``clear``.
 
@@ -526,6 +530,8 @@ def scheduling_around(
     sizes: dict[int, int] = {}
     for its in (one for one in servers if not getattr(one, "best_effort", False)):
         sizes[its.priority] = max(1, sizes.get(its.priority, 0), len(taken[its.name]))
+    for rank in {place.priority for place in places.values()} & sizes.keys():
+        sizes[rank] += 1  # behind all of it
     priorities = server_priorities(sizes)
 
     def wanted_in(server: Server | ReservationServer, one: NodeThread) -> Scheduling:
@@ -548,8 +554,13 @@ def scheduling_around(
         if one.thread.role != "executor" or one.thread.identity in planned or core is None:
             continue
         receiving_pids.add(one.thread.pid)
-        if one.thread.priority in (0, below) or not busy.isdisjoint(one.thread.cores):
-            receiving.append(WantedScheduling(one, Scheduling(below, (core,)), None, _RECEIVES))
+        place = next((places[node] for node in one.nodes if node in places), None)
+        priority, reason = below, _RECEIVES
+        if place is not None and place.priority in priorities:
+            priority, reason = priorities[place.priority][-1], _RECEIVES_IN_PLACE
+            core = place.core if place.core in available_cores else core
+        if one.thread.priority in (0, priority) or not busy.isdisjoint(one.thread.cores):
+            receiving.append(WantedScheduling(one, Scheduling(priority, (core,)), None, reason))
     planned |= {one.thread.thread.identity for one in receiving}
     free_cores = tuple(sorted(set(available_cores) - busy))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
@@ -630,7 +641,8 @@ def left_by_back_end(
 ) -> tuple[WantedScheduling, ...]:
     """What threads get from us where a back end schedules its servers' threads itself: no priority,
     and under sched_ext none may be left, since the kernel runs real-time threads above it. ``free``
-    threads, which no back end keeps in their slots, do stand above; a receiver is left as it is.
+    threads, which no back end keeps in their slots, do stand above, and so do receivers that have a
+    place there; others are left as they are.
     """
     if back_end not in ("scx", "litmus"):
         return tuple(wanted)

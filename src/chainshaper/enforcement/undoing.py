@@ -38,7 +38,7 @@ from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import find_thread, open_process
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError, PlatformError, storable
-from chainshaper.values.files import open_output
+from chainshaper.values.files import open_output, read_regular
 
 CLAIMS = "claims"
 PATIENCE_S = 20.0
@@ -118,7 +118,7 @@ def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | 
     for journal in find_journals(folder):
         state = None
         with contextlib.suppress(OSError, ValueError):
-            content = journal.path.with_name(runs.STATE_FILE).read_bytes()
+            content = read_regular(journal.path.with_name(runs.STATE_FILE))
             state = TypeAdapter(RunState).validate_json(content)
         if journal.path.exists():  # not over meanwhile
             yield journal, state

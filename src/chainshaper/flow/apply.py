@@ -33,14 +33,13 @@ from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
-from chainshaper.flow.threads import LEAD_NS
 from chainshaper.linux.own_processes import end_command, end_in_words, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.planning import application_plan as planned
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done
-from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.offsets import LEAD_NS, chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan, shaping_nodes
 from chainshaper.planning.plan_file import plan_values

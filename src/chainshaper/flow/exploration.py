@@ -11,10 +11,10 @@ from chainshaper.analysis import (
     ChainEnumeration,
     DataFlow,
     callback_statistics,
-    data_flow,
     enumerate_chains,
     graph_of,
     load_named_paths,
+    recorded_flow,
 )
 from chainshaper.analysis.chains import close_names
 from chainshaper.analysis.contradictions import shown_periods
@@ -36,7 +36,7 @@ def list_chains(
 ) -> ChainEnumeration:
     """The chains of a recording, and the heaviest of them by mean response times."""
     if isinstance(source, Recording):
-        source = data_flow(source.events, source.info.clock_offset_ns)
+        source = recorded_flow(source)
     statistics = callback_statistics(source).drop_nulls("response_ns")
     mean = statistics["response_ns"].struct.field("mean")
     weights = dict(zip(statistics["callback_id"], mean, strict=True))
@@ -97,7 +97,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
     description can be made of it.
     """
     recording = opened(recording)
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     graph, heaviest = graph_of(flow), list_chains(flow).heaviest
     if heaviest is None:
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
@@ -145,7 +145,7 @@ def application_file(recording: Recording | str | Path, chain: str | None = None
 def describe_application(recording: Recording | str | Path) -> ApplicationDescription:
     """The application that a recording or trace shows: its graph and its services."""
     recording = opened(recording)
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     return ApplicationDescription(
         graph=graph_of(flow),
         services=services(recording.events),

@@ -6,10 +6,11 @@ them or to the node with which the chain begins: what feeds a subscription there
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain as joined
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -18,7 +19,13 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis import DataFlow, LatencyAnalysis, analyse_latency, data_flow, executors
+from chainshaper.analysis import (
+    DataFlow,
+    LatencyAnalysis,
+    analyse_latency,
+    executors,
+    recorded_flow,
+)
 from chainshaper.analysis.contradictions import refuse_contradicted, shown_periods
 from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
@@ -26,7 +33,7 @@ from chainshaper.analysis.latency import Executor
 from chainshaper.linux.threads import dds_kind
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.margins import read_latencies
-from chainshaper.planning.profile import Interfering
+from chainshaper.planning.profile import UNKNOWN, Interfering, Reception
 from chainshaper.planning.request import DEFAULT_CORE
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
@@ -41,6 +48,7 @@ from chainshaper.workload.live import timing_of
 
 DEFAULT_PRIORITY = 80
 _STANDARD = PlanRequest()
+_ONE_BEGINNING_NS = 5_000_000  # so far apart are two timers' starts in all cycles, but for others
 _SAME_SPEED = 0.02  # so far may /clock be from the speed of time
 
 
@@ -72,7 +80,7 @@ def profile_chains(
     if since_ns or until_ns is not None:
         until = None if until_ns is None else begun + until_ns
         recording = replace(recording, events=events.happened(all_events, begun + since_ns, until))
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     analyses = [analyse_latency(flow, chain_of(recording, chain, flow)) for chain in chains]
     stages = [graph_stages(one.graph, one.chain) for one in analyses]
     planned = {number for own in stages for stage in own for number in stage.members}
@@ -87,7 +95,7 @@ def profile_chains(
     if others := ", ".join(mode_recordings.keys() - modes.bands.keys()):
         raise InputError(f"{others}: none of the modes {', '.join(modes.bands)}: correct it")
     # Announcements are counted from the first one on, also where that is left out.
-    announced = data_flow(all_events, recording.info.clock_offset_ns) if since_ns else flow
+    announced = recorded_flow(replace(recording, events=all_events)) if since_ns else flow
     for number, analysis in enumerate(analyses):
         apart: dict[str, Profile] = {}
         for mode, place in mode_recordings.items():
@@ -141,7 +149,16 @@ def _profile_of(
     own = {*chain.callbacks, *(n for stage in stages for n in stage.members)}
     branches = own - {*chain.callbacks}
     steps = _steps(flow, analysis, cores, {*planned, *chain.callbacks} - branches)
+    graph_steps, begins = np.zeros((0, 0), np.int64), tuple[int, ...]()
+    if branches:
+        graph_steps, begins = _graph_steps(flow, analysis, stages, cores, planned)
+    measured_rows, every_row = (one["traversal"].to_numpy() for one in (measured, every))
     sends = events.table(flow.events, "asynchronous_send")
+    receivers = tuple(  # tools such as `ros2 topic echo`, which come and go, have hidden names
+        node
+        for node in graph.subscribers.get(chain.topics[-1], ())
+        if node not in nodes and not node.rpartition("/")[2].startswith("_")
+    )
     return Profile(
         latencies_ns=measured["latency_ns"].to_numpy().astype(np.int64),
         every_latency_ns=every["latency_ns"].to_numpy().astype(np.int64),
@@ -157,14 +174,14 @@ def _profile_of(
         cores=cores,
         every_node=tuple(node.name for node in graph.nodes),
         together=_together(graph, nodes),
-        receivers=tuple(  # tools such as `ros2 topic echo`, which come and go, have hidden names
-            node
-            for node in graph.subscribers.get(chain.topics[-1], ())
-            if node not in nodes and not node.rpartition("/")[2].startswith("_")
-        ),
+        receivers=receivers,
+        reception=_reception(flow, analysis, receivers, cores, period),
         callbacks=tuple(_times(flow, instances, stage, core_of[stage.node]) for stage in stages),
-        steps_ns=steps[measured["traversal"].to_numpy()],
-        every_step_ns=steps[every["traversal"].to_numpy()],
+        steps_ns=steps[measured_rows],
+        every_step_ns=steps[every_row],
+        graph_steps_ns=graph_steps[measured_rows] if branches else graph_steps,
+        every_graph_step_ns=graph_steps[every_row] if branches else graph_steps,
+        begins_ns=begins,
         fifo_priority=min(97, priority.get(stages[-1].node, DEFAULT_PRIORITY) + 5),
         recording=str(recording.path),
         incomplete=analysis.statistics.incomplete - analysis.incomplete.get("not used", 0),
@@ -180,6 +197,53 @@ def _profile_of(
         interfering=_interfering(flow, analysis, running, {*planned, *chain.callbacks}),
         contradictions=tuple(one.note for one in flow.contradictions if own & one.callbacks),
         all_disturbed=all_disturbed or None,
+    )
+
+
+def _reception(
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    receivers: Sequence[str],
+    core_of: Mapping[str, int],
+    period_ns: int,
+) -> Reception | None:
+    """How a chain's output gets to those that receive it; None: no message did."""
+    output, callbacks = analysis.chain.topics[-1], analysis.graph.callbacks
+    own = [one.id for one in callbacks if one.trigger == output and one.node in receivers]
+    known = analysis.traversals.filter(pl.col("complete") & ~pl.col("reception_disturbed"))
+    known = known.drop_nulls("received")
+    if not own or not known.height:
+        return None
+    cores = {core_of.get(node) for node in receivers}
+    core = cores.pop() if len(cores) == 1 else None
+    same = [one.id for one in callbacks if core is not None and core_of.get(one.node) == core]
+    busy = flow.instances.drop_nulls("end").sort("start")
+    others = busy.filter(pl.col("callback_id").is_in(same))
+    end, received = known["end"].to_numpy(), known["received"].to_numpy()
+    ended = np.maximum.accumulate(others["end"].to_numpy())
+    began = np.maximum(others["start"].to_numpy(), np.append(0, ended)[:-1])
+    waited = stalled_within(end, received, began, ended, np.zeros_like(began))
+    shortest = int((received - end).min())
+    on_its_way = np.maximum(received - end - waited, shortest)
+    members = {
+        k for one in executors(flow) if not one.callbacks.isdisjoint(own) for k in one.callbacks
+    }
+    took = pl.coalesce("execution_ns", pl.col("end") - pl.col("start"))
+    ran = busy.with_columns(took=took, cycle=pl.col("start") // period_ns)
+    of_output, beside = (
+        ran.filter(pl.col("callback_id").is_in(list(which)))
+        for which in (own, members.difference(own))
+    )
+    in_cycle = beside.group_by("cycle").agg(pl.col("took").sum())["took"]
+    together = of_output.group_by("cycle").agg(pl.col("took").sum())["took"]
+    return Reception(
+        core=core,
+        shortest_ns=int(on_its_way.min()),
+        mean_ns=round(float(on_its_way.mean())),
+        longest_ns=int(on_its_way.max()),
+        time_ns=int(together.max() or 0),  # type: ignore[arg-type]
+        beside_ns=int(in_cycle.max() or 0),  # type: ignore[arg-type]
+        longest_beside_ns=int(beside["took"].max() or 0),  # type: ignore[arg-type]
     )
 
 
@@ -394,7 +458,8 @@ def _steps(
     quickest = int((sent["time"] - sent["sent"]).min() or 0)
     for hop, number in enumerate(chain.callbacks):
         own = hops.filter((pl.col("hop") == hop) & pl.col("publish").is_not_null())
-        own = own.with_columns(pl.coalesce("end", "publish"))
+        # Where another callback of the node publishes, this one's own end comes before.
+        own = own.with_columns(end=pl.max_horizontal("end", "publish"))
         row, start, end = (own[name].to_numpy() for name in ("traversal", "start", "end"))
         parts = (own[f"{part}_ns"].fill_null(0) for part in PARTS)
         steps[row, hop] = sum(parts, own["hop"] * 0).to_numpy()
@@ -408,6 +473,90 @@ def _steps(
             steps[row, hop] -= np.minimum(taken, np.maximum(0, start - since - quickest))
         free[row] = end
     return steps
+
+
+def _graph_steps(
+    flow: DataFlow,
+    analysis: LatencyAnalysis,
+    stages: Sequence[_Stage],
+    core_of: dict[str, int],
+    planned: Collection[int],
+) -> tuple[npt.NDArray[np.int64], tuple[int, ...]]:
+    """What each stage of a graph took, a row per traversal's number of its chain; and how long
+    after the chain each begins that waits for none, at most.
+
+    Every way through the graph to the chain's output is a chain of its own, whose traversals end
+    with the same publications. A callback that joins branches took what it did behind the message
+    that came last: the least of its ways.
+    """
+    known = analysis.traversals.filter("complete").select("traversal", "publication", "start")
+    rows = 1 + int(analysis.traversals["traversal"].max() or 0)  # type: ignore[arg-type]
+    took = np.full((rows, len(stages)), np.inf)
+    begins = [0] * len(stages)
+    for way in _ways(analysis.chain, stages):
+        callbacks = _callbacks_along(analysis.graph, stages, way)
+        own = analysis
+        if callbacks != analysis.chain.callbacks:
+            topics = tuple(stages[place].topic for place in way)
+            spec = f"{stages[way[0]].node}..{topics[-1]}"
+            own = analyse_latency(flow, Chain(spec, callbacks, topics))
+        steps = _steps(flow, own, core_of, planned)
+        ended = own.traversals.filter("complete").select(
+            "publication", number="traversal", began="start"
+        )
+        pairs = known.join(ended.unique("publication", keep="last"), on="publication")
+        row, number = pairs["traversal"].to_numpy(), pairs["number"].to_numpy()
+        for hop, place in enumerate(way):
+            took[row, place] = np.fmin(took[row, place], steps[number, hop])
+        if callbacks[0] != analysis.chain.callbacks[0] and pairs.height:
+            later = _later(pairs["began"] - pairs["start"])
+            begins[way[0]] = UNKNOWN if later is None else max(begins[way[0]], later)
+    longest = np.max(np.where(np.isfinite(took), took, 0), axis=0)
+    return np.where(np.isfinite(took), took, longest).astype(np.int64), tuple(begins)
+
+
+def _later(behind: pl.Series) -> int | None:
+    """How long after its chain a branch begins, at most (ns); None: instances pile up and wait for
+    each other, so that none says when it would begin by itself.
+    """
+    longest, least = int(behind.max() or 0), int(behind.min() or 0)  # type: ignore[arg-type]
+    return max(0, longest) if longest - least < _ONE_BEGINNING_NS else None
+
+
+def _ways(chain: Chain, stages: Sequence[_Stage]) -> Iterator[tuple[int, ...]]:
+    """The chain's way through the graph, and ways that have all that it does not pass: by places of
+    stages."""
+    along = tuple(
+        next(k for k, one in enumerate(stages) if number in one.members and one.topic == topic)
+        for number, topic in zip(chain.callbacks, chain.topics, strict=True)
+    )
+    yield along
+    following = {before: k for k, one in enumerate(stages) for before in one.after}
+    following |= dict(pairwise(along))
+    seen = set(pairwise(along))
+    for place, one in enumerate(stages):
+        for before in one.after:
+            if (before, place) in seen:
+                continue
+            way = [before, place]
+            while stages[way[0]].after:
+                way.insert(0, stages[way[0]].after[0])
+            while way[-1] != len(stages) - 1:
+                way.append(following[way[-1]])
+            seen |= set(pairwise(way))
+            yield tuple(way)
+
+
+def _callbacks_along(
+    graph: ApplicationGraph, stages: Sequence[_Stage], way: Sequence[int]
+) -> tuple[int, ...]:
+    """The callbacks by which data goes along a way: of several inputs, that which reads it."""
+    found = [stages[way[0]].members[0]]
+    for before, place in pairwise(way):
+        members = stages[place].members
+        read = (n for n in members if graph.callbacks[n].trigger == stages[before].topic)
+        found.append(next(read, members[0]))
+    return tuple(found)
 
 
 def _instances_apart_from(flow: DataFlow, disturbed: pl.DataFrame) -> pl.DataFrame:

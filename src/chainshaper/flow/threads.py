@@ -32,7 +32,7 @@ from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import Thread, ThreadRole, read_proc
 from chainshaper.planning import application_plan as joint
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
-from chainshaper.planning.offsets import chain_name, linked, with_windows
+from chainshaper.planning.offsets import LEAD_NS, chain_name, linked, with_windows
 from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
 from chainshaper.planning.plan import (
     Adaptation,
@@ -57,7 +57,6 @@ if TYPE_CHECKING:
 
 
 _LONGEST_SETTINGS = 1 << 20  # of a file of a node's parameters or profiles (bytes)
-LEAD_NS = 2_000_000  # the cycle starts so long after the chain's timer expires (DESIGN section 6)
 
 
 def find_threads(

@@ -29,7 +29,7 @@ from chainshaper.linux.threads import (
     start_of,
 )
 from chainshaper.values.errors import OperationError, PlatformError, text_of
-from chainshaper.values.files import open_output
+from chainshaper.values.files import open_output, read_regular
 
 _T = TypeVar("_T")
 
@@ -441,6 +441,6 @@ def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
 
 def _plain(path: Path) -> dict[str, Any] | None:
     with contextlib.suppress(OSError, ValueError):
-        content = json.loads(path.read_text())
+        content = json.loads(read_regular(path))
         return content if isinstance(content, dict) else None
     return None

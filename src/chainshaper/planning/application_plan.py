@@ -16,10 +16,19 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, model_validator
 
 from chainshaper.planning import plan as plans
-from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.offsets import BEFORE_NS, BEHIND_NS, chain_name
 from chainshaper.planning.overruns import in_cycle, slots_without, united, with_output_moved
 from chainshaper.planning.overruns import open_until_done as chain_open_until_done
-from chainshaper.planning.plan import PER_CALLBACK, Plan, Server, ShapingNode, Slot, Thread, Wrong
+from chainshaper.planning.plan import (
+    PER_CALLBACK,
+    Plan,
+    ReceiverPlace,
+    Server,
+    ShapingNode,
+    Slot,
+    Thread,
+    Wrong,
+)
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import Part, wrong_value, wrong_values_refused
@@ -28,10 +37,6 @@ _GRID_NS = 1_000  # moved slots are found to microseconds
 MOST_SLOTS = 10_000  # of all servers in a hyper-period
 MOST_OPENED = 64  # of a server that is opened for overruns: sched_ext's tables have no more room
 WAITING_NS = 1_000_000  # so long before a timer expires its thread's server is closed already
-# Where a shaping node's server is in force, it is open for so long before the node watches for its
-# slot: 2 ms to take messages, and 2 ms for cycles whose beginning no server holds back (`LEAD_NS`
-# of `flow/threads.py`); and behind its pause, for its notes.
-BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
 
 
 class ApplicationPlan(Part):
@@ -121,6 +126,15 @@ class ApplicationPlan(Part):
         return tuple(node for chain in self.chains for node in plans.shaping_nodes(chain))
 
     @property
+    def receivers_at(self) -> dict[str, ReceiverPlace]:
+        """The places of nodes that receive outputs; of several, the first."""
+        found: dict[str, ReceiverPlace] = {}
+        for shaping in self.shaping_nodes:
+            if shaping.receivers_at is not None:
+                found = dict.fromkeys(shaping.receivers, shaping.receivers_at) | found
+        return found
+
+    @property
     def takes_turns(self) -> bool:
         """Whether threads of all servers of one priority take turns."""
         return any(chain.equal_priorities == "round-robin" for chain in self.chains)
@@ -130,12 +144,20 @@ class ApplicationPlan(Part):
         """The nodes that have an order among the threads of their server, which is the plan's.
 
         None has where they take turns, and only that which begins the chain where slots are made of
-        what single callbacks took: one that is interrupted by another takes longer.
+        what single callbacks took: one that is interrupted by another takes longer. In a pipeline
+        those downstream come first: they work on the older instance. Shaping nodes have none: the
+        one that wakes first publishes first, and watches the clock until then.
         """
         found: dict[str, None] = {}
+        gates = {node.thread for node in self.shaping_nodes}
         for chain in () if self.takes_turns else self.chains:
-            nodes = [thread.node for server in chain.servers for thread in server.threads]
-            found |= dict.fromkeys(nodes[:1] if chain.policy in PER_CALLBACK else nodes)
+            threads = [thread for server in chain.servers for thread in server.threads]
+            nodes = [thread.node for thread in threads if thread not in gates]
+            if chain.policy == "pipelined":
+                nodes.reverse()
+            elif chain.policy in PER_CALLBACK:
+                nodes = nodes[:1]
+            found |= dict.fromkeys(nodes)
         return tuple(found)
 
     @property

@@ -16,12 +16,12 @@ CP-SAT solver of OR-tools decides, which is exact as well but may run out of tim
 import math
 import random
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
 from itertools import combinations, product
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,14 +30,18 @@ from chainshaper.planning.overruns import in_cycle, slots_without
 from chainshaper.planning.plan import (
     PER_CALLBACK,
     Plan,
+    Server,
     Slot,
     below_executors,
+    publish_slots,
     publisher_servers,
     publishing_servers,
     revised,
     running_servers,
+    server_of,
+    shaping_nodes,
 )
-from chainshaper.planning.shaping import OUTPUT_PRIORITY
+from chainshaper.planning.shaping import BOUNDARY_NS, OUTPUT_PRIORITY
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 
@@ -46,31 +50,61 @@ TIME_LIMIT_SECONDS = 60.0
 MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
 SHARES = (0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of a slot that begins while no better one is open
 START_NS = 1_000_000  # at the least, so that the first callback begins in time
+LEAD_NS = 2_000_000  # a cycle starts so long after the chain's timer expires (DESIGN section 6)
+# Where a shaping node's server is in force, it is open for so long before the node watches for its
+# slot: 2 ms to take messages, and 2 ms for cycles whose beginning no server holds back
+# (:data:`LEAD_NS`); and behind its pause, for its notes.
+BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
+WAKE_UP_NS = 150_000  # of a gate that waits for the others
 MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
 
 
+_Slots: TypeAlias = Mapping[tuple[int, int], Sequence[Slot]]
+
+
 class Timetable(NamedTuple):
-    """What moves as one against others: a cycle, and the slots in it by core and priority."""
+    """What moves as one against others: a cycle, and the slots in it by core and priority.
+
+    ``begins`` are slots, by core and priority, in which no better server of others may run: that
+    which they do in ``busy``, by the same, with the time for which gates watch the clock before.
+    """
 
     name: str
     cycle_ns: int
     slots: dict[tuple[int, int], list[Slot]]
+    begins: _Slots = MappingProxyType({})
+    busy: _Slots = MappingProxyType({})
 
 
 def _timetable(own: Sequence[Plan], plans: Sequence[Plan], alone: float | None) -> Timetable:
-    """The slots of a chain, or of several that share servers, of which each counts once; and of
-    better servers of all plans, which must not run for this share of the slot that it begins with.
+    """The slots of a chain, or of several that share servers, of which each counts once; and the
+    share of the slot that it begins with in which no better server of the plans may run.
     """
     named = {one.name: one for plan in own for one in plan.servers if not one.best_effort}
+    watched_ns = {server.name: spin_ns for plan in own for server, spin_ns in _watching(plan)}
     slots: dict[tuple[int, int], list[Slot]] = {}
+    begins: dict[tuple[int, int], list[Slot]] = {}
+    busy: dict[tuple[int, int], list[Slot]] = {}
     for server in named.values():
-        slots.setdefault((server.core, server.priority), []).extend(server.slots)
+        before = watched_ns.get(server.name, 0)
+        place = server.core, server.priority
+        slots.setdefault(place, []).extend(server.slots)
+        watched = ((start - before, end) for start, end in server.slots)
+        busy.setdefault(place, []).extend(watched)
     first = {one.core: one for one in named.values() if one.slots[0][0] == 0}
     for core, best in sorted({(one.core, one.priority) for p in plans for one in p.servers}):
         if alone is not None and core in first and best < first[core].priority:
             length_ns = max(START_NS, int(alone * first[core].slots[0][1]))
-            slots.setdefault((core, best), []).append((0, length_ns))
-    return Timetable(" and ".join(map(chain_name, own)), own[0].cycle_ns, slots)
+            begins.setdefault((core, best), []).append((0, length_ns))
+    name = " and ".join(map(chain_name, own))
+    return Timetable(name, own[0].cycle_ns, slots, begins, busy)
+
+
+def _watching(plan: Plan) -> Iterator[tuple[Server, int]]:
+    """The servers of shaping nodes, and for how long these watch the clock before a slot."""
+    for node in shaping_nodes(plan):
+        if (server := server_of(plan, node.thread)) is not None:
+            yield server, node.spin_ns
 
 
 def place_chains(
@@ -78,7 +112,7 @@ def place_chains(
     *,
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
-    at_once: Callable[[], Sequence[Plan]] | None = None,
+    at_once: Callable[[bool], Sequence[Plan]] | None = None,
 ) -> tuple[tuple[Plan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
@@ -86,32 +120,105 @@ def place_chains(
     plans them again, with the latencies that they have when they run at the same time: the chain
     with the shorter period at the better priority, and only their publish slots stay apart. None
     begins while a better one runs, where that can be, for slots count from when a chain begins.
+    Where it cannot, ``at_once`` plans for stamps that shift (it is given True).
 
     Raises: as :func:`with_offsets`; OperationError also where chains that cannot take turns may not
-    run at the same time, or nothing says how long they delay each other then.
+    run at the same time, nothing says how long they delay each other then, or stamps shift so far
+    that an output may have to wait for others beyond its slot.
     """
     groups = together or [[k] for k in range(len(plans))]
     if at_once is None:
         _refuse_too_full(plans)
     try:
-        return with_offsets(plans, together=together, time_limit_s=time_limit_s), []
+        turns = with_offsets(plans, together=together, time_limit_s=time_limit_s)
     except OperationError as error:
         shared = _shared_threads(plans, groups)
         if at_once is None or shared:
             raise OperationError(f"{error}. {_turns_only(plans, shared)}") from error
-        ranked = _ranked(at_once(), groups)
         remark = f"{error}. Instead, the chains run at the same time at priorities of their own,"
         remark += " and only their publish slots do not overlap."
-        apart = partial(with_offsets, ranked, together=together, time_limit_s=time_limit_s)
-        return _longest_alone(apart), [remark]
+        apart = partial(with_offsets, together=together, time_limit_s=time_limit_s)
+        placed = _longest_alone(partial(apart, _ranked(at_once(False), groups)))
+        if placed is None:
+            placed = apart(_ranked(at_once(True), groups))
+        turns, remarks = placed, [remark]
+    else:
+        remarks = []
+    _refuse_outputs_behind_others(turns)
+    return turns, remarks
 
 
-def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...]:
-    """The offsets with which no better chain has the core for the largest of the shares."""
+def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...] | None:
+    """The offsets with which no better chain has the core for the largest of the shares, if any."""
     for share in SHARES:
         with suppress(OperationError):
             return apart(alone=share)
-    return apart()
+    return None
+
+
+def stamp_shift_ns(plan: Plan, plans: Sequence[Plan]) -> int:
+    """How much later than its cycle begins a chain may take the stamp from which its slots count:
+    0 where no better server, of any of the plans, has the core then.
+    """
+    (first, *_) = sorted(running_servers(plan), key=lambda one: one.slots[0][0])
+    own = {one.name for one in plan.servers}
+    for other in plans:
+        better = _timetable([other], [other], None)
+        common = math.gcd(plan.cycle_ns, other.cycle_ns)
+        named = {(one.core, one.priority) for one in other.servers if one.name not in own}
+        for core, priority in named if other is not plan else ():
+            if core != first.core or priority >= first.priority:
+                continue
+            for start, end in better.busy[core, priority]:
+                later = (start + other.offset_ns - plan.offset_ns) % common
+                if later < START_NS or later + end - start > common:
+                    return plan.evidence.interference_ns or 0
+    return 0
+
+
+def _refuse_outputs_behind_others(plans: Sequence[Plan]) -> None:
+    """Refuse outputs that have to wait for those of others beyond their slot when stamps shift.
+
+    The gate that wakes up first publishes first, so an output waits for publications that are due
+    at the same time, and for no watching of the clock.
+    """
+    shifts = [
+        stamp_shift_ns(one, plans) if one.anchor == "stamp" and one.shaping_node else 0
+        for one in plans
+    ]
+    for plan, shift in zip(plans, shifts, strict=True):
+        if plan.shaping_thread == "in-slots" and shift > BEHIND_NS:
+            said = f"{chain_name(plan)}: its stamps shift by up to {duration_text(shift)} where"
+            said += " chains run at the same time, and the slots of its shaping node's server do"
+            said += " not: leave the node's thread free (--shaping-thread free), or count slots"
+            raise OperationError(f"{said} from the cycle (--anchor cycle)")
+    longest = (one.evidence.longest_publication_ns for one in plans)
+    cost = [WAKE_UP_NS + (START_NS if one is None else one) for one in longest]
+    for k, plan in enumerate(plans):
+        if plan.shaping_node is None or not (slots := publish_slots(plan)):
+            continue
+        start, end = slots[-1]
+        waits, names = 0, []
+        for j, other in enumerate(plans):
+            if j == k or other.shaping_node is None or not (shifts[j] or shifts[k]):
+                continue
+            if other.shaping_node.core != plan.shaping_node.core:
+                continue
+            common = math.gcd(plan.cycle_ns, other.cycle_ns)
+            distance = other.offset_ns - plan.offset_ns - start
+            for its, _ in publish_slots(other):
+                later = (its + distance) % common
+                if later <= shifts[k] or common - later <= shifts[j] + cost[j]:
+                    waits += cost[j]
+                    names.append(chain_name(other))
+                    break
+        if waits >= end - start:
+            said = f"{chain_name(plan)}: stamps shift by up to"
+            said += f" {duration_text(max(shifts))} where chains run at the same time, and its slot"
+            said += f" of {duration_text(end - start)} may be over before the outputs of"
+            said += f" {', '.join(names)} are published: count slots from the cycle (--anchor"
+            said += f" cycle), or make them {duration_text(waits + BOUNDARY_NS)} long"
+            raise OperationError(f"{said} (--publish-slot)")
 
 
 def _shared_threads(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> set[str]:
@@ -222,7 +329,7 @@ def with_windows(
     together = linked(len(plans), [(j, k) for j, k in pairs if names[j] & names[k]])
     own = {n: at for n, (k, *_) in enumerate(together) if (at := windows_ns[k]) is not None}
     found = partial(with_offsets, plans, together=together, time_limit_s=time_limit_s, windows=own)
-    return _longest_alone(found)
+    return _longest_alone(found) or found()
 
 
 def _find_offsets(
@@ -280,10 +387,16 @@ class _Puzzle:
         for (j, one), (k, two) in combinations(enumerate(tables), 2):
             common = math.gcd(one.cycle_ns, two.cycle_ns)
             taken: list[Slot] = []
-            for place in one.slots.keys() & two.slots.keys():
-                for (start, end), (its, ends) in product(one.slots[place], two.slots[place]):
-                    # They collide if `two` starts later by more than start − ends, less than this:
-                    taken += in_cycle(start - ends + 1, end - its, common)
+            both: Sequence[tuple[_Slots, _Slots]] = (
+                (one.slots, two.slots),
+                (one.begins, two.busy),
+                (one.busy, two.begins),
+            )
+            for ours, theirs in both:
+                for place in ours.keys() & theirs.keys():
+                    for (start, end), (its, ends) in product(ours[place], theirs[place]):
+                        # They collide if `two` starts later by more than start − ends, less than:
+                        taken += in_cycle(start - ends + 1, end - its, common)
             if taken:
                 self.free[j, k] = common, slots_without([(0, common)], taken)
                 if not self.free[j, k][1]:
@@ -414,9 +527,13 @@ def _fullest(tables: Sequence[Timetable], group: Sequence[int]) -> str:
 
 
 def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
+    places = one.slots.keys() & two.slots.keys()
+    if not places:
+        reason = "one begins while a better one runs, at every offset"
+        return f"{one.name} and {two.name}: {reason} modulo {duration_text(common)}"
     needed, (core, priority) = max(
         (sum(max(end - start for start, end in own.slots[place]) for own in (one, two)), place)
-        for place in one.slots.keys() & two.slots.keys()
+        for place in places
     )
     excess = f", {duration_text(needed - common)} too long" if needed > common else ""
     said = f"the slots of {one.name} and {two.name} on core {core} at priority {priority} collide"

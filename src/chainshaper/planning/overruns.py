@@ -282,7 +282,10 @@ def plan_warnings(*chains: Plan) -> list[str]:
     found = []
     for plan in chains:
         name = f"{plan.chain.spec or plan.chain.output}: " if chains[1:] else ""
-        about = chain(_about_stages(plan), _about_late_outputs(plan), _about_evidence(plan))
+        about = chain(
+            *(_about_stages(plan), _about_late_outputs(plan), _about_evidence(plan)),
+            _about_receivers(plan),
+        )
         found += [f"{name}{warning}" for warning in (*about, *publication_warnings(plan))]
     return found
 
@@ -358,6 +361,15 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
     if cycles >= needed and late > OVERRUN_PROBABILITY and margin.source != "derived":
         said = f"by the latencies of all cycles, up to {late:.1%} of the outputs will miss their"
         yield f"{said} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."
+
+
+def _about_receivers(plan: Plan) -> Iterator[str]:
+    """Who receives an output without a place in the plan."""
+    node = plan.shaping_node
+    if node is not None and node.receivers and node.receivers_at is None:
+        said = f"{', '.join(node.receivers)}, which get {node.output}, run below all servers, and"
+        said += " when their callbacks start is not promised: the plan has no room for them, or the"
+        yield f"{said} recording does not say how long they take. A core without servers helps."
 
 
 def modes_with_one_slot(plan: Plan) -> Iterator[tuple[tuple[str, ...], Slot]]:

@@ -96,7 +96,9 @@ class Evidence(Part):
     of the average and the longest latency that is for others
     (:mod:`~chainshaper.planning.profile`). ``longest_send_ns`` is of the output's asynchronous
     publisher, ``longest_publication_ns`` of its synchronous one; ``publish_slot`` says where Δ is
-    from. ``intra_process``: subscribers get the output without DDS. None is: not known.
+    from. ``delivery_ns`` is how long an output is on its way to its receiver's callback: least,
+    mean and longest, without the time for which others had that one's core. ``intra_process``:
+    subscribers get the output without DDS. None is: not known.
     """
 
     recording: str | None = None
@@ -115,6 +117,7 @@ class Evidence(Part):
     longest_send_ns: Duration | None = None
     longest_publication_ns: Duration | None = None
     publish_slot: Literal["given", "measured", "least"] | None = None
+    delivery_ns: tuple[Duration, Duration, Duration] | None = None
     lost_events: FromOne | None = None
     all_disturbed: Literal[True] | None = None
     intra_process: Literal[True] | None = None
@@ -204,6 +207,18 @@ class Server(Part):
         return self
 
 
+class ReceiverPlace(Part):
+    """Where the executors of those run that receive a shaped output.
+
+    At the ``priority`` of outputs, as servers count it, they run behind shaping nodes and above all
+    servers of chains. For ``time_ns`` in a cycle, at most, the plan leaves the core to them.
+    """
+
+    core: Count
+    priority: FromOne
+    time_ns: Duration
+
+
 class ShapingNode(Part):
     """The node that takes the chain's output from ``input`` and republishes it on ``output``, in
     the slots of the server that has its thread.
@@ -211,10 +226,10 @@ class ShapingNode(Part):
     It spins from ``spin_ns`` before the slot on, and pauses for ``pause_ns`` after a publication so
     that it does not delay delivery. ``publisher`` is the node whose output it takes, where that is
     not `chain.publisher`. The executors of ``receivers``, which subscribe to the output, run under
-    SCHED_FIFO below all servers. ``depth`` messages may wait in it (None: see :class:`.Wishes`).
-    With ``in_process`` it is a thread in the publisher's process, where a library takes what is
-    published, which tracers call ``input``. With ``delivery_ns`` a library in the receivers'
-    processes hands them each message that long behind its publication.
+    SCHED_FIFO, at ``receivers_at`` or, without, below all servers. ``depth`` messages may wait in
+    it (None: see :class:`.Wishes`). With ``in_process`` it is a thread in the publisher's process,
+    where a library takes what is published, which tracers call ``input``. With ``delivery_ns`` a
+    library in the receivers' processes hands them each message that long behind its publication.
     """
 
     name: Annotated[str, _plain_name("node")]
@@ -226,6 +241,7 @@ class ShapingNode(Part):
     spin_ns: Duration
     pause_ns: Duration
     receivers: tuple[FullName, ...] = ()
+    receivers_at: ReceiverPlace | None = None
     depth: FromOne | None = None
     in_process: bool = False
     delivery_ns: PositiveDuration | None = None
@@ -287,7 +303,8 @@ class Prediction(Part):
     """What the plan promises: end-to-end latency, and the share of cycles per latency band.
 
     A band is represented by the end of its slot (section 4.1). The jitter is the widest distance of
-    two outputs, from the start of the first slot to the end of the last. ``modes`` has each mode's.
+    two outputs, from the start of the first slot to the end of the last. ``modes`` has each mode's,
+    ``receivers`` the same until the receiver's callback starts (None: nothing is promised).
     """
 
     mean_ns: Duration
@@ -295,6 +312,7 @@ class Prediction(Part):
     jitter_ns: Duration
     shares: tuple[Share, ...] = ()
     modes: "dict[ModeName, Prediction] | None" = None
+    receivers: "Prediction | None" = None
 
 
 class BandPrediction(NamedTuple):

@@ -42,7 +42,8 @@ _SECTION_COMMENTS = {
     "equal_priorities": "servers of one core and priority take turns; apart: they never overlap",
     "servers": "a thread runs only in its server's slots; a smaller priority is better, and of\n"
     "# its threads the first is the most urgent",
-    "shaping_node": "republishes the output in its slots; receivers get SCHED_FIFO below servers",
+    "shaping_node": "republishes the output in its slots; those that receive it have\n"
+    "# SCHED_FIFO above the servers of chains, for so long in a cycle; or, without a place, below",
     "modes": "each mode's band, 1 is the first slot; the topic (std_msgs/String) names the mode",
     "adaptation": "how slots follow the latencies (apply --adapt): later when so many times the"
     " promised share\n# of a window is late, earlier for this gain after so many cycles",

@@ -11,14 +11,14 @@ the longest time for which the others can have it (Joseph and Pandya, The Comput
 over all that may run before the chain on its cores, each every T, for C at most, and up to J later
 in one cycle than in another: the branches that begin with it, in any order, behind the fork; chains
 of a better priority, where they run at the same time; the shaping nodes of all other chains, which
-spin before a slot and publish.
+take a message when it comes, and later watch the clock before a slot and publish.
 
 The longest latency, and the last slot with it, is behind all of it; bands before that are placed by
 what was measured, as far as it is in between.
 """
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain as joined
 from typing import Literal, NamedTuple, TypeAlias
@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.margins import check_latencies
-from chainshaper.planning.plan import PER_CALLBACK, SHORTEST_SLOT_NS
+from chainshaper.planning.plan import PER_CALLBACK, SHORTEST_SLOT_NS, UNSHAPED
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
@@ -35,9 +35,14 @@ from chainshaper.values.plan_choices import Wishes
 
 _Stage: TypeAlias = tuple[str, str | None]
 """A callback of a graph, by its node and what it publishes."""
+UNKNOWN = -1  # of a duration that a recording does not tell
 START_UP_NS = 3_000_000_000  # in so long an application starts, or ends
 APART = 1.3  # so many times as long as others is no part of their tail
 FEWEST = 20  # cycles, to tell one from the others
+MOST_ROUNDS = 20  # until the chains' delays, which depend on each other, stay as they are
+# A gate wakes up for a message, takes it, wakes up again behind its pause, and takes notes: so long
+# in the simulator (docs/simulator.md), and less in a live one, beside watching and publishing.
+GATE_TAKES_NS = 400_000
 OFTEN = 0.05  # of a chain's cycles: so often a callback of others on its threads is worth a note
 
 
@@ -50,6 +55,23 @@ class Interfering(NamedTuple):
     origins: tuple[str, ...]
     share: float
     longest_ns: int
+
+
+class Reception(NamedTuple):
+    """How an output gets to those that receive it (ns).
+
+    ``core`` is theirs (None: several, or not known). A message is on its way for ``shortest_ns`` to
+    ``longest_ns``, without the time for which others had that core. Its callbacks take ``time_ns``
+    at most, and others of their executors ``beside_ns`` in a cycle, each ``longest_beside_ns``.
+    """
+
+    core: int | None
+    shortest_ns: int
+    mean_ns: int
+    longest_ns: int
+    time_ns: int
+    beside_ns: int = 0
+    longest_beside_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -67,12 +89,17 @@ class Profile:
     callback's number in the graph, and its name, ``upstream`` the topics that the output waits for:
     on the chain, on those branches, and before. ``callbacks`` are those of the chain and its
     branches, see :func:`~chainshaper.planning.shaping.server_per_callback`. ``steps_ns`` and
-    ``every_step_ns`` are what each callback of the chain took, a row per latency.
+    ``every_step_ns`` are what each callback of the chain took, a row per latency;
+    ``graph_steps_ns`` and ``every_graph_step_ns`` the same of ``callbacks``, where some are on
+    branches: ``begins_ns`` is how long after the chain each began, at most, which waits for none,
+    :data:`UNKNOWN` where that varies.
     ``asynchronous``: the process of the output's writer has a thread that publishes. ``together``
     are nodes that share a process, ``simulated`` nodes of the chain that follow `/clock`,
+    ``others_ns`` is for how long gates of other chains may have its cores in a cycle,
     ``interfering`` what else the chain's threads run, ``contradictions`` what in the recording's
-    events contradicts itself about its callbacks, in words. The rest is
-    :class:`~chainshaper.planning.plan.Evidence`, and :class:`~.plan.ChainOfPlan`.
+    events contradicts itself about its callbacks, in words; ``reception`` is None where nothing
+    says how the output is received. The rest is :class:`~chainshaper.planning.plan.Evidence`, and
+    :class:`~.plan.ChainOfPlan`.
     """
 
     latencies_ns: NDArray[np.int64]
@@ -91,9 +118,15 @@ class Profile:
     every_node: tuple[str, ...] = ()
     together: tuple[tuple[str, ...], ...] = ()
     receivers: tuple[str, ...] = ()
+    reception: Reception | None = None
     callbacks: tuple[CallbackTimes, ...] = ()
     steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     every_step_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    graph_steps_ns: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
+    every_graph_step_ns: NDArray[np.int64] = field(
+        default_factory=lambda: np.zeros((0, 0), np.int64)
+    )
+    begins_ns: tuple[int, ...] = ()
     fifo_priority: int = 84
     output_depth: int | None = None
     recording: str | None = None
@@ -104,6 +137,7 @@ class Profile:
     longest_stall_ns: int | None = None
     utilisation: float | None = None
     interference_ns: int | None = None
+    others_ns: int = 0
     longest_send_ns: int | None = None
     longest_publication_ns: int | None = None
     asynchronous: bool | None = None
@@ -151,8 +185,10 @@ class Profile:
     def chosen(self, these: NDArray[np.bool_]) -> "Profile":
         """The profile with the longest latency of these cycles; the others stay in ``every``."""
         steps = self.steps_ns[these] if len(self.steps_ns) == len(these) else self.steps_ns
+        of_graph = self.graph_steps_ns
         return replace(
             self,
+            graph_steps_ns=of_graph[these] if len(of_graph) == len(these) else of_graph,
             latencies_ns=self.latencies_ns[these],
             starts_ns=self.starts[these],
             measured_ns=None if self.measured_ns is None else self.measured_ns[these],
@@ -270,39 +306,107 @@ def interference(own_ns: int, rivals: Sequence[Rival], limit_ns: int) -> int:
 
 
 def with_interference(
-    profiles: Sequence[Profile], groups: Sequence[Sequence[int]], wishes: Wishes, *, at_once: bool
+    profiles: Sequence[Profile],
+    groups: Sequence[Sequence[int]],
+    wishes: Wishes,
+    *,
+    at_once: bool,
+    shifting: bool = False,
 ) -> list[Profile]:
     """The profiles with the latencies that the chains can have while all of them run.
 
     ``groups`` are the places of chains that begin together. With ``at_once`` groups do not take
-    turns: those of a shorter period run at a better priority. Where every callback has slots of
-    its own nothing is added.
+    turns: those of a shorter period run at a better priority, and, with ``shifting``, one may have
+    to wait before it takes its stamp, from which its slots count. Where every callback has slots of
+    its own nothing is added to the latency: ``others_ns`` is what each slot has to have room for.
     """
-    if len(profiles) == 1 or wishes.policy in PER_CALLBACK:
+    if len(profiles) == 1:
         return list(profiles)
+    if wishes.policy in PER_CALLBACK:
+        return [
+            replace(one, others_ns=_of_gates_beside(k, profiles, wishes))
+            for k, one in enumerate(profiles)
+        ]
     undelayed = [alone(profile) for profile in profiles]
-    delayed = list(undelayed)
-    gates = wishes.policy != "server-per-chain" and wishes.publication != "asynchronous"
-    better: list[list[Profile]] = []  # the chains of each group so far
+    delays = [0] * len(profiles)
+    for _ in range(MOST_ROUNDS):
+        before = delays
+        delays = _delays(undelayed, groups, wishes, before, (at_once, shifting))
+        if delays == before:
+            break
+    measured = (profile.latencies_ns for profile in profiles)
+    return list(map(_later, undelayed, delays, measured))
+
+
+def _of_gates_beside(k: int, profiles: Sequence[Profile], wishes: Wishes) -> int:
+    """For how long the gates of other chains may have the cores of a chain in one of its cycles."""
+    if wishes.policy in UNSHAPED or wishes.publication == "asynchronous":
+        return 0
+    own, cores = profiles[k], {*profiles[k].core_of.values()}
+    return sum(
+        (1 + -(-own.period_ns // one.period_ns)) * one.cost_ns
+        for place, other in enumerate(profiles)
+        if place != k and other.core_of.get(other.last or "") in cores
+        for one in _of_gate(other, wishes, 0, False)
+    )
+
+
+def _delays(
+    profiles: Sequence[Profile],
+    groups: Sequence[Sequence[int]],
+    wishes: Wishes,
+    before_ns: Sequence[int],
+    together: tuple[bool, bool],
+) -> list[int]:
+    """How long each chain may be delayed, where the others come up to ``before_ns`` later, by
+    whether they run at once, and stamps shift.
+    """
+    at_once, shifting = together
+    delays, better = [0] * len(profiles), list[Sequence[int]]()
+    gates = wishes.policy not in UNSHAPED and wishes.publication != "asynchronous"
     for group in sorted(groups, key=lambda one: (profiles[one[0]].period_ns, one[0])):
         for k in group:
-            one, siblings = undelayed[k], [undelayed[j] for j in group if j != k]
+            one, siblings = profiles[k], [profiles[j] for j in group if j != k]
             forked = {*_stages([one])} - {*_stages(siblings)}  # none of these before the fork
             rivals = [Rival(one.period_ns, _demand(one, siblings, forked))]
-            for chains in better if at_once else ():  # what waits elsewhere comes late
+            for places in better if at_once else ():  # what waits elsewhere comes late
+                chains = [profiles[j] for j in places]
                 cost = _demand(one, chains, _stages([one]))
-                jitter = max(0, max(map(_longest_in_time, chains)) - cost)
-                rivals.append(Rival(chains[0].period_ns, cost, jitter))
-            for place, other in enumerate(undelayed):
+                latest = max(_longest_in_time(profiles[j], delays[j]) for j in places)
+                rivals.append(Rival(chains[0].period_ns, cost, max(0, latest - cost)))
+            for place, other in enumerate(profiles):
                 cores = _cores(one, forked if place in group else _stages([one]))
                 if gates and place != k and other.core_of.get(other.last or "") in cores:
-                    longest = other.longest_publication_ns
-                    cost = wishes.spin_ns + (SHORTEST_SLOT_NS if longest is None else longest)
-                    rivals.append(Rival(other.period_ns, cost))
-            delay = interference(_longest_in_time(one), rivals, one.period_ns)
-            delayed[k] = _later(one, delay, profiles[k].latencies_ns)
-        better.append([delayed[k] for k in group])
-    return delayed
+                    rivals += _of_gate(other, wishes, before_ns[place], shifting)
+                    rivals += _of_receivers(other, profiles, before_ns[place])
+            delays[k] = interference(_longest_in_time(one), rivals, one.period_ns)
+        better.append(group)
+    return delays
+
+
+def _of_gate(other: Profile, wishes: Wishes, delay_ns: int, shifting: bool) -> Iterator[Rival]:
+    """For how long the gate of another chain, which may be delayed by so much, has its core: for
+    each message when it comes, and when it leaves.
+    """
+    apart = max(0, _longest_in_time(other) - int(other.every.min()))
+    yield Rival(other.period_ns, GATE_TAKES_NS, apart + delay_ns)
+    longest = other.longest_publication_ns
+    cost = wishes.spin_ns + (SHORTEST_SLOT_NS if longest is None else longest)
+    shift = delay_ns if shifting and wishes.anchor == "stamp" else 0
+    yield Rival(other.period_ns, cost, shift + (0 if wishes.bands == 1 else apart + delay_ns))
+
+
+def _of_receivers(other: Profile, profiles: Sequence[Profile], delay_ns: int) -> Iterator[Rival]:
+    """For how long those have the core that receive another chain's output, if they are on it."""
+    one = other.reception
+    if one is not None and one.core in (None, *planned_cores(profiles)):
+        apart = max(0, _longest_in_time(other) - int(other.every.min()))
+        yield Rival(other.period_ns, one.time_ns + one.beside_ns, apart + delay_ns)
+
+
+def planned_cores(profiles: Sequence[Profile]) -> set[int]:
+    """The cores on which servers run these chains."""
+    return {core for one in profiles for core in one.core_of.values()}
 
 
 def alone(profile: Profile) -> Profile:
@@ -329,9 +433,11 @@ def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> P
     )
 
 
-def _longest_in_time(profile: Profile) -> int:
-    """The longest of all cycles that fit into the period: one that does not is late anyway."""
-    every = profile.every
+def _longest_in_time(profile: Profile, delay_ns: int = 0) -> int:
+    """The longest of all cycles that fit into the period when all are so much later: one that does
+    not is late anyway.
+    """
+    every = profile.every + delay_ns
     return int(every[every < profile.period_ns].max(initial=0))
 
 

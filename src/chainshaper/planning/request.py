@@ -27,9 +27,17 @@ from chainshaper.planning.bands import (
 )
 from chainshaper.planning.cores import assign_cores
 from chainshaper.planning.offsets import refuse_common
-from chainshaper.planning.pipeline import pipelined, stage_places
+from chainshaper.planning.pipeline import Work, pipelined, stage_places, work_of
 from chainshaper.planning.plan import UNSHAPED, Evidence, Margin, Modes, Plan, Prediction, Slot
-from chainshaper.planning.profile import Profile, alone, deciding_cycles, up_to, with_interference
+from chainshaper.planning.profile import (
+    UNKNOWN,
+    Profile,
+    alone,
+    deciding_cycles,
+    up_to,
+    with_interference,
+)
+from chainshaper.planning.receivers import with_receivers_placed, without_reception
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Policy, Wishes
@@ -68,6 +76,8 @@ def plan_chain(
     try:
         return _plan_chain(profile, request, sinks)
     except OperationError as error:
+        if profile.reception is not None:  # there may be room for the chain alone
+            return plan_chain(without_reception(profile), request, sinks)
         remark = next(filter(None, map(deciding_cycles, (profile, *sinks))), None)
         if remark is None or request.percentile is not None:
             raise
@@ -78,7 +88,9 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
     refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
     refuse_simulated((profile, *sinks), request)
-    profile, *sinks = _prepared((profile, *sinks), request)
+    if not keeps_places(request):
+        profile = without_reception(profile)
+    profile, *sinks = _prepared((profile, *map(without_reception, sinks)), request)
     if (modes := request.modes) is not None and profile.of_modes and request.policy == "shaped":
         profile, margin, modes, finish = _together(profile, request, modes)
     else:
@@ -120,7 +132,14 @@ def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]
         raise InputError(f"{reason}: leave it out, or plan with --publication synchronous")
     plan = shaping.with_executors(plan, [one.executors for one in (profile, *sinks)])
     plan = shaping.with_turns(plans.revised(plan, modes=modes), request.equal_priorities)
+    (plan,) = with_receivers_placed([plan], [profile])
     return shaping.with_best_effort([plan], best_effort_cores([profile], request))[0]
+
+
+def keeps_places(request: PlanRequest) -> bool:
+    """Whether a plan keeps places for those that receive what shaping nodes publish."""
+    gates = request.policy not in UNSHAPED and request.publication != "asynchronous"
+    return gates and request.with_receivers
 
 
 def _prepared(every: Sequence[Profile], request: PlanRequest) -> list[Profile]:
@@ -134,14 +153,42 @@ def _prepared(every: Sequence[Profile], request: PlanRequest) -> list[Profile]:
 
 
 def _apart(profile: Profile) -> Profile:
-    """The profile of a chain whose instances do not overlap: what its callbacks took, in sum."""
+    """The profile of a chain whose instances do not overlap: what its callbacks took, in sum, or,
+    where branches join, on the longest way.
+    """
     name = profile.name or "a chain"
     if not profile.steps_ns.size:
         raise InputError(f"{name}: stages are cut by what callbacks took: plan from a recording")
-    if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
-        reason = f"{name} waits for {', '.join(beside)} beside it, which would begin too early"
-        raise InputError(f"{reason}: begin the chain behind what waits for them")
-    return alone(profile)
+    if not profile.graph_steps_ns.size:
+        if beside := sorted(Counter(p.node for p in profile.callbacks) - Counter(profile.nodes)):
+            reason = f"{name} waits for {', '.join(beside)} beside it, and what these took"
+            raise InputError(f"{reason} is not known: plan from a recording")
+        return alone(profile)
+    if UNKNOWN in profile.begins_ns:
+        node = profile.callbacks[profile.begins_ns.index(UNKNOWN)].node
+        reason = f"{name} waits for what {node} begins, and how long after {profile.nodes[0]} that"
+        reason += " is varies in the recording, in which instances wait for each other: record its"
+        raise InputError(f"{reason} nodes on more cores (`chainshaper profile --policy pipelined`)")
+    return replace(
+        profile,
+        latencies_ns=_work(profile, profile.graph_steps_ns).finished_ns[:, -1],
+        every_latency_ns=_work(profile, profile.every_graph_step_ns).finished_ns[:, -1],
+    )
+
+
+def _work(profile: Profile, steps_ns: NDArray[np.int64]) -> Work:
+    """What a pipeline is made of: these steps, of the chain or, with branches, of the graph."""
+    if not profile.graph_steps_ns.size:
+        along = [range(k - 1, k) if k else () for k in range(len(profile.nodes))]
+        return work_of(profile.nodes, along, steps_ns, [0] * len(along))
+    callbacks = profile.callbacks
+    nodes, first = [one.node for one in callbacks], profile.topics[0]
+    begins = next(
+        k
+        for k, one in enumerate(callbacks)
+        if (one.node, one.publishes) == (profile.nodes[0], first)
+    )
+    return work_of(nodes, [one.after for one in callbacks], steps_ns, profile.begins_ns, begins)
 
 
 def best_effort_cores(
@@ -165,8 +212,12 @@ def best_effort_cores(
 
 def _places(profiles: Sequence[Profile], cores: Sequence[int]) -> dict[str, int]:
     """The place in ``cores`` of the stage that each node of a pipeline is in."""
-    staged = (stage_places(p.nodes, _apart(p).steps_ns, p.period_ns, len(cores)) for p in profiles)
-    return {node: place for own in staged for node, place in own.items()}
+    places: dict[str, int] = {}
+    for one in profiles:
+        apart = _apart(one)
+        steps = apart.graph_steps_ns if apart.graph_steps_ns.size else apart.steps_ns
+        places |= stage_places(_work(apart, steps), one.period_ns, len(cores))
+    return places
 
 
 def stages_before(profiles: Sequence[Profile], request: PlanRequest) -> dict[str, int]:
@@ -416,44 +467,63 @@ def _margin(profile: Profile, request: PlanRequest) -> Margin:
             epsilon_ns=request.epsilon_ns, overrun_probability=late, independent_cycles=clustered
         )
     covered = profile.latencies_ns if request.ideal_machine else every
-    least = margins.least_epsilon_ns(request.publication)
     # No margin covers cycles for a slot that stands elsewhere, or those that have been left out.
     covers = request.policy not in OWN_SLOTS or request.policy == "pipelined"
-    if request.percentile is not None:
-        covers = False
+    covers &= request.percentile is None
     if probability is not None and covers:
-        margin = margins.derive_margin(
-            covered, probability, request.seed, longest_ns=longest, least_ns=least
-        )
-        if not request.ideal_machine:
-            return margin
-        in_time = longest + margin.epsilon_ns - least
-        late = margins.late_share(every, in_time, independent)
-        beyond = np.any(every > in_time)
-        return margin.model_copy(update={"overrun_probability": late}) if beyond else margin
+        return _asked_margin(covered, profile, request, probability, independent)
     stalls = max(0, _covering(covered, profile, request) - longest) if covers else 0
-    # Of the latencies themselves: what the least margin adds is the way to the shaping node, and
-    # how many cycles end within it is an accident of the sample.
-    late = margins.late_share(every, longest + stalls, independent)
-    usual = margins.OVERRUN_PROBABILITY
-    if covers and covered is every and independent >= margins.cycles_needed(usual):
-        # Which of the longest covers the usual share was fixed before they were seen.
-        rank = margins.covering_rank(independent, usual)
-        if longest + stalls >= np.sort(every)[-rank]:
-            fewer = int(np.count_nonzero(every > longest)) if stalls == 0 else rank - 1
-            surely = margins.most_probable(fewer, independent, margins.WELL_COVERED)
-            late = min(usual, surely)
+    all_covered = covers and not request.ideal_machine
+    late = _late_by_default(every, longest, stalls, independent, all_covered=all_covered)
     if probability is not None and late > probability:
         reason = f"up to {late:.2g} of the outputs will be late, more than {probability:g}"
         remedy = "the margin covers no share with --percentile, nor where slots are a policy's own"
         raise OperationError(f"{reason}: {remedy}. Leave out --overrun-probability")
     return Margin(
-        epsilon_ns=least + stalls,
+        epsilon_ns=margins.least_epsilon_ns(request.publication) + stalls,
         source="measured",
         overrun_probability=late,
         stalls_ns=stalls,
         independent_cycles=clustered,
     )
+
+
+def _asked_margin(
+    covered: NDArray[np.int64],
+    profile: Profile,
+    request: PlanRequest,
+    probability: float,
+    independent: int,
+) -> Margin:
+    """The margin for a share of late outputs that was asked for, of the cycles that are covered;
+    where others are late besides, with the share of all."""
+    longest, least = profile.longest_ns, margins.least_epsilon_ns(request.publication)
+    margin = margins.derive_margin(
+        covered, probability, request.seed, longest_ns=longest, least_ns=least
+    )
+    in_time = longest + margin.epsilon_ns - least
+    if not request.ideal_machine or not np.any(profile.every > in_time):
+        return margin
+    late = margins.late_share(profile.every, in_time, independent)
+    return margin.model_copy(update={"overrun_probability": late})
+
+
+def _late_by_default(
+    every: NDArray[np.int64], longest: int, stalls: int, independent: int, *, all_covered: bool
+) -> float:
+    """The share of outputs that will be late where the least margin is behind ``longest + stalls``.
+
+    It is counted from the latencies themselves: what the least margin adds is the way to the
+    shaping node, and how many cycles end within it is an accident of the sample. Where the usual
+    share is covered, that is promised, or what is smaller by a confidence that leaves no doubt.
+    """
+    usual = margins.OVERRUN_PROBABILITY
+    if all_covered and independent >= margins.cycles_needed(usual):
+        rank = margins.covering_rank(independent, usual)  # fixed before the sample was seen
+        if longest + stalls >= np.sort(every)[-rank]:
+            beyond = rank - 1 if stalls else int(np.count_nonzero(every > longest))
+            return min(usual, margins.most_probable(beyond, independent, margins.WELL_COVERED))
+    return margins.late_share(every, longest + stalls, independent)
 
 
 def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
@@ -473,10 +543,16 @@ def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
         reason = f"the policy {request.policy} needs the chain's callbacks"
         raise InputError(f"{reason}: plan from a recording")
     if request.policy == "pipelined":
-        steps, every = profile.steps_ns, profile.every_step_ns
+        with_branches = bool(profile.graph_steps_ns.size)
+        steps = profile.graph_steps_ns if with_branches else profile.steps_ns
         if profile.all_disturbed:
-            steps = every[every.sum(axis=1) <= profile.longest_ns]
-        return pipelined(plan, profile.nodes, steps, profile.core_of, request.cores)
+            every = profile.every_graph_step_ns if with_branches else profile.every_step_ns
+            steps = every[_work(profile, every).finished_ns[:, -1] <= profile.longest_ns]
+        work, cores = _work(profile, steps), request.cores
+        one, room_ns = profile.reception, profile.others_ns
+        if one is not None and one.core in (None, *(cores or profile.core_of.values())):
+            room_ns += one.time_ns + one.beside_ns
+        return pipelined(plan, work, profile.core_of, cores, room_ns=room_ns)
     if request.policy == "server-per-callback":
         margin_ns = plan.margin.epsilon_ns
         return shaping.server_per_callback(plan, profile.callbacks, margin_ns=margin_ns)

@@ -27,9 +27,15 @@ from chainshaper.planning.plan import (
     with_slots,
 )
 from chainshaper.planning.profile import Profile, with_interference
+from chainshaper.planning.receivers import (
+    has_places,
+    with_receivers_placed,
+    without_reception,
+)
 from chainshaper.planning.request import (
     PlanRequest,
     best_effort_cores,
+    keeps_places,
     moved_to,
     on_cores,
     plan_chain,
@@ -61,9 +67,14 @@ def plan_application(
         raise InputError("no chain is named: give one at least")
     refuse_entangled(profiles, request.policy)
     refuse_simulated(profiles, request)
+    if not keeps_places(request):
+        profiles = [without_reception(one) for one in profiles]
     try:
         return _on_wished_cores(profiles, request, time_limit_s)
     except OperationError as error:
+        if any(one.reception for one in profiles):  # there may be room for the chains alone
+            alone = [without_reception(one) for one in profiles]
+            return plan_application(alone, request, time_limit_s=time_limit_s)
         fits = list(_fitting(profiles, request, time_limit_s)) if len(profiles) > 1 else []
         if not fits:
             raise
@@ -135,8 +146,8 @@ def _planned(
 ) -> tuple[ApplicationPlan, list[str]]:
     own, groups = replace(request, best_effort=()), beginning_together(profiles)
 
-    def plans(at_once: bool) -> list[Plan]:
-        delayed = with_interference(profiles, groups, request, at_once=at_once)
+    def plans(shifting: bool = False, *, at_once: bool) -> list[Plan]:
+        delayed = with_interference(profiles, groups, request, at_once=at_once, shifting=shifting)
         found = [_beside_others(profile, delayed, own) for profile in delayed]
         for group in groups:
             for k, plan in zip(group, _sharing_servers([found[k] for k in group]), strict=True):
@@ -147,6 +158,10 @@ def _planned(
     placed, remarks = place_chains(
         plans(at_once=False), together=groups, time_limit_s=time_limit_s, at_once=at_once
     )
+    # What has no place in the chain's plan alone has none beside others.
+    pairs = zip(placed, profiles, strict=True)
+    placed_for = [one if has_places(plan) else without_reception(one) for plan, one in pairs]
+    placed = tuple(with_receivers_placed(placed, placed_for))
     return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 
 

@@ -132,7 +132,7 @@ def _gate(
         raise InputError("asynchronous publication: name the node that publishes the output")
     pause = min(PAUSE_NS, chain.period_ns // 20) if wishes.pause_ns is None else wishes.pause_ns
     node = ShapingNode(
-        **_names(chain.output),
+        **_names(chain.output),  # type: ignore[arg-type]
         depth=wishes.depth,
         core=core,
         fifo_priority=fifo_priority,
@@ -157,6 +157,7 @@ def _node_like(
     """A shaping node for another topic, with the core, priority and waiting of a given one."""
     delivery_ns = node.delivery_ns if receivers else None
     others = {"publisher": publisher, "receivers": tuple(receivers), "delivery_ns": delivery_ns}
+    others["receivers_at"] = None
     return ShapingNode.model_validate({**node.model_dump(), **_names(output), **others})
 
 

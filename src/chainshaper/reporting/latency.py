@@ -373,6 +373,12 @@ def prediction_table(judged: JudgedPrediction, name: str = "") -> ResultTable:
         differs = "worse" if figure.worse else "better"
         verdict = {True: "as predicted", False: differs, None: ABSENT}[figure.holds]
         table.add(title, figure.range_text, ms(figure.measured_ns), verdict, "", "", "")
+    if (received := judged.receivers) is not None:
+        promised = f"{milliseconds(received.predicted_max_ns)} at most"
+        verdict = f"{received.behind} of {received.count} behind"
+        table.add("received, maximum", promised, ms(received.max_ns), verdict, "", "", "")
+        promised = f"{milliseconds(received.predicted_jitter_ns)} at most"
+        table.add("received, jitter", promised, ms(received.jitter_ns), "", "", "", "")
     table.line()
     for number, band in enumerate(judged.bands, start=1):
         name = band.mode or f"band {number}"
@@ -413,6 +419,7 @@ def prediction_json(judged: JudgedPrediction) -> dict[str, Any]:
         "mean_ns": plain(judged.mean),
         "max_ns": plain(judged.max),
         "jitter_ns": plain(judged.jitter),
+        "receivers": None if judged.receivers is None else vars(judged.receivers),
         "bands": [vars(band) for band in judged.bands],
         "late": judged.late,
         "late_of_all": judged.outputs.late,

@@ -371,7 +371,19 @@ def plan_table(plan: Plan) -> ResultTable:
         table.add(one.name, one.core, one.priority, slots_ms(*one.slots), ", ".join(threads))
     offset = f", offset {milliseconds(plan.offset_ns)}" if plan.offset_ns else ""
     table.caption = f"cycle {milliseconds(plan.cycle_ns)}{offset}; {expected_jitter_text(plan)}"
+    if (received := receivers_text(plan)) is not None:
+        table.caption += f"\n{received}"
     return table
+
+
+def receivers_text(plan: Plan) -> str | None:
+    """What a plan promises for those that receive its output, and where they run."""
+    node, promised = plan.shaping_node, plan.predicted.receivers
+    if node is None or node.receivers_at is None or promised is None:
+        return None
+    said = f"{', '.join(node.receivers)} on core {node.receivers_at.core}: callbacks start by"
+    said += f" {milliseconds(promised.max_ns)}, jitter"
+    return f"{said} {milliseconds(promised.jitter_ns)} at most"
 
 
 def bands_table(plan: Plan) -> ResultTable:

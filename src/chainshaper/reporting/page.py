@@ -25,7 +25,7 @@ from typing import Any, Literal
 import numpy as np
 import polars as pl
 
-from chainshaper.analysis import DataFlow, callback_statistics, data_flow
+from chainshaper.analysis import DataFlow, callback_statistics, recorded_flow
 from chainshaper.planning import Plan, dump_plan, publish_slots
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting import latency as of_chain
@@ -97,7 +97,7 @@ def report_page(
     shared, several = chains[0].measurements, len(chains) > 1
     names = distinct_names([one.recording.path for one in shared])
     recorded = {id(one.recording): one.recording for one in every}  # once, whatever its chains
-    flows = {key: data_flow(one.events, one.info.clock_offset_ns) for key, one in recorded.items()}
+    flows = {key: recorded_flow(one) for key, one in recorded.items()}
     page, of_each, style, script = (
         (resources.files("chainshaper.reporting") / name).read_text("utf-8")
         for name in ("page.html", "chain.html", "page.css", "page.js")

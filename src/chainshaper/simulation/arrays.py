@@ -12,7 +12,7 @@ import numpy as np
 from chainshaper.analysis.chains import find_chain
 from chainshaper.gate.decision import CHANGES
 from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Server, Thread
+from chainshaper.planning.plan import ReceiverPlace, Server, Thread
 from chainshaper.simulation import layout as at
 from chainshaper.simulation.layout import NONE, C, D, E, G, H, I, Int64s, M, P, R, T, X
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
@@ -77,14 +77,15 @@ class Process(NamedTuple):
 class System:
     """An application with everything that runs in it, numbered as in the engine's array.
 
-    ``servers`` are by thread. ``chain`` has its callbacks by entity; it is empty where it is not
-    followed.
+    ``servers`` are by thread, and ``receivers`` of outputs, which are in none, with their places.
+    ``chain`` has its callbacks by entity; it is empty where it is not followed.
     """
 
     application: Application
     processes: tuple[Process, ...]
     threads: tuple[ThreadInfo, ...]
     servers: Mapping[int, Server]
+    receivers: Mapping[int, ReceiverPlace]
     cores: tuple[int, ...]
     entities: tuple[Entity, ...]
     publishers: tuple[Publisher, ...]
@@ -123,8 +124,10 @@ def build_system(
     threads = list(_threads(application, processes, publishers))
     servers = {} if plan is None else _servers(plan, threads)
     cores = sorted({thread.cores[0] for thread in threads})
-    for number, server in servers.items():
-        threads[number] = threads[number].model_copy(update={"cores": (server.core,)})
+    receivers = {} if plan is None else _receivers(plan, threads, servers)
+    homes = {number: one.core for number, one in (servers | receivers).items()}
+    for number, core in homes.items():
+        threads[number] = threads[number].model_copy(update={"cores": (core,)})
     chain = Chain(application.chain, (), ())
     if follow_chain:
         chain = find_chain(_graph(processes, entities, publishers), application.chain)
@@ -133,7 +136,8 @@ def build_system(
         processes=processes,
         threads=tuple(threads),
         servers=servers,
-        cores=tuple(dict.fromkeys([*cores, *(server.core for server in servers.values())])),
+        receivers=receivers,
+        cores=tuple(dict.fromkeys([*cores, *homes.values()])),
         entities=tuple(entities),
         publishers=tuple(publishers),
         chain=chain,
@@ -205,6 +209,19 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
                 )
             found |= dict.fromkeys(numbers[thread], server)
     return found
+
+
+def _receivers(
+    plan: ApplicationPlan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
+) -> dict[int, ReceiverPlace]:
+    """The place of each thread that receives an output, and is in no server."""
+    place_of = plan.receivers_at
+    return {
+        number: place
+        for number, one in enumerate(threads)
+        if number not in servers and one.role == "executor"
+        if (place := place_of.get(one.node or "")) is not None
+    }
 
 
 def _graph(
@@ -398,7 +415,8 @@ class Machine:
                 continue
             ranked = [server for server in plan.servers if server in governed.values()]
             ranked.sort(key=lambda server: server.priority)
-            self._rank(plan, governed, ranked)
+            receiving = {n: one for n, one in system.receivers.items() if one.core == core}
+            self._rank(plan, governed, ranked, receiving)
             table = _slot_table(plan, ranked)
             first, end = rows.put([number for pair in table for number in pair])
             # The run starts anywhere in a cycle.
@@ -412,19 +430,34 @@ class Machine:
             rows[place + C.BOUNDARY] = timing.start_ns - elapsed + until
 
     def _rank(
-        self, plan: ApplicationPlan, governed: dict[int, Server], ranked: list[Server]
+        self,
+        plan: ApplicationPlan,
+        governed: dict[int, Server],
+        ranked: list[Server],
+        receiving: dict[int, ReceiverPlace],
     ) -> None:
-        """Server and rank of the threads that are ``governed`` on a core."""
+        """Server and rank of the threads that are ``governed`` on a core: by the priority of the
+        server and, within one, in the plan's order, as `server_priorities` has them live; and the
+        rank of those ``receiving`` an output, behind all of their priority.
+        """
         order = plan.most_urgent_first
-        places = {node: place for place, node in enumerate(order)}
+        place_of = {node: place for place, node in enumerate(order)}
+        named = {
+            number: place_of.get(self._system.threads[number].node, len(order))
+            for number in governed
+        }
+        taken = {
+            server.name: sorted({named[n] for n, one in governed.items() if one is server})
+            for server in ranked
+        }
         urgency = {
-            number: (
-                server.priority if plan.takes_turns else ranked.index(server),
-                places.get(self._system.threads[number].node, len(order)),
-            )
+            number: (server.priority, taken[server.name].index(named[number]))
             for number, server in governed.items()
         }
-        urgent = sorted(set(urgency.values()))
+        behind = {number: (one.priority, len(governed)) for number, one in receiving.items()}
+        urgent = sorted({*urgency.values(), *behind.values()})
+        for number, key in behind.items():
+            self._rows[self._threads[number] + T.RANK] = urgent.index(key) - len(urgent)
         for number, server in governed.items():
             rank = urgent.index(urgency[number]) - len(urgent)
             if server.best_effort:  # under the fair class, behind all real-time threads

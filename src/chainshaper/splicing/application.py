@@ -108,7 +108,9 @@ def nothing_to_splice(plan: Plan) -> InputError:
 
 
 def _placed(application: Application, joint: ApplicationPlan) -> Application:
-    """The application with nodes where the servers have them: core, and rank where they differ."""
+    """The application with nodes where the servers have them: core, and rank where they differ;
+    and who receives an output in the place for that, behind the shaping nodes.
+    """
     publishing = {one.name for chain in joint.chains for one in publishing_servers(chain)}
     running = [server for server in joint.servers if server.name not in publishing]
     server_of = {thread.node: server for server in running for thread in server.threads}
@@ -121,6 +123,10 @@ def _placed(application: Application, joint: ApplicationPlan) -> Application:
             if (own.core, own.priority) != (server.core, rank):
                 placed = {"core": server.core, "priority": rank}
                 nodes[name] = node.model_copy(update=placed)
+        elif (place := joint.receivers_at.get(node_name(name))) is not None:
+            gates = (one.fifo_priority for one in joint.shaping_nodes)
+            receiving = {"core": place.core, "priority": max(1, min(gates) - 1)}
+            nodes[name] = node.model_copy(update=receiving)
     return application.model_copy(update={"nodes": nodes})
 
 

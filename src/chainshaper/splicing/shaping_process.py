@@ -429,7 +429,7 @@ def has_bytes(message_type: str) -> bool:
     """Whether a message of the ROS 2 environment has a field ``uint8[]``."""
     package, _, name = message_type.partition("/msg/")
     definitions = (folder / f"{name}.msg" for folder in _message_folders(package))
-    found = next((one.read_text("utf-8", "replace") for one in definitions if one.is_file()), "")
+    found = next((text_of(one.read_bytes()) for one in definitions if one.is_file()), "")
     return re.search(r"^\s*(uint8|char)\[\]", found, re.MULTILINE) is not None
 
 

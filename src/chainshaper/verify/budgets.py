@@ -22,7 +22,7 @@ import polars as pl
 import yaml
 from pydantic import BeforeValidator, Field, PlainSerializer, SerializationInfo
 
-from chainshaper.analysis import data_flow
+from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.latency import (
     PERCENTILES,
@@ -173,7 +173,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
     def limit(ns: float | None) -> int | None:
         return None if ns is None else -int(-ns * (1 + room) // GRAIN_NS) * GRAIN_NS or None
 
-    of_chains, flow = [], data_flow(recording.events, recording.info.clock_offset_ns)
+    of_chains, flow = [], recorded_flow(recording)
     for chain in chains or [chain_of(recording, None, flow)]:
         analysis = measure_latency(recording, chain, flow=flow).analysis
         refuse_contradicted(flow.contradictions, analysis.chain.callbacks, recording.path)
@@ -209,7 +209,7 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
     """
     found: list[Judged] = []
     name = name or str(recording.path)
-    flow = data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = recorded_flow(recording)
     for chain in budget.chains:
         try:
             analysis = measure_latency(recording, chain.chain, flow=flow).analysis

@@ -18,9 +18,9 @@ import polars as pl
 from chainshaper.analysis import (
     LatencyAnalysis,
     analyse_latency,
-    data_flow,
     enumerate_chains,
     graph_of,
+    recorded_flow,
 )
 from chainshaper.analysis.flow import DataFlow, left_when_taken
 from chainshaper.analysis.latency import summary
@@ -87,11 +87,6 @@ class Measurement:
     prediction: JudgedPrediction | None
     left_out: LeftOut
 
-    @property
-    def period_ns(self) -> int | None:
-        """The period of the timer that starts the chain; None: no timer does."""
-        return _period_of(self.analysis)
-
 
 @dataclass(frozen=True)
 class Comparison:
@@ -103,7 +98,7 @@ class Comparison:
     @property
     def remark(self) -> str | None:
         """What makes its recordings hard to compare: other periods; None: nothing does."""
-        periods = {one.recording.path.name: one.period_ns for one in self.measurements}
+        periods = {one.recording.path.name: one.analysis.period_ns for one in self.measurements}
         if len({*periods.values()} - {None}) < 2:
             return None
         found = ", ".join(
@@ -125,7 +120,7 @@ def chain_of(recording: Recording, chain: str | None, flow: DataFlow | None = No
     named = chain or recording.info.chain
     if named is not None:
         return named
-    flow = flow or data_flow(recording.events, recording.info.clock_offset_ns)
+    flow = flow or recorded_flow(recording)
     found = enumerate_chains(graph_of(flow), limit=MOST_PROPOSED)
     if found.complete and len(found.chains) == 1:
         return found.chains[0].spec
@@ -180,7 +175,7 @@ def _measured(
     joint, info = _plan_of(recording, plan), recording.info
     due = [] if joint is None else [due for one in joint.chains for due in due_of(one)]
     spell, left_out = _in_force(recording)
-    flow = flow or data_flow(recording.events, info.clock_offset_ns)
+    flow = flow or recorded_flow(recording)
     if gated := [one for one in joint.chains if any(publisher_servers(one))] if joint else []:
         flow = left_when_taken(flow, [one.chain.output for one in gated])
     if spell is not None:
@@ -215,14 +210,10 @@ def _measured(
     return measurements
 
 
-def _period_of(analysis: LatencyAnalysis) -> int | None:
-    return analysis.graph.callbacks[analysis.chain.callbacks[0]].period_ns
-
-
 def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recording) -> None:
     """Refuse to judge by a plan whose cycle is not the chain's period, or several of them (a source
     may be faster than the cycle)."""
-    period = _period_of(analysis)
+    period = analysis.period_ns
     if period is not None and plan.cycle_ns % period:
         raise InputError(
             f"{recording.path}: {analysis.chain.spec} starts every {duration_text(period)} there,"

@@ -26,6 +26,7 @@ import polars as pl
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
 from chainshaper.analysis.disturbance import Due
 from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.planning.overruns import (
     GATE_NS,
     STOPPED_THREAD_NS,
@@ -35,7 +36,12 @@ from chainshaper.planning.overruns import (
 )
 from chainshaper.planning.plan import SHORTEST_SLOT_NS, Slot, publisher_servers, server_of
 from chainshaper.values.durations import milliseconds
-from chainshaper.verify.promises import STANDARD_ERRORS, OutputsDue, outputs_due
+from chainshaper.verify.promises import (
+    STANDARD_ERRORS,
+    OutputsDue,
+    most_by_chance,
+    outputs_due,
+)
 
 MISSING = 0.003  # a band that is empty with no more than this probability is expected
 
@@ -98,12 +104,39 @@ class BandHeld:
 
 
 @dataclass(frozen=True)
+class JudgedReceivers:
+    """What a plan promises until a receiver's callback starts, and what was measured (ns).
+
+    It is of outputs that were in time, and that the machine did not disturb on their way. ``count``
+    of them were received, ``behind`` of which came later than promised; ``most_behind`` may.
+    """
+
+    predicted_max_ns: int
+    predicted_jitter_ns: int
+    max_ns: int | None
+    jitter_ns: int | None
+    count: int
+    behind: int
+    most_behind: int
+
+    @property
+    def broken(self) -> str | None:
+        """The promise that the measurement breaks, with its figures; None: it does not."""
+        if self.behind <= self.most_behind:
+            return None
+        said = f"{self.behind} of {self.count} outputs received behind"
+        said += f" {milliseconds(self.predicted_max_ns)} ms, at"
+        return f"{said} {milliseconds(self.max_ns or 0)} ms at the latest"
+
+
+@dataclass(frozen=True)
 class JudgedPrediction:
     """A plan's prediction beside the measurement, over undisturbed cycles.
 
     The figures are latencies, or with ``counted_from`` the cycle places in it. ``late`` counts
     outputs that missed their last slot; they are in the figures, not in the bands. ``outputs`` has
-    all that were due, in whatever cycle. Policies without slots have no ``bands``.
+    all that were due, in whatever cycle. Policies without slots have no ``bands``, plans that keep
+    no place for them no ``receivers``.
     """
 
     mean: JudgedFigure
@@ -113,6 +146,7 @@ class JudgedPrediction:
     late: int
     outputs: OutputsDue
     counted_from: Literal["chain", "cycle"]
+    receivers: JudgedReceivers | None = None
 
     @property
     def broken(self) -> tuple[str, ...]:
@@ -132,6 +166,8 @@ class JudgedPrediction:
         if self.outputs.kept is False:
             most = f"{self.outputs.most_missed} at most" if self.outputs.most_missed else "none"
             broken.append(f"{self.outputs.text}, {most} expected")
+        if self.receivers is not None and self.receivers.broken is not None:
+            broken.append(self.receivers.broken)
         return tuple(broken)
 
     @property
@@ -212,6 +248,29 @@ def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
         late=int(outputs["late"].sum()),
         outputs=outputs_due(analysis, plan),
         counted_from="cycle" if from_cycle else "chain",
+        receivers=_receivers(plan, analysis, from_cycle),
+    )
+
+
+def _receivers(plan: Plan, analysis: LatencyAnalysis, from_cycle: bool) -> JudgedReceivers | None:
+    """What is promised for those that receive the output, beside the measurement."""
+    promised = plan.predicted.receivers
+    if promised is None:
+        return None
+    in_time = pl.col("complete") & ~pl.col("reception_disturbed") & ~pl.col("late").fill_null(False)
+    place = pl.col("place_ns" if from_cycle else "latency_ns")
+    known = analysis.traversals.filter(in_time).drop_nulls("reception_ns")
+    at = known.select(place + pl.col("reception_ns") - pl.col("latency_ns")).to_series()
+    share = max(OVERRUN_PROBABILITY, plan.margin.overrun_probability or 0.0)
+    found = latency_statistics(at)
+    return JudgedReceivers(
+        predicted_max_ns=promised.max_ns,
+        predicted_jitter_ns=promised.jitter_ns,
+        max_ns=found.max_ns,
+        jitter_ns=found.jitter_ns,
+        count=len(at),
+        behind=int((at > promised.max_ns).sum()),
+        most_behind=most_by_chance(len(at), share),
     )
 
 

@@ -62,7 +62,7 @@ class OutputsDue:
         """So many may be missed as promised, as far as chance goes."""
         if self.promised is None:
             return None
-        return _by_chance(self.due, self.promised)
+        return most_by_chance(self.due, self.promised)
 
     @property
     def kept(self) -> bool | None:
@@ -82,7 +82,7 @@ class OutputsDue:
         return f"{self.missed} of {self.due} outputs missed ({', '.join(parts)}{usual})"
 
 
-def _by_chance(count: int, share: float) -> int:
+def most_by_chance(count: int, share: float) -> int:
     """How many of so many may be hit where this share is, as far as chance goes."""
     mean = count * share
     return math.floor(mean + STANDARD_ERRORS * math.sqrt(mean))
@@ -96,7 +96,7 @@ def promised_by(plan: Plan) -> float:
 def _usual(evidence: Evidence, before: int, due: int, absent: int) -> int:
     """How many of the ``absent`` are so as often as ``before``, in what was planned from."""
     planned_from = evidence.samples + evidence.disturbed + evidence.incomplete
-    return min(absent, _by_chance(due, before / planned_from)) if before else 0
+    return min(absent, most_by_chance(due, before / planned_from)) if before else 0
 
 
 def outputs_due(analysis: LatencyAnalysis, plan: Plan | None = None) -> OutputsDue:

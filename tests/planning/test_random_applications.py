@@ -1,0 +1,21 @@
+"""A few of the random applications of several chains: what a plan promises of them is kept."""
+
+from pathlib import Path
+
+import pytest
+from random_applications import drawn, judged, refusal, table
+
+ONCE_BROKEN = (8, 68)  # a third of the outputs of a chain were late, where 1 % may be
+
+
+@pytest.mark.parametrize("number", [*ONCE_BROKEN, 1, 2, 3, 5, 12, 21])
+def test_no_promise_to_several_chains_is_broken(number: int, tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    row = judged(number, 300, tmp_path)
+    assert drawn(number) == drawn(number), "an application is known by its number"
+    if "refused" in row:
+        assert any(chain in row["refused"] for chain in ("/c0", "/c1", "/c2", "/c3"))
+        assert "/c" not in refusal(row["refused"]), "counted without names"
+        return
+    assert [one for one in row["outputs"] if one["broken"]] == []
+    assert "0 applications with a broken promise" in "\n".join(table([row]))
