@@ -28,8 +28,9 @@ def _under_load(load_ms: int) -> Application:
 def _five_servers() -> Plan:
     """[0, 16), [16, 32), … [64, 80) ms."""
     latencies = np.array([70 * MS, 71 * MS])
-    own = {"output": "/t5", "publisher": NODES[-1], "nodes": NODES, "core": 1}
-    shaped = plan_shaping(latencies, 100 * MS, **own)
+    shaped = plan_shaping(
+        latencies, 100 * MS, output="/t5", publisher=NODES[-1], nodes=NODES, core=1
+    )
     times = [
         CallbackTimes(node, 1, 5 * MS, 10 * MS, 16 * MS, (number - 1,) if number else ())
         for number, node in enumerate(NODES)
