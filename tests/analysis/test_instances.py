@@ -39,6 +39,15 @@ def test_overlapping_instances_of_processes_and_threads() -> None:
     assert pairs(story) == [(11, 10, 30), (2, 11, 40), (12, 12, 20)]
 
 
+def test_behind_an_end_whose_start_was_not_recorded_instances_that_touch_are_told_apart() -> None:
+    """One ends in the nanosecond in which the next one starts, as executors under load have it."""
+    starts = pl.DataFrame({"pid": [1, 1], "tid": [1, 1], "callback": [7, 7], "time": [20, 30]})
+    ends = pl.DataFrame(
+        {"pid": [1, 1, 1], "tid": [1, 1, 1], "callback": [7, 7, 7], "time": [10, 30, 40]}
+    )
+    assert list(ends_of_starts(starts, ends)) == [1, 2]
+
+
 Happenings = list[tuple[int, int, int]]
 
 
@@ -51,8 +60,10 @@ def by_definition(starts: Happenings, ends: Happenings) -> list[int]:
         ordered: list[tuple[int, int, int]] = []
         for moment in sorted({t for t, _, _ in own}):
             now = [event for event in own if event[0] == moment]
-            is_open = sum(1 if kind == 0 else -1 for _, kind, _ in ordered) > 0
-            ordered += sorted(now, key=lambda e: (e[1] == 0) == is_open)
+            depth = 0
+            for _, kind, _ in ordered:  # an end without a start is of an instance of before
+                depth = depth + 1 if kind == 0 else max(0, depth - 1)
+            ordered += sorted(now, key=lambda event, is_open=depth > 0: (event[1] == 0) == is_open)
         for (_, kind, row), (_, after, end) in itertools.pairwise(ordered):
             if (kind, after) == (0, 1):
                 result[row] = end

@@ -241,9 +241,15 @@ def test_mcap_has_every_callback_and_every_cycle(tmp_path: Path) -> None:
     assert "ends in .mcap" in wrong
 
 
-def test_a_recording_without_a_chain_is_exported_without_one(tmp_path: Path) -> None:
+def test_a_recording_that_names_no_chain_is_exported_with_its_only_one(tmp_path: Path) -> None:
     known, file = known_run(tmp_path / "known", chain=None), tmp_path / "t.pftrace"
     assert called("export", "--perfetto", known.path, "-o", file).code == 0
     trace = _Trace(file.read_bytes())
-    assert trace.slices("Chain") == []
+    assert trace.slices("Chain")
     _same_counts(known, trace)
+
+
+def test_a_trace_of_several_chains_is_exported_without_one(tmp_path: Path) -> None:
+    several = reference_folder("galactic_caret_end_to_end") / "trace"
+    assert called("export", "--perfetto", several, "-o", tmp_path / "t.pftrace").code == 0
+    assert _Trace((tmp_path / "t.pftrace").read_bytes()).slices("Chain") == []

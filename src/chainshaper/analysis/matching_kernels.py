@@ -129,6 +129,7 @@ def walk_pairs(starts, began, start_count, ends, ended, end_count, found, table,
                     if get(place, OPEN) > 0:
                         store_word(found + 4 * (get(place, OPEN) - 1), np.uint64(row))
                     put(place, OPEN, np.int64(0))
-                    put(place, DEPTH, get(place, DEPTH) - 1)
+                    if get(place, DEPTH) > 0:  # else it is of an instance that began unrecorded
+                        put(place, DEPTH, get(place, DEPTH) - 1)
         i, j = next_i, next_j
     return np.int64(0)
