@@ -169,7 +169,8 @@ def test_a_plan_is_written_and_printed(tmp_path: Path, unshaped: Recording) -> N
     assert values["anchor"] == planned.anchor == "cycle"
     assert values["margin"]["epsilon_ns"] == planned.margin.epsilon_ns == 2_000_000
     assert values["bands_ns"] == [planned.servers[-1].slots[-1][1]]
-    assert set(values["predicted"]) == {"mean_ns", "max_ns", "jitter_ns", "shares", "modes"}
+    figures = {"mean_ns", "max_ns", "jitter_ns", "shares", "modes", "receivers"}
+    assert set(values["predicted"]) == figures
     assert [server["core"] for server in values["servers"]] == [EXECUTOR_CORE, EXECUTOR_CORE]
     longest = measure_latency(unshaped).analysis.undisturbed.max_ns
     assert values["evidence"]["max_latency_ns"] == longest

@@ -40,7 +40,8 @@ def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path, unshaped: Re
     assert latencies.min() >= 3 * PERIOD_NS  # type: ignore[operator]
     assert (latencies < 3.5 * PERIOD_NS).sum() >= 0.8 * latencies.len()
     simulated = simulate(application, tmp_path / "simulated", plan, cycles=20)
-    assert measure_latency(simulated).analysis.statistics.jitter_ns == 0
+    # Gates of one core whose slots begin at one instant publish one behind the other.
+    assert measure_latency(simulated).analysis.statistics.jitter_ns <= plan.predicted.jitter_ns
 
 
 def application_of(messages: str, depth: int) -> Application:
