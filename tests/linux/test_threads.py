@@ -1,6 +1,8 @@
 """Threads as the kernel shows them, what their names say, and what is asked of it for them."""
 
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -172,3 +174,29 @@ def test_our_own_real_time_threads_are_not_foreign() -> None:
     thread.start()
     thread.join()
     assert not any(f"({os.getpid()})" in name for name in listed[0])
+
+
+def in_time_namespace(offset_s: int, *command: str) -> list[str]:
+    """A command whose CLOCK_MONOTONIC and CLOCK_BOOTTIME are so far ahead of ours; skips where the
+    kernel makes no such namespaces, or not for us.
+    """
+    offsets = (f"--monotonic={offset_s}", f"--boottime={offset_s}")
+    words = ["unshare", "--time", *offsets, "--fork", "--kill-child"]
+    if subprocess.run([*words, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("no time namespace can be made here")
+    return [*words, *command]
+
+
+def test_a_process_has_the_same_start_for_those_in_other_time_namespaces() -> None:
+    """Else whoever looks from there takes a run that is in force for one that has crashed."""
+    ours = str(start_of(os.getpid(), os.getpid()))
+    program = (
+        "import sys; from chainshaper.linux.threads import has_ended, list_threads, start_of;"
+        "pid, started = map(int, sys.argv[1:]); thread, = list_threads(pid)[:1];"
+        "print(start_of(pid, pid), thread.started, has_ended(pid, started))"
+    )
+    command = [sys.executable, "-c", program, str(os.getpid()), ours]
+    there = subprocess.run(
+        in_time_namespace(200_000, *command), capture_output=True, text=True, check=True
+    )
+    assert there.stdout.split() == [ours, ours, "False"]
