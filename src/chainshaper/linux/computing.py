@@ -115,7 +115,7 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
             f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`,"
             " and give the address that it prints"
         ) from error
-    # Dask logs a traceback for each connection that breaks; what it means to the work is said below.
+    # Dask logs a traceback for each connection that breaks; what that means is said below.
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     with _closed_in_time(connected) as client:
         completed = distributed.as_completed(loop=client.loop)
@@ -161,7 +161,7 @@ def _closed_in_time(client: Any) -> Iterator[Any]:
 
 
 def _has_workers(client: Any) -> bool | None:
-    """Whether a cluster has workers; None: its scheduler does not answer, as one that is stopped."""
+    """Whether a cluster has workers; None: its scheduler does not answer, as when it is stopped."""
     try:
         return bool(client.sync(client.scheduler.ncores, callback_timeout=ANSWER_S))
     except (TimeoutError, asyncio.TimeoutError):
