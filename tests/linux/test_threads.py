@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 from actors import acting
 from known import known
-from processes import wait_for
+from processes import in_time_namespace, wait_for
 
 from chainshaper.linux.scheduling import (
     Scheduling,
@@ -174,17 +174,6 @@ def test_our_own_real_time_threads_are_not_foreign() -> None:
     thread.start()
     thread.join()
     assert not any(f"({os.getpid()})" in name for name in listed[0])
-
-
-def in_time_namespace(offset_s: int, *command: str) -> list[str]:
-    """A command whose CLOCK_MONOTONIC and CLOCK_BOOTTIME are so far ahead of ours; skips where the
-    kernel makes no such namespaces, or not for us.
-    """
-    offsets = (f"--monotonic={offset_s}", f"--boottime={offset_s}")
-    words = ["unshare", "--time", *offsets, "--fork", "--kill-child"]
-    if subprocess.run([*words, "true"], capture_output=True, check=False).returncode:
-        pytest.skip("no time namespace can be made here")
-    return [*words, *command]
 
 
 def test_a_process_has_the_same_start_for_those_in_other_time_namespaces() -> None:

@@ -45,7 +45,7 @@ from chainshaper.sources.ebpf.trace_points import (
     event_table,
     version_of,
 )
-from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
+from chainshaper.sources.system import NEXT_HOST, info_of, of_another_clock, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.events import EventTables
@@ -121,7 +121,8 @@ class TracedProcess:
     written, and counts as lost what may have been overwritten meanwhile. ``pid`` is the process's
     number here, ``inner_pid`` what it calls itself in its container.
 
-    Raises InputError: the descriptor is of no such memory, or of one that may shrink.
+    Raises InputError: the descriptor is of no such memory, of one that may shrink, or of a process
+    whose times are of another clock.
     """
 
     def __init__(self, descriptor: int, pid: int = 0) -> None:
@@ -142,6 +143,8 @@ class TracedProcess:
         self.pid = pid or self.inner_pid
         if not (0 < self.pid <= _LARGEST_ID and 0 < self.inner_pid <= _LARGEST_ID):
             raise InputError(f"what was sent says that it is of process {self.inner_pid}")
+        if of_another_clock(self.pid):
+            raise InputError("it has another clock, that of a time namespace: record it in there")
         self.damage: str | None = None
         self._tids: dict[int, int] = {}
         self._rings = np.frombuffer(memory, _RING, _RINGS, _HEADER.itemsize)

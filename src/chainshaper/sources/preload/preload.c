@@ -257,7 +257,6 @@ static void begin(struct memory *made) {
   made->rings = RINGS;
   made->ring_records = RING_RECORDS;
   made->object_records = OBJECT_RECORDS;
-  made->magic = 0x63687368;
 }
 
 // Close the memory's descriptor, unless the node has closed it and the number is another file's now.
@@ -312,6 +311,9 @@ static bool make_memory(void) {
     refused = !memory;
     return memory;  // another thread was faster, or there is none
   }
+  // Who attaches takes the first memory that has this: not one that was made in vain beside it.
+  atomic_thread_fence(memory_order_release);
+  *(volatile uint32_t *)&made->magic = 0x63687368;
   fstat(file, &identity);
   descriptor = file;
   Dl_info behind;
