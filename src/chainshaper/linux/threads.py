@@ -244,6 +244,15 @@ def _started_later() -> int:
     return 0
 
 
+def of_another_clock(pid: int) -> bool:
+    """Whether a process may see another CLOCK_MONOTONIC than we do: it has a time namespace of its
+    own (time_namespaces(7)), as containers may have that were moved here while they ran.
+    """
+    with suppress(OSError):  # it has ended, is another user's, or the kernel is older than 5.6
+        return not Path(f"/proc/{pid}/ns/time").samefile("/proc/self/ns/time")
+    return False
+
+
 def since_boot_ns() -> int:
     """For how long the machine has run, sleep included: the clock of :attr:`Thread.started`."""
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - _started_later() * TICK_NS

@@ -5,7 +5,6 @@ Upstream: changelogs of tracetools; https://www.dds-foundation.org/dds-rtps-vend
 
 import re
 from collections.abc import Collection, Iterable, Mapping
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -58,15 +57,6 @@ def info_of(
 def own_pid_namespace() -> int:
     """The pid namespace whose numbers we see processes under (its inode)."""
     return Path("/proc/self/ns/pid").stat().st_ino
-
-
-def of_another_clock(pid: int) -> bool:
-    """Whether a process may see another CLOCK_MONOTONIC than we do: it has a time namespace of its
-    own (time_namespaces(7)), as containers may have that were moved here while they ran.
-    """
-    with suppress(OSError):  # it has ended, is another user's, or the kernel is older than 5.6
-        return not Path(f"/proc/{pid}/ns/time").samefile("/proc/self/ns/time")
-    return False
 
 
 def distribution_of(

@@ -37,7 +37,13 @@ from numpy.typing import NDArray
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import descendants, run_users
-from chainshaper.linux.threads import innermost_id, list_threads, parents, read_proc
+from chainshaper.linux.threads import (
+    innermost_id,
+    list_threads,
+    of_another_clock,
+    parents,
+    read_proc,
+)
 from chainshaper.sources.ebpf.trace_points import (
     Argument,
     TracePoint,
@@ -45,7 +51,7 @@ from chainshaper.sources.ebpf.trace_points import (
     event_table,
     version_of,
 )
-from chainshaper.sources.system import NEXT_HOST, info_of, of_another_clock, own_pid_namespace
+from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.events import EventTables
