@@ -180,7 +180,7 @@ def test_nodes_that_are_recorded_without_a_terminal_shut_down_in_order(
     attempt: Callable[..., Attempt], words: tuple[str, ...]
 ) -> None:
     """Launch signals its nodes itself there: a second SIGINT would kill them, exit code -2."""
-    done, _ = attempt(PARKING, "record", "ended", "--duration", "3s", launch_words=words)
+    done, _ = attempt(PARKING, "record", "ended", "--duration", "15s", launch_words=words)
     said = done.stdout + done.stderr
     assert done.returncode == 0, said[-3000:]
     assert "process has died" not in said

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from chainshaper.splicing.redirection import (
     Redirect,
     expanded,
+    nodes_of,
     redirect_command,
     redirect_request,
     redirecting,
@@ -195,6 +196,18 @@ def test_what_was_started_is_compared_with_the_graph(
     assert (found is None) if mistake is None else (found or "").startswith(mistake), found
     said = redirect.message(found or "", ["/icp"], [])
     assert said.startswith(f"/pose: {found or ''}. Publishers found: of /pose /icp; of /pose_tmp n")
+
+
+def test_a_publisher_whose_node_discovery_has_not_named_yet_is_no_other_node() -> None:
+    """What `rmw` says of an endpoint whose participant has not told its nodes yet."""
+    ndt = SimpleNamespace(node_namespace="/", node_name="ndt")
+    unknown = SimpleNamespace(
+        node_namespace="_NODE_NAMESPACE_UNKNOWN_", node_name="_NODE_NAME_UNKNOWN_"
+    )
+    assert nodes_of([ndt]) == (["/ndt"], False)
+    assert nodes_of([ndt, unknown]) == (["/ndt"], True)
+    redirect = started(pose(), NAMED)
+    assert redirect.mistake(nodes_of([unknown])[0], nodes_of([ndt, unknown])[0]) is None
 
 
 def test_any_may_subscribe_to_a_throttled_topic_and_what_has_ended_may_start_again() -> None:

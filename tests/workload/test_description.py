@@ -185,3 +185,11 @@ def test_whatever_is_described_survives_its_file(
     path = tmp_path_factory.mktemp("any") / "robot.yaml"
     path.write_text(yaml.safe_dump(application_as_written(application)))
     assert load_application(path) == application
+
+
+def test_a_node_that_is_bound_to_no_core_asks_for_none(tmp_path: Path) -> None:
+    path = tmp_path / "robot.yaml"
+    path.write_text(RIGHT.replace("    core: 0", "    core: 7"))
+    assert {0, 1, 7} == load_application(path).cores().keys()
+    path.write_text(path.read_text().replace("core: 7", "core: 7\n    bound: false"))
+    assert {0, 1} == load_application(path).cores().keys()

@@ -74,20 +74,21 @@ def test_a_package_has_what_the_description_says(tmp_path: Path) -> None:
     assert "project(robot CXX)" in (folder / "CMakeLists.txt").read_text()
     table = (folder / "src/application.hpp").read_text()
     scan, data = '{"/scan", 3, false, 20000000, 7}', '{"/map", 10, true, 0, 1024}'
-    fused = '{"/fused", 10, true, 0, 1024}'
+    fused, none = '{"/fused", 10, true, 0, 1024}', "{Distribution::constant, {}, 1}"
+    started = "0, {}, -1, {Distribution::constant, {0}, 1}"
     for line in (
         '  {"/front/lidar", {0, 70}, {0, 90}, {0}, {',
-        f"    {{50000000, 5000000, {{}}, {{Distribution::constant, {{2000000}}, 1}}, "
+        f"    {{50000000, 5000000, {{}}, -1, {{Distribution::constant, {{2000000}}, 1}}, {none}, "
         f'{{{scan}, {data}}}, {{}}, "", false}}',
         '  {"/fusion", {1, 80}, {0, 60}, {1}, {',
-        f"    {{0, 0, {{{scan}, {data}}}, {{Distribution::normal, "
-        f'{{8000000, 2000000, 4000000, 14000000}}, 1}}, {{{fused}}}, {{}}, "", false}}',
-        f"    {{0, 0, {{{fused}}}, "
-        '{Distribution::samples, {1000000, 2000000}, 2}, {}, {}, "", false}',
+        f"    {{0, 0, {{{scan}, {data}}}, -1, {{Distribution::normal, "
+        f'{{8000000, 2000000, 4000000, 14000000}}, 1}}, {none}, {{{fused}}}, {{}}, "", false}}',
+        f"    {{0, 0, {{{fused}}}, -1, {{Distribution::samples, {{1000000, 2000000}}, 2}}, {none}, "
+        '{}, {}, "", false}',
         '  {"/threads", {1, 80}, {0, 90}, {1, 0, 1}, {',
-        '    {1000000000, 0, {}, {Distribution::constant, {0}, 1}, {}, {}, "slow", true}',
-        '    {2000000000, 0, {}, {Distribution::constant, {0}, 1}, {}, {}, "one", false}',
-        '    {3000000000, 0, {}, {Distribution::constant, {0}, 1}, {}, {}, "", false}',
+        f'    {{1000000000, {started}, {none}, {{}}, {{}}, "slow", true}}',
+        f'    {{2000000000, {started}, {none}, {{}}, {{}}, "one", false}}',
+        f'    {{3000000000, {started}, {none}, {{}}, {{}}, "", false}}',
         r'{"city", "a\042\134\303\251"}, "", false}}',
     ):
         assert line in table
@@ -153,6 +154,36 @@ def test_the_command_writes_a_package_once(tmp_path: Path) -> None:
     assert all(Path(file).is_file() for file in value["files"])
     again = called(*command)
     assert (again.code, "exists already" in again.err) == (2, True)
+
+
+TRIGGERED = """
+name: triggered
+chain: /lidar../fused
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  camera: {callbacks: [{timer: 20ms, execution: {constant: 1ms}, publishes: [/camera]}]}
+  lidar:
+    callbacks:
+      - timer: 100ms
+        phase: 10ms
+        execution: {constant: 1ms}
+        afterwards: {constant: 7ms}
+        publishes: [/lidar]
+  fusion:
+    callbacks:
+      - {synchronises: [/lidar, /camera], triggered_by: /lidar, publishes: [/fused]}
+  motor: {callbacks: [{subscription: /fused}]}
+"""
+
+
+def test_what_a_described_recording_has_is_generated(tmp_path: Path) -> None:
+    """Work behind the publications, and the input that triggers a set, by its number."""
+    cs.generate_package(written(tmp_path, TRIGGERED), tmp_path / "robot")
+    text = (tmp_path / "robot/src/application.hpp").read_text()
+    (lidar,) = (line for line in text.splitlines() if "100000000, 10000000" in line)
+    assert "{Distribution::constant, {1000000}, 1}, {Distribution::constant, {7000000}, 1}" in lidar
+    (fusion,) = (line for line in text.splitlines() if '"/camera"' in line and '"/lidar"' in line)
+    assert '{"/camera", 10, true, 0, 1024}}, 0, {Distribution' in fusion
 
 
 @pytest.mark.skipif(shutil.which("g++") is None, reason="no C++ compiler")

@@ -25,6 +25,8 @@ from typing import Any
 WITHIN = "chainshaper_within"  # a launch argument: how long (s) after its start all has to run
 WITHIN_S = 30.0
 DISCOVERY_S = 5.0  # how long before that it begins to listen for who publishes and subscribes
+MOST_LOOKS = 10  # at who publishes, a second apart, while discovery has not named all nodes
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of an endpoint that was discovered before its node was (rmw)
 
 _DRY_RUN = "chainshaper_dry_run"
 _RULE = re.compile(r"(?:(\w+):(?!//|=))?(?:rostopic://)?([^:]+):=(.+)", re.DOTALL)
@@ -372,25 +374,40 @@ def _times_loaded(context: Any, redirect: Redirect) -> int:
     return sum(get_node_name_count(context, node) for node in redirect.nodes)
 
 
-def _check(context: Any, redirects: Sequence[Redirect]) -> None:
-    """Compare what was redirected with the graph of ROS 2; a RuntimeError ends the launch."""
+def nodes_of(endpoints: Sequence[Any]) -> tuple[list[str], bool]:
+    """The nodes that publishers or subscriptions belong to, by full name, and whether discovery has
+    yet to say whose some of them are: these are nobody's so far.
+    """
+    known = [info for info in endpoints if info.node_name != UNKNOWN_NODE]
+    names = [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in known]
+    return names, len(known) < len(endpoints)
+
+
+def _check(context: Any, redirects: Sequence[Redirect], looks: int = MOST_LOOKS) -> Any:
+    """Compare what was redirected with the graph of ROS 2; a RuntimeError ends the launch. Where
+    discovery has not named all nodes yet, it looks again a second later, ``looks`` times in all.
+    """
     import launch.logging
+    from launch.actions import OpaqueFunction, TimerAction
     from launch_ros.ros_adapters import get_ros_node
 
     logger, asked = launch.logging.get_logger("chainshaper"), get_ros_node(context)
-    messages = []
+    seen = []
     for one in redirects:
         ask = getattr(asked, f"get_{one.kind}s_info_by_topic")
-        on_topic, on_target = (
-            [f"{info.node_namespace.rstrip('/')}/{info.node_name}" for info in ask(topic)]
-            for topic in (one.topic, one.target)
-        )
+        seen.append([nodes_of(ask(topic)) for topic in (one.topic, one.target)])
+    if looks > 1 and any(unknown for both in seen for _, unknown in both):
+        again = OpaqueFunction(function=_check, args=[redirects, looks - 1])
+        return [TimerAction(period=1.0, actions=[again])]
+    messages = []
+    for one, ((on_topic, _), (on_target, _)) in zip(redirects, seen, strict=True):
         if mistake := one.mistake(on_topic, on_target):
             messages.append(one.message(mistake, on_topic, on_target))
         there = "is redirected" if {*one.nodes} <= {*on_target} else "is redirected when it comes"
         logger.info(f"{one.topic} of {_names(one.nodes)} {there}: {one.target}")
     if messages:
         raise RuntimeError("; ".join(messages))
+    return None
 
 
 def dry_run(

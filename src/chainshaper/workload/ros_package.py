@@ -115,12 +115,6 @@ def _refuse(application: Application, place: str, callback: CallbackDescription)
         "computes": callback.computes is not None
         and "a function in Python, which no node in C++ calls; describe its `execution` instead, "
         "such as the `samples` of a recording",
-        "afterwards": callback.afterwards is not None
-        and "work behind the publications, which generated nodes do not do; remove it, or add it to"
-        " `execution`",
-        "triggered_by": callback.triggered_by is not None
-        and "a set of one input's message and the newest of the others, for which message_filters"
-        " has no class; remove it",
         "kind": callback.kind != "subscription"
         and f"a {callback.kind}'s messages on a topic, which ROS 2 has not; remove `kind`",
         "subscription": not announced.isdisjoint(callback.inputs)
@@ -152,10 +146,15 @@ def _callback(
         _list(_topic(application, topic) for topic in topics)
         for topics in (callback.inputs, callback.publishes)
     )
-    own = (callback.timer_ns or 0, callback.phase_ns, inputs, _execution(callback.execution))
+    trigger = -1
+    if callback.triggered_by is not None:
+        trigger = callback.synchronises.index(callback.triggered_by)
+    starts = (callback.timer_ns or 0, callback.phase_ns, inputs, trigger)
+    times = (_execution(callback.execution), _execution(callback.afterwards))
     alone = "true" if callback.group and not node.exclusive_group(callback) else "false"
     group = _text(callback.group or "")
-    return _list([*own, outputs, _list(map(_text, callback.announces)), group, alone])
+    announces = _list(map(_text, callback.announces))
+    return _list([*starts, *times, outputs, announces, group, alone])
 
 
 def _topic(application: Application, name: str) -> str:
@@ -164,7 +163,9 @@ def _topic(application: Application, name: str) -> str:
     return _list([_text(name), own.depth, reliable, own.lifespan_ns or 0, own.payload])
 
 
-def _execution(own: ExecutionTime) -> str:
+def _execution(own: ExecutionTime | None) -> str:
+    if own is None:
+        return "{Distribution::constant, {}, 1}"
     distributions = {
         "constant": None if own.constant_ns is None else (own.constant_ns,),
         "uniform": own.uniform_ns,

@@ -31,6 +31,7 @@ from typing import Any
 SNAPSHOT = "_chainshaper_snapshot"  # nodes' names; hidden: `ros2 node list` does not show them
 SETTER = "_chainshaper_parameter"
 WATCHER = "_chainshaper_watch"
+UNKNOWN_NODE = "_NODE_NAME_UNKNOWN_"  # of an endpoint that was discovered before its node was (rmw)
 QUIET_S, LOOK_S = 2.0, 0.2
 FIRST_S = 4.0  # to hear of any node: one of Fast DDS may call again only after three seconds
 ANSWER_S, SPIN_S = 5.0, 0.05
@@ -81,7 +82,8 @@ def print_graph(patience: float = 10.0) -> None:
             quiet_since + (QUIET_S if found else FIRST_S), begun + patience
         ):
             found = endpoints(node)
-            if len(found) != known:
+            unknown = any(one["node"].endswith(UNKNOWN_NODE) for one in found)
+            if unknown or len(found) != known:  # whose an endpoint is comes behind it
                 known, quiet_since = len(found), time.monotonic()
             time.sleep(LOOK_S)
         json.dump({"endpoints": found}, sys.stdout)

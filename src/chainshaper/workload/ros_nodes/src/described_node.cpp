@@ -18,6 +18,7 @@
 #include <map>
 #include <memory>
 #include <mutex>
+#include <optional>
 #include <stdexcept>
 #include <string>
 #include <type_traits>
@@ -76,12 +77,15 @@ void take_core() {
   stay_on(0, {cores_in_turn[next++ % cores_in_turn.size()]});
 }
 
-// What a callback does: spend its time, and pass a stamp on to all its topics. Several threads may
-// at once, for callbacks of a reentrant group.
+// What a callback does: spend its time, pass a stamp on to all its topics, and spend what it takes
+// afterwards. Several threads may at once, for callbacks of a reentrant group.
 class Work {
  public:
-  Work(rclcpp::Node &node, const Callback &described, ExecutionTimes times)
-      : times_{std::move(times)}, announces_{described.announces} {
+  Work(rclcpp::Node &node, const Callback &described, ExecutionTimes times,
+       ExecutionTimes afterwards)
+      : times_{std::move(times)},
+        afterwards_{std::move(afterwards)},
+        announces_{described.announces} {
     for (const auto &topic : described.outputs) {
       if (announces_.empty()) {
         outputs_.push_back(node.create_publisher<Data>(topic.name, quality(topic, true)));
@@ -95,7 +99,7 @@ class Work {
   void run(const Stamp &stamp, std::int64_t since_ns) {
     take_core();
     std::unique_lock<std::mutex> alone{mutex_};
-    const auto cpu_ns = times_.next();
+    const auto cpu_ns = times_.next(), afterwards_ns = afterwards_.next();
     auto messages = messages_;
     Text mode;
     if (modes_) mode.data = announces_[turn_++ % announces_.size()];
@@ -104,10 +108,11 @@ class Work {
     spend(cpu_ns, since_ns);
     for (std::size_t i = 0; i < outputs_.size(); ++i) outputs_[i]->publish(messages[i]);
     if (modes_) modes_->publish(mode);
+    spend(afterwards_ns, used_ns());
   }
 
  private:
-  ExecutionTimes times_;
+  ExecutionTimes times_, afterwards_;
   std::vector<std::string> announces_;
   std::vector<rclcpp::Publisher<Data>::SharedPtr> outputs_;
   std::vector<Data> messages_;
@@ -127,12 +132,13 @@ void subscribe(F &filter, rclcpp::Node *node, const Topic &input,
   }
 }
 
-// Works for a set of the oldest message of every input, with the stamp of the first input's.
+// Works for a set of the oldest message of every input, with the stamp of the first input's; with a
+// trigger, for each message of that input, with the newest of the others, which are kept.
 class Synchroniser {
  public:
-  Synchroniser(rclcpp::Node *node, const std::vector<Topic> &inputs, std::shared_ptr<Work> work,
-               const rclcpp::SubscriptionOptions &options)
-      : inputs_{inputs}, waiting_(inputs.size()), work_{std::move(work)} {
+  Synchroniser(rclcpp::Node *node, const std::vector<Topic> &inputs, int trigger,
+               std::shared_ptr<Work> work, const rclcpp::SubscriptionOptions &options)
+      : inputs_{inputs}, trigger_{trigger}, waiting_(inputs.size()), work_{std::move(work)} {
     for (std::size_t i = 0; i < inputs.size(); ++i) {
       filters_.push_back(std::make_unique<Filter>());
       filters_[i]->registerCallback(std::function<void(const Data::ConstSharedPtr &)>(
@@ -147,16 +153,23 @@ class Synchroniser {
     std::unique_lock<std::mutex> alone{mutex_};
     waiting_[i].push_back(stamp);
     if (waiting_[i].size() > inputs_[i].depth) waiting_[i].pop_front();
-    for (const auto &stamps : waiting_) {
-      if (stamps.empty()) return;
+    const bool all_there = std::none_of(waiting_.begin(), waiting_.end(),
+                                        [](const auto &stamps) { return stamps.empty(); });
+    std::optional<Stamp> first;  // of a set
+    if (trigger_ >= 0) {
+      const auto trigger = static_cast<std::size_t>(trigger_);
+      if (all_there && i == trigger) first = waiting_[0].back();
+      waiting_[trigger].clear();
+    } else if (all_there) {
+      first = waiting_[0].front();
+      for (auto &stamps : waiting_) stamps.pop_front();
     }
-    const Stamp first = waiting_[0].front();
-    for (auto &stamps : waiting_) stamps.pop_front();
     alone.unlock();
-    work_->run(first, since_ns);
+    if (first) work_->run(*first, since_ns);
   }
 
   std::vector<Topic> inputs_;
+  int trigger_;
   std::vector<std::deque<Stamp>> waiting_;
   std::shared_ptr<Work> work_;
   std::vector<std::unique_ptr<Filter>> filters_;
@@ -173,15 +186,18 @@ class DescribedNode : public rclcpp::Node {
     const auto number = static_cast<std::uint32_t>(&described - application.data());
     std::uint32_t index = 0;
     for (const auto &callback : described.callbacks) {
-      ExecutionTimes times{callback.execution, seed, number, index++};
-      const auto work = std::make_shared<Work>(*this, callback, std::move(times));
+      constexpr std::uint32_t first_after = 1 << 16;  // as in the live workload and the simulator
+      ExecutionTimes times{callback.execution, seed, number, index};
+      ExecutionTimes afterwards{callback.afterwards, seed, number, first_after + index++};
+      const auto work =
+          std::make_shared<Work>(*this, callback, std::move(times), std::move(afterwards));
       rclcpp::SubscriptionOptions options;
       options.callback_group = group_of(callback);
       const auto &inputs = callback.inputs;
       if (callback.period_ns > 0) {
         add_timer(callback, work, start_ns);
       } else if (inputs.size() > 1) {
-        synchronisers_.push_back(std::make_unique<Synchroniser>(this, inputs, work, options));
+        synchronisers_.push_back(std::make_unique<Synchroniser>(this, inputs, callback.trigger, work, options));
       } else {
         const auto run = [work](const Data &message) { work->run(message.header.stamp, used_ns()); };
         const auto qos = quality(inputs[0]);

@@ -29,6 +29,7 @@ class ExecutionTimes {
 
   std::int64_t next() {
     const auto &values = execution_.values;
+    if (values.empty()) return 0;
     switch (execution_.distribution) {
       case Distribution::uniform:
         return std::uniform_int_distribution<std::int64_t>{values[0], values[1]}(random_);
