@@ -248,9 +248,14 @@ def of_another_clock(pid: int) -> bool:
     """Whether a process may see another CLOCK_MONOTONIC than we do: it has a time namespace of its
     own (time_namespaces(7)), as containers may have that were moved here while they ran.
     """
+    return time_namespace(pid) not in (0, time_namespace())
+
+
+def time_namespace(pid: int | Literal["self"] = "self") -> int:
+    """The time namespace of a process (its inode); 0: not known."""
     with suppress(OSError):  # it has ended, is another user's, or the kernel is older than 5.6
-        return not Path(f"/proc/{pid}/ns/time").samefile("/proc/self/ns/time")
-    return False
+        return Path(f"/proc/{pid}/ns/time").stat().st_ino
+    return 0
 
 
 def since_boot_ns() -> int:

@@ -43,6 +43,7 @@ from chainshaper.linux.threads import (
     of_another_clock,
     parents,
     read_proc,
+    time_namespace,
 )
 from chainshaper.sources.ebpf.trace_points import (
     Argument,
@@ -71,7 +72,8 @@ _HEADER = np.dtype(
         *((name, "<u4") for name in _COUNTS),
         ("objects", "<u8"),
         ("dropped", "<u8"),
-        ("unused", "<u8", 3),
+        ("clock", "<u8"),
+        ("unused", "<u8", 2),
     ]
 )
 _RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
@@ -149,7 +151,8 @@ class TracedProcess:
         self.pid = pid or self.inner_pid
         if not (0 < self.pid <= _LARGEST_ID and 0 < self.inner_pid <= _LARGEST_ID):
             raise InputError(f"what was sent says that it is of process {self.inner_pid}")
-        if of_another_clock(self.pid):
+        clock = int(header["clock"][0])  # what it said counts, for it may have ended since
+        if clock not in (0, time_namespace()) or (not clock and of_another_clock(self.pid)):
             raise InputError("it has another clock, that of a time namespace: record it in there")
         self.damage: str | None = None
         self._tids: dict[int, int] = {}
