@@ -1,8 +1,11 @@
 """What /proc says about the processes that a test started, directly or through others."""
 
+import subprocess
 import time
 from collections.abc import Callable
 from pathlib import Path
+
+import pytest
 
 from chainshaper.linux.threads import list_threads, parents
 
@@ -49,3 +52,14 @@ def wait_for(
     while not condition():
         assert time.monotonic() < deadline, f"waited {seconds} s in vain for {what}"
         time.sleep(pause)
+
+
+def in_time_namespace(offset_s: int, *command: str) -> list[str]:
+    """A command whose CLOCK_MONOTONIC and CLOCK_BOOTTIME are so far ahead of ours; skips where the
+    kernel makes no such namespaces, or not for us.
+    """
+    offsets = (f"--monotonic={offset_s}", f"--boottime={offset_s}")
+    words = ["unshare", "--time", *offsets, "--fork", "--kill-child"]
+    if subprocess.run([*words, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("no time namespace can be made here")
+    return [*words, *command]

@@ -146,6 +146,8 @@ exec chroot "$0/root" env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin sh -ec "$2"
 INSTALLED = """
 there() { find /etc /usr /var/lib/dpkg /opt/chainshaper* -name '*chainshaper*' | sort; }
 cd /tmp && there > before 2> /dev/null
+test "$(dpkg-deb -c package.deb | head -1 | cut -c1-10)" = drwxr-xr-x  # it is the robot's /
+dpkg -i package.deb > /dev/null
 dpkg -i package.deb > /dev/null
 python3 -c "
 from importlib.metadata import entry_points
@@ -160,6 +162,13 @@ python3 -c 'import polars' 2>&1 | grep ModuleNotFoundError
 chainshaper status
 dpkg -r chainshaper > /dev/null
 rm -rf simulated recorded plan.yaml && there > after 2> /dev/null
+diff before after
+dpkg -i package.deb > /dev/null
+rm -rf /opt/chainshaper
+dpkg -r chainshaper > removed 2>&1
+grep "/opt/chainshaper is gone, so no plan in force was ended" removed > /dev/null
+if grep Traceback removed; then exit 1; fi
+there > after 2> /dev/null
 diff before after && echo nothing is left
 """
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from applied_plans import node_command
 from command_line import called
-from processes import wait_for
+from processes import children_of, in_time_namespace, wait_for
 from roles import role
 from story import OFFSET, Story
 
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.threads import planned_changes
 from chainshaper.planning import PlanRequest, Profile, plan_application, plan_chain, plan_shaping
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, RecordingInfo
 
 MS = 1_000_000
@@ -86,6 +86,25 @@ def test_running_nodes_that_follow_clock_are_refused_before_anything_changes(
                     planned_changes(stamped, "fifo")
             with pytest.raises(OperationError, match=r"/chainshaper_t2 .* is not running"):
                 planned_changes(stamped if given == "otherwise" else cycled, "fifo")
+        finally:
+            process.kill()
+
+
+def test_a_shaping_node_of_another_clock_is_refused_before_anything_changes(
+    tmp_path: Path,
+) -> None:
+    """In a time namespace it would count its slots from an instant that is none of its own."""
+    about: dict[str, Any] = {"spec": "/t1../t2", "output": "/t2", "publisher": "/origin"}
+    plan = plan_shaping(np.array([8, 12]) * MS, 100 * MS, **about, nodes=("/origin",))
+    output = tmp_path / "ran"
+    words = in_time_namespace(100_000, *node_command("chainshaper_t2", output))
+    with subprocess.Popen(words) as process:
+        try:
+            wait_for(lambda: output.exists() and output.stat().st_size > 0, "the node")
+            (pid,) = children_of(process.pid)
+            said = rf"/chainshaper_t2 \(process {pid}\) has another clock .*nsenter --time"
+            with pytest.raises(PlatformError, match=said):
+                planned_changes(plan, "fifo")
         finally:
             process.kill()
 

@@ -1,13 +1,15 @@
 """Threads as the kernel shows them, what their names say, and what is asked of it for them."""
 
 import os
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
 import pytest
 from actors import acting
 from known import known
-from processes import wait_for
+from processes import in_time_namespace, wait_for
 
 from chainshaper.linux.scheduling import (
     Scheduling,
@@ -172,3 +174,18 @@ def test_our_own_real_time_threads_are_not_foreign() -> None:
     thread.start()
     thread.join()
     assert not any(f"({os.getpid()})" in name for name in listed[0])
+
+
+def test_a_process_has_the_same_start_for_those_in_other_time_namespaces() -> None:
+    """Else whoever looks from there takes a run that is in force for one that has crashed."""
+    ours = str(start_of(os.getpid(), os.getpid()))
+    program = (
+        "import sys; from chainshaper.linux.threads import has_ended, list_threads, start_of;"
+        "pid, started = map(int, sys.argv[1:]); thread, = list_threads(pid)[:1];"
+        "print(start_of(pid, pid), thread.started, has_ended(pid, started))"
+    )
+    command = [sys.executable, "-c", program, str(os.getpid()), ours]
+    there = subprocess.run(
+        in_time_namespace(200_000, *command), capture_output=True, text=True, check=True
+    )
+    assert there.stdout.split() == [ours, ours, "False"]

@@ -152,3 +152,41 @@ def test_a_fleet_is_checked_as_here(helped: str, tmp_path: Path) -> None:
     assert slowdowns_in(*sides, scheduler=helped) == slowdowns_in(*sides)
     with pytest.raises(InputError, match="gone: no such folder"):
         slowdowns_in(every, paths, scheduler=helped)
+
+
+@pytest.mark.parametrize("ending", [signal.SIGKILL, signal.SIGSTOP])
+def test_a_scheduler_that_dies_or_hangs_costs_no_finished_row(
+    start: Start,
+    ending: signal.Signals,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(computing, "WITHOUT_WORKERS_S", 2)
+    monkeypatch.setattr(computing, "ANSWER_S", 1)
+    file = tmp_path / "scheduler.json"
+    port = ("--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
+    process: Any = start("scheduler", *port)
+    wait_for(lambda: file.exists() and file.stat().st_size > 0, "the scheduler")
+    address = str(json.loads(file.read_text())["address"])
+    helper = worker(start, address)
+    with distributed.Client(address, set_as_default=False) as client:
+        client.wait_for_workers(1, timeout=60)
+
+    def end(share: float, _: str) -> None:
+        if share and process.poll() is None:
+            process.send_signal(ending)
+            helper.send_signal(signal.SIGSTOP)  # it computes no more either
+
+    try:
+        with pytest.raises(OperationError, match=f"the Dask cluster at {address} failed") as failed:
+            swept(tmp_path / "out.parquet", scheduler=address, progress=end)
+    finally:
+        process.send_signal(signal.SIGCONT)
+        helper.kill()
+    assert "finished rows stay" in str(failed.value)
+    assert len(rows_beside(tmp_path / "out.parquet").read_text().splitlines()) > 1
+    assert "Traceback" not in capfd.readouterr().err
+    process.kill()
+    goes_on = swept(tmp_path / "out.parquet", workers=1)
+    assert goes_on.equals(swept(tmp_path / "here.parquet", workers=1))

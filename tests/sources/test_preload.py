@@ -3,6 +3,7 @@
 import fcntl
 import os
 import platform
+import random
 import re
 import shutil
 import signal
@@ -19,7 +20,7 @@ import numpy as np
 import pytest
 from command_line import called, json_of
 from lttng_node import required_node
-from processes import wait_for
+from processes import in_time_namespace, wait_for
 from traced_program import (
     Traced,
     assert_everything,
@@ -354,6 +355,70 @@ def test_a_process_that_is_killed_has_lost_nothing_and_leaves_nothing(tmp_path: 
     before = set(Path("/dev/shm").iterdir())
     assert taken(traced(tracer_of(tmp_path), run)) == list(range(100))
     assert set(Path("/dev/shm").iterdir()) == before
+
+
+@pytest.mark.parametrize("ahead_s", [-1000, 100_000])
+def test_a_process_of_another_clock_is_refused_and_named(tmp_path: Path, ahead_s: int) -> None:
+    """In a time namespace: its times fit to no other process's, whether they seem to lie ahead."""
+
+    def run() -> list[list[str]]:
+        python("for n in range(5): take(n)")
+        command = in_time_namespace(ahead_s, sys.executable, "-c", CALLER + "take(99)")
+        subprocess.run(command, check=True, timeout=60)
+        return []
+
+    found = traced(tracer_of(tmp_path), run)
+    assert taken(found) == list(range(5))
+    (note,) = (one for one in found.info.notes if one.startswith("nothing of process"))
+    assert "another clock, that of a time namespace" in note
+
+
+FLOOD = """
+#include <stdint.h>
+void ros_trace_rmw_publish(uint64_t, uint64_t, uint64_t) __attribute__((weak));
+int main(void) {
+  for (uint64_t n = 1;; n++) ros_trace_rmw_publish(n, ~n, 3 * n);
+}
+"""
+
+
+def test_who_is_stopped_or_killed_in_the_middle_of_a_write_leaves_no_wrong_record(
+    tmp_path: Path,
+) -> None:
+    """All that the process does is to write: read are whole records, in order, each once."""
+    (tmp_path / "flood.c").write_text(FLOOD)
+    subprocess.run(["cc", "-o", tmp_path / "flood", tmp_path / "flood.c"], check=True)
+    environment = {**os.environ, "LD_PRELOAD": str(installed_library())}
+    dice, last, total = random.Random(39), 0, 0
+    with subprocess.Popen([tmp_path / "flood"], env=environment) as process:
+        there: dict[int, TracedProcess] = {}
+
+        def look() -> None:
+            nonlocal last, total
+            for records in there[process.pid].new_records():
+                numbers, inverted, thrice = records["values"].T[:3]
+                assert (inverted == ~numbers).all()
+                assert (thrice == 3 * numbers).all()
+                assert (np.diff(numbers) == 1).all()
+                assert numbers[0] > last
+                last, total = int(numbers[-1]), total + records.size
+
+        try:
+            users = {os.geteuid()}
+            wait_for(lambda: process.pid in dict(memories(users, ())), "its memory")
+            there.update(memories(users, ()))
+            for _ in range(50):
+                process.send_signal(signal.SIGSTOP)
+                look()
+                process.send_signal(signal.SIGCONT)
+                time.sleep(dice.random() * 0.01)
+        finally:
+            process.kill()
+        process.wait()
+        look()
+    memory = there[process.pid]
+    assert total + memory.lost == last > 0
+    assert memory.damage is None
 
 
 def test_a_reader_that_is_killed_disturbs_nothing_and_leaves_nothing(tmp_path: Path) -> None:

@@ -5,16 +5,18 @@ import os
 import re
 import signal
 import socket
+import struct
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from datetime import datetime
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
-from threading import Thread
+from threading import Event, Thread
 from types import SimpleNamespace
 from typing import Any, ClassVar
 from urllib.request import urlopen
@@ -42,6 +44,7 @@ from chainshaper.values.recording import open_recording
 from chainshaper.verify import watch as watch_module
 from chainshaper.verify.budgets import load_budget
 from chainshaper.verify.measure import PARTS, measure_latency
+from chainshaper.verify.metrics import SCRAPERS
 from chainshaper.verify.promises import OutputsDue
 from chainshaper.verify.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 
@@ -481,6 +484,111 @@ def test_metrics_are_the_figures_that_are_shown() -> None:
     key = (("chain", CHAIN), ("span", "hour"), ("statistic", "max"))
     assert sent["chainshaper.chain.latency"][key].as_double == known(hour.max_ns) / SECOND
     assert "chainshaper.events.lost" in sent
+
+
+@contextmanager
+def exported(*, port: int | None = None, endpoint: str | None = None) -> "Iterator[list[str]]":
+    """Metrics of a look while this is entered; what there was to say about the collector."""
+    said: list[str] = []
+    with exporting(port, endpoint) as export:
+        until = Event()
+
+        def look() -> None:
+            while not until.wait(0.05):
+                said.extend(export(seen_with(latency_statistics(np.arange(5, 9)), 0, ())))
+
+        thread = Thread(target=look)
+        thread.start()
+        try:
+            yield said
+        finally:
+            until.set()
+            thread.join()
+
+
+def free_port() -> int:
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return int(free.getsockname()[1])
+
+
+def test_whoever_scrapes_disturbs_neither_the_watch_nor_others(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Connections that are reset, nonsense, and more that say nothing than the port serves."""
+    port, slow = free_port(), list[socket.socket]()
+    with exported(port=port):
+        for _ in range(20):
+            for request in (os.urandom(200), b"GET /metrics HTTP/1.1\r\n\r\n", b"G" * 70_000):
+                with socket.create_connection(("127.0.0.1", port)) as rude, suppress(OSError):
+                    rude.setsockopt(
+                        socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0)
+                    )  # closing it is a reset
+                    rude.sendall(request)
+        for _ in range(3 * SCRAPERS):
+            slow.append(socket.create_connection(("127.0.0.1", port), timeout=60))
+            slow[-1].sendall(b"GET /metr")
+        serving = [one for one in threading.enumerate() if "process_request" in one.name]
+        assert len(serving) <= 2 * SCRAPERS, "those that were closed may be about to end"
+        assert b"chainshaper_" in urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60).read()
+        assert slow[0].recv(1) == b"", "it was closed for those that came later"
+    for connection in slow:
+        connection.close()
+    assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize("collector", ["nobody listens", "it hangs", "it closes"])
+def test_a_collector_that_is_away_is_named_once_and_holds_nobody_up(
+    collector: str, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watch_module, "EVERY_MS", 100)
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "1")  # of an attempt, with all its retries
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        endpoint = f"http://127.0.0.1:{listening.getsockname()[1]}/v1/metrics"
+        if collector == "nobody listens":
+            listening.close()
+        elif collector == "it closes":
+            Thread(target=_close_all, args=(listening,), daemon=True).start()
+        with exported(endpoint=endpoint) as said:
+            wait_for(lambda: bool(said), "it to be told")
+            time.sleep(1.5)  # for another attempt or two
+    assert [one.partition(" (")[0] for one in said] == [f"metrics do not arrive at {endpoint}"]
+    assert capfd.readouterr().err == ""
+
+
+def _close_all(listening: socket.socket) -> None:
+    with suppress(OSError):  # it is closed
+        while True:
+            listening.accept()[0].close()
+
+
+def test_a_collector_that_comes_back_gets_metrics_and_is_named(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(watch_module, "EVERY_MS", 100)
+    monkeypatch.setenv("OTEL_EXPORTER_OTLP_TIMEOUT", "1")
+    port = free_port()
+    with exported(endpoint=f"http://127.0.0.1:{port}/v1/metrics") as said:
+        wait_for(lambda: bool(said), "it to be missed")
+        with HTTPServer(("127.0.0.1", port), Collector) as server:
+            Thread(target=server.serve_forever, daemon=True).start()
+            wait_for(lambda: len(said) > 1, "it to be found again")
+            server.shutdown()
+    assert said[1] == f"metrics arrive at http://127.0.0.1:{port}/v1/metrics again"
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        *(f"--metrics={port}" for port in ("0", "65536", "80x")),
+        *(f"--otlp={url}" for url in ("collector:4318", "ftp://host/", "http://", "http://[::1")),
+        "--otlp=http://host:99999/",
+    ],
+)
+def test_no_port_and_no_address_are_wrong_use(option: str) -> None:
+    said = called("watch", "--chain", CHAIN, option)
+    assert said.code == 2
+    assert "Traceback" not in said.err
 
 
 def test_wrong_use_and_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -284,7 +284,10 @@ def watch(
         Path(),
     ),
     metrics: int | None = opt.option(
-        "--metrics PORT", "Serve OpenMetrics (Prometheus) on this port of this machine.", min=1
+        "--metrics PORT",
+        "Serve OpenMetrics (Prometheus) on this port of this machine.",
+        min=1,
+        max=65535,
     ),
     otlp: str | None = opt.option(
         "--otlp URL", "Send metrics there every ten seconds, by OTLP over HTTP (OpenTelemetry)."
@@ -354,7 +357,7 @@ def watch(
                 _save(watched, recorder)
             if (late := time.monotonic_ns() - next_look) >= 0:
                 next_look += (1 + late // every) * every  # none is made up for
-                export(seen := watched.look())
+                out.notes(export(seen := watched.look()))
                 publish(seen)
                 broken = [one.text for one in judged(seen)]
                 if json:

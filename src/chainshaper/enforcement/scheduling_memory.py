@@ -16,7 +16,6 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from time import CLOCK_BOOTTIME, clock_gettime_ns
 from typing import Any
 
 from chainshaper.linux.cgroups import threads_in
@@ -40,6 +39,7 @@ from chainshaper.linux.threads import (
     find_thread,
     list_threads,
     parents,
+    since_boot_ns,
     start_of,
 )
 from chainshaper.values.errors import OperationError, PlatformError
@@ -127,7 +127,7 @@ def note_scheduling(
         noted.append((thread, target))
         entry = {name: getattr(thread, name) for name in ("tid", "started", "pid", "comm")}
         entry |= {"before": asdict(before), "given": asdict(target)}
-        entries.append({**entry, "at": clock_gettime_ns(CLOCK_BOOTTIME) // TICK_NS})
+        entries.append({**entry, "at": since_boot_ns() // TICK_NS})
     if entries:
         journal.note(KIND, *entries)
     return noted

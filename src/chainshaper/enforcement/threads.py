@@ -46,7 +46,14 @@ from chainshaper.linux.processes import (
     user_name,
 )
 from chainshaper.linux.scheduling import Scheduling
-from chainshaper.linux.threads import TICK_NS, Thread, ThreadRole, gate_thread_name, is_of_zenoh
+from chainshaper.linux.threads import (
+    TICK_NS,
+    Thread,
+    ThreadRole,
+    gate_thread_name,
+    is_of_zenoh,
+    since_boot_ns,
+)
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import Plan, ReceiverPlace, Server, ShapingNode, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
@@ -288,7 +295,7 @@ def _is_same(process: Process, named: tuple[str, ...], seen: RecordedProcess) ->
     pid = process.pid if seen.numbered_here else process.inner_pid
     if seen.pid != pid or not process.threads:
         return False
-    asleep_ns = time.clock_gettime_ns(time.CLOCK_BOOTTIME) - time.monotonic_ns()
+    asleep_ns = since_boot_ns() - time.monotonic_ns()
     if process.threads[0].started * TICK_NS - asleep_ns > seen.seen_ns + TICK_NS:
         return False
     return not (named and seen.nodes) or not set(named).isdisjoint(seen.nodes)

@@ -124,6 +124,7 @@ def apply_plan(
         run.await_nodes((START_NS if command else 0) if wait_ns is None else wait_ns, progress)
         run.guardians.await_ready(run.go_on)
         threads.refuse_simulated(given, run.found)
+        threads.refuse_other_clocks(given, run.found)
         said = threads.check_publishers(given, run.found, recordings)
         said += allocation.waiting_receivers(given, run.schedule())
         run.begin_state(command, plan_path)

@@ -29,7 +29,7 @@ from chainshaper.flow.phase import Phase, measure_phase
 from chainshaper.linux import processes as running
 from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.linux.threads import Thread, ThreadRole, read_proc
+from chainshaper.linux.threads import Thread, ThreadRole, of_another_clock, read_proc
 from chainshaper.planning import application_plan as joint
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import LEAD_NS, chain_name, linked, with_windows
@@ -47,6 +47,7 @@ from chainshaper.values.errors import (
     ChainshaperError,
     InputError,
     OperationError,
+    PlatformError,
     shown,
     text_of,
 )
@@ -208,6 +209,18 @@ def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
                 raise InputError(simulated_stamps(node))
 
 
+def refuse_other_clocks(plan: ApplicationPlan, found: Allocation) -> None:
+    """Raises PlatformError: a shaping node, which gets its slots in our clock, has another."""
+    shaping = {node.thread.node for node in plan.shaping_nodes}
+    for one in found.threads:
+        for node in shaping.intersection(one.nodes):
+            if of_another_clock(pid := one.thread.pid):
+                raise PlatformError(
+                    f"the shaping node {node} (process {pid}) has another clock than we, that of a"
+                    f" time namespace: apply the plan in there (`nsenter --time --target {pid} …`)"
+                )
+
+
 def _follows_clock(pid: int) -> bool:
     words = os.fsdecode(read_proc(f"/proc/{pid}/cmdline")).split("\0")
     texts = [one for one in words if one.startswith("use_sim_time")]
@@ -294,6 +307,7 @@ def planned_changes(
         choice = choose_back_end(back_end)
         refuse_unfit(plan, choice.name)
         refuse_simulated(plan, found)
+        refuse_other_clocks(plan, found)
         wanted = allocation.plan_scheduling(plan, found, available_cores())
         threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
         notes = (*found.notes, *allocation.waiting_receivers(plan, threads))

@@ -7,11 +7,12 @@ interpreter's lock. And they open no port that other users could reach.
 import asyncio
 import importlib
 import importlib.metadata
+import logging
 import re
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import AbstractContextManager, contextmanager, suppress
 from dataclasses import dataclass
 from queue import SimpleQueue
 from threading import Event
@@ -23,6 +24,8 @@ from chainshaper.values.errors import ChainshaperError, InputError, OperationErr
 CONNECT_S = 10
 WITHOUT_WORKERS_S = 60
 LOOK_S = 0.5
+ANSWER_S = 5
+CLOSE_S = 3
 ASKED_OF_CLUSTER = 10_000
 """So many points at a time are with a cluster: more than its workers compute at once."""
 SAME = ("chainshaper", "numpy", "distributed")
@@ -112,7 +115,9 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
             f"no Dask scheduler answers at {address} ({error}): start one with `dask scheduler`,"
             " and give the address that it prints"
         ) from error
-    with connected as client:
+    # Dask logs a traceback for each connection that breaks; what that means is said below.
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    with _closed_in_time(connected) as client:
         completed = distributed.as_completed(loop=client.loop)
 
         def submit(function: Callable[..., Any], *arguments: Any) -> Any:
@@ -127,9 +132,11 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
                 time.sleep(0.02)
                 if time.monotonic() - looked > LOOK_S:
                     looked = time.monotonic()
-                    seen = looked if client.nthreads() else seen
-                    if looked - seen > WITHOUT_WORKERS_S:
-                        raise TimeoutError(f"it has had no workers for {WITHOUT_WORKERS_S} s")
+                    there = _has_workers(client)
+                    seen = time.monotonic() if there else seen
+                    if time.monotonic() - seen > WITHOUT_WORKERS_S:
+                        none = "it does not answer" if there is None else "it has had no workers"
+                        raise TimeoutError(f"{none} for {WITHOUT_WORKERS_S} s")
             return next(completed)
 
         try:
@@ -141,6 +148,24 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
                 f"the Dask cluster at {address} failed ({type(error).__name__}: {error}){stays}."
                 " See that workers run, with chainshaper and memory; then the same command goes on"
             ) from error
+
+
+@contextmanager
+def _closed_in_time(client: Any) -> Iterator[Any]:
+    """A client of a cluster that may not answer any more when it is closed."""
+    try:
+        yield client
+    finally:
+        with suppress(Exception):  # its scheduler is gone, or hangs
+            client.close(timeout=CLOSE_S)
+
+
+def _has_workers(client: Any) -> bool | None:
+    """Whether a cluster has workers; None: its scheduler does not answer, as when it is stopped."""
+    try:
+        return bool(client.sync(client.scheduler.ncores, callback_timeout=ANSWER_S))
+    except (TimeoutError, asyncio.TimeoutError):
+        return None
 
 
 def _versions() -> dict[str, str]:

@@ -11,6 +11,7 @@ Zenoh, `zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, "Identifying T
 import functools
 import os
 import re
+import time
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -25,6 +26,7 @@ RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
 """A flag that shares the word with the policy."""
 TICK_NS = 1_000_000_000 // os.sysconf("SC_CLK_TCK")
 """The kernel shows the start of a thread in ticks of 10 ms."""
+_STARTED = 19  # of the fields of /proc/…/stat from the state on
 _DEAD = {b"Z", b"X"}
 
 _OF_PYTHON = ("SCHED_OTHER", "SCHED_FIFO", "SCHED_RR", "SCHED_BATCH", "SCHED_IDLE")
@@ -172,7 +174,7 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
         policy=POLICIES.get(policy, str(policy)),
         priority=int(fields[37]),
         cores=cores,
-        started=int(fields[19]),
+        started=int(fields[_STARTED]),
         inner_tid=inner_tid,
         kind=None if tid == pid else dds_kind(comm),
     )
@@ -191,7 +193,8 @@ def living_processes() -> Iterator[tuple[int, int]]:
         with suppress(OSError):  # it ended meanwhile
             if fields[0] not in _DEAD:
                 status = read_proc(f"/proc/{pid}/status")
-                yield from ((one, int(fields[19])) for one in {pid, innermost_id(status) or pid})
+                started = int(fields[_STARTED])
+                yield from ((one, started) for one in {pid, innermost_id(status) or pid})
 
 
 def parents() -> dict[int, int]:
@@ -222,7 +225,42 @@ def read_stat(folder: str) -> tuple[str, list[bytes]]:
     stat = read_proc(f"{folder}/stat")
     name_end = stat.rindex(b")")  # a name may contain spaces and brackets
     name = stat[stat.index(b"(") + 1 : name_end]
-    return text_of(name), stat[name_end + 1 :].split()
+    fields = stat[name_end + 1 :].split()
+    if _started_later():
+        fields[_STARTED] = b"%d" % (int(fields[_STARTED]) - _started_later())
+    return text_of(name), fields
+
+
+@functools.cache
+def _started_later() -> int:
+    """By how many ticks the kernel shows us all starts later than to those who share no time
+    namespace with us (time_namespaces(7)): a start names a process to all of them alike.
+    """
+    with suppress(OSError, ValueError):  # before Linux 5.6
+        for line in lines_of(read_proc("/proc/self/timens_offsets")):
+            clock, seconds, ns = line.split()
+            if clock == b"boottime":
+                return (int(seconds) * 1_000_000_000 + int(ns)) // TICK_NS
+    return 0
+
+
+def of_another_clock(pid: int) -> bool:
+    """Whether a process may see another CLOCK_MONOTONIC than we do: it has a time namespace of its
+    own (time_namespaces(7)), as containers may have that were moved here while they ran.
+    """
+    return time_namespace(pid) not in (0, time_namespace())
+
+
+def time_namespace(pid: int | Literal["self"] = "self") -> int:
+    """The time namespace of a process (its inode); 0: not known."""
+    with suppress(OSError):  # it has ended, is another user's, or the kernel is older than 5.6
+        return Path(f"/proc/{pid}/ns/time").stat().st_ino
+    return 0
+
+
+def since_boot_ns() -> int:
+    """For how long the machine has run, sleep included: the clock of :attr:`Thread.started`."""
+    return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - _started_later() * TICK_NS
 
 
 def status_field(status: bytes, name: str, base: int = 10) -> list[int]:
@@ -241,7 +279,7 @@ def innermost_id(status: bytes) -> int | None:
 def start_of(pid: int, tid: int) -> int | None:
     """When a thread started, in clock ticks since the machine booted; None if there is none."""
     with suppress(OSError):
-        return int(read_stat(f"/proc/{pid}/task/{tid}")[1][19])
+        return int(read_stat(f"/proc/{pid}/task/{tid}")[1][_STARTED])
     return None
 
 
@@ -249,7 +287,7 @@ def has_ended(tid: int, started: int) -> bool:
     """Whether the thread that started then is gone, or a zombie."""
     with suppress(OSError):
         fields = read_stat(f"/proc/{tid}")[1]
-        return int(fields[19]) != started or fields[0] in _DEAD
+        return int(fields[_STARTED]) != started or fields[0] in _DEAD
     return True
 
 

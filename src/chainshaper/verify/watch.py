@@ -59,6 +59,13 @@ from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.recording import InForceInfo, Recording, refuse_existing, write_recording
 from chainshaper.verify.measure import PARTS
+from chainshaper.verify.metrics import (
+    EVERY_MS,
+    LONGEST_END_MS,
+    check_endpoint,
+    serving,
+    tell_delivery,
+)
 from chainshaper.verify.predictions import due_of
 from chainshaper.verify.promises import OutputsDue
 
@@ -531,39 +538,35 @@ def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[C
 @contextlib.contextmanager
 def exporting(
     port: int | None = None, endpoint: str | None = None
-) -> Iterator[Callable[[Seen], None]]:
+) -> Iterator[Callable[[Seen], list[str]]]:
     """Metrics of what was seen last: OpenMetrics on a local port, OTLP to an HTTP endpoint.
 
-    What it gives wants every look. Times are in seconds, as both conventions have it; cycles count
-    from the beginning of the watch.
+    What it gives wants every look, and answers with what there is to say about the collector. Times
+    are in seconds, as both conventions have it; cycles count from the beginning of the watch.
 
     Raises PlatformError: the OpenTelemetry SDK is not installed. OperationError: no such port.
+    InputError: no such endpoint.
     """
     if port is None and endpoint is None:
-        yield lambda _: None
+        yield lambda _: []
         return
     library = partial(extra_library, purpose="exporting metrics", extra="metrics")
     metrics, export = (library(f"opentelemetry.sdk.metrics{sub}") for sub in ("", ".export"))
     observation = library("opentelemetry.metrics").Observation
-    readers = []
+    readers, told = [], list[Callable[[], list[str]]]()
     with contextlib.ExitStack() as until:
+        if endpoint is not None:
+            check_endpoint(endpoint)
         if port is not None:
-            serving = library("prometheus_client")
-            try:
-                server, _ = serving.start_http_server(port, addr="127.0.0.1")
-            except OSError as error:
-                raise OperationError(
-                    f"port {port} cannot be served ({error.strerror}): name another with --metrics"
-                ) from error
-            until.callback(server.server_close)
-            until.callback(server.shutdown)
+            until.enter_context(serving(port, library("prometheus_client").MetricsHandler))
             readers.append(library("opentelemetry.exporter.prometheus").PrometheusMetricReader())
         if endpoint is not None:
             otlp = library("opentelemetry.exporter.otlp.proto.http.metric_exporter")
             exporter = otlp.OTLPMetricExporter(endpoint=endpoint)
-            readers.append(export.PeriodicExportingMetricReader(exporter, 10_000))
+            told.append(tell_delivery(exporter, endpoint))
+            readers.append(export.PeriodicExportingMetricReader(exporter, EVERY_MS))
         provider = metrics.MeterProvider(metric_readers=readers)
-        until.callback(provider.shutdown)
+        until.callback(provider.shutdown, timeout_millis=LONGEST_END_MS)
         meter, last = provider.get_meter("chainshaper"), list[Seen]()
 
         def observed(wanted: str, _options: object) -> Iterator[Any]:
@@ -577,8 +580,9 @@ def exporting(
             values = [partial(observed, name)]
             create(f"chainshaper.{name}", values, unit=unit, description=about)
 
-        def take(seen: Seen) -> None:
+        def take(seen: Seen) -> list[str]:
             last[:] = [seen]
+            return [text for one in told for text in one()]
 
         yield take
 

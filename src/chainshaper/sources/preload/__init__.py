@@ -37,7 +37,14 @@ from numpy.typing import NDArray
 from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import descendants, run_users
-from chainshaper.linux.threads import innermost_id, list_threads, parents, read_proc
+from chainshaper.linux.threads import (
+    innermost_id,
+    list_threads,
+    of_another_clock,
+    parents,
+    read_proc,
+    time_namespace,
+)
 from chainshaper.sources.ebpf.trace_points import (
     Argument,
     TracePoint,
@@ -65,7 +72,8 @@ _HEADER = np.dtype(
         *((name, "<u4") for name in _COUNTS),
         ("objects", "<u8"),
         ("dropped", "<u8"),
-        ("unused", "<u8", 3),
+        ("clock", "<u8"),
+        ("unused", "<u8", 2),
     ]
 )
 _RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
@@ -121,7 +129,8 @@ class TracedProcess:
     written, and counts as lost what may have been overwritten meanwhile. ``pid`` is the process's
     number here, ``inner_pid`` what it calls itself in its container.
 
-    Raises InputError: the descriptor is of no such memory, or of one that may shrink.
+    Raises InputError: the descriptor is of no such memory, of one that may shrink, or of a process
+    whose times are of another clock.
     """
 
     def __init__(self, descriptor: int, pid: int = 0) -> None:
@@ -142,6 +151,9 @@ class TracedProcess:
         self.pid = pid or self.inner_pid
         if not (0 < self.pid <= _LARGEST_ID and 0 < self.inner_pid <= _LARGEST_ID):
             raise InputError(f"what was sent says that it is of process {self.inner_pid}")
+        clock = int(header["clock"][0])  # what it said counts, for it may have ended since
+        if clock not in (0, time_namespace()) or (not clock and of_another_clock(self.pid)):
+            raise InputError("it has another clock, that of a time namespace: record it in there")
         self.damage: str | None = None
         self._tids: dict[int, int] = {}
         self._rings = np.frombuffer(memory, _RING, _RINGS, _HEADER.itemsize)

@@ -76,7 +76,8 @@ struct memory {
   uint32_t magic, format, pid, rings, ring_records, object_records;
   _Atomic uint64_t objects;  // records that were asked for: more than there are, when it is full
   _Atomic uint64_t dropped;  // events that found no room
-  uint64_t unused[3];
+  uint64_t clock;             // the time namespace whose CLOCK_MONOTONIC it is; 0: not known
+  uint64_t unused[2];
   struct ring ring[RINGS];
   struct record object[OBJECT_RECORDS];
   struct record records[RINGS][RING_RECORDS];
@@ -257,7 +258,8 @@ static void begin(struct memory *made) {
   made->rings = RINGS;
   made->ring_records = RING_RECORDS;
   made->object_records = OBJECT_RECORDS;
-  made->magic = 0x63687368;
+  struct stat clock;
+  if (stat("/proc/self/ns/time", &clock) == 0) made->clock = clock.st_ino;
 }
 
 // Close the memory's descriptor, unless the node has closed it and the number is another file's now.
@@ -312,6 +314,9 @@ static bool make_memory(void) {
     refused = !memory;
     return memory;  // another thread was faster, or there is none
   }
+  // Who attaches takes the first memory that has this: not one that was made in vain beside it.
+  atomic_thread_fence(memory_order_release);
+  *(volatile uint32_t *)&made->magic = 0x63687368;
   fstat(file, &identity);
   descriptor = file;
   Dl_info behind;
