@@ -63,7 +63,8 @@ def by_definition(starts: Happenings, ends: Happenings) -> list[int]:
             depth = 0
             for _, kind, _ in ordered:  # an end without a start is of an instance of before
                 depth = depth + 1 if kind == 0 else max(0, depth - 1)
-            ordered += sorted(now, key=lambda event, is_open=depth > 0: (event[1] == 0) == is_open)
+            first = 1 if depth > 0 else 0  # the end of what is open, or else a start
+            ordered += sorted(now, key=lambda event, first=first: event[1] != first)  # type: ignore[misc]
         for (_, kind, row), (_, after, end) in itertools.pairwise(ordered):
             if (kind, after) == (0, 1):
                 result[row] = end
