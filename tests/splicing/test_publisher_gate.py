@@ -168,11 +168,16 @@ def decided(rows: list[dict[str, Any]]) -> list[tuple[Any, ...]]:
 
 
 def in_real_time(case: Case) -> bool:
-    """Whether no slot is short, nor a message there just as a slot that it may miss opens."""
+    """Whether no slot is short, no message is there just as a slot that it may miss opens, and none
+    comes in the last millisecond of a slot behind which it is discarded.
+    """
+    ages = [arrival - (stamp or 0) for arrival, stamp in case.arrivals]
     opening = {start for start, _ in case.gate.slots}
-    just = any((arrival - (stamp or 0)) in opening for arrival, stamp in case.arrivals)
+    just = any(age in opening for age in ages)
     last = case.gate.into_open_slot == "next-slot" and just
-    return not last and min(end - start for start, end in case.gate.slots) >= MS
+    left = [end - age % case.gate.cycle_ns for age in ages for _, end in case.gate.slots]
+    closing = case.gate.overrun == "discard" and any(0 < ns < MS for ns in left)
+    return not (last or closing) and min(end - start for start, end in case.gate.slots) >= MS
 
 
 def expected(case: Case) -> list[tuple[Any, ...]]:
