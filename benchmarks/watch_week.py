@@ -148,7 +148,7 @@ class Process:
                 words = np.frombuffer(text.encode().ljust(40, b"\0"), np.uint64).tolist()
                 objects.append(_record(created_ns, pid, 1, [16 * len(text) + place, *words]))
         sizes = (RINGS, RING_RECORDS, OBJECT_RECORDS)
-        header = np.array([(0x63687368, 2, pid, *sizes, len(objects), 0, [0] * 3)], _HEADER)
+        header = np.array([(0x63687368, 2, pid, *sizes, len(objects), 0, 0, [0] * 2)], _HEADER)
         os.pwrite(self.file, np.array(objects, RECORD).tobytes(), self._of_objects)
         os.pwrite(self.file, header.tobytes(), 0)
 
