@@ -551,8 +551,8 @@ def rows_of(
                     break
             if not pending:
                 return
-            future = computing.finished()
-            result, of = future.result(), pending.pop(future)
+            future, result = computing.finished()
+            of = pending.pop(future)
             if isinstance(of, int):
                 yield of, result
             else:

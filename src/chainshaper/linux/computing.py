@@ -39,10 +39,10 @@ Other = TypeVar("Other")
 @dataclass(frozen=True)
 class Engine:
     """Who computes: ``submit`` (a function and its arguments, futures among them), the next future
-    that is ``finished``, and how many may be ``under_way``."""
+    that is ``finished`` and its result, and how many may be ``under_way``."""
 
     submit: Callable[..., Any]
-    finished: Callable[[], Any]
+    finished: Callable[[], tuple[Any, Any]]
     under_way: int
 
 
@@ -73,8 +73,8 @@ def computed(
         while len(found) < len(items):
             while len(pending) < computing.under_way and (one := next(coming, None)):
                 pending[computing.submit(function, one[1], *more)] = one[0]
-            future = computing.finished()
-            found[pending.pop(future)] = future.result()
+            future, result = computing.finished()
+            found[pending.pop(future)] = result
             progress(len(found) / len(items), f"{len(found)} of {len(items)} recordings")
     return [found[number] for number in range(len(items))]
 
@@ -94,9 +94,13 @@ def _threads(workers: int) -> Iterator[Engine]:
         future.add_done_callback(done.put)
         return future
 
+    def finished() -> tuple[Any, Any]:
+        future = done.get()
+        return future, future.result()
+
     pool = ThreadPoolExecutor(workers, "computing")
     try:
-        yield Engine(submit, done.get, 2 * workers)
+        yield Engine(submit, finished, 2 * workers)
     finally:
         ending.set()
         pool.shutdown(cancel_futures=True)
@@ -125,8 +129,10 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
             completed.add(future)
             return future
 
-        def finished() -> Any:
-            """The next result. Workers may come and go, but one has to be there now and then."""
+        def finished() -> tuple[Any, Any]:
+            """The next result. Workers may come and go, but one has to be there now and then; one
+            that has a result may hang before it has sent it.
+            """
             seen = looked = time.monotonic()
             while not completed.has_ready():
                 time.sleep(0.02)
@@ -137,7 +143,8 @@ def _cluster(address: str, purpose: str, stays: str) -> Iterator[Engine]:
                     if time.monotonic() - seen > WITHOUT_WORKERS_S:
                         none = "it does not answer" if there is None else "it has had no workers"
                         raise TimeoutError(f"{none} for {WITHOUT_WORKERS_S} s")
-            return next(completed)
+            future = next(completed)
+            return future, future.result(timeout=WITHOUT_WORKERS_S)
 
         try:
             yield Engine(submit, finished, ASKED_OF_CLUSTER)
