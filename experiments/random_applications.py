@@ -141,7 +141,9 @@ def _add_chain(
         else:
             callback |= {"timer": f"{period}ms", "phase": f"{draw.randrange(period)}ms"}
         core = home if home >= cores or draw.random() < 0.8 else draw.randrange(cores)
-        others = [own for own in graph.nodes if own[0] == "c" and not own.startswith(f"c{chain}_")]
+        others = [
+            node for node in graph.nodes if node[0] == "c" and not node.startswith(f"c{chain}_")
+        ]
         if others and place and draw.random() < 0.06:
             graph.nodes[draw.choice(others)]["callbacks"].append(callback)
         else:
@@ -238,17 +240,17 @@ def refusal(text: str) -> str:
 def table(rows: Sequence[dict[str, Any]]) -> Iterator[str]:
     """What is printed."""
     planned = [row for row in rows if "outputs" in row]
-    broken = [row for row in planned if any(one["broken"] for one in row["outputs"])]
-    outputs = [one for row in planned for one in row["outputs"]]
+    broken = [row for row in planned if any(output["broken"] for output in row["outputs"])]
+    outputs = [output for row in planned for output in row["outputs"]]
     yield f"{len(rows)} applications: {len(planned)} planned, {len(rows) - len(planned)} refused"
-    yield f"{len(outputs)} chains, {sum(one['cycles'] for one in outputs)} cycles simulated,"
-    late = sum((one["late"] or 0) + one["never"] for one in outputs)
-    promised = sum(one["cycles"] * one["promised"] for one in outputs)
+    yield f"{len(outputs)} chains, {sum(output['cycles'] for output in outputs)} cycles simulated,"
+    late = sum((output["late"] or 0) + output["never"] for output in outputs)
+    promised = sum(output["cycles"] * output["promised"] for output in outputs)
     yield f"{late} outputs late or never published; up to {promised:.0f} were promised"
-    received = [one for one in outputs if "received" in one]
-    behind = sum(one["behind"] for one in received)
+    received = [output for output in outputs if "received" in output]
+    behind = sum(output["behind"] for output in received)
     yield f"{len(received)} chains with a place for receivers: {behind} outputs of"
-    yield f"{sum(one['received'] for one in received)} received later than promised (1 % may)"
+    yield f"{sum(output['received'] for output in received)} received later than promised (1 % may)"
     yield f"{len(broken)} applications with a broken promise: {[row['number'] for row in broken]}"
     yield ""
     yield f"{'kind':<55} {'drawn':>6} {'refused':>8} {'at once':>8} {'broken':>7}"
@@ -275,11 +277,11 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--cycles", type=int, default=SIMULATED)
     given = parser.parse_args()
-    lines = given.results.read_text().splitlines() if given.results.exists() else []
+    lines = given.results.read_text(encoding="utf-8").splitlines() if given.results.exists() else []
     rows = [json.loads(line) for line in lines]
     known = {row["number"] for row in rows}
     begun = time.monotonic()
-    with given.results.open("a") as results:
+    with given.results.open("a", encoding="utf-8") as results:
         for number in range(given.first, given.first + given.applications):
             if number in known:
                 continue

@@ -674,14 +674,19 @@ def test_a_memory_of_another_shape_is_refused_at_once(
     rings: int, records: int, objects: int, size: int
 ) -> None:
     program = HOSTILE.format(rings=rings, records=records, objects=objects, size=size)
+    assert memories_of(program) == []
+
+
+def memories_of(program: str) -> list[tuple[int, TracedProcess]]:
+    """What is found in a process that says its number, and waits until it has been looked at."""
     with subprocess.Popen(
         [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     ) as process:
         assert process.stdout is not None
         assert int(process.stdout.readline()) == process.pid
-        known = all_but(process.pid)
-        assert [*memories({os.geteuid()}, known)] == []
+        seen = [*memories({os.geteuid()}, all_but(process.pid))]
         process.communicate(b"\n")
+    return seen
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="a file in the root of a file system takes root")
@@ -696,16 +701,7 @@ input()
     pipe = Path("/memfd:chainshaper-trace")
     os.mkfifo(pipe)
     try:
-        with subprocess.Popen(
-            [sys.executable, "-c", program],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        ) as process:
-            assert process.stdout is not None
-            assert int(process.stdout.readline()) == process.pid
-            known = all_but(process.pid)
-            assert [*memories({os.geteuid()}, known)] == []
-            process.communicate(b"\n")
+        assert memories_of(program) == []
     finally:
         pipe.unlink(missing_ok=True)
 

@@ -393,7 +393,7 @@ struct FoundObject {
   unsigned long long flags;  // NOLINT - the C library's
   void * start;
   void * end;
-  struct link_map * library;
+  struct link_map * loaded;
   void * others[16];
 };
 
@@ -418,7 +418,7 @@ const char * library_of(void * address) {
   FoundObject object{};
   if (loader().find_object != nullptr) {  // takes no lock
     const bool is_known = loader().find_object(address, &object) == 0;
-    return is_known && object.library->l_name != nullptr ? object.library->l_name : "";
+    return is_known && object.loaded->l_name != nullptr ? object.loaded->l_name : "";
   }
   Dl_info library{};
   const bool is_known = dladdr(address, &library) != 0 && library.dli_fname != nullptr;
