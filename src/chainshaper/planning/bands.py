@@ -32,6 +32,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper import _core
 from chainshaper.gate.decision import IntoOpenSlot
 from chainshaper.planning import plan as plans
 from chainshaper.planning.margins import check_latencies
@@ -40,7 +41,7 @@ from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.plan_choices import Goal, Solver
 
-UNREACHABLE = 2**63 - 1  # the cost of what cannot be placed
+UNREACHABLE = _core.UNREACHABLE  # the cost of what cannot be placed
 MOST_CELLS = 120_000_000  # grid points × bands: more than a gigabyte
 MOST_BANDS = 12  # as far as `auto` looks; figure 7 is flat from the fourth on
 RANDOM_TRIES = 10_000
@@ -352,15 +353,16 @@ class _Tables:
         costs[0] = np.where(reachable, behind * last, UNREACHABLE)
         self.counts, self.costs = counts, costs
         self.successors = np.full(costs.shape, -1, dtype=np.int32)
-        work = np.empty((3, size), dtype=np.int64)
         for layer in range(1, layers - 1):
-            # What loads machine code takes a moment to import, and two bands do without it.
-            from chainshaper.values.compiled import kernel
-
-            rows = (costs[layer - 1], costs[layer], self.successors[layer])
-            tables = (counts, self.ends, nearest, farthest, *rows, work)
-            places = [table.ctypes.data for table in tables]
-            kernel("chainshaper.planning.band_kernel", "fill_layer")(*places, size)
+            _core.add_band(
+                ends_ns=self.ends,
+                counts=counts,
+                nearest=nearest,
+                farthest=farthest,
+                behind=costs[layer - 1],
+                costs=costs[layer],
+                successors=self.successors[layer],
+            )
 
     def totals(self, bands: int) -> NDArray[np.int64]:
         """The cost of all bands for every position of the first; two bands at least."""

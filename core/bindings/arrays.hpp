@@ -1,0 +1,32 @@
+// NumPy arrays as spans: the only form in which rows cross the border to Python.
+
+#pragma once
+
+#include <nanobind/nanobind.h>
+#include <nanobind/ndarray.h>
+
+#include <span>
+#include <stdexcept>
+#include <string>
+
+namespace chainshaper::bindings {
+
+namespace nb = nanobind;
+
+// A contiguous array of one dimension in the machine's memory; `const T` for one that is only read.
+template <typename T>
+using Array = nb::ndarray<T, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
+
+template <typename T>
+std::span<T> span_of(const Array<T> & array) {
+  return {array.data(), array.size()};
+}
+
+// Raises ValueError where an array has another length than the rows that it belongs to.
+inline void check_length(const char * name, std::size_t length, std::size_t expected) {
+  if (length != expected)
+    throw std::invalid_argument(std::string(name) + " has " + std::to_string(length) +
+                                " entries where " + std::to_string(expected) + " are needed");
+}
+
+}  // namespace chainshaper::bindings

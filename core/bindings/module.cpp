@@ -1,0 +1,14 @@
+// chainshaper._core: the native library, for Python. One function per folder of the library.
+
+#include <nanobind/nanobind.h>
+
+namespace chainshaper::bindings {
+
+void bind_bands(nanobind::module_ & module);
+
+}  // namespace chainshaper::bindings
+
+NB_MODULE(_core, module) {
+  module.doc() = "What must be fast: trace decoder, joins, band placement, simulator (C++).";
+  chainshaper::bindings::bind_bands(module);
+}
