@@ -1,4 +1,4 @@
-# `make demo` and `make test` need nothing but Python 3.10 or newer; see scripts/setup.
+# `make demo` and `make test` need Python 3.10 or newer; scripts/setup brings what else they need.
 
 # Where it is set, as images of containers like to, every process of a test compiles all it imports.
 export PYTHONDONTWRITEBYTECODE =
@@ -61,13 +61,19 @@ experiments: .venv/.ready-dev
 docs: .venv/.ready-dev
 	.venv/bin/mkdocs build --strict
 
-.venv/.ready: pyproject.toml scripts/setup
+# What is compiled: the native library, and what stands in front of ROS 2 (core/CMakeLists.txt). Where
+# some of it has changed, scripts/setup builds again, and only that.
+compiled := $(shell find core -type f) $(wildcard src/chainshaper/gate/*.py) \
+	src/chainshaper/sources/preload/preload.c \
+	$(shell find src/chainshaper/splicing/nodes -name '*.[ch]pp*')
+
+.venv/.ready: pyproject.toml scripts/setup $(compiled)
 	scripts/setup
 	touch $@
 
-.venv/.ready-dev: pyproject.toml scripts/setup
+.venv/.ready-dev: pyproject.toml scripts/setup $(compiled)
 	scripts/setup dev
 	touch $@ .venv/.ready
 
 clean:
-	rm -rf .venv site .mypy_cache .ruff_cache .pytest_cache
+	rm -rf .venv build site .mypy_cache .ruff_cache .pytest_cache

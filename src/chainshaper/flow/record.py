@@ -41,7 +41,7 @@ from chainshaper.sources.system import own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values import recording as recordings
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import ChainshaperError, InputError, OperationError, PlatformError
+from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import open_to_all, rename_output
 from chainshaper.values.leftovers import claimed, leftover_text, leftovers
 from chainshaper.values.recording import EndpointInfo, Recording, ThreadInfo
@@ -142,10 +142,10 @@ def record_command(
     except OSError as error:
         raise OperationError(f"{parent}: no trace can be written there: {error}") from error
     try:
-        tracer, notes = _tracer(source, folder, command, pids, buffer, users=taken)
+        tracer = _tracer(source, folder, command, pids, buffer, users=taken)
         how = (command, duration_ns, stop or threading.Event(), progress, taken, pids)
-        run = _Run(tracer, folder, *how, gate_logs, notes)
-        for note in notes:
+        run = _Run(tracer, folder, *how, gate_logs)
+        for note in run.notes:
             progress(0.0, note)
         try:
             _trace(run, scheduling, command_stdout, stalls=watch_stalls)
@@ -180,29 +180,21 @@ def _tracer(
     buffer: int | None,
     *,
     users: frozenset[int],
-) -> tuple[Tracer, tuple[str, ...]]:
-    """Who records; where that was not said, why it is not the library in front of ROS 2."""
-    notes: tuple[str, ...] = ()
-    if source is None and (buffer is not None or not command):
-        source = "lttng"  # both are LTTng's to answer
-    elif source is None:
-        source = "preload"
-        try:
-            preload.installed_library()
-        except PlatformError as error:
-            if shutil.which("lttng") is None:
-                raise
-            source, notes = "lttng", (f"LTTng recorded: {error}.",)
+) -> Tracer:
+    """Who records."""
+    if source is None:
+        # A given buffer, and processes that run already, are LTTng's to answer.
+        source = "lttng" if buffer is not None or not command else "preload"
     if source == "lttng":
-        return lttng.LttngSession(folder, command, pids, buffer, users), notes
+        return lttng.LttngSession(folder, command, pids, buffer, users)
     if source not in ("ebpf", "preload"):
         raise InputError(f"{source!r} is no source of events: name lttng, preload or ebpf")
     if buffer is not None:
         why = f"leave it out with `--source {source}`"
         raise InputError(f"--buffer is about LTTng's buffers: {why}")
     if source == "preload":
-        return preload.PreloadTracer(folder, command, pids, users), ()
-    return ebpf.EbpfTracer(folder, command, pids, users), ()
+        return preload.PreloadTracer(folder, command, pids, users)
+    return ebpf.EbpfTracer(folder, command, pids, users)
 
 
 def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool) -> None:

@@ -20,13 +20,14 @@ from typing import Any, Literal
 import yaml
 
 from chainshaper.analysis.chains import close_names
-from chainshaper.gate import decision, handover
-from chainshaper.gate.decision import DEPTH, Gate, Modes, NodeParameters, gate_parameters
+from chainshaper.gate import decision
+from chainshaper.gate.decision import DEPTH, Gate, Modes, gate_parameters
+from chainshaper.gate.schema_header import schema_header
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
-from chainshaper.sources.preload import compile_library, in_cache
+from chainshaper.sources.preload import native_library
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.files import write_whole
 from chainshaper.values.plan_choices import STANDBY, NodeKind
@@ -304,11 +305,6 @@ def python_node(executable: str) -> str:
 
 GATES = "CHAINSHAPER_GATES"
 """The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
-_GATE_SOURCES = ("publisher_gate.cpp", "subscriber_gate.cpp", "in_front_of_rmw.hpp")
-_GATE_FILE = "libchainshaper_gate.so"
-_GATE_OPTIONS = ("-O2", "-std=c++17", "-shared", "-fPIC", "-static-libstdc++", "-static-libgcc")
-_EXPORTED = "{ global: rcl_*; rmw_*; ros_trace_*; pthread_mutex_init; local: *; };\n"
-
 
 def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
     """The block of an output in the file that :data:`GATES` names, a line for each value."""
@@ -338,40 +334,14 @@ def settings_text(values: Mapping[str, Any]) -> str:
 
 
 def gate_library() -> Path:
-    """The library with both gates, in the user's cache; compiled at the first use.
-
-    Raises PlatformError: there is no C++ compiler, or as :func:`.in_cache`.
-    """
-    sources = [_NODES / name for name in _GATE_SOURCES]
-    programs = [str(path) for path in sources if path.suffix == ".cpp"]
-    headers = {path: text for path, text in cpp_package().items() if path.endswith(".hpp")}
-
-    def build(folder: Path) -> Path:
-        _write(folder, {**headers, "exported.map": _EXPORTED})
-        linked = (f"-Wl,--version-script={folder / 'exported.map'}", "-ldl", "-lpthread")
-        words = (*_GATE_OPTIONS, f"-I{folder / 'include'}", *programs, *linked)
-        options = "--publication in-process", "--publication synchronous"
-        return compile_library("c++", words, folder / _GATE_FILE, options)
-
-    made_of = (
-        *(one.read_text("utf-8") for one in sources),
-        *headers.values(),
-        *_GATE_OPTIONS,
-        _EXPORTED,
-    )
-    return in_cache(_GATE_FILE, made_of, build)
+    """The library with both gates, which was built with the package."""
+    return native_library("libchainshaper_gate.so")
 
 
 # Packages in C++ ----------------------------------------------------------------------------------
 
 GENERIC_PACKAGE = "chainshaper_shaping"
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)/msg/([A-Z][A-Za-z0-9]*)")
-_CPP_TYPES = {
-    int: "std::int64_t",
-    str: "std::string",
-    list[int]: "std::vector<std::int64_t>",
-    list[str]: "std::vector<std::string>",
-}
 
 
 @dataclass(frozen=True)
@@ -443,7 +413,7 @@ def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -
     # The modes of the system are a std_msgs/String.
     messages = sorted({"std_msgs", *([] if shaped is None else [shaped.package])})
     depends = [*messages, "rclcpp_components"] if component else messages
-    values = _schema() | {
+    values = {
         "PROJECT": GENERIC_PACKAGE,
         "FOR": "topics of any type",
         "NODES": "shaping_node throttler",
@@ -466,50 +436,13 @@ def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -
     files = {"scripts/respawning": _RESPAWNING.read_text(encoding="utf-8")}
     for path in sorted((_NODES / "cpp").rglob("*.*")):
         text = path.read_text(encoding="utf-8")
-        if path.suffix == ".in":
+        if path.name == "schema.hpp.in":
+            text = schema_header(text)
+        elif path.suffix == ".in":
             text = re.sub("@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
         files[str(path.relative_to(_NODES / "cpp")).removesuffix(".in")] = text
     del files[left_out]
     return files
-
-
-def _schema() -> dict[str, str]:
-    """What the gate in C++ shares with the one in Python, as `schema.hpp.in` has it."""
-    words = {
-        "Anchor": decision.ANCHORS,
-        "Policy": decision.LATE,
-        "Entry": decision.INTO_OPEN_SLOT,
-        "Messages": decision.MESSAGES,
-        "Dropped": decision.DROPPED,
-    }
-    numbers = {
-        name.lower(): value
-        for room in (decision, handover)
-        for name, value in vars(room).items()
-        if name.isupper() and isinstance(value, int) and not name.startswith("_")
-    }
-    numbers["log_columns"] = len(decision.LOG_COLUMNS)
-    usual = vars(NodeParameters())
-    types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
-    return {
-        "WORDS": "\n".join(
-            f"enum class {kind} {{ {', '.join(name.replace('-', '_') for name in names)} }};\n"
-            f"inline constexpr std::array<const char *, {len(names)}> {kind.lower()}_names{{\n"
-            f"    {', '.join(map(_in_cpp, names))}}};"
-            for kind, names in words.items()
-        ),
-        "CONSTANTS": "\n".join(
-            f"inline constexpr std::int64_t {name} = {value};" for name, value in numbers.items()
-        ),
-        "LOG_HEADER": '"\n    "'.join(f"{n}," for n in decision.LOG_COLUMNS).removesuffix(","),
-        "FIELDS": ", ".join(handover.FIELDS),
-        "PARAMETERS": "\n  ".join(f"{types[n]} {n}{{{_in_cpp(usual[n])}}};" for n in types),
-        "READS": "\n    ".join(f'read("{name}", {name});' for name in types),
-    }
-
-
-def _in_cpp(value: str | int | list[Any]) -> str:
-    return f'"{value}"' if isinstance(value, str) else str(value).strip("[]")
 
 
 def check_build_tools() -> None:

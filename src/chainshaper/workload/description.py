@@ -330,7 +330,7 @@ class Application(Part):
     @model_validator(mode="after")
     def _consistent(self) -> "Application":
         published = {topic for _, callback in self.callbacks() for topic in callback.publishes}
-        order = TopologicalSorter[str]()
+        order: TopologicalSorter[str] = TopologicalSorter()  # generic from Python 3.11 on
         same: dict[str, str] = {}
         for name, described in self.nodes.items():
             if not _NODE.fullmatch(name):

@@ -11,21 +11,16 @@ that process, whose events from there on are counted as lost.
 
 import fcntl
 import functools
-import hashlib
 import mmap
 import os
-import platform
 import re
 import secrets
-import shutil
 import socket
 import stat
 import struct
-import subprocess
-import tempfile
 import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -34,8 +29,8 @@ import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
+from chainshaper import _core
 from chainshaper.gate.decision import clock_offset
-from chainshaper.linux.own_processes import tool_environment
 from chainshaper.linux.processes import descendants, run_users
 from chainshaper.linux.threads import (
     innermost_id,
@@ -56,7 +51,7 @@ from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.events import EventTables
-from chainshaper.values.files import open_output, own_cache, why_distrusted
+from chainshaper.values.files import open_output
 from chainshaper.values.recording import RecordingInfo
 
 SOURCE = Path(__file__).with_name("preload.c")
@@ -315,82 +310,26 @@ def _tables(
 
 
 VARIABLE = "CHAINSHAPER_TRACE"
-_FILE = "libchainshaper_trace.so"
 _BETWEEN_LOOKS_S = 0.1
 _BETWEEN_SEARCHES_NS = 1_000_000_000
-_OPTIONS = ("-O2", "-std=gnu11", "-shared", "-fPIC", "-ftls-model=initial-exec")
-_LIBRARIES = ("-ldl", "-lpthread")
-_REMEDY = "name another cache in $XDG_CACHE_HOME"
 _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
-def build_library(folder: Path) -> Path:
-    """Compile the library into a folder. Raises: as :func:`compile_library`."""
-    words = (*_OPTIONS, str(SOURCE), *_LIBRARIES)
-    return compile_library("cc", words, folder / _FILE, ("--source preload", "--source lttng"))
-
-
-def compile_library(
-    compiler: Literal["cc", "c++"], words: Sequence[str], library: Path, options: tuple[str, str]
-) -> Path:
-    """Compile a library; ``options`` are the one that needs it and the one that does without.
-
-    Raises PlatformError: there is no compiler, or it fails.
-    """
-    needs, without = options
-    path = shutil.which(compiler, path=tool_environment()["PATH"])
-    if path is None:
-        package = {"cc": "gcc", "c++": "g++"}[compiler]
-        raise PlatformError(
-            f"`{needs}` needs a compiler ({compiler}), and there is none: install one (Debian and "
-            f"Ubuntu: `apt-get install {package} libc6-dev`), or choose `{without}`"
-        )
-    library = library.absolute()
-    command, environment = [path, "-o", str(library), *words], tool_environment()
-    done = subprocess.run(command, env=environment, capture_output=True, check=False)
-    if done.returncode:
-        last = "; ".join(text_of(done.stderr).splitlines()[-2:])
-        raise PlatformError(f"{path} cannot compile {library.name}: {last}; see `{path} -v`")
-    return library
+def native_library(name: str) -> Path:
+    """A library that was built with the package: it is beside `chainshaper._core`."""
+    return Path(_core.__file__).with_name(name)
 
 
 def installed_library() -> Path:
-    """The package's library, or the cache's, built at first use. Raises: as :func:`in_cache`."""
-    if (shipped := SOURCE.with_name(_FILE)).exists():
-        return shipped
-    return in_cache(_FILE, [SOURCE.read_text("utf-8")], build_library)
-
-
-def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -> Path:
-    """A library of these sources in the user's cache, which ``build`` makes in a folder.
-
-    Raises PlatformError: what ``build`` raises, or others may write to the cache.
-    """
-    content, cache = "\0".join([*sources, platform.machine()]).encode(), own_cache()
-    library = cache / f"preload-{hashlib.sha256(content).hexdigest()[:16]}" / name
-    existing = next(place for place in (cache, *cache.parents) if place.exists())
-    if (reason := why_distrusted(existing)) is not None:
-        raise PlatformError(f"no library is built in {cache}: {reason}; {_REMEDY}")
-    if not library.exists():
-        try:
-            cache.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=cache) as folder:
-                built = build(Path(folder))
-                library.parent.mkdir(exist_ok=True)
-                built.replace(library)  # whole, also where two of us build at once
-        except OSError as error:
-            why = f"{library} cannot be written ({error.strerror}): {_REMEDY}"
-            raise PlatformError(why) from error
-    if (reason := why_distrusted(library)) is not None:
-        raise PlatformError(f"{library} is not loaded into nodes: {reason}; {_REMEDY}")
-    return library
+    """The library that traces from the front of ROS 2."""
+    return native_library("libchainshaper_trace.so")
 
 
 def preloading(library: Path) -> str:
     """`LD_PRELOAD` with the library in front of what it names. Raises PlatformError: it cannot."""
     if re.search(r"[\s:]", str(library)):
         why = f"{str(library)!r} has a space or a colon in it, so LD_PRELOAD cannot name it"
-        raise PlatformError(f"{why}: {_REMEDY}")
+        raise PlatformError(f"{why}: install chainshaper in a folder whose path has neither")
     before = os.environ.get("LD_PRELOAD", "").split(":")
     return ":".join([str(library), *(one for one in before if one and one != str(library))])
 
