@@ -2,15 +2,12 @@
 
 import fcntl
 import os
-import platform
 import random
-import re
 import shutil
 import signal
 import subprocess
 import sys
 import time
-import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 from command_line import called, json_of
-from lttng_node import required_node
+from native_build import built_for_arm64
 from processes import in_time_namespace, wait_for
 from traced_program import (
     Traced,
@@ -32,13 +29,10 @@ from traced_program import (
 )
 
 import chainshaper as cs
-from chainshaper.sources import preload
 from chainshaper.sources.preload import (
     PreloadTracer,
     TracedProcess,
-    build_library,
     event_names,
-    in_cache,
     installed_library,
     memories,
     preloading,
@@ -48,7 +42,6 @@ from chainshaper.values.errors import InputError, OperationError, PlatformError
 pytestmark = pytest.mark.waiting
 
 RING, RINGS = 1 << 14, 64
-ELF_MACHINES = {"x86_64": 62, "aarch64": 183}
 CYCLES, PERIOD_NS = 20, 50_000_000
 
 CALLER = """
@@ -116,9 +109,7 @@ def test_every_argument_arrives_on_arm64(tmp_path: Path) -> None:
     program = build(tmp_path / "prefix", compiler="aarch64-linux-gnu-gcc")
     if shutil.which("qemu-aarch64") is None:
         pytest.skip("qemu-aarch64 is not installed (package qemu-user)")
-    library = tmp_path / "library.so"
-    words = ["aarch64-linux-gnu-gcc", *preload._OPTIONS, "-o", str(library), str(preload.SOURCE)]
-    subprocess.run([*words, *preload._LIBRARIES], check=True)
+    library = built_for_arm64() / installed_library().name
     emulated = ["qemu-aarch64", "-L", "/usr/aarch64-linux-gnu", "-E", f"LD_PRELOAD={library}"]
 
     def run() -> list[list[str]]:
@@ -129,43 +120,6 @@ def test_every_argument_arrives_on_arm64(tmp_path: Path) -> None:
     (tmp_path / "trace").mkdir()
     run_there = traced(tracer_of(tmp_path / "trace"), run)
     assert_everything(run_there, {"8.2.3": run_there.printed}, WAITING)
-
-
-def test_a_wheel_brings_the_library_that_works_for_its_machine(tmp_path: Path) -> None:
-    """Installed beside nothing else; and of another machine, by its compiler."""
-    pytest.importorskip("hatchling")
-    root, files = Path(__file__).parents[2], "chainshaper/sources/preload/libchainshaper_trace.so"
-    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d"]
-    machines = {"no-compiler": "", "aarch64-linux-gnu-gcc": "aarch64", "cc": platform.machine()}
-    for compiler, machine in machines.items():
-        if machine and shutil.which(compiler) is None:
-            pytest.skip(f"no {compiler} to build the library with")
-        words, environment = [*build, str(tmp_path / compiler)], {**os.environ, "CC": compiler}
-        subprocess.run(words, check=True, cwd=root, env=environment, capture_output=True)
-        (wheel,) = (tmp_path / compiler).iterdir()
-        names, tag = zipfile.ZipFile(wheel).namelist(), wheel.stem.split("-")[-1]
-        if machine:
-            assert re.fullmatch(rf"manylinux_2_\d+_{machine}", tag), tag
-            content = zipfile.ZipFile(wheel).read(files)
-            assert int.from_bytes(content[18:20], "little") == ELF_MACHINES[machine]
-        else:
-            assert (tag, files in names) == ("any", False)
-    site = tmp_path / "site"
-    words = ["-m", "pip", "install", "--no-deps", "--no-index", "--target", str(site), str(wheel)]
-    subprocess.run([sys.executable, *words], check=True, capture_output=True)
-    program = "from chainshaper.sources.preload import *\nprint(preloading(installed_library()))"
-    found = subprocess.check_output(
-        [sys.executable, "-c", program],
-        env={**os.environ, "PYTHONPATH": str(site), "PATH": "", "HOME": str(tmp_path)},
-        text=True,
-    )
-    assert found.strip() == str(site / files)
-    shown = subprocess.check_output(
-        [sys.executable, "-c", CALLER + "take(1)\nprint(open('/proc/self/maps').read())"],
-        env={**os.environ, "LD_PRELOAD": found.strip()},
-        text=True,
-    )
-    assert "memfd:chainshaper-trace" in shown
 
 
 def test_execution_times_are_the_threads_own_cpu_time(
@@ -745,24 +699,6 @@ def test_what_runs_with_the_library_is_attached_to_and_left(tmp_path: Path) -> N
     assert json_of("latency", tmp_path / "rec", "--chain", "/ebpf1../ebpf2", "--json")["count"] >= 5
 
 
-def test_without_a_library_lttng_records_and_says_why(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Neither a compiler nor what it has built before; then without LTTng as well."""
-    required_node()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.setattr(preload, "SOURCE", tmp_path / "preload.c")
-    (tmp_path / "preload.c").write_text("no C")
-    words = "no process with LTTng trace points was seen.*LTTng recorded: .*cannot compile"
-    with pytest.raises(OperationError, match=words):
-        cs.record_command(tmp_path / "rec", ["true"])
-    absent = ("cc", "lttng")
-    monkeypatch.setattr(shutil, "which", lambda name, **_: None if name in absent else name)
-    with pytest.raises(PlatformError, match=r"a compiler \(cc\), and there is none: install one"):
-        cs.record_command(tmp_path / "rec", ["true"])
-    assert not (tmp_path / "rec").exists()
-
-
 def test_wrong_use_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     attach = ("--pid", str(os.getpid()))  # not 1, whose descendants are all that runs here
     attached = called("record", "--source", "preload", "-o", tmp_path / "r", *attach)
@@ -773,9 +709,6 @@ def test_wrong_use_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPat
         preloading(Path("/my home/library.so"))
     monkeypatch.setenv("LD_PRELOAD", "/other.so")
     assert preloading(Path("/ours.so")) == "/ours.so:/other.so"
-    monkeypatch.setenv("PATH", str(tmp_path))
-    with pytest.raises(PlatformError, match=r"needs a compiler \(cc\), and there is none"):
-        build_library(tmp_path)
 
 
 def test_a_ring_whose_count_is_damaged_costs_no_other() -> None:
@@ -789,13 +722,3 @@ def test_a_ring_whose_count_is_damaged_costs_no_other() -> None:
             file.flush()
             assert memory.new_records() == []
         assert memory.lost == len(counts)
-
-
-def test_root_builds_nothing_where_others_may_write(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    tmp_path.chmod(0o777)
-    monkeypatch.setattr(preload, "own_cache", lambda: tmp_path / "own")
-    with pytest.raises(PlatformError, match="writable by others"):
-        in_cache("x.so", ["source"], lambda _: pytest.fail("it is built all the same"))
-    assert list(tmp_path.iterdir()) == []

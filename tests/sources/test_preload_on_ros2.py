@@ -17,7 +17,7 @@ from small_chain import small_chain
 
 import chainshaper as cs
 from chainshaper.flow.record import record_command
-from chainshaper.sources.preload import PreloadTracer, build_library, event_names
+from chainshaper.sources.preload import PreloadTracer, event_names, installed_library
 from chainshaper.verify.watch import SECOND, Watch
 
 SECONDS = 6
@@ -88,7 +88,7 @@ def test_what_is_watched_is_what_lttng_records(
     launch: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Attached and detached while LTTng records: the same cycles, but for where both are unsure."""
-    monkeypatch.setenv("LD_PRELOAD", str(build_library(tmp_path)))
+    monkeypatch.setenv("LD_PRELOAD", str(installed_library()))
     watch, over = Watch(["/t1../t3"], users={os.geteuid()}, longest_ns=SECOND // 2), Event()
 
     def follow() -> None:

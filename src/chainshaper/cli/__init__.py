@@ -18,7 +18,7 @@ from typing import Any, NoReturn
 __all__ = ["main"]
 
 REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
-OF_ANALYSIS = ("matplotlib", "scipy")
+OF_ANALYSIS = ("matplotlib",)
 """What a robot does without, of the extra `analysis`; and Numba, without which all is slower."""
 _LACK_OF_MEMORY = (
     "cannot allocate memory",

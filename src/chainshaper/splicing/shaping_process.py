@@ -306,6 +306,7 @@ def python_node(executable: str) -> str:
 GATES = "CHAINSHAPER_GATES"
 """The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
 
+
 def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
     """The block of an output in the file that :data:`GATES` names, a line for each value."""
     values = {

@@ -31,7 +31,6 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy import stats
 
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.disturbance import stalled_after
@@ -41,6 +40,7 @@ from chainshaper.sources import open_source
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import measure_latency
+from chainshaper.verify.student import t_quantile, t_tail
 
 LEVEL = 1 / 200
 LEAST = log1p(0.005)
@@ -51,6 +51,7 @@ RUN_SHARE, RUN_LEAST, RUN_MOST = 0.25, 0.001, 0.015
 """Standard deviation from run to run: this share of that of ratios of instances, and limits."""
 WINDOW, ALIKE, SHIFT = 32, 0.8, 128
 BLOCKS, FEWEST = 20, 40
+NORMAL_QUARTILE = 0.6744897501960817  # of a normal distribution, in standard deviations
 SEVERAL, MUCH = 3, 0.03
 
 Times: TypeAlias = npt.NDArray[np.float64]
@@ -264,8 +265,20 @@ def _beside(ratios: Times) -> tuple[float, float, float]:
     """How much longer instances took than those of the first recording: median of log ratios, its
     standard error, and their robust standard deviation."""
     medians = [np.median(block) for block in np.array_split(ratios, BLOCKS)]
-    noise = float(stats.median_abs_deviation(ratios, scale="normal"))
-    return float(np.median(ratios)), float(stats.sem(medians)), noise
+    error = float(np.std(medians, ddof=1)) / np.sqrt(len(medians))
+    return float(np.median(ratios)), error, float(_robust_deviation(ratios))
+
+
+def _robust_deviation(values: Times) -> Times:
+    """The standard deviation along the last axis, from the median distance from the median."""
+    apart = np.abs(values - np.median(values, axis=-1, keepdims=True))
+    return np.asarray(np.median(apart, axis=-1) / NORMAL_QUARTILE)
+
+
+def _ranks(values: Times) -> Times:
+    """The rank of each value, from 1; the same values have the mean of theirs."""
+    _, places, counts = np.unique(values, return_inverse=True, return_counts=True)
+    return np.asarray((np.cumsum(counts) - (counts - 1) / 2)[places])
 
 
 def _ratios(first: Times, own: Times) -> Times:
@@ -279,9 +292,7 @@ def _ratios(first: Times, own: Times) -> Times:
 
 def _alike(first: Times, own: Times) -> tuple[Places, Places]:
     """Which instances of two recordings did the same work; in their order, if none seem to."""
-    ranks, others = (
-        stats.rankdata(np.nan_to_num(one, nan=np.nanmedian(one))) for one in (first, own)
-    )
+    ranks, others = (_ranks(np.nan_to_num(one, nan=np.nanmedian(one))) for one in (first, own))
     shift, found, likeness = 0, list[tuple[int, int]](), list[float]()
     for start in range(0, len(own) - WINDOW + 1, WINDOW):
         low, high = max(0, start + shift - SHIFT), start + shift + SHIFT + WINDOW
@@ -324,9 +335,7 @@ def _tested(
     sides = np.split(shifts, [before], axis=1)
     centres = [np.median(side, axis=1, keepdims=True) for side in sides]
     apart = np.hstack([side - centre for side, centre in zip(sides, centres, strict=True)])
-    far = 3 * np.maximum(
-        np.sqrt(variance), stats.median_abs_deviation(apart, axis=1, scale="normal")
-    )
+    far = 3 * np.maximum(np.sqrt(variance), _robust_deviation(apart))
     before_, after = (
         np.clip(side, centre - far[:, None], centre + far[:, None])
         for side, centre in zip(sides, centres, strict=True)
@@ -335,8 +344,9 @@ def _tested(
     freedom = PRIOR + runs - 2
     error = np.sqrt((PRIOR * variance + squares) / freedom * (1 / before + 1 / (runs - before)))
     change = after.mean(axis=1) - before_.mean(axis=1)
-    p = np.minimum(1.0, count * stats.t.sf((change - LEAST) / error, freedom))
-    quantiles = stats.t.isf(LEVEL / count, freedom) + stats.t.isf(0.05, freedom)
+    tails = np.array([t_tail(t, freedom) for t in ((change - LEAST) / error).tolist()])
+    p = np.minimum(1.0, count * tails)
+    quantiles = t_quantile(LEVEL / count, freedom) + t_quantile(0.05, freedom)
     taken_out = np.median(common[:, before:]) - np.median(common[:, :before])
     return float(taken_out), (change, p, LEAST + quantiles * error)
 
