@@ -99,8 +99,6 @@ def _programs_but_compilers(folder: Path) -> Path:
         for program in sorted(Path(place).glob("*")) if place else ():
             name = program.name
             is_compiler = name in COMPILERS or name.startswith(OF_COMPILERS)
-                ("gcc-", "g++-", "clang-", "c89", "c99")
-            )
             if not is_compiler and not (links / name).exists():
                 (links / name).symlink_to(program)
     return links

@@ -82,7 +82,7 @@ class _Run:
     users: frozenset[int]
     pids: Sequence[int]
     gate_logs: Sequence[Path]
-    notes: tuple[str, ...]
+    notes: tuple[str, ...] = ()
     command: "subprocess.Popen[bytes] | None" = None
     schedule: Callable[[Sequence[Process]], bool] | None = None
     begun_ns: int = 0
@@ -120,9 +120,9 @@ def record_command(
 
     ``command`` is started, and ended with the recording; it prints to ``command_stdout``. Without
     one, `ebpf` and `preload` attach to ``pids`` and their descendants, or to all that ``users`` run
-    (as :func:`.find_threads`). Without ``source`` it is `preload`, or `lttng` where the library
-    cannot be had. ``buffer`` is the size of LTTng's buffer of a core in bytes. ``chain`` is noted
-    as the chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
+    (as :func:`.find_threads`). Without ``source`` it is `preload`, or `lttng` where there is no
+    command, or a ``buffer`` (the size of LTTng's of a core, in bytes). ``chain`` is noted as the
+    chain of interest, ``plan`` as the plan in force; ``gate_logs`` are where its shaping
     nodes note what they do. ``watch_stalls`` watches every core for stalls (2 % of it).
 
     Raises InputError: ``output`` exists, or no such command, process or source does. PlatformError:
@@ -145,8 +145,6 @@ def record_command(
         tracer = _tracer(source, folder, command, pids, buffer, users=taken)
         how = (command, duration_ns, stop or threading.Event(), progress, taken, pids)
         run = _Run(tracer, folder, *how, gate_logs)
-        for note in run.notes:
-            progress(0.0, note)
         try:
             _trace(run, scheduling, command_stdout, stalls=watch_stalls)
             progress(1.0, "reading the events")
