@@ -36,11 +36,17 @@ test-waiting: .venv/.ready-dev
 test-kernel: .venv/.ready-dev
 	.venv/bin/python tests/kernel/run_kernel_checks.py
 
+# The C++ library's sources; how each is compiled is what the last build noted.
+core = $(shell find core -name '*.[ch]pp')
+
 lint: .venv/.ready-dev
 	.venv/bin/ruff check .
 	.venv/bin/ruff format --check .
 	nice .venv/bin/mypy
 	nice .venv/bin/lint-imports --no-cache
+	.venv/bin/clang-format --dry-run --Werror $(core)
+	nice .venv/bin/clang-tidy --quiet -p $(dir $(firstword $(shell ls -t build/cp*/compile_commands.json))) \
+		$(filter %.cpp,$(core))
 
 # Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.
 benchmark: .venv/.ready-dev
@@ -51,6 +57,7 @@ benchmark: .venv/.ready-dev
 	.venv/bin/python benchmarks/ctf_decode.py
 	.venv/bin/python benchmarks/trace_to_latency.py
 	.venv/bin/python benchmarks/fleet.py
+	.venv/bin/python benchmarks/first_use.py
 	.venv/bin/python benchmarks/enforcement/enter_exit.py
 
 # The paper's tables and figures, ours beside them, in experiments/RESULTS.md. An hour on a quiet

@@ -17,6 +17,7 @@ import pytest
 from small_chain import small_chain_text
 
 import chainshaper as cs
+from chainshaper import _core
 from chainshaper.sources import open_source
 
 if sys.version_info >= (3, 11):
@@ -34,8 +35,13 @@ def _named(requirement: str) -> str | None:
 
 @pytest.fixture(scope="module")
 def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder of links to the packages that the core needs, and those need."""
+    """A folder of links to the package, and to those that it needs, and those need."""
     folder = tmp_path_factory.mktemp("core")
+    (folder / "chainshaper").mkdir()
+    # In editable installs the native library is in another folder than the rest.
+    for source in {Path(cs.__file__).parent, Path(_core.__file__).parent}:
+        for entry in source.iterdir():
+            (folder / "chainshaper" / entry.name).symlink_to(entry)
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     wanted, known = [_named(one) for one in project["dependencies"]], set[str]()
     while wanted:
@@ -56,8 +62,7 @@ def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def _run(core: Path, *words: str) -> subprocess.CompletedProcess[str]:
-    paths = os.pathsep.join([str(Path(cs.__file__).parents[1]), str(core)])
-    environment = {**os.environ, "PYTHONPATH": paths, "PYTHONDONTWRITEBYTECODE": "1"}
+    environment = {**os.environ, "PYTHONPATH": str(core), "PYTHONDONTWRITEBYTECODE": "1"}
     python = getattr(sys, "_base_executable", sys.executable)
     command = [python, "-m", "chainshaper", *words]
     return subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -78,6 +83,9 @@ def test_measuring_planning_and_simulating_give_what_they_give_compiled(
     assert json.loads(latency.stdout)["max_ns"] == here.analysis.statistics.max_ns
     plan = _run(core, "plan", str(tmp_path / "robot"), "-o", str(tmp_path / "plan.yaml"))
     assert plan.returncode == 0, plan.stderr
+    same = ["check", str(tmp_path / "robot"), "--baseline", str(tmp_path / "here")]
+    checked = _run(core, *same)
+    assert "Traceback" not in checked.stderr and "chainshaper[" not in checked.stderr
     trace = [sys.executable, str(ROOT / "examples/write_trace.py"), str(tmp_path / "trace")]
     subprocess.run(trace, check=True, capture_output=True, cwd=ROOT)
     read = _run(core, "info", str(tmp_path / "trace"), "--json")

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import pytest
 from command_line import called
 
+from chainshaper import _core
 from chainshaper.cli.ros2_chain import ChainCommand
 
 ROOT = Path(__file__).parents[2]
@@ -107,5 +108,7 @@ def test_colcon_would_install_everything(tmp_path: Path) -> None:
     ours = {p.relative_to(ROOT / "src") for p in (ROOT / "src" / "chainshaper").rglob("*")}
     wanted = {p for p in ours if (ROOT / "src" / p).is_file() and "__pycache__" not in p.parts}
     assert wanted - installed == set()
+    native = {Path(_core.__file__).name, "libchainshaper_gate.so", "libchainshaper_trace.so"}
+    assert native <= {p.name for p in installed if p.parent.name == "chainshaper"}
     assert (prefix / "share/ament_index/resource_index/packages/chainshaper").is_file()
     assert (prefix / "share/chainshaper/package.xml").is_file()
