@@ -29,9 +29,9 @@ def built_for_arm64() -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "lock").open("w") as lock:  # the tests run in several processes
         fcntl.flock(lock, fcntl.LOCK_EX)
-        words = [cmake, "-S", ROOT / "core", "-B", folder, toolchain, *options]
+        words = [cmake, "-S", str(ROOT / "core"), "-B", str(folder), toolchain, *options]
         subprocess.run(words, check=True, capture_output=True, timeout=100)
-        build = [cmake, "--build", folder, "--parallel", "2", "--target"]
+        build = [cmake, "--build", str(folder), "--parallel", "2", "--target"]
         targets = ["chainshaper_trace", "chainshaper_gate"]
         subprocess.run([*build, *targets], check=True, capture_output=True, timeout=160)
     return folder / "preloaded"
