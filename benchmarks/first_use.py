@@ -2,8 +2,8 @@
 
     python benchmarks/first_use.py [ROUNDS]
 
-Each round makes a fresh home and runs every verb in it (those of `tests/every_verb.py`, but the live
-ones, which last as long as they are told), and then every verb again, with the same home. Medians
+Each round makes a fresh home and runs every verb in it (those of `tests/every_verb.py`, but the
+live ones, which last as long as they are told), and then all again in the same home. Medians
 are printed (ms of wall time, and of the CPU time of all its processes, which a busy machine changes
 less). The first use is no slower than the second where nothing is compiled or cached at it.
 """
