@@ -39,6 +39,8 @@ COMMANDS = (
     (0, "offsets plan.yaml -o offsets.yaml"),
     (0, "generate app.yaml -o package"),
     (0, "splice plan.yaml -o spliced --node python -- ros2 run robot node5"),
+    (0, "plan before --publication in-process -o inside.yaml"),
+    (0, "splice inside.yaml -o spliced_inside -- ros2 run robot node5"),
     (0, "doctor --watch 200ms"),
     (0, "threads"),
     (0, "status"),
