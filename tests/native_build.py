@@ -32,6 +32,6 @@ def built_for_arm64() -> Path:
         words = [cmake, "-S", str(ROOT / "core"), "-B", str(folder), toolchain, *options]
         subprocess.run(words, check=True, capture_output=True, timeout=100)
         build = [cmake, "--build", str(folder), "--parallel", "2", "--target"]
-        targets = ["chainshaper_trace", "chainshaper_gate"]
+        targets = ["chainshaper_core", "chainshaper_trace", "chainshaper_gate"]
         subprocess.run([*build, *targets], check=True, capture_output=True, timeout=160)
     return folder / "preloaded"
