@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import yaml
 
+from chainshaper import _core
 from chainshaper.analysis.chains import close_names
 from chainshaper.gate import decision, handover
 from chainshaper.gate.decision import DEPTH, Gate, Modes, NodeParameters, gate_parameters
@@ -35,6 +36,7 @@ OF_ONE_TYPE = ("typed", "component")
 _SOURCES = Path(__file__).parents[2]
 _NODES = Path(__file__).parent / "nodes"
 _RESPAWNING = _NODES / "python/respawning.py"
+_CORE = Path(_core.__file__).with_name("core")  # the headers that the library was built from
 
 
 @dataclass(frozen=True)
@@ -469,35 +471,23 @@ def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -
         if path.suffix == ".in":
             text = re.sub("@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
         files[str(path.relative_to(_NODES / "cpp")).removesuffix(".in")] = text
+    for path in sorted((_CORE / "gate").glob("*.hpp")):
+        files[f"include/gate/{path.name}"] = path.read_text(encoding="utf-8")
     del files[left_out]
     return files
 
 
 def _schema() -> dict[str, str]:
-    """What the gate in C++ shares with the one in Python, as `schema.hpp.in` has it."""
-    words = {
-        "Anchor": decision.ANCHORS,
-        "Policy": decision.LATE,
-        "Entry": decision.INTO_OPEN_SLOT,
-        "Messages": decision.MESSAGES,
-        "Dropped": decision.DROPPED,
-    }
+    """What nodes in C++ share with those in Python, as `schema.hpp.in` has it."""
     numbers = {
         name.lower(): value
-        for room in (decision, handover)
-        for name, value in vars(room).items()
+        for name, value in vars(handover).items()
         if name.isupper() and isinstance(value, int) and not name.startswith("_")
     }
     numbers["log_columns"] = len(decision.LOG_COLUMNS)
     usual = vars(NodeParameters())
     types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
     return {
-        "WORDS": "\n".join(
-            f"enum class {kind} {{ {', '.join(name.replace('-', '_') for name in names)} }};\n"
-            f"inline constexpr std::array<const char *, {len(names)}> {kind.lower()}_names{{\n"
-            f"    {', '.join(map(_in_cpp, names))}}};"
-            for kind, names in words.items()
-        ),
         "CONSTANTS": "\n".join(
             f"inline constexpr std::int64_t {name} = {value};" for name, value in numbers.items()
         ),
