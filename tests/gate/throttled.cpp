@@ -4,7 +4,7 @@
 #include <iostream>
 #include <sstream>
 
-#include "chainshaper_shaping/gate.hpp"
+#include "gate/throttling.hpp"
 
 int main() {
   for (std::string line; std::getline(std::cin, line);) {

@@ -4,7 +4,7 @@
 #include <iostream>
 #include <string>
 
-#include "chainshaper_shaping/gate.hpp"
+#include "chainshaper_shaping/shaper.hpp"
 #include "chainshaper_shaping/gate_log.hpp"
 
 using namespace chainshaper;  // NOLINT

@@ -16,7 +16,7 @@ Of several **messages** in a cycle leave ``all-in-order`` (the oldest is dropped
 after it. Slots that follow latencies are **moved**, all by the same time, from the first cycle that
 begins after an instant.
 
-`schema.hpp` of the node in C++ is generated from the words, limits, columns and parameters here.
+The gate in C++ (core/gate) has the words and limits from here, its nodes columns and parameters.
 Every gate runs `tests/gate_conformance.yaml`. Only the standard library is imported, since this is
 a part of the Python nodes' own files.
 """

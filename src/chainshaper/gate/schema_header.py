@@ -1,4 +1,4 @@
-"""`schema.hpp`: what the gate in C++ shares with the gate in Python, as a header in C++.
+"""`schema.hpp`: what nodes in C++ share with those in Python, as a header in C++.
 
 The package's build makes it (`core/CMakeLists.txt`) by `python -m chainshaper.gate.schema_header
 TEMPLATE HEADER`, before any package is installed: so only the standard library is imported here.
@@ -28,29 +28,15 @@ def schema_header(template: str) -> str:
 
 def _values() -> dict[str, str]:
     """What stands in each place of the template."""
-    words = {
-        "Anchor": decision.ANCHORS,
-        "Policy": decision.LATE,
-        "Entry": decision.INTO_OPEN_SLOT,
-        "Messages": decision.MESSAGES,
-        "Dropped": decision.DROPPED,
-    }
     numbers = {
         name.lower(): value
-        for room in (decision, handover)
-        for name, value in vars(room).items()
+        for name, value in vars(handover).items()
         if name.isupper() and isinstance(value, int) and not name.startswith("_")
     }
     numbers["log_columns"] = len(decision.LOG_COLUMNS)
     usual = vars(NodeParameters())
     types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
     return {
-        "WORDS": "\n".join(
-            f"enum class {kind} {{ {', '.join(name.replace('-', '_') for name in names)} }};\n"
-            f"inline constexpr std::array<const char *, {len(names)}> {kind.lower()}_names{{\n"
-            f"    {', '.join(map(_in_cpp, names))}}};"
-            for kind, names in words.items()
-        ),
         "CONSTANTS": "\n".join(
             f"inline constexpr std::int64_t {name} = {value};" for name, value in numbers.items()
         ),

@@ -36,6 +36,7 @@ OF_ONE_TYPE = ("typed", "component")
 _SOURCES = Path(__file__).parents[2]
 _NODES = Path(__file__).parent / "nodes"
 _RESPAWNING = _NODES / "python/respawning.py"
+_CORE = native_library("core")  # the headers that the library was built from
 
 
 @dataclass(frozen=True)
@@ -442,6 +443,8 @@ def cpp_package(shaped: MessageType | None = None, *, component: bool = False) -
         elif path.suffix == ".in":
             text = re.sub("@([A-Z_]+)@", lambda found: values.get(found[1], found[0]), text)
         files[str(path.relative_to(_NODES / "cpp")).removesuffix(".in")] = text
+    for path in sorted((_CORE / "gate").glob("*.hpp")):
+        files[f"include/gate/{path.name}"] = path.read_text(encoding="utf-8")
     del files[left_out]
     return files
 

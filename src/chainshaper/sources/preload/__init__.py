@@ -316,7 +316,7 @@ _CREDENTIALS = struct.Struct("iII")  # struct ucred: pid, uid, gid
 
 
 def native_library(name: str) -> Path:
-    """A library that was built with the package: it is beside `chainshaper._core`."""
+    """What was built or installed with the native library: it is beside `chainshaper._core`."""
     return Path(_core.__file__).with_name(name)
 
 

@@ -8,7 +8,7 @@
 //
 // rcl takes every message of a subscription by one of the three functions below.
 
-#include "chainshaper_shaping/gate.hpp"
+#include "chainshaper_shaping/shaper.hpp"
 #include "in_front_of_rmw.hpp"
 
 namespace {

@@ -8,6 +8,7 @@
 #include <vector>
 
 #include "chainshaper_shaping/node.hpp"
+#include "gate/throttling.hpp"
 
 namespace {
 

@@ -16,7 +16,7 @@
 #include <string_view>
 #include <thread>
 
-#include "gate.hpp"
+#include "shaper.hpp"
 #include "guest.hpp"
 
 namespace chainshaper {

@@ -12,7 +12,7 @@
 #include <cstring>
 #include <memory>
 
-#include "gate.hpp"
+#include "shaper.hpp"
 #include "guest.hpp"
 
 namespace chainshaper {

@@ -12,7 +12,7 @@
 #include <cstring>
 #include <memory>
 
-#include "gate.hpp"
+#include "shaper.hpp"
 #include "rclcpp/rclcpp.hpp"
 #include "rclcpp/version.h"
 

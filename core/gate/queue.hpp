@@ -1,0 +1,162 @@
+// Which of the messages that wait at a gate leave, and when it is the turn of each. It knows no
+// clock. The same as `Queue` of chainshaper/gate/decision.py.
+
+#pragma once
+
+#include <algorithm>
+#include <cstdint>
+#include <cstdlib>
+#include <deque>
+#include <optional>
+#include <utility>
+
+#include "gate/decision.hpp"
+
+namespace chainshaper {
+
+// What a decision needs to know of a message.
+struct Arrival {
+  std::int64_t arrival_ns;
+  Maybe stamp_ns;         // its origin; none: it has none that is of use
+  std::int64_t phase_ns;  // where cycles began when it came
+};
+
+// A gate's decisions, a message after the other, and what it has to know between two of them.
+// (`Queue` has the messages as well; in a simulation they stay in the history of their reader.)
+class Turns {
+public:
+  explicit Turns(Gate gate) : gate(std::move(gate)) { check(this->gate); }
+
+  // When a message would leave, whatever left before it.
+  Release release_at(const Arrival & message, std::int64_t ready_ns) const {
+    return release_of(gate, message.arrival_ns, message.stamp_ns, changes, ready_ns,
+                      message.phase_ns, moves);
+  }
+
+  // When the oldest message may leave, or why it never does.
+  Release decide(const Arrival & oldest) {
+    const std::int64_t ready_ns = std::max(oldest.arrival_ns, free_ns);
+    Release release = release_at(oldest, ready_ns);
+    if (!release.slot || gate.messages == Messages::all_in_order) return release;
+    if (same_cycle(release, left_)) {
+      if (gate.messages == Messages::first) {
+        release.drop(Dropped::surplus);
+        return release;
+      }
+      const std::int64_t last_end = *left_ + moved_at(moves, *left_) + gate.slots.back().end;
+      release = release_at(oldest, std::max(ready_ns, last_end));
+      if (release.at_ns && !release.slot) release.at_ns = ready_ns;
+      if (!release.slot) return release;
+    }
+    if (!same_cycle(release, leaving_)) leaving_ = release.start_ns(gate.cycle_ns);
+    return release;
+  }
+
+  // Whether a newer message leaves for the oldest, which was to leave like this.
+  bool is_replaced(const Release & release, const Arrival & newer, std::int64_t now_ns) const {
+    if (gate.messages != Messages::newest || !release.slot) return false;
+    const Release instead = release_at(newer, now_ns);
+    return instead.slot && same_cycle(instead, leaving_);
+  }
+
+  // The oldest message leaves, or is dropped.
+  void left(const Release & release) {
+    if (release.slot) left_ = leaving_;
+  }
+
+  // A mode is announced, in force from the next cycle on.
+  void switch_mode(std::size_t mode, std::int64_t now_ns) {
+    if (mode != (changes.empty() ? gate.first_mode : changes.back().second))
+      remember(changes, Change{now_ns, mode});
+  }
+
+  const Gate gate;
+  std::deque<Change> changes;
+  std::deque<Move> moves;
+  std::int64_t free_ns{0};  // when it is the turn of the oldest message, if it is there then
+
+private:
+  // Stamps are not quite periodic: cycles are the same less than half a cycle apart.
+  bool same_cycle(const Release & release, Maybe start_ns) const {
+    return start_ns && 2 * std::abs(release.start_ns(gate.cycle_ns) - *start_ns) < gate.cycle_ns;
+  }
+
+  // When cycles start: the one that the oldest message, or another for it, leaves in, and the one in
+  // which the last has left.
+  Maybe leaving_;
+  Maybe left_;
+};
+
+// A message that has come and not left; `number` tells it from the others.
+template <typename Message>
+struct Waiting : Arrival {
+  Message message;
+  Maybe source_timestamp;
+  Maybe lost;
+  std::uint64_t number;
+};
+
+template <typename Message>
+struct Outcome {
+  Waiting<Message> waiting;
+  Release release;
+  std::int64_t awake_ns;
+};
+
+// The messages that wait at a gate, with its decisions.
+template <typename Message>
+class Queue : public Turns {
+public:
+  explicit Queue(Gate gate) : Turns(std::move(gate)), phase_ns(this->gate.phase_ns) {}
+
+  // The wall clock was stepped: stamps of messages under way are of no use until the last has come.
+  void doubt_stamps(std::int64_t now_ns) {
+    unsure_until_ns_ = now_ns + (gate.due_cycles + 1) * gate.cycle_ns;
+  }
+
+  // A message came; the one for which there is no room any more.
+  std::optional<Outcome<Message>> arrive(Message message, std::int64_t arrival_ns, Maybe stamp_ns,
+                                         Maybe source_timestamp = {}, Maybe lost = {}) {
+    if (arrival_ns < unsure_until_ns_) stamp_ns.reset();
+    waiting.push_back({{arrival_ns, stamp_ns, phase_ns},
+                       std::move(message),
+                       source_timestamp,
+                       lost,
+                       number_++});
+    if (gate.counts_from(stamp_ns, arrival_ns)) phase_ns = *stamp_ns % gate.cycle_ns;
+    if (waiting.size() <= gate.depth) return std::nullopt;
+    Release release = release_at(waiting.front(), arrival_ns);
+    release.drop(Dropped::overflowed);
+    return Outcome<Message>{take_oldest(), release, arrival_ns};
+  }
+
+  Release decide() { return Turns::decide(waiting.front()); }
+
+  bool replaced(const Release & release, std::int64_t now_ns) const {
+    return std::any_of(waiting.begin() + 1, waiting.end(), [&](const Arrival & newer) {
+      return is_replaced(release, newer, now_ns);
+    });
+  }
+
+  // The oldest message leaves, or is dropped; no release: it is not this gate's to decide.
+  Waiting<Message> leave(const std::optional<Release> & release, std::int64_t now_ns) {
+    free_ns = now_ns;
+    if (release) left(*release);
+    return take_oldest();
+  }
+
+  std::int64_t phase_ns;
+  std::deque<Waiting<Message>> waiting;
+
+private:
+  Waiting<Message> take_oldest() {
+    Waiting<Message> oldest = std::move(waiting.front());
+    waiting.pop_front();
+    return oldest;
+  }
+
+  std::int64_t unsure_until_ns_{0};
+  std::uint64_t number_{0};
+};
+
+}  // namespace chainshaper
