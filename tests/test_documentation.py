@@ -69,7 +69,7 @@ def shortened(command: str, cycles: int) -> str:
 
 def as_in_a_clone(folder: Path) -> None:
     """What a command or an example takes from a clone's folder."""
-    for name in ("examples", "scripts", "src"):
+    for name in ("core", "examples", "scripts", "src"):
         unread = shutil.ignore_patterns("__pycache__")
         shutil.copytree(ROOT / name, folder / name, ignore=unread)
     for file in filter(Path.is_file, ROOT.iterdir()):
@@ -132,6 +132,7 @@ def tried(steps: Callable[[Path, int], Iterable[str]], folder: Path, recorded: P
     pytest.fail(f"{command}\n{finished.out}\n{finished.err}")
 
 
+@pytest.mark.timeout(600)  # to install a clone compiles it
 @pytest.mark.parametrize("page", PAGES_WITH_COMMANDS)
 def test_every_command_runs(page: Path, tmp_path: Path, recorded: Path) -> None:
     def read(folder: Path, cycles: int) -> Iterable[str]:
