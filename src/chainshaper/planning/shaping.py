@@ -182,7 +182,9 @@ def _with_gates_at(plan: Plan, priority: int) -> Plan:
     if node is None or node.fifo_priority == priority:
         return plan
     level = node.model_copy(update={"fifo_priority": priority})
-    further = [one.model_copy(update={"fifo_priority": priority}) for one in plan.further_shaping_nodes]
+    further = [
+        one.model_copy(update={"fifo_priority": priority}) for one in plan.further_shaping_nodes
+    ]
     if plans.inner_gates(plan):
         further = [_inside(one) for one in further]
     return plans.revised(plan, shaping_node=level, further_shaping_nodes=tuple(further))
