@@ -10,8 +10,8 @@ in force, with other execution times. An output that came behind its slot, or ne
 promises that no more than a share of a chain's outputs is late; the promise is broken where so many
 late outputs have a probability below a limit, which is 1 % in all over 10,000 applications
 (binomial test, 60,000 chains; some 42,000 are drawn). The share itself is an upper bound with 95 %
-confidence, by the recording: where it is broken although plan and simulation agree on what runs when, more cycles
-in the recording would have shown it.
+confidence, by the recording: where it is broken although plan and simulation agree on what runs
+when, more cycles in the recording would have shown it.
 
 Every application is known by its number, from which it is drawn. RESULTS.jsonl has a line for each,
 as it was done; numbers that are in it already are left out, so that the command goes on where it
