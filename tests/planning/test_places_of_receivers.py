@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from bare_plans import MS
 from known import known
+from small_chain import small_chain_plan
 
 from chainshaper import load_application, simulate
 from chainshaper.flow.plan import plan_recording, profile_chains
@@ -174,3 +175,38 @@ def test_outputs_of_several_chains_wait_for_each_other_at_their_receiver(tmp_pat
         judged = known(measure_latency(shaped, chain.chain.spec).prediction)
         assert judged.broken == ()
         assert known(judged.receivers).behind == 0
+
+
+FORK = """\
+name: two outputs of one graph
+chain: /a../b
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a: {callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/a]}]}
+  b: {callbacks: [{subscription: /a, execution: {constant: 10ms}, publishes: [/b]}]}
+  d: {callbacks: [{subscription: /a, execution: {constant: 10ms}, publishes: [/d]}]}
+  actuator: {callbacks: [{subscription: /b}]}
+  display: {callbacks: [{subscription: /d}]}
+"""
+
+
+def test_of_further_sinks_receivers_have_no_place_and_the_plan_says_so(tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    application = described(tmp_path, text=FORK)
+    recording = simulate(application, tmp_path / "profile", cycles=100)
+    plan = plan_recording(recording, sinks=["/a../d"])
+    (sink,) = plan.further_shaping_nodes
+    assert (sink.receivers, sink.receivers_at) == (("/display",), None)
+    (said,) = (one for one in plan_warnings(plan) if "/display" in one)
+    assert "no place in the plan" in said and "/display run below all servers" in said
+    assert "--chain instead of --sink" in said
+    both, _ = plan_application(profile_chains(recording, ("/a../b", "/a../d")))
+    assert all(known(one.shaping_node).receivers_at for one in both.chains), "as it says"
+    assert not [one for one in plan_warnings(*both.chains) if "no place" in one]
+
+
+def test_behind_an_asynchronous_publisher_receivers_have_no_promise() -> None:
+    plan = small_chain_plan(10 * MS, 20 * MS, publication="asynchronous", overrun="wait")
+    (said,) = (one for one in plan_warnings(plan) if "who receives /t3" in one)
+    assert "--publication synchronous" in said
+    assert not [one for one in plan_warnings(small_chain_plan(10 * MS, 20 * MS)) if "who" in one]

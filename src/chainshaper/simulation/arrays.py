@@ -451,8 +451,12 @@ class Machine:
             server.name: sorted({named[n] for n, one in governed.items() if one is server})
             for server in ranked
         }
+        behind_outputs = plan.behind_outputs
         urgency = {
-            number: (server.priority, taken[server.name].index(named[number]))
+            number: (
+                server.priority,
+                taken[server.name].index(named[number]) + (server.name in behind_outputs),
+            )
             for number, server in governed.items()
         }
         behind = {number: (one.priority, len(governed)) for number, one in receiving.items()}
