@@ -144,10 +144,12 @@ class Scene:
     def applied(self, *arguments: int | str) -> subprocess.Popen[bytes]:
         """`apply_process.py`, in force."""
         command = [sys.executable, str(HERE / "apply_process.py"), *map(str, arguments)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        said = Path("/tmp/apply_process.err")
+        with said.open("wb") as errors:
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors)
         self._processes.append(process)
         assert process.stdout is not None
-        assert process.stdout.readline() == b"in force\n"
+        assert process.stdout.readline() == b"in force\n", said.read_text()
         return process
 
     def close(self) -> None:
