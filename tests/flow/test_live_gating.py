@@ -149,9 +149,7 @@ def _overrunning(folder: Path, slot_ends: SlotEnds) -> tuple[Application, Plan]:
     application = with_times(small_chain(folder), {**times, "third": third})
     plan = small_chain_plan(4 * MS, 24 * MS, core=EXECUTOR_CORE)
     slots = {"chain": [(0, 14 * MS)], "output": [(25 * MS, 26 * MS)]}
-    return application, revised(
-        plan, servers=with_slots(plan.servers, slots), slot_ends=slot_ends
-    )
+    return application, revised(plan, servers=with_slots(plan.servers, slots), slot_ends=slot_ends)
 
 
 def test_closed_servers_of_a_described_application_gate_its_executors(tmp_path: Path) -> None:

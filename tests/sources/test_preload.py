@@ -409,7 +409,9 @@ def test_a_running_process_of_another_clock_is_named_where_it_is_attached_to(
     """By `record`, which says so and records the others, or fails with the reason; and `watch`."""
     with waiting_in_time_namespace() as pid:
         left_out = rf"nothing of process {pid} \(python.*\) is recorded: it has another clock, that"
-        left_out += rf" of a time namespace: record it in there \(`nsenter --time --target {pid} …`\)"
+        left_out += (
+            rf" of a time namespace: record it in there \(`nsenter --time --target {pid} …`\)"
+        )
         tracer = PreloadTracer(tmp_path / "one", (), (pid,))
         with pytest.raises(OperationError, match=rf"{left_out}, or attach with"):
             tracer.start()

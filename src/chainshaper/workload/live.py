@@ -346,7 +346,9 @@ def _watch(
 
 
 def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:
-    found = [(node_name(name), one) for name, child in nodes.items() for one in node_threads(child.pid)]
+    found = [
+        (node_name(name), one) for name, child in nodes.items() for one in node_threads(child.pid)
+    ]
     found += [("", one) for child in meters.values() for one in list_threads(child.pid)]
     return tuple(
         ThreadInfo(

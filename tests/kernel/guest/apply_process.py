@@ -1,4 +1,4 @@
-"""`apply` with the back end scx: the node `sensor` in [0, END) of every CYCLE, or that and `worker`.
+"""`apply` with the back end scx: the node `sensor` in [0, END) of every CYCLE, alone or not.
 
     apply_process.py CYCLE END FOLLOWS [SLOT_ENDS]
 
@@ -20,9 +20,11 @@ from chainshaper.flow.phase import DriftWatch
 from chainshaper.planning import plan as of
 
 cycle, end, follows = map(int, sys.argv[1:4])
-nodes, how = ["sensor"], dict[str, Any](policy="server-per-chain")  # closed outside its slots
+nodes = ["sensor"]
+how: dict[str, Any] = {"policy": "server-per-chain"}  # closed outside its slots
 if slot_ends := sys.argv[4:]:
-    nodes, how = ["sensor", "worker"], dict(policy="server-per-callback", slot_ends=slot_ends[0])
+    nodes = ["sensor", "worker"]
+    how = {"policy": "server-per-callback", "slot_ends": slot_ends[0]}
 servers = [
     of.Server(
         name=node,

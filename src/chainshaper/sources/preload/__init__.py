@@ -121,7 +121,7 @@ def _events_of_objects() -> NDArray[np.bool_]:
     return known
 
 
-class RefusedMemory(InputError):
+class RefusedMemoryError(InputError):
     """The memory of a process, ``inner_pid`` as that calls itself, that says nothing to us."""
 
     def __init__(self, why: str, inner_pid: int) -> None:
@@ -137,8 +137,8 @@ class TracedProcess:
     written, and counts as lost what may have been overwritten meanwhile. ``pid`` is the process's
     number here, ``inner_pid`` what it calls itself in its container.
 
-    Raises InputError: the descriptor is of no such memory, or of one that may shrink. RefusedMemory:
-    it is of another version, or of a process whose times are of another clock.
+    Raises InputError: the descriptor is of no such memory, or of one that may shrink.
+    RefusedMemoryError: it is of another version, or of a process whose times are of another clock.
     """
 
     def __init__(self, descriptor: int, pid: int = 0) -> None:
@@ -153,8 +153,10 @@ class TracedProcess:
         # Whatever a process says, no more is read than a memory of this version has.
         known = [_RINGS, _RING_RECORDS, _OBJECT_RECORDS]
         if (magic, form, counts) != (_MAGIC, _FORMAT, known) or size != _SIZE:
-            why = "its memory is that of another version of chainshaper: start it again with this one"
-            raise RefusedMemory(why, self.inner_pid)
+            why = (
+                "its memory is that of another version of chainshaper: start it again with this one"
+            )
+            raise RefusedMemoryError(why, self.inner_pid)
         memory = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
         self.header: NDArray[Any] = np.frombuffer(memory, _HEADER, 1)
         self.pid = pid or self.inner_pid
@@ -162,7 +164,7 @@ class TracedProcess:
             raise InputError(f"what was sent says that it is of process {self.inner_pid}")
         clock = int(header["clock"][0])  # what it said counts, for it may have ended since
         if clock not in (0, time_namespace()) or (not clock and of_another_clock(self.pid)):
-            raise RefusedMemory(
+            raise RefusedMemoryError(
                 "it has another clock, that of a time namespace: record it in there"
                 f" (`nsenter --time --target {self.pid} …`)",
                 self.inner_pid,
@@ -451,7 +453,7 @@ def memories(
                     # Another process's memory is open in one that reads it, as we do.
                     if memory is None or memory.inner_pid != inner_pid:
                         continue
-                    if isinstance(memory, RefusedMemory):
+                    if isinstance(memory, RefusedMemoryError):
                         refused(pid, _left_out(pid, memory))
                     else:
                         yield pid, memory
@@ -471,7 +473,7 @@ def _left_out(pid: int, why: Exception) -> str:
     return f"nothing of process {pid}{name} is recorded: {why}."
 
 
-def _memory_of(descriptor: Path, pid: int) -> TracedProcess | RefusedMemory | None:
+def _memory_of(descriptor: Path, pid: int) -> TracedProcess | RefusedMemoryError | None:
     """The memory behind an open file of a process, in `/proc`; None: it is another kind of file.
 
     Anything may have the name of a memory, and opening a pipe or a device may wait for ever or do
@@ -485,7 +487,7 @@ def _memory_of(descriptor: Path, pid: int) -> TracedProcess | RefusedMemory | No
             return None
         with Path(f"/proc/self/fd/{place}").open("rb") as file:
             return TracedProcess(file.fileno(), pid)
-    except RefusedMemory as refused:
+    except RefusedMemoryError as refused:
         return refused
     except InputError:
         return None
