@@ -128,7 +128,7 @@ def test_a_process_and_an_executor_of_several_threads_are_measured() -> None:
     ("lasts", "cycle", "words"),
     [
         (0.2, CYCLE, "ended while its phase was measured"),
-        (60, 10 * MS, r"does not wake up: not once in 12 cycles of 10ms\. .*--phase"),
+        (60, 10 * MS, r"does not wake up: not once in 12 cycles of 10 ms\. .*--phase"),
     ],
 )
 def test_a_thread_that_ends_or_never_wakes_has_no_phase(
@@ -149,9 +149,9 @@ def test_what_a_thread_lacks_of_a_beginning_is_counted_by_place(
     with pytest.raises(OperationError) as raised:
         measure_phase(7, [8], 20 * MS)
     said = (
-        "thread 8 of process 7 does not wake up at one place of the cycle 20ms: 12 wake-ups in 12"
+        "thread 8 of process 7 does not wake up at one place of the cycle 20 ms: 12 wake-ups in 12"
     )
-    said += " cycles, of which 7 at most have one within the same 400us, and 10 have to."
+    said += " cycles, of which 7 at most have one within the same 400 us, and 10 have to."
     assert str(raised.value).startswith(said)
     assert str(raised.value).endswith("try again when it is calm; or give its --phase")
 

@@ -75,13 +75,13 @@ def _irregular(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> s
     """
     length, width = duration_text(cycle_ns), duration_text(_width(cycle_ns))
     if not wake_ups.size:
-        said = f"does not wake up: not once in {cycles} cycles of {length}. Is the chain running?"
+        said = f"does not wake up: not once in {cycles} cycles of {length}. Start the chain"
     else:
         seen = max(seen for _, seen, _ in _places(wake_ups, cycle_ns))
         said = f"does not wake up at one place of the cycle {length}: {len(wake_ups)} wake-ups in"
         said += f" {cycles} cycles, of which {seen} at most have one within the same {width}, and"
-        said += f" {math.ceil(SEEN_IN * cycles)} have to. Has the chain the period of the plan? On"
-        said += " a busy machine, whose cores serve others first, try again when it is calm"
+        said += f" {math.ceil(SEEN_IN * cycles)} have to. Plan with the period that the chain has;"
+        said += " on a busy machine, whose cores serve others first, try again when it is calm"
     return f"{said}; or give its --phase"
 
 
