@@ -4,6 +4,7 @@ its slot, and pipelines of stages.
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
@@ -29,15 +30,19 @@ from chainshaper import (
     shape_application,
 )
 from chainshaper.enforcement.undoing import RunState
+from chainshaper.flow import described
 from chainshaper.flow.described import gated_threads
 from chainshaper.linux.scheduling import available_cores
+from chainshaper.linux.threads import Thread as RunningThread
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publish_slots, publisher_servers, revised, with_slots
+from chainshaper.planning.plan import Thread, publish_slots, publisher_servers, revised, with_slots
 from chainshaper.values.plan_choices import SlotEnds
 from chainshaper.values.recording import Recording
+from chainshaper.workload import live
 from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
+from chainshaper.workload.launcher import WORKER_NAME
 
 ROOT = Path(__file__).parents[2]
 pytestmark = [needs_fifo, needs_cgroups]
@@ -162,6 +167,19 @@ def test_closed_servers_of_a_described_application_gate_its_executors(tmp_path: 
     assert [one.node for one in threads] == ["/first", "/second", "/third"]
     kept = revised(closed, shaping_thread="in-slots")
     assert [one.name for one, _ in gated_threads(whole(kept))] == ["chain", "output"]
+
+
+def test_every_thread_of_an_executor_is_gated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A multi-threaded one's others are told by the name that they have."""
+    common: dict[str, Any] = {"pid": 7, "policy": "SCHED_FIFO", "priority": 1, "cores": (0,)}
+    running = (
+        RunningThread(7, comm="filter", role="executor", **common),
+        RunningThread(8, comm=WORKER_NAME, role="unknown", **common),
+        RunningThread(9, comm="recv", role="dds", **common),
+    )
+    monkeypatch.setattr(live, "list_threads", lambda _: running)
+    started = live.StartedNodes({"/filter": 7}, 0, 0)
+    assert described._threads_of(Thread(node="/filter"), started) == [7, 8]
 
 
 def test_a_described_application_overruns_into_the_next_slot_where_servers_are_closed(
