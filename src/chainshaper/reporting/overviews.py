@@ -529,7 +529,9 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
         lost += f"; {unclear} cycles unclear: the clock was set"
     if unused := sum(one.counted["not_used"] for one in seen.chains):
         lost += f"; {unused} messages not used: newer ones were stored"
-    tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
+    lost += "".join(f"; {one.rstrip('.')}" for one in seen.left_out)
+    problem = tables[-1].caption
+    tables[-1].caption = f"{problem}; {nodes}{lost}" if problem else f"{nodes}{lost}"
     return tables
 
 
