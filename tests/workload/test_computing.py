@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 from calm_runs import calm_run
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
 from processes import wait_for
 from small_chain import DDS_CORE, EXECUTOR_CORE
 
@@ -120,12 +122,12 @@ def test_counterparts_that_are_discovered_while_they_are_counted_end_no_node(
     publisher = dds.Publisher(participant, "/t", "reliable", 1)
     subscription = dds.Subscription(participant, "/t", "reliable", 1)
     known, counts = count(1), ("_get_matched_subscriptions", "_get_matched_publications")
-    monkeypatch.setattr(dds.DataWriter, counts[0], lambda *_: next(known))
-    monkeypatch.setattr(dds.DataReader, counts[1], lambda *_: next(known))
+    monkeypatch.setattr(DataWriter, counts[0], lambda *_: next(known))
+    monkeypatch.setattr(DataReader, counts[1], lambda *_: next(known))
     assert [publisher.matched(), subscription.matched()] == [1, 2]
     monkeypatch.undo()
     wait_for(lambda: publisher.matched() == subscription.matched() == 1, "discovery")
-    monkeypatch.setattr(dds.DataWriter, counts[0], lambda *_: -3)
+    monkeypatch.setattr(DataWriter, counts[0], lambda *_: -3)
     with pytest.raises(OperationError, match="code -3"):
         publisher.matched()
 

@@ -24,7 +24,6 @@ import yaml
 
 from chainshaper.analysis import DataFlow, analyse_latency, graph_of, recorded_flow
 from chainshaper.analysis.chains import find_chain
-from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.graph import MESSAGE_FILTER
 from chainshaper.analysis.occupation import (
     Occupation,
@@ -454,13 +453,13 @@ def _expiry(evidence: _Evidence, callback: Callback, own: pl.DataFrame) -> tuple
     """A timer's period, and an instant at which it expired (ns)."""
     starts = own["start"].sort().to_numpy().astype(np.int64)
     apart = int(np.median(np.diff(starts))) if len(starts) > 1 else 0
-    shown = shown_periods(evidence.flow.contradictions).get(callback.id)
-    if shown is not None:
+    period = callback.period_ns or max(1_000, round(apart, -3))
+    if callback.declared_ns not in (None, callback.period_ns):
         evidence.notes.append(
-            f"{callback.label} started every {duration_text(round(shown, -3))}: that is its period"
-            " in the description."
+            f"{callback.node} has a timer that was declared with a period of"
+            f" {duration_text(callback.declared_ns or 0)} and started every"
+            f" {duration_text(period)}: that is its period in the description."
         )
-    period = shown or callback.period_ns or max(1_000, round(apart, -3))
     number = np.rint((starts - starts[0]) / period).astype(np.int64)
     behind = starts - number * period
     third = len(starts) // 3
