@@ -335,6 +335,7 @@ class Machine:
         self._system, self._handles, self._plan, self._timing = system, handles, plan, timing
         self._rows = rows = Rows([0] * X.COLUMNS)
         self._streams = Streams(system.application.seed, rows)
+        self._deliveries: dict[tuple[int, int, int], int] = {}  # streams, by reader
         self._cores = rows.add(len(system.cores), C.COLUMNS)
         self._threads = rows.add(len(system.threads), T.COLUMNS, NONE)
         self._first_threads = {
@@ -587,13 +588,19 @@ class Machine:
             rows[row + P.ENDS_CHAIN] = ends and publisher.topic == system.chain.topics[-1]
 
     def _delivery(self, reader: Entity, publisher: Publisher) -> int:
-        """The stream of a reader's own times of delivery from a publisher; NONE: it has none."""
+        """The stream of a reader's own times of delivery, from all publishers of its topic in the
+        order of their publications; NONE: it has none."""
         process = self._system.processes[reader.process]
         described = self._system.application.simulation.deliveries.get(process.key, {})
         if publisher.topic not in described:
             return NONE
-        number = FIRST_DELIVERY + (publisher.process << 32) + (reader.index << 16) + reader.number
-        return self._streams.add(described[publisher.topic], process.node, number)
+        place = (reader.process, reader.index, reader.number)
+        if place not in self._deliveries:
+            number = FIRST_DELIVERY + (publisher.process << 32)
+            number += (reader.index << 16) + reader.number
+            stream = self._streams.add(described[publisher.topic], process.node, number)
+            self._deliveries[place] = stream
+        return self._deliveries[place]
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
