@@ -269,12 +269,14 @@ class Rows(list[int]):
 class Streams:
     """All streams of a simulation: drawn in Python, consumed by the engine.
 
-    A callback's stream is that of the live workload, value for value.
+    A callback's stream is that of the live workload, value for value. ``deliveries`` are the places
+    of those by which messages reach an entity: by process, callback and input.
     """
 
     def __init__(self, seed: int, rows: Rows) -> None:
         self._seed, self._rows = seed, rows
         self._drawn: list[tuple[int, Iterator[Int64s]]] = []
+        self.deliveries: dict[tuple[int, int, int], int] = {}
         self._first = 0
 
     def add(self, times: ExecutionTime, node: str, index: int) -> int:
@@ -335,7 +337,6 @@ class Machine:
         self._system, self._handles, self._plan, self._timing = system, handles, plan, timing
         self._rows = rows = Rows([0] * X.COLUMNS)
         self._streams = Streams(system.application.seed, rows)
-        self._deliveries: dict[tuple[int, int, int], int] = {}  # streams, by reader
         self._cores = rows.add(len(system.cores), C.COLUMNS)
         self._threads = rows.add(len(system.threads), T.COLUMNS, NONE)
         self._first_threads = {
@@ -595,12 +596,12 @@ class Machine:
         if publisher.topic not in described:
             return NONE
         place = (reader.process, reader.index, reader.number)
-        if place not in self._deliveries:
+        if place not in self._streams.deliveries:
             number = FIRST_DELIVERY + (publisher.process << 32)
             number += (reader.index << 16) + reader.number
             stream = self._streams.add(described[publisher.topic], process.node, number)
-            self._deliveries[place] = stream
-        return self._deliveries[place]
+            self._streams.deliveries[place] = stream
+        return self._streams.deliveries[place]
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
