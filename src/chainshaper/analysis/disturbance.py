@@ -28,7 +28,6 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.traversals import Traversals
@@ -162,8 +161,7 @@ def due_within(flow: DataFlow, chain: Chain, due: Due | None) -> int | None:
 def timer_period(flow: DataFlow, chain: Chain) -> int | None:
     """The period of the timer that starts a chain, as its starts show it (ns; None: no timer)."""
     first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
-    declared: int | None = first["period_ns"].max()  # type: ignore[assignment]
-    return shown_periods(flow.contradictions).get(chain.callbacks[0], declared)
+    return first["period_ns"].max()  # type: ignore[return-value]
 
 
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:

@@ -162,7 +162,8 @@ def _plan_of(recording: Recording, plan: Plan | ApplicationPlan | None) -> Appli
     """The plan in force: the given one, or that of the recording."""
     if plan is not None:
         return whole(plan)
-    return None if recording.info.plan is None else plan_in(recording.info.plan)
+    known = recording.info.plan
+    return None if known is None else plan_in(known, f"{recording.path}, its plan in force")
 
 
 def _measured(

@@ -175,7 +175,8 @@ class Seen:
         return statuses
 
 
-_SAME = ("node", "kind", "topic", "period_ns")  # a callback, also of a node that was started again
+# A callback, also of a node that was started again, or whose timer is seen at another period.
+_SAME = ("node", "kind", "topic", "declared_ns")
 _CYCLE = pl.Schema(
     {"start": pl.Int64, "latency_ns": pl.Int64, "late": pl.Boolean, "place_ns": pl.Int64}
 )
@@ -542,9 +543,9 @@ def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[C
         found = [own[node, starts] for own in looks if (node, starts) in own]
         response, execution = (
             max((one for one in times if one is not None), default=None)
-            for times in zip(*found, strict=True)
+            for times in zip(*(one.times for one in found), strict=True)
         )
-        yield CallbackNow(node, starts, (response, execution))
+        yield CallbackNow(node, starts, Longest(response, execution, found[-1].shown))
 
 
 @contextlib.contextmanager
