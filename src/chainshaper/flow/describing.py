@@ -23,7 +23,7 @@ import polars as pl
 import yaml
 
 from chainshaper.analysis import DataFlow, analyse_latency, graph_of, recorded_flow
-from chainshaper.analysis.chains import find_chain
+from chainshaper.analysis.chains import find_chain, parse_chain
 from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.graph import MESSAGE_FILTER
 from chainshaper.analysis.occupation import (
@@ -38,7 +38,7 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS, Callback
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import duration_text, format_duration, milliseconds
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
@@ -72,6 +72,8 @@ class _Evidence:
 
     recording: Recording
     flow: DataFlow
+    graph: ApplicationGraph
+    chain: Chain
     callbacks: dict[int, Callback]
     found: Occupation
     hops: pl.DataFrame
@@ -118,14 +120,14 @@ def application_file(
     it, or no description can be made of it.
     """
     recording = opened(recording)
-    evidence, spec = _evidence(recording, chain)
+    evidence = _evidence(recording, chain)
     nodes = _nodes(evidence)
     if not nodes:
         raise InputError(f"{recording.path}: no callback of it ran twice: record longer")
     scheduling = _scheduling(evidence, nodes)
     values: dict[str, Any] = {
         "name": recording.path.name,
-        "chain": spec,
+        "chain": _chain_described(evidence),
         "scheduling": scheduling,
         "topics": _topics(evidence, nodes),
         "simulation": _costs(evidence, nodes),
@@ -147,7 +149,7 @@ def application_file(
 
 def _simulated_back(evidence: _Evidence, application: Application) -> str:
     """How near the description comes to the recording: latencies simulated and recorded."""
-    recorded = analyse_latency(evidence.flow, application.chain)
+    recorded = analyse_latency(evidence.flow, evidence.chain.spec)
     complete = recorded.traversals.drop_nulls("latency_ns").sort("latency_ns")
     if complete.is_empty():
         return "No cycle completes: the description cannot be compared with the recording."
@@ -173,14 +175,13 @@ def _comment(note: str) -> str:
     return fill(note, 98, initial_indent="# ", subsequent_indent="#   ") + "\n"
 
 
-def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
-    """What a recording's description is made from, and the chain as it will be written."""
+def _evidence(recording: Recording, chain: str | None) -> _Evidence:
+    """What a recording's description is made from."""
     flow = recorded_flow(recording)
     graph, heaviest = graph_of(flow), list_chains(flow).heaviest
     if heaviest is None:
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
-    spec = chain or recording.info.chain or heaviest.spec
-    path = find_chain(graph, spec)
+    path = find_chain(graph, chain or recording.info.chain or heaviest.spec)
     counting = publication_that_counts(flow, frozenset(path.topics))
     found = occupation(flow, recording.info, counting)
     timers = [one.id for one in graph.callbacks if one.kind == "timer"]
@@ -199,6 +200,8 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
     evidence = _Evidence(
         recording=recording,
         flow=flow,
+        graph=graph,
+        chain=path,
         callbacks=callbacks,
         found=found,
         hops=deliveries(flow, found),
@@ -232,7 +235,7 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
             "The recording is of a shaped application: a shaping node is described as one that"
             " computes while it holds a message. Describe a recording without it."
         )
-    return evidence, spec
+    return evidence
 
 
 def _latencies(application: Application, cycles: int) -> Numbers:
@@ -265,7 +268,7 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
     published = {topic for one in ran for topic in _written(one)}
     nodes: dict[str, _Node] = {}
     for members in chosen:
-        name = _name(evidence, evidence.callbacks[members[0]].node)
+        name = _name(evidence, evidence.callbacks[members[0]])
         node = nodes.setdefault(name, _Node())
         node.callbacks.append(_described(evidence, node, members, published))
     for node in nodes.values():
@@ -283,14 +286,31 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
     return nodes
 
 
-def _name(evidence: _Evidence, node: str) -> str:
-    """A node's name as descriptions permit it."""
+def _name(evidence: _Evidence, callback: Callback) -> str:
+    """The name of a callback's node as descriptions permit it, of its own for each process."""
+    node = evidence.graph.node_text(callback)
     name = re.sub(r"[^A-Za-z0-9_/]", "_", node).strip("/")
     if not re.match(r"[A-Za-z_]", name):
         name = f"node_{name}"
     if name != node.strip("/"):
         evidence.notes.append(f"{node} is no name of a node in a description: it is {name} there.")
     return name
+
+
+def _chain_described(evidence: _Evidence) -> str:
+    """The text of the chain with the names that its nodes have in the description."""
+    names = dict[str, str]()
+    for callback in evidence.graph.path(evidence.chain):
+        described = f"/{_name(evidence, callback)}"
+        processes = [f"{callback.node}@{pid}" for pid in callback.processes]
+        names |= dict.fromkeys((callback.node, *processes), described)
+    topics = {*evidence.graph.topics}
+    way_points = []
+    for way_point in parse_chain(evidence.chain.spec):
+        is_topic = not topics.isdisjoint((way_point, f"/{way_point}"))
+        node = f"/{way_point.removeprefix('/')}"
+        way_points.append(way_point if is_topic else names.get(node, way_point))
+    return "..".join(way_points)
 
 
 def _describable(callback: Callback) -> bool:

@@ -335,6 +335,7 @@ class Machine:
         self._system, self._handles, self._plan, self._timing = system, handles, plan, timing
         self._rows = rows = Rows([0] * X.COLUMNS)
         self._streams = Streams(system.application.seed, rows)
+        self._deliveries: dict[tuple[str, str, int], int] = {}
         self._cores = rows.add(len(system.cores), C.COLUMNS)
         self._threads = rows.add(len(system.threads), T.COLUMNS, NONE)
         self._first_threads = {
@@ -592,8 +593,14 @@ class Machine:
         described = self._system.application.simulation.deliveries.get(process.key, {})
         if publisher.topic not in described:
             return NONE
-        number = FIRST_DELIVERY + (publisher.process << 32) + (reader.index << 16) + reader.number
-        return self._streams.add(described[publisher.topic], process.node, number)
+        times = described[publisher.topic]
+        # A sequence is of the topic's messages in the order of their sending, by whichever node.
+        sender = publisher.process if times.sequence_ns is None else 0
+        number = FIRST_DELIVERY + (sender << 32) + (reader.index << 16) + reader.number
+        stream = process.node, publisher.topic, number
+        if stream not in self._deliveries:
+            self._deliveries[stream] = self._streams.add(times, process.node, number)
+        return self._deliveries[stream]
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
