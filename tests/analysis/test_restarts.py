@@ -203,7 +203,9 @@ def test_nodes_of_one_name_are_described_as_two(
     trace(tmp_path, namesakes())
     run("describe", file, "--chain", chain.format(process), "-o", described)
     text = Path(described).read_text()
-    assert f"/talker@{process} is no name of a node in a description: it is talker_{process}" in text
+    assert (
+        f"/talker@{process} is no name of a node in a description: it is talker_{process}" in text
+    )
     application = load_application(described)
     assert [*application.nodes] == ["talker_100", "talker_101", "relay"]
     assert f"/talker_{process}.." in application.chain
