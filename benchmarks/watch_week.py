@@ -264,7 +264,7 @@ class Application:
                 self.events += parts[which].records.size
 
     def memories(
-        self, _: object, known: Collection[int], refused: object = None
+        self, _: object, known: Collection[int], _refused: object = None
     ) -> Iterator[tuple[int, TracedProcess]]:
         for one in self.running:
             if one.pid not in known:

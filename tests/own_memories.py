@@ -5,7 +5,7 @@ checkout's tests, of the same user on the same machine.
 """
 
 import os
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,12 @@ def _born_of(pid: int, ancestor: int) -> bool:
 
 def follow_only_children_of(ancestor: int) -> None:
     """From now on watches in this process follow these alone."""
-    every = watch_module.memories
+    every = vars(watch_module)["memories"]
 
-    def own(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, Any]]:
-        return (found for found in every(users, known) if _born_of(found[0], ancestor))
+    def own(*given: Any) -> Iterator[tuple[int, Any]]:
+        return (found for found in every(*given) if _born_of(found[0], ancestor))
 
-    watch_module.memories = own
+    setattr(watch_module, "memories", own)  # noqa: B010 - a name that it imports
 
 
 def program(code: str = "from chainshaper.cli import main; main()") -> str:

@@ -376,7 +376,7 @@ def test_a_process_of_another_clock_is_refused_and_named(tmp_path: Path, ahead_s
     assert re.match(r"nothing of process \d+ \(python[\d.]*\) is recorded: ", note), "or its end"
 
 
-WAITING = """
+TAKES_A_LINE = """
 take(1)
 print("ready", flush=True)
 while not sys.stdin.readline().startswith("end"):
@@ -390,7 +390,7 @@ def waiting_in_time_namespace() -> Iterator[int]:
     that it reads; its number here.
     """
     environment = {**os.environ, "LD_PRELOAD": str(installed_library())}
-    program = CALLER + WAITING
+    program = CALLER + TAKES_A_LINE
     command = in_time_namespace(100_000, sys.executable, "-c", program)
     with subprocess.Popen(
         command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -430,7 +430,7 @@ def test_a_running_process_of_another_clock_is_named_where_it_is_attached_to(
         assert re.fullmatch(left_out + r"\.", note)
         assert [one for one in seen.left_out if re.match(left_out, one)]
         assert here in seen.processes
-        assert f"process {pid} " in watch_tables(seen)[-1].caption
+        assert f"process {pid} " in (watch_tables(seen)[-1].caption or "")
     watched._searched_ns = 0  # it looks again, and the process has ended
     assert not [one for one in watched.look().left_out if re.match(left_out, one)]
 

@@ -37,7 +37,7 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS, Callback
+from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import duration_text, format_duration, milliseconds
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
@@ -71,6 +71,8 @@ class _Evidence:
 
     recording: Recording
     flow: DataFlow
+    graph: ApplicationGraph
+    chain: Chain
     callbacks: dict[int, Callback]
     found: Occupation
     hops: pl.DataFrame
@@ -117,14 +119,14 @@ def application_file(
     it, or no description can be made of it.
     """
     recording = opened(recording)
-    evidence, spec = _evidence(recording, chain)
+    evidence = _evidence(recording, chain)
     nodes = _nodes(evidence)
     if not nodes:
         raise InputError(f"{recording.path}: no callback of it ran twice: record longer")
     scheduling = _scheduling(evidence, nodes)
     values: dict[str, Any] = {
         "name": recording.path.name,
-        "chain": _described_chain(evidence, spec, nodes),
+        "chain": _described_chain(evidence, nodes),
         "scheduling": scheduling,
         "topics": _topics(evidence, nodes),
         "simulation": _costs(evidence, nodes),
@@ -138,15 +140,15 @@ def application_file(
     values = _written_out(values, _chosen(evidence, values))
     with wrong_values_refused(Application, f"{recording.path}: "):
         application = Application.model_validate(values, context=AS_YAML, strict=False)
-    compared = _simulated_back(evidence, spec, application)
+    compared = _simulated_back(evidence, application)
     notes = tuple(dict.fromkeys((*evidence.notes, compared)))
     body = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     return "".join((*map(_comment, notes), body)), notes
 
 
-def _simulated_back(evidence: _Evidence, spec: str, application: Application) -> str:
+def _simulated_back(evidence: _Evidence, application: Application) -> str:
     """How near the description comes to the recording: latencies simulated and recorded."""
-    recorded = analyse_latency(evidence.flow, spec)
+    recorded = analyse_latency(evidence.flow, evidence.chain.spec)
     complete = recorded.traversals.drop_nulls("latency_ns").sort("latency_ns")
     if complete.is_empty():
         return "No cycle completes: the description cannot be compared with the recording."
@@ -172,14 +174,13 @@ def _comment(note: str) -> str:
     return fill(note, 98, initial_indent="# ", subsequent_indent="#   ") + "\n"
 
 
-def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
-    """What a recording's description is made from, and the chain as it will be written."""
+def _evidence(recording: Recording, chain: str | None) -> _Evidence:
+    """What a recording's description is made from."""
     flow = recorded_flow(recording)
     graph, heaviest = graph_of(flow), list_chains(flow).heaviest
     if heaviest is None:
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
-    spec = chain or recording.info.chain or heaviest.spec
-    path = find_chain(graph, spec)
+    path = find_chain(graph, chain or recording.info.chain or heaviest.spec)
     counting = publication_that_counts(flow, frozenset(path.topics))
     found = occupation(flow, recording.info, counting)
     timers = [one.id for one in graph.callbacks if one.kind == "timer"]
@@ -198,6 +199,8 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
     evidence = _Evidence(
         recording=recording,
         flow=flow,
+        graph=graph,
+        chain=path,
         callbacks=callbacks,
         found=found,
         hops=deliveries(flow, found),
@@ -231,7 +234,7 @@ def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
             "The recording is of a shaped application: a shaping node is described as one that"
             " computes while it holds a message. Describe a recording without it."
         )
-    return evidence, spec
+    return evidence
 
 
 def _latencies(application: Application, cycles: int) -> Numbers:
@@ -310,7 +313,7 @@ def _names(evidence: _Evidence, ran: Sequence[Callback]) -> dict[tuple[str, int]
     return found
 
 
-def _described_chain(evidence: _Evidence, spec: str, nodes: Mapping[str, _Node]) -> str:
+def _described_chain(evidence: _Evidence, nodes: Mapping[str, _Node]) -> str:
     """A chain by the names that its nodes have in the description."""
     named = dict[str, str]()
     for name, node in nodes.items():
@@ -318,7 +321,7 @@ def _described_chain(evidence: _Evidence, spec: str, nodes: Mapping[str, _Node])
         for known_by in (first.node, *(f"{first.node}@{pid}" for pid in first.processes)):
             named |= {known_by: f"/{name}", known_by.removeprefix("/"): f"/{name}"}
     topics = {topic for one in evidence.callbacks.values() for topic in one.publishes}
-    points = parse_chain(spec)
+    points = parse_chain(evidence.chain.spec)
     return "..".join(
         point if {point, f"/{point}"} & topics else named.get(point, point) for point in points
     )

@@ -435,7 +435,8 @@ def _on_longest_way(
 ) -> NDArray[np.int64]:
     """When the output is done in each cycle, from what each callback took (a row per cycle)."""
     if not graph_steps_ns.size:
-        return steps_ns.sum(axis=1)
+        along: NDArray[np.int64] = steps_ns.sum(axis=1)
+        return along
     done = np.zeros_like(graph_steps_ns)
     for place, callback in enumerate(profile.callbacks):
         inputs = [done[:, before] for before in callback.after]

@@ -270,13 +270,13 @@ class Streams:
     """All streams of a simulation: drawn in Python, consumed by the engine.
 
     A callback's stream is that of the live workload, value for value. ``deliveries`` are the places
-    of those by which messages reach an entity: by process, callback and input.
+    of those by which messages reach an entity: by its node, the topic, and the stream's number.
     """
 
     def __init__(self, seed: int, rows: Rows) -> None:
         self._seed, self._rows = seed, rows
         self._drawn: list[tuple[int, Iterator[Int64s]]] = []
-        self.deliveries: dict[tuple[int, int, int], int] = {}
+        self.deliveries: dict[tuple[str, str, int], int] = {}
         self._first = 0
 
     def add(self, times: ExecutionTime, node: str, index: int) -> int:
@@ -599,13 +599,15 @@ class Machine:
         described = self._system.application.simulation.deliveries.get(process.key, {})
         if publisher.topic not in described:
             return NONE
-        place = (reader.process, reader.index, reader.number)
-        if place not in self._streams.deliveries:
-            number = FIRST_DELIVERY + (publisher.process << 32)
-            number += (reader.index << 16) + reader.number
-            stream = self._streams.add(described[publisher.topic], process.node, number)
-            self._streams.deliveries[place] = stream
-        return self._streams.deliveries[place]
+        times = described[publisher.topic]
+        # A sequence is of the topic's messages in the order of their sending, by whichever node.
+        sender = publisher.process if times.sequence_ns is None else 0
+        number = FIRST_DELIVERY + (sender << 32) + (reader.index << 16) + reader.number
+        stream = process.node, publisher.topic, number
+        deliveries = self._streams.deliveries
+        if stream not in deliveries:
+            deliveries[stream] = self._streams.add(times, process.node, number)
+        return deliveries[stream]
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
