@@ -194,13 +194,14 @@ def release(
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed.
 
-    What was being written into the current folder when its run was killed is removed as well.
+    What was being written into the current folder when its run was killed is removed as well, and
+    what it had among temporary files and in the cache.
     """
     from chainshaper.enforcement.freezer import groups_of, run_of
     from chainshaper.enforcement.scheduling_memory import look_alikes
     from chainshaper.enforcement.undoing import release_strays
     from chainshaper.linux.runs import find_journals
-    from chainshaper.values.leftovers import clear_leftovers
+    from chainshaper.values.files import clear_killed_runs
 
     runs = find_journals()
     chosen = [journal for journal in runs if run in (None, journal.name)]
@@ -222,7 +223,7 @@ def release(
     for folder in strays:
         out.show_line(f"{folder}, of a run whose journal is gone: its threads run again")
     problems += left
-    removed, stays = clear_leftovers(Path.cwd()) if run is None else ([], [])
+    removed, stays = clear_killed_runs(Path.cwd()) if run is None else ([], [])
     for line in removed:
         out.show_line(line)
     out.notes([*strangers, *stays])
