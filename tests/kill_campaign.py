@@ -231,6 +231,12 @@ def mount(folder: Path, size: str) -> None:
     subprocess.run(words, check=True)
 
 
+def writes() -> bool:
+    """Whether the verb has begun to write: an output, a temporary file."""
+    places = (one for folder in (WORK / "small", *EMPTY) for one in folder.iterdir())
+    return any(one.name != "filling" for one in places)
+
+
 def output_of() -> bytes:
     """What the verb has printed so far."""
     return (WORK / "said").read_bytes()
@@ -325,6 +331,9 @@ def run_case(case: Case, folder: Path, victim: Victim, longest: dict[str, float]
         if in_force:
             wait(lambda: b"in force" in output_of() or process.poll() is not None, 30)
             time.sleep(chance.uniform(0, 0.5))
+        elif output is not None and chance.random() < 0.5:
+            wait(lambda: writes() or process.poll() is not None, 60)
+            time.sleep(chance.uniform(0, 0.3))
         else:
             most = longest.get(case.verb, LONGEST_S)
             wait(lambda: process.poll() is not None, chance.uniform(0, most))

@@ -44,10 +44,10 @@ with scratch_folder() as made:
 """
 
 
-def older(*folders: Path) -> None:
+def older(*paths: Path) -> None:
     """As if they had been made a minute ago."""
-    for folder in folders:
-        os.utime(folder, (time.time() - 60,) * 2)
+    for path in paths:
+        os.utime(path, (time.time() - 60,) * 2)
 
 
 def writing(
@@ -88,18 +88,16 @@ def test_of_a_killed_run_and_not_of_one_that_goes_on(tmp_path: Path) -> None:
 def test_a_hidden_file_of_a_killed_run_is_named_and_removed_and_not_one_that_is_written(
     tmp_path: Path,
 ) -> None:
-    output = tmp_path / "page.html"
-    lives, filled = writing(output, _FILE_WRITER)
-    dies, _ = writing(output, _FILE_WRITER)
+    lives, filled = writing(tmp_path / "plan.yaml", _FILE_WRITER)
+    dies, left = writing(tmp_path / "page.html", _FILE_WRITER)
     try:
         assert leftovers(tmp_path) == []
         dies.kill()
         dies.wait()
-        (left,) = leftovers(tmp_path, "page.html")
+        assert leftovers(tmp_path) == leftovers(tmp_path, "page.html") == [left]
         removed, stays = clear_leftovers(tmp_path)
         assert (len(removed), stays) == (1, [])
-        assert not left.exists()
-        assert len([*tmp_path.iterdir()]) == 1, f"{filled} goes on"
+        assert [*tmp_path.iterdir()] == [filled]
     finally:
         lives.kill()
         lives.wait()
@@ -113,9 +111,9 @@ def test_release_removes_what_killed_runs_left_among_temporary_files_and_in_the_
     for folder in (temporary, cache / "chainshaper", here):
         folder.mkdir(parents=True)
     dies, left = writing(here, _SCRATCH_WRITER, TMPDIR=str(temporary))
+    lives, filled = writing(here, _SCRATCH_WRITER, TMPDIR=str(temporary))
     dies.kill()
     dies.wait()
-    lives, filled = writing(here, _SCRATCH_WRITER, TMPDIR=str(temporary))
     built = cache / "chainshaper" / ".preload-1.partial-a1"
     built.mkdir()
     older(left, built)
