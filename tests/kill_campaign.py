@@ -388,16 +388,19 @@ def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) ->
     case.left += orphans() + victim.changed()
     if (said := output_of()) and b"Traceback" in said:
         case.left += tracebacks(case, said)
-    for place in EMPTY:
-        case.left += [f"{one} is left" for one in place.iterdir()]
+    for place in EMPTY:  # the folder of pages of a user stays where /run had no room
+        left = [one for one in place.iterdir() if one.name != f"chainshaper-{os.geteuid()}"]
+        case.left += [f"{one} is left" for one in left]
     runs = Path("/run/chainshaper")
-    kept = () if case.verb == "handover" else ("outputs",)
     pages = [*(runs / "outputs").iterdir()] if (runs / "outputs").is_dir() else []
     if runs.is_dir():
-        case.left += [f"{one} is left" for one in runs.iterdir() if one.name not in kept]
-    case.left += [f"the page {one} is left" for one in pages]
+        case.left += [f"{one} is left" for one in runs.iterdir() if one.name != "outputs"]
+    for one in pages:
+        case.left.append(f"the page {one} is left")
+        one.unlink()
     for one in small.iterdir():
-        named = ".tracing-" in one.name and one.name.encode() in released.stderr
+        mark = one.name.rpartition(".tracing-")
+        named = mark[1] and mark[2].encode() in released.stderr
         if one.name.startswith(".") and not named:
             case.left.append(f"beside the output: {one.name!r}")
     if output is not None:

@@ -169,6 +169,19 @@ def test_what_only_looks_like_it_stays(tmp_path: Path) -> None:
     assert leftovers(tmp_path) == [young, traced]
 
 
+def test_an_output_may_have_any_name(tmp_path: Path) -> None:
+    """A line feed ended the name, so that nothing named or removed what was left."""
+    output = os.fsdecode(b"out\xfc)\n")
+    left = tmp_path / f".{output}.partial-cz82e5z1"
+    file = tmp_path / f".{output}.html.partial-0123abcd"
+    left.mkdir()
+    file.write_text("half")
+    older(left, file)
+    assert leftovers(tmp_path, output) == [left]
+    removed, stays = clear_leftovers(tmp_path)
+    assert (len(removed), stays, [*tmp_path.iterdir()]) == (2, [], [])
+
+
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to another user")
 def test_another_users_folder_is_not_ours_to_remove(tmp_path: Path) -> None:
     theirs = tmp_path / ".r.partial-1"

@@ -15,8 +15,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_HIDDEN = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|tracing|older)-\w+")
-_FILE = re.compile(r".+-[0-9a-f]{8}")
+_HIDDEN = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|tracing|older)-\w+", re.DOTALL)
+_FILE = re.compile(r".+-[0-9a-f]{8}", re.DOTALL)
 """How names of such files end; a name that is less like ours may be of a file that is not."""
 _YOUNG_S = 10
 """Younger than this, it may be without its lock since it has just been made."""
