@@ -139,3 +139,38 @@ def test_live_nodes_that_receive_stand_between_the_chain_and_its_gate(tmp_path: 
     gate = known(plan.shaping_node)
     assert [*priorities, gate.fifo_priority] == [80, 84, 85]
     assert spliced.scheduling_of("actuator").core == 1
+
+
+THREE = """\
+name: three chains on a core each, and one actuator for all
+chain: /a
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a: {core: 1, callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/a]}]}
+  b: {core: 2, callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/b]}]}
+  c: {core: 3, callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/c]}]}
+  actuator:
+    core: 4
+    callbacks:
+      - {subscription: /a, execution: {constant: 3ms}}
+      - {subscription: /b, execution: {constant: 2ms}}
+      - {subscription: /c, execution: {constant: 1ms}}
+"""
+
+
+def test_outputs_of_several_chains_wait_for_each_other_at_their_receiver(tmp_path: Path) -> None:
+    """Under LET they leave at one time: of 3, 2 and 1 ms the last has waited for 5 ms at most."""
+    pytest.importorskip("numba")
+    application = described(tmp_path, text=THREE)
+    profiles = profile_chains(
+        simulate(application, tmp_path / "rec", cycles=100), ("/a", "/b", "/c")
+    )
+    plan, _ = plan_application(profiles, PlanRequest(policy="let-per-chain"))
+    shaped = simulate(application, tmp_path / "shaped", plan, cycles=300)
+    waits = (3, 4, 5)  # of /a for the others' 2 and 1 ms, and so on
+    for chain, wait_ms in zip(plan.chains, waits, strict=True):
+        promised = known(chain.predicted.receivers)
+        assert wait_ms * MS <= promised.jitter_ns - chain.predicted.jitter_ns < (wait_ms + 0.3) * MS
+        judged = known(measure_latency(shaped, chain.chain.spec).prediction)
+        assert judged.broken == ()
+        assert known(judged.receivers).behind == 0

@@ -98,7 +98,9 @@ def with_punctuality(
     origin = counted_from - _cycles_behind(cycle_ns)
     opens, closes = _last_slot(frame, due)
     place = end - pl.when(gated).then(origin).otherwise(began)
-    overran = pl.col("overrun").is_not_null() | (origin < counted_from)
+    # Under LET per callback, the gates before the last have each kept the message for a cycle.
+    behind = counted_from - origin > (0 if due is None else due.cycles) * pl.lit(cycle_ns or 0)
+    overran = pl.col("overrun").is_not_null() | behind
     late = pl.when(gated).then(overran | (place >= closes).fill_null(False))
     due_at = pl.when(gated).then(pl.min_horizontal("release", origin + opens))
     bound = pl.lit(None, dtype=pl.Int64) if due is None else began + limit

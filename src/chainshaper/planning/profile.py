@@ -62,7 +62,8 @@ class Reception(NamedTuple):
 
     ``core`` is theirs (None: several, or not known). A message is on its way for ``shortest_ns`` to
     ``longest_ns``, without the time for which others had that core. Its callbacks take ``time_ns``
-    at most, and others of their executors ``beside_ns`` in a cycle, each ``longest_beside_ns``.
+    at most, and others of their executors ``beside_ns`` in a cycle; ``longest_beside_ns`` is the sum
+    of the longest execution of each other callback, for which an output may have to wait.
     """
 
     core: int | None
