@@ -499,8 +499,8 @@ def main() -> None:
             group = mount_point() / f"kills-{os.getpid()}-{lane}"
             wait(lambda group=group: not _removed(group), 5)  # type: ignore[misc]
         sys.exit(any(codes))
-    lane, _, inputs = os.environ.pop(INSIDE).partition(" ")
-    sys.exit(run_lane(given, int(lane), Path(inputs)))
+    number, _, inputs = os.environ.pop(INSIDE).partition(" ")
+    sys.exit(run_lane(given, int(number), Path(inputs)))
 
 
 def _remove_groups(folder: Path) -> None:
