@@ -419,7 +419,8 @@ def tracebacks(case: Case, said: bytes) -> Iterator[str]:
     for trace in text.split("Traceback (most recent call last)")[1:]:
         frames = [name for name in _FRAME.findall(trace) if "/chainshaper/" in name]
         early = all(name.endswith(("chainshaper/__init__.py", "__main__.py")) for name in frames)
-        if "KeyboardInterrupt" in trace and early and any("SIGINT" in one for one in case.faults):
+        asked = any("SIGINT" in one for one in case.faults) or 'File "<string>"' in trace
+        if "KeyboardInterrupt" in trace and early and asked:  # that string is the application
             case.faults.append("a traceback before our first line")
         else:
             yield f"a traceback: {trace[-1500:]}"

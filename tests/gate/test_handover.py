@@ -253,6 +253,7 @@ def test_pages_that_no_process_has_are_removed_and_the_folder_behind_is_not_made
     behind = tmp_path / "behind"
     monkeypatch.setattr(FOLDERS, lambda: iter([str(folder), str(behind)]))
     open_page("gone", "/gone").close()
+    (folder / f"no_room.0.v{VERSION}").touch()
     in_force = open_page("t5", "/t5")
     assert in_force.lock()
     assert not behind.exists()
@@ -263,7 +264,8 @@ def test_pages_that_no_process_has_are_removed_and_the_folder_behind_is_not_made
         with subprocess.Popen(["sleep", "1000"], pass_fds=[inherited]) as child:
             os.close(inherited)
             places = (str(folder), str(opened), str(behind))
-            assert remove_abandoned_pages(places) == [f"{folder}/gone.0.v{VERSION}"]
+            gone = [f"{folder}/{name}.0.v{VERSION}" for name in ("gone", "no_room")]
+            assert remove_abandoned_pages(places) == gone
             child.kill()
     in_force.unlock()
     assert len(remove_abandoned_pages(places)) == 2

@@ -113,14 +113,23 @@ def remove_abandoned_pages(folders: Iterable[str] | None = None) -> list[str]:
         with suppress(OSError):
             names = sorted(os.listdir(folder))  # noqa: PTH208
         for name in names:
-            with suppress(OSError, ValueError), closing(Page(folder, name)) as page:
-                rights = (PUBLISHING, STANDING_BY, PASSING, MOVING)
-                there = os.stat(page.path)  # noqa: PTH116
-                used = (there.st_dev, there.st_ino) in opened or any(map(page.is_locked, rights))
-                if page.owner == os.geteuid() and not used:
-                    os.unlink(page.path)  # noqa: PTH108
-                    removed.append(page.path)
+            path = f"{folder}/{name}"
+            with suppress(OSError):
+                there = os.lstat(path)
+                used = (there.st_dev, there.st_ino) in opened or _has_rights(folder, name)
+                if there.st_uid == os.geteuid() and not used:
+                    os.unlink(path)  # noqa: PTH108
+                    removed.append(path)
     return removed
+
+
+def _has_rights(folder: str, name: str) -> bool:
+    """Whether a process has a right of a page; of one for which there was no room, none has."""
+    try:
+        with closing(Page(folder, name)) as page:
+            return any(map(page.is_locked, (PUBLISHING, STANDING_BY, PASSING, MOVING)))
+    except ValueError:
+        return False
 
 
 def _opened_pages() -> set[tuple[int, int]]:
