@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 from functools import cmp_to_key, partial
 from itertools import count
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from textwrap import fill
 from typing import Any
 
@@ -40,6 +39,7 @@ from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import duration_text, format_duration, milliseconds
 from chainshaper.values.errors import InputError
+from chainshaper.values.files import scratch_folder
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML, wrong_values_refused
 from chainshaper.verify.measure import opened
@@ -242,8 +242,8 @@ def _latencies(application: Application, cycles: int) -> Numbers:
     try:
         found = simulate_latencies(application, cycles=cycles)
     except InputError:  # stored messages lead through nodes of which events alone tell
-        with TemporaryDirectory() as folder:
-            recording = simulate(application, Path(folder) / "simulated", cycles=cycles)
+        with scratch_folder() as folder:
+            recording = simulate(application, folder / "simulated", cycles=cycles)
             traversals = analyse_latency(recording, application.chain).traversals
             found = traversals["latency_ns"].drop_nulls().to_numpy()
     return found[found >= 0]

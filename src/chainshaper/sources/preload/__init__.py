@@ -22,7 +22,6 @@ import socket
 import stat
 import struct
 import subprocess
-import tempfile
 import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
@@ -56,7 +55,8 @@ from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.events import EventTables
-from chainshaper.values.files import open_output, own_cache, why_distrusted
+from chainshaper.values.files import folder_beside, open_output, own_cache, why_distrusted
+from chainshaper.values.leftovers import clear_leftovers
 from chainshaper.values.recording import RecordingInfo
 
 SOURCE = Path(__file__).with_name("preload.c")
@@ -389,7 +389,8 @@ def in_cache(name: str, sources: Iterable[str], build: Callable[[Path], Path]) -
     if not library.exists():
         try:
             cache.mkdir(parents=True, exist_ok=True)
-            with tempfile.TemporaryDirectory(dir=cache) as folder:
+            clear_leftovers(cache, library.parent.name)
+            with folder_beside(library.parent) as folder:
                 built = build(Path(folder))
                 library.parent.mkdir(exist_ok=True)
                 built.replace(library)  # whole, also where two of us build at once
