@@ -72,7 +72,8 @@ def main() -> int:
         code, said, seconds = run(command, folder, environment)
         sys.stdout.write(f"{code} {seconds:6.2f} s  chainshaper {command}\n")
         sys.stdout.flush()
-        if code != expected or "Traceback" in said:
+        named = code == 0 or "error: " in said
+        if code != expected or not named or "Traceback" in said:
             failed += 1
             sys.stdout.write(f"    expected {expected}; it said:\n{said}\n")
     return min(failed, 1)

@@ -93,6 +93,16 @@ def test_a_timer_s_callback_too(executes: bool) -> None:
         assert flow.instances.filter(pl.col("end").is_null()).height == 1
 
 
+def test_where_no_event_was_lost_a_callback_took_its_next_message_itself() -> None:
+    """As a shaping node does, which takes what comes while it holds a message."""
+    story = relayed(PAIR, looks=False)
+    flow = data_flow(story.tables(), complete=True)
+    (relay,) = flow.objects.callbacks.filter(node="/relay")["callback_id"]
+    own = flow.instances.filter(callback_id=relay)
+    assert (own["end"] - own["start"]).to_list() == [30] * 4 + [130] + [30] * 14
+    assert not [note for note in flow.notes if "took the next message" in note]
+
+
 def test_another_callback_of_the_thread_proves_it_too() -> None:
     """No event of executors is there, but of a timer of the same thread."""
     story = relayed(PAIR | {("take", 600)}, looks=False)

@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +20,17 @@ from cpp_program import compiled
 from processes import wait_for
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import MOVING, RING, STANDING_BY, Page, Standby, Turn, open_page
+from chainshaper.gate.handover import (
+    MOVING,
+    RING,
+    STANDING_BY,
+    VERSION,
+    Page,
+    Standby,
+    Turn,
+    open_page,
+)
+from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
 
 MS = 1_000_000
 PROCESS = Path(__file__).parent / "output_process.py"
@@ -233,6 +244,32 @@ def test_a_page_that_is_removed_while_it_is_used_is_made_again(
     output.send_many(5)
     output.check(begun)
     assert [path.name for path in folder.iterdir()] == ["t5.0.v3"]
+
+
+def test_pages_that_no_process_has_are_removed_and_the_folder_behind_is_not_made(
+    tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each launch left a page in /run for good, and an empty folder in /dev/shm beside it."""
+    behind = tmp_path / "behind"
+    monkeypatch.setattr(FOLDERS, lambda: iter([str(folder), str(behind)]))
+    open_page("gone", "/gone").close()
+    (folder / f"no_room.0.v{VERSION}").touch()
+    in_force = open_page("t5", "/t5")
+    assert in_force.lock()
+    assert not behind.exists()
+    opened = tmp_path / "chainshaper-1"
+    opened.mkdir(mode=0o700)
+    with closing(Page(str(opened), f"t.0.v{VERSION}", "/t", os.O_RDWR | os.O_CREAT)) as page:
+        inherited = os.open(page.path, os.O_RDONLY)
+        with subprocess.Popen(["sleep", "1000"], pass_fds=[inherited]) as child:
+            os.close(inherited)
+            places = (str(folder), str(opened), str(behind))
+            gone = [f"{folder}/{name}.0.v{VERSION}" for name in ("gone", "no_room")]
+            assert remove_abandoned_pages(places) == gone
+            child.kill()
+    in_force.unlock()
+    assert len(remove_abandoned_pages(places)) == 2
+    assert not in_force.is_current
 
 
 def test_a_node_that_finds_its_page_made_anew_puts_its_slots_back(folder: Path) -> None:

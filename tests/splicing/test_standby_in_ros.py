@@ -10,8 +10,10 @@ import random
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +23,7 @@ from known import known
 from processes import wait_for
 from ros2 import ros2_environment
 
-from chainshaper import splice_launch_files
+from chainshaper import measure_latency, splice_launch_files
 from chainshaper.planning import Plan, plan_shaping
 from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
 from chainshaper.splicing.shaping_process import build_package
@@ -67,9 +69,21 @@ def plan() -> Plan:
 
 
 @pytest.fixture(params=["python", "cpp"])
-def launched(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Launched]:
+def kind(request: pytest.FixtureRequest) -> NodeKind:
+    wanted: NodeKind = request.param
+    return wanted
+
+
+@pytest.fixture
+def launched(kind: NodeKind, tmp_path: Path) -> Iterator[Launched]:
+    with launching(kind, tmp_path) as app:
+        yield app
+
+
+@contextmanager
+def launching(kind: NodeKind, tmp_path: Path, *recorder: str) -> Iterator[Launched]:
+    """The spliced application, which `ros2 launch` runs, behind a recorder's words if there are."""
     environment = {**ros2_environment(), "ROS_DOMAIN_ID": DOMAIN, "CHAINSHAPER_TEST": str(tmp_path)}
-    kind: NodeKind = request.param
     if kind == "cpp" and shutil.which("colcon", path=environment["PATH"]) is None:
         pytest.skip("colcon is not on the PATH, so no package can be built")
     robot = tmp_path / "robot.launch.py"
@@ -84,7 +98,7 @@ def launched(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Launche
         f"def generate_launch_description():\n    return LaunchDescription([\n{nodes}    ])\n"
     )
     splicing = splice_launch_files(plan(), [robot], tmp_path / "spliced", node=kind)
-    command = ["ros2", "launch", str(splicing.launch[robot])]
+    command = [*recorder, "ros2", "launch", str(splicing.launch[robot])]
     if kind == "cpp":
         with pytest.MonkeyPatch.context() as monkeypatch:
             for name, value in environment.items():
@@ -93,12 +107,17 @@ def launched(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Launche
         command = ["bash", "-c", 'source "$0" && exec "$@"', str(setup), *command]
     with (tmp_path / "said").open("wb") as said:
         process = subprocess.Popen(
-            ["env", *command], env=environment, stdout=said, stderr=said, start_new_session=True
+            ["env", *command],
+            env=environment,
+            stdin=subprocess.DEVNULL,
+            stdout=said,
+            stderr=said,
+            start_new_session=True,
         )
     try:
         yield Launched(tmp_path, process)
         process.send_signal(signal.SIGINT)
-        process.wait(30)
+        process.wait(120 if recorder else 30)  # a recorder reads the events then
     finally:
         if process.poll() is None:
             os.killpg(process.pid, signal.SIGKILL)
@@ -163,3 +182,26 @@ def test_whichever_is_killed_the_output_goes_on_and_both_are_back(
     if len(victims) == 1:
         assert figures["lost"] == 0
     assert came[-1] == sent[-1], "it goes on"
+
+
+def test_a_recording_in_which_the_shaping_node_was_killed_is_of_one_chain(
+    kind: NodeKind, tmp_path: Path
+) -> None:
+    folder, pids = tmp_path / "recording", list[int]()
+    words = ("-m", "chainshaper", "record", "-o", str(folder), "--source", "preload", "--")
+    with launching(kind, tmp_path, sys.executable, *words) as app:
+        for _ in range(2):
+            pids.append(known(await_shaped(app, *pids).shaping_node))
+            time.sleep(2)
+            os.kill(pids[-1], signal.SIGKILL)
+        pids.append(known(await_shaped(app, *pids).shaping_node))
+        time.sleep(2)
+    found = measure_latency(folder, "/t5_tmp../t5").analysis
+    (gate,) = (one for one in found.graph.path(found.chain) if one.node == "/chainshaper_t5")
+    assert gate.processes == tuple(pids)
+    whole, missing = found.statistics.count, found.incomplete
+    # Of each process that was killed, what it held and had not published may be missing.
+    assert whole > 20 * missing.get("not published", 0), missing
+    assert not [note for note in found.notes if "took the next message" in note]
+    page = ("-m", "chainshaper", "report", str(folder), "--chain", "/t5_tmp../t5")
+    subprocess.run([sys.executable, *page, "-o", str(tmp_path / "page.html")], check=True)

@@ -11,9 +11,10 @@ from pathlib import Path
 import pytest
 from command_line import chainshaper
 
+from chainshaper.values.files import scratch_folder
 from chainshaper.values.leftovers import claimed, clear_leftovers, leftover_text, leftovers
 
-_WRITER = """
+_FOLDER_WRITER = """
 import sys, time
 from pathlib import Path
 from chainshaper.values.files import folder_beside
@@ -22,18 +23,42 @@ with folder_beside(Path(sys.argv[1])) as made:
     print(made, flush=True)
     time.sleep(1000)
 """
+_FILE_WRITER = """
+import sys, time
+from pathlib import Path
+from chainshaper.values.files import write_whole
+output = Path(sys.argv[1])
+def parts():
+    yield b"half"
+    print(*output.parent.glob(f".{output.name}.*"), flush=True)
+    time.sleep(1000)
+write_whole(output, parts())
+"""
+_SCRATCH_WRITER = """
+import time
+from chainshaper.values.files import scratch_folder
+with scratch_folder() as made:
+    (made / "content").write_text("some")
+    print(made, flush=True)
+    time.sleep(1000)
+"""
 
 
-def older(*folders: Path) -> None:
+def older(*paths: Path) -> None:
     """As if they had been made a minute ago."""
-    for folder in folders:
-        os.utime(folder, (time.time() - 60,) * 2)
+    for path in paths:
+        os.utime(path, (time.time() - 60,) * 2)
 
 
-def writing(output: Path) -> tuple[subprocess.Popen[str], Path]:
-    """A process that writes an output, and the folder that it fills."""
+def writing(
+    output: Path, writer: str = _FOLDER_WRITER, **variables: str
+) -> tuple[subprocess.Popen[str], Path]:
+    """A process that writes an output, and the hidden folder or file that it fills."""
     process = subprocess.Popen(
-        [sys.executable, "-c", _WRITER, str(output)], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", writer, str(output)],
+        stdout=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **variables},
     )
     assert process.stdout is not None
     made = Path(process.stdout.readline().strip())
@@ -60,11 +85,74 @@ def test_of_a_killed_run_and_not_of_one_that_goes_on(tmp_path: Path) -> None:
         lives.wait()
 
 
+def test_a_hidden_file_of_a_killed_run_is_named_and_removed_and_not_one_that_is_written(
+    tmp_path: Path,
+) -> None:
+    lives, filled = writing(tmp_path / "plan.yaml", _FILE_WRITER)
+    dies, left = writing(tmp_path / "page.html", _FILE_WRITER)
+    try:
+        assert leftovers(tmp_path) == []
+        dies.kill()
+        dies.wait()
+        assert leftovers(tmp_path) == leftovers(tmp_path, "page.html") == [left]
+        removed, stays = clear_leftovers(tmp_path)
+        assert (len(removed), stays) == (1, [])
+        assert [*tmp_path.iterdir()] == [filled]
+    finally:
+        lives.kill()
+        lives.wait()
+
+
+def test_release_removes_what_killed_runs_left_among_temporary_files_and_in_the_cache(
+    tmp_path: Path,
+) -> None:
+    """A sweep simulates in a folder there: it stood for ever when the sweep was killed."""
+    temporary, cache, here = (tmp_path / name for name in ("tmp", "cache", "here"))
+    for folder in (temporary, cache / "chainshaper", here):
+        folder.mkdir(parents=True)
+    dies, left = writing(here, _SCRATCH_WRITER, TMPDIR=str(temporary))
+    lives, filled = writing(here, _SCRATCH_WRITER, TMPDIR=str(temporary))
+    dies.kill()
+    dies.wait()
+    built = cache / "chainshaper" / ".preload-1.partial-a1"
+    built.mkdir()
+    older(left, built)
+    try:
+        said = subprocess.run(
+            [sys.executable, "-m", "chainshaper", "release", "--crashed"],
+            cwd=here,
+            env={**os.environ, "TMPDIR": str(temporary), "XDG_CACHE_HOME": str(cache)},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert [*temporary.iterdir()] == [filled], said
+        assert [*built.parent.iterdir()] == []
+        assert str(built) in said.stdout
+    finally:
+        lives.kill()
+        lives.wait()
+
+
+def test_the_next_scratch_folder_removes_that_of_a_killed_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dies, left = writing(tmp_path, _SCRATCH_WRITER, TMPDIR=str(tmp_path))
+    dies.kill()
+    dies.wait()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    with scratch_folder() as made:
+        assert not left.exists()
+        assert [*tmp_path.iterdir()] == [made]
+    assert [*tmp_path.iterdir()] == []
+
+
 def test_what_only_looks_like_it_stays(tmp_path: Path) -> None:
     (tmp_path / "elsewhere").mkdir()
     (tmp_path / "elsewhere" / "content").write_text("mine")
     (tmp_path / ".r.partial-link").symlink_to(tmp_path / "elsewhere")
     (tmp_path / ".r.partial-file").write_text("a file")
+    older(tmp_path / ".r.partial-file")
     young, traced, plain = (tmp_path / f".r.{n}" for n in ("partial-1", "tracing-2", "partials"))
     for folder in (young, traced, plain):
         folder.mkdir()
@@ -79,6 +167,19 @@ def test_what_only_looks_like_it_stays(tmp_path: Path) -> None:
         assert leftovers(tmp_path) == []
     older(young)
     assert leftovers(tmp_path) == [young, traced]
+
+
+def test_an_output_may_have_any_name(tmp_path: Path) -> None:
+    """A line feed ended the name, so that nothing named or removed what was left."""
+    output = os.fsdecode(b"out\xfc)\n")
+    left = tmp_path / f".{output}.partial-cz82e5z1"
+    file = tmp_path / f".{output}.html.partial-0123abcd"
+    left.mkdir()
+    file.write_text("half")
+    older(left, file)
+    assert leftovers(tmp_path, output) == [left]
+    removed, stays = clear_leftovers(tmp_path)
+    assert (len(removed), stays, [*tmp_path.iterdir()]) == (2, [], [])
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to another user")

@@ -54,8 +54,8 @@ def without_disproved_ends(
 ) -> LostEnds:
     """Look for ends that the thread's other events disprove, and leave them out.
 
-    Where no event was lost (``complete``), an instance in which the thread looked for work did so
-    itself.
+    Where no event was lost (``complete``), an instance in which the thread looked for work, or took
+    a message, did so itself: as shaping nodes do, which take what comes while they hold a message.
 
     The executor's events are asked only where an instance is suspiciously long, or has no end: as
     a rule no other step needs them.
@@ -66,6 +66,8 @@ def without_disproved_ends(
     rows = first_after(instances, own, key, "start", "took", strictly=True)
     if not _suspicious(rows):
         return LostEnds(instances.with_columns(until=_NO_TIME), _NONE, _NONE, complete)
+    if complete:
+        own = own.clear()
     own = pl.concat([own, _executions_of_timers(tables, callbacks)]).sort("took")
     rows = first_after(rows.drop("took"), own, key, "start", "took", strictly=True)
     looks = pl.concat(events.table(tables, name).select(*thread, looked="time") for name in LOOKS)

@@ -194,13 +194,16 @@ def release(
 ) -> None:
     """End plans in force, and put back what crashed runs have left changed.
 
-    What was being written into the current folder when its run was killed is removed as well.
+    What was being written into the current folder when its run was killed is removed as well, and
+    what it had among temporary files and in the cache; and what outputs have left in memory that no
+    process shapes any more.
     """
     from chainshaper.enforcement.freezer import groups_of, run_of
     from chainshaper.enforcement.scheduling_memory import look_alikes
     from chainshaper.enforcement.undoing import release_strays
     from chainshaper.linux.runs import find_journals
-    from chainshaper.values.leftovers import clear_leftovers
+    from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
+    from chainshaper.values.files import clear_killed_runs
 
     runs = find_journals()
     chosen = [journal for journal in runs if run in (None, journal.name)]
@@ -222,10 +225,12 @@ def release(
     for folder in strays:
         out.show_line(f"{folder}, of a run whose journal is gone: its threads run again")
     problems += left
-    removed, stays = clear_leftovers(Path.cwd()) if run is None else ([], [])
+    removed, stays = clear_killed_runs(Path.cwd()) if run is None else ([], [])
     for line in removed:
         out.show_line(line)
-    out.notes([*strangers, *stays])
+    pages = remove_abandoned_pages() if run is None else []
+    forgotten = [f"{len(pages)} pages of outputs that no process shapes any more are removed"]
+    out.notes([*strangers, *stays, *(forgotten if pages else ())])
     if problems:
         raise OperationError("; ".join(problems))
     if not chosen and not strays and not removed and not stays:

@@ -8,7 +8,6 @@ throttler the subscribers: a player or a driver often is started elsewhere.
 
 import difflib
 import json
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
@@ -26,7 +25,7 @@ from chainshaper.splicing import spliced_launch as launching
 from chainshaper.splicing.application import nothing_to_splice
 from chainshaper.splicing.redirection import Redirect
 from chainshaper.values.errors import InputError, OperationError, PlatformError, storable
-from chainshaper.values.files import write_whole
+from chainshaper.values.files import scratch_folder, write_whole
 from chainshaper.values.plan_choices import STANDBY, Fallback, NodeKind
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
@@ -247,7 +246,7 @@ def _spliced(
     if dry is None:
         place = launching.new_folder(folder, {name: words}, throttled=throttled)
     else:
-        place = tempfile.TemporaryDirectory()
+        place = scratch_folder()
     with place as partial:
         made, environment = written(Path(partial, launching.NODES))
         text = launching.launch_text(words, made, redirects, environment)

@@ -20,7 +20,6 @@ import io
 import json
 import os
 import re
-import tempfile
 import time
 from collections import defaultdict, deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
@@ -47,7 +46,7 @@ from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.arrays import build_system
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
-from chainshaper.values.files import new_file, open_output, write_whole
+from chainshaper.values.files import new_file, open_output, scratch_folder, write_whole
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.verify.promises import OutputsDue
 from chainshaper.workload.description import Application, application_as_written, origin_timer
@@ -387,8 +386,8 @@ def profile_at(grid: Grid, values: Values, progress: Progress | None = None) -> 
         application = _urgent(application_at(grid, values))
         most = MOST_RECORDED if values.get("policy") in BY_CALLBACK else STRUCTURE_CYCLES
         recorded = min(grid.cycles, most)
-        with tempfile.TemporaryDirectory(prefix="chainshaper-sweep-") as folder:
-            place = Path(folder) / "profile"
+        with scratch_folder() as folder:
+            place = folder / "profile"
             recording = simulate(application, place, cycles=recorded, progress=progress)
             (profile,) = profile_chains(recording)
         latencies = simulate_latencies(application, cycles=grid.cycles, progress=progress)

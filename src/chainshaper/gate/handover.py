@@ -107,22 +107,27 @@ def open_page(name: str, topic: str) -> "Page":
         for folder in page_folders():
             try:
                 file = f"{name}.{int(domain)}.v{VERSION}"
-                return Page(_private(folder), file, topic, os.O_RDWR | flags)
+                return Page(_private(folder, flags), file, topic, os.O_RDWR | flags)
             except (OSError, ValueError) as error:
                 problem = OSError(f"{folder}: {error}")
     raise problem
 
 
-def _private(folder: str) -> str:
-    """A folder that is ours alone."""
-    # Not writable by others, whatever the umask: pages of every output are found through it.
-    os.makedirs(os.path.dirname(folder), 0o755, exist_ok=True)  # noqa: PTH103, PTH120 - of a node's file
-    with suppress(FileExistsError):
-        os.mkdir(folder, 0o700)  # noqa: PTH102
+def _private(folder: str, flags: int) -> str:
+    """A folder that is ours alone, made where a page is to be. Raises OSError: it is not."""
+    if flags & os.O_CREAT:
+        _make_private(folder)
     found = os.lstat(folder)
     if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
         raise PermissionError("it is not a folder of this user alone (mode 0700)")
     return folder
+
+
+def _make_private(folder: str) -> None:
+    # Not writable by others, whatever the umask: pages of every output are found through it.
+    os.makedirs(os.path.dirname(folder), 0o755, exist_ok=True)  # noqa: PTH103, PTH120 - of a node's file
+    with suppress(FileExistsError):
+        os.mkdir(folder, 0o700)  # noqa: PTH102
 
 
 class Page:

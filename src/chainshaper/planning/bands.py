@@ -22,7 +22,6 @@ Particle swarm and chance (section 5.1.5, tables 3 and 4) are for comparison.
 """
 
 import os
-import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -523,10 +522,10 @@ def _quiet_and_seeded(seed: int | None) -> Iterator[None]:
     current folder, unless a configuration says otherwise.
     """
     state, configured = np.random.get_state(), os.environ.get("LOG_CFG")
-    with tempfile.NamedTemporaryFile("w", suffix=".yaml", encoding="utf-8") as configuration:
+    with os.fdopen(os.memfd_create("logging"), "w", encoding="utf-8") as configuration:
         configuration.write("version: 1\nincremental: true\n")
         configuration.flush()
-        os.environ["LOG_CFG"] = configuration.name
+        os.environ["LOG_CFG"] = f"/proc/self/fd/{configuration.fileno()}"  # gone with us
         try:
             np.random.seed(seed)
             yield

@@ -269,12 +269,14 @@ class Rows(list[int]):
 class Streams:
     """All streams of a simulation: drawn in Python, consumed by the engine.
 
-    A callback's stream is that of the live workload, value for value.
+    A callback's stream is that of the live workload, value for value. ``deliveries`` are the places
+    of those by which messages reach an entity: by its node, the topic, and the stream's number.
     """
 
     def __init__(self, seed: int, rows: Rows) -> None:
         self._seed, self._rows = seed, rows
         self._drawn: list[tuple[int, Iterator[Int64s]]] = []
+        self.deliveries: dict[tuple[str, str, int], int] = {}
         self._first = 0
 
     def add(self, times: ExecutionTime, node: str, index: int) -> int:
@@ -451,8 +453,12 @@ class Machine:
             server.name: sorted({named[n] for n, one in governed.items() if one is server})
             for server in ranked
         }
+        behind_outputs = plan.behind_outputs
         urgency = {
-            number: (server.priority, taken[server.name].index(named[number]))
+            number: (
+                server.priority,
+                taken[server.name].index(named[number]) + (server.name in behind_outputs),
+            )
             for number, server in governed.items()
         }
         behind = {number: (one.priority, len(governed)) for number, one in receiving.items()}
@@ -587,13 +593,21 @@ class Machine:
             rows[row + P.ENDS_CHAIN] = ends and publisher.topic == system.chain.topics[-1]
 
     def _delivery(self, reader: Entity, publisher: Publisher) -> int:
-        """The stream of a reader's own times of delivery from a publisher; NONE: it has none."""
+        """The stream of a reader's own times of delivery, from all publishers of its topic in the
+        order of their publications; NONE: it has none."""
         process = self._system.processes[reader.process]
         described = self._system.application.simulation.deliveries.get(process.key, {})
         if publisher.topic not in described:
             return NONE
-        number = FIRST_DELIVERY + (publisher.process << 32) + (reader.index << 16) + reader.number
-        return self._streams.add(described[publisher.topic], process.node, number)
+        times = described[publisher.topic]
+        # A sequence is of the topic's messages in the order of their sending, by whichever node.
+        sender = publisher.process if times.sequence_ns is None else 0
+        number = FIRST_DELIVERY + (sender << 32) + (reader.index << 16) + reader.number
+        stream = process.node, publisher.topic, number
+        deliveries = self._streams.deliveries
+        if stream not in deliveries:
+            deliveries[stream] = self._streams.add(times, process.node, number)
+        return deliveries[stream]
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:

@@ -14,7 +14,15 @@ from typing import Literal, TypeAlias
 from pydantic import TypeAdapter
 
 from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import MOVING, STANDING_BY, VERSION, Page, page_folders
+from chainshaper.gate.handover import (
+    MOVING,
+    PASSING,
+    PUBLISHING,
+    STANDING_BY,
+    VERSION,
+    Page,
+    page_folders,
+)
 from chainshaper.linux.processes import run_users, user_name
 from chainshaper.linux.threads import innermost_id, parents, read_proc, status_field
 from chainshaper.values.durations import duration_text
@@ -91,6 +99,51 @@ def _in_containers() -> list[tuple[str, str, dict[int, int]]]:
                     page = found.setdefault((file.st_dev, file.st_ino), (folder, name, {}))
                     page[2][inner] = pid
     return list(found.values())
+
+
+def remove_abandoned_pages(folders: Iterable[str] | None = None) -> list[str]:
+    """Remove the pages of this user's outputs that no process has open: the files removed.
+
+    One with a right taken stays as well: its process may be in a container, and not to be seen. A
+    node that looks for its page meanwhile finds that it is gone, and makes another.
+    """
+    opened, removed = _opened_pages(), list[str]()
+    for folder in page_folders() if folders is None else folders:
+        names = list[str]()
+        with suppress(OSError):
+            names = sorted(os.listdir(folder))  # noqa: PTH208
+        for name in names:
+            path = f"{folder}/{name}"
+            with suppress(OSError):
+                there = os.lstat(path)
+                used = (there.st_dev, there.st_ino) in opened or _has_rights(folder, name)
+                if there.st_uid == os.geteuid() and not used:
+                    os.unlink(path)  # noqa: PTH108
+                    removed.append(path)
+    return removed
+
+
+def _has_rights(folder: str, name: str) -> bool:
+    """Whether a process has a right of a page; of one for which there was no room, none has."""
+    try:
+        with closing(Page(folder, name)) as page:
+            return any(map(page.is_locked, (PUBLISHING, STANDING_BY, PASSING, MOVING)))
+    except ValueError:
+        return False
+
+
+def _opened_pages() -> set[tuple[int, int]]:
+    """Device and number of each page that another process has open, as far as they are seen."""
+    opened = set[tuple[int, int]]()
+    for pid in parents():
+        folder = f"/proc/{pid}/fd"
+        with suppress(OSError):  # it has ended, or is another user's
+            for name in os.listdir(folder) if pid != os.getpid() else ():  # noqa: PTH208
+                with suppress(OSError):
+                    if _PAGE.search(os.readlink(f"{folder}/{name}")):  # noqa: PTH115
+                        file = os.stat(f"{folder}/{name}")  # noqa: PTH116
+                        opened.add((file.st_dev, file.st_ino))
+    return opened
 
 
 def output_text(output: ShapedOutput) -> str:

@@ -23,6 +23,7 @@ from chainshaper.splicing.redirection import Redirect
 from chainshaper.splicing.shaping_process import ShapingProcess
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import folder_beside, open_to_all, rename_output, write_whole
+from chainshaper.values.leftovers import claimed
 from chainshaper.values.yaml_file import read_text
 
 MANIFEST = "splice.json"
@@ -293,13 +294,14 @@ def _replace(folder: Path, new: Path) -> None:
     if not folder.exists():
         rename_output(new, folder)
         return
-    aside = _moved_aside(folder)
-    try:
-        rename_output(new, folder)
-    except OSError:
-        rename_output(aside, folder)
-        raise
-    shutil.rmtree(aside, ignore_errors=True)
+    with claimed(folder):  # of a killed run, `chainshaper release` removes it
+        aside = _moved_aside(folder)
+        try:
+            rename_output(new, folder)
+        except OSError:
+            rename_output(aside, folder)
+            raise
+        shutil.rmtree(aside, ignore_errors=True)
 
 
 def _moved_aside(folder: Path) -> Path:
@@ -318,6 +320,7 @@ def undo_splice(folder: str | Path) -> None:
         raise InputError(f"{folder}: no such folder, so there is nothing to undo")
     _refuse_changed(folder, "not removed: move away what you need, and remove the rest")
     try:
-        shutil.rmtree(_moved_aside(folder))
+        with claimed(folder):
+            shutil.rmtree(_moved_aside(folder))
     except OSError as error:
         raise OperationError(f"{folder}: cannot be removed: {error}") from error

@@ -21,7 +21,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.leftovers import claimed
+from chainshaper.values.leftovers import claim, claimed, clear_leftovers
 
 
 def why_distrusted(path: str | Path) -> str | None:
@@ -75,6 +75,8 @@ def _is_own_group(gid: int, uid: int) -> bool:
 
 
 _LONGEST_FILE = 512 << 20
+SCRATCH = "chainshaper"
+"""What :func:`scratch_folder` makes folders for: it names them."""
 _FOLDER = os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
@@ -201,11 +203,12 @@ def write_whole(path: Path, parts: Iterable[bytes]) -> Path:
         folder = open_folder(path.absolute().parent)  # it stays the same, whatever is renamed
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
         with os.fdopen(os.open(name, flags, 0o600, dir_fd=folder), "wb") as stream:
+            claim(stream.fileno())  # until it has its name
             stream.writelines(parts)
             stream.flush()
             os.fsync(stream.fileno())
             os.fchmod(stream.fileno(), 0o644)
-        os.rename(name, path.name, src_dir_fd=folder, dst_dir_fd=folder)
+            os.rename(name, path.name, src_dir_fd=folder, dst_dir_fd=folder)
     except BaseException as error:  # Ctrl-C among them
         if folder is not None:
             with suppress(OSError):  # it was not made, or it is in its place
@@ -226,6 +229,30 @@ def folder_beside(path: Path) -> Iterator[str]:
     new = tempfile.TemporaryDirectory(prefix=name, dir=parent, ignore_cleanup_errors=True)
     with new as made, claimed(Path(made)):
         yield made
+
+
+@contextmanager
+def scratch_folder() -> Iterator[Path]:
+    """A new folder for a while, among the machine's temporary ones; what a killed run has left of
+    its own there, the next one removes, and `chainshaper release`.
+    """
+    place = Path(tempfile.gettempdir()).absolute()
+    clear_leftovers(place, SCRATCH)
+    with folder_beside(place / SCRATCH) as made:
+        yield Path(made)
+
+
+def clear_killed_runs(folder: Path) -> tuple[list[str], list[str]]:
+    """Remove what killed runs have left in a folder, among temporary files and in our cache, as
+    :func:`.clear_leftovers`.
+    """
+    removed, stays = clear_leftovers(folder)
+    for place, name in ((Path(tempfile.gettempdir()).absolute(), SCRATCH), (own_cache(), None)):
+        if place.is_dir() and not place.samefile(folder):
+            more, still = clear_leftovers(place, name)
+            removed += more
+            stays += still
+    return removed, stays
 
 
 def rename_output(made: Path, path: Path) -> Path:

@@ -1,7 +1,8 @@
-"""Folders that a killed run has left beside its output: ``.NAME.partial-…``, ``.NAME.tracing-…``.
+"""What a killed run has left beside its output: ``.NAME.partial-…``, ``.NAME.tracing-…``,
+``.NAME.older-…``, each a folder or a file.
 
-Who fills such a folder holds a lock of it, which the kernel takes back with the process: whatever
-is locked belongs to a run that goes on, whoever started it and under whatever number.
+Who fills one holds a lock of it, which the kernel takes back with the process: whatever is locked
+belongs to a run that goes on, whoever started it and under whatever number.
 """
 
 import fcntl
@@ -14,10 +15,19 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-_HIDDEN = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|tracing)-\w+")
+_HIDDEN = re.compile(r"\.(?P<name>.+)\.(?P<kind>partial|tracing|older)-\w+", re.DOTALL)
+_FILE = re.compile(r".+-[0-9a-f]{8}", re.DOTALL)
+"""How names of such files end; a name that is less like ours may be of a file that is not."""
 _YOUNG_S = 10
-"""Younger than this, a folder may be without its lock since it has just been made."""
-_FOLDER = os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW | os.O_CLOEXEC
+"""Younger than this, it may be without its lock since it has just been made."""
+_ENTRY = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
+_FOLDER = _ENTRY | os.O_DIRECTORY
+
+
+def claim(descriptor: int) -> None:
+    """Lock an open file or folder of ours until it is closed, where its file system has locks."""
+    with suppress(OSError):
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
 
 @contextmanager
@@ -28,8 +38,7 @@ def claimed(folder: Path) -> Iterator[Path]:
     """
     descriptor = os.open(folder, _FOLDER)
     try:
-        with suppress(OSError):
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        claim(descriptor)
         yield folder
     finally:
         os.close(descriptor)
@@ -48,12 +57,13 @@ def leftovers(folder: Path, output: str | None = None) -> list[Path]:
 
 def _abandoned(path: Path) -> bool:
     try:
-        descriptor = os.open(path, _FOLDER)
+        descriptor = os.open(path, _ENTRY)
     except OSError:
         return False
     try:
         state = os.fstat(descriptor)
-        ours = state.st_uid == os.geteuid() and stat.S_ISDIR(state.st_mode)
+        plain = stat.S_ISREG(state.st_mode) and _FILE.fullmatch(path.name) is not None
+        ours = state.st_uid == os.geteuid() and (plain or stat.S_ISDIR(state.st_mode))
         if not ours or time.time() - state.st_mtime < _YOUNG_S:
             return False
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -79,17 +89,22 @@ def leftover_text(path: Path) -> str:
     return f"{said}`chainshaper release` removes it, in that folder"
 
 
-def clear_leftovers(folder: Path) -> tuple[list[str], list[str]]:
-    """Remove what killed runs have left in a folder, but for traces: what was removed, what stays.
+def clear_leftovers(folder: Path, output: str | None = None) -> tuple[list[str], list[str]]:
+    """Remove what killed runs have left in a folder, of one ``output`` or of all, but for traces:
+    what was removed, what stays.
 
     Each is a line for people.
     """
     removed, stays = list[str](), list[str]()
-    for path in leftovers(folder):
+    for path in leftovers(folder, output):
         if is_trace(path):
             stays.append(leftover_text(path))
             continue
-        shutil.rmtree(path, ignore_errors=True)
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                path.unlink()
         if path.exists():
             stays.append(f"{path} was left by a run that was killed, and cannot be removed whole")
         else:

@@ -109,9 +109,11 @@ inline std::vector<std::string> page_folders() {
   return folders;
 }
 
-inline void check_private(const std::string & folder) {
-  mkdir(folder.substr(0, folder.rfind('/')).c_str(), 0755);
-  mkdir(folder.c_str(), 0700);
+inline void check_private(const std::string & folder, bool make) {
+  if (make) {
+    mkdir(folder.substr(0, folder.rfind('/')).c_str(), 0755);
+    mkdir(folder.c_str(), 0700);
+  }
   struct stat found{};
   if (lstat(folder.c_str(), &found) != 0)
     throw std::runtime_error(folder + ": " + std::strerror(errno));
@@ -128,7 +130,7 @@ inline std::unique_ptr<Page> open_page(const std::string & name, const std::stri
   for (const bool make : {false, true}) {
     for (const auto & folder : folders) {
       try {
-        check_private(folder);
+        check_private(folder, make);
         return std::make_unique<Page>(folder, file, topic, make);
       } catch (const std::runtime_error & error) {
         problem = error.what();
