@@ -218,9 +218,9 @@ def test_a_trace_is_kept_and_named_whatever_reading_it_ends_with(
 ) -> None:
     tracers, said = list[BrokenTracer](), list[str]()
 
-    def tracer(_: None, folder: Path, *__: object, **___: object) -> tuple[BrokenTracer, tuple[()]]:
+    def tracer(_: None, folder: Path, *__: object, **___: object) -> BrokenTracer:
         tracers.append(BrokenTracer(error, folder))
-        return tracers[-1], ()
+        return tracers[-1]
 
     monkeypatch.setattr(record, "_tracer", tracer)
     with pytest.raises(type(error)) as caught:
@@ -292,7 +292,7 @@ class FullTracer(BrokenTracer):
 
 @pytest.fixture
 def full_tracer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(record, "_tracer", lambda _, folder, *__, **___: (FullTracer(folder), ()))
+    monkeypatch.setattr(record, "_tracer", lambda _, folder, *__, **___: FullTracer(folder))
 
 
 @pytest.mark.usefixtures("full_tracer")

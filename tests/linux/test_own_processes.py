@@ -139,7 +139,11 @@ _STARTS = (
 )
 
 
-def started(root: Path, python: str = sys.executable) -> "subprocess.CompletedProcess[str]":
+# An editable install of ours goes before PYTHONPATH, so it is none of an environment's.
+BASE_PYTHON: str = getattr(sys, "_base_executable", sys.executable)
+
+
+def started(root: Path, python: str = BASE_PYTHON) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(
         [python, "-B", "-c", _STARTS.format(root=str(root))],
         env={**os.environ, "PYTHONPATH": str(root)},
