@@ -48,3 +48,11 @@ def test_a_missing_compiler_is_installed_by_root(tmp_path: Path) -> None:
     assert first.startswith("install -y --no-install-recommends ")
     assert first.endswith(" g++")
     assert others == ["update"], "a fresh machine has no package lists"
+
+
+def test_changed_sources_of_the_library_are_built_again() -> None:
+    places = ("core/bands/placement.cpp", "src/chainshaper/sources/preload/preload.c")
+    for source in (*places, "src/chainshaper/gate/decision.py"):
+        words = ["make", "--dry-run", f"--what-if={source}", ".venv/.ready-dev"]
+        done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
+        assert "scripts/setup dev" in done.stdout.splitlines(), source
