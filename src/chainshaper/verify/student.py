@@ -3,7 +3,7 @@
 SciPy has it, but takes 125 MB of a robot's disk, and this is all that a robot needs of it.
 """
 
-from math import exp, lgamma, log, log1p
+from math import exp, lgamma, log
 
 _SMALLEST = 1e-300  # in place of a zero in a denominator (Lentz's method)
 _MOST_TERMS = 500
@@ -11,7 +11,8 @@ _MOST_TERMS = 500
 
 def t_tail(t: float, freedom: float) -> float:
     """The probability of more than ``t``, with so many degrees of freedom."""
-    beyond = _incomplete_beta(freedom / 2, 0.5, freedom / (freedom + t * t)) / 2
+    square = freedom + t * t
+    beyond = _incomplete_beta(freedom / 2, 0.5, freedom / square, t * t / square) / 2
     return beyond if t >= 0 else 1 - beyond
 
 
@@ -28,13 +29,16 @@ def t_quantile(probability: float, freedom: float) -> float:
     return middle
 
 
-def _incomplete_beta(a: float, b: float, x: float) -> float:
-    """The regularised incomplete beta function (Abramowitz and Stegun, 26.5.8)."""
-    if x in (0, 1):
+def _incomplete_beta(a: float, b: float, x: float, rest: float) -> float:
+    """The regularised incomplete beta function (Abramowitz and Stegun, 26.5.8).
+
+    ``rest`` is 1 − x, with the digits that a subtraction from 1 has lost.
+    """
+    if 0 in (x, rest):
         return x
     if x > (a + 1) / (a + b + 2):  # where the fraction converges slowly
-        return 1 - _incomplete_beta(b, a, 1 - x)
-    logarithm = a * log(x) + b * log1p(-x) + lgamma(a + b) - lgamma(a) - lgamma(b)
+        return 1 - _incomplete_beta(b, a, rest, x)
+    logarithm = a * log(x) + b * log(rest) + lgamma(a + b) - lgamma(a) - lgamma(b)
     return exp(logarithm) / (a * _continued_fraction(a, b, x))
 
 
