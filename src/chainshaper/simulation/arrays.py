@@ -275,7 +275,15 @@ class Streams:
     def __init__(self, seed: int, rows: Rows) -> None:
         self._seed, self._rows = seed, rows
         self._drawn: list[tuple[int, Iterator[Int64s]]] = []
+        self._of_topics: dict[tuple[str, str, int], int] = {}
         self._first = 0
+
+    def of_topic(self, topic: str, times: ExecutionTime, node: str, index: int) -> int:
+        """The place of a reader's stream of delays, which publishers of a topic may share."""
+        stream = topic, node, index
+        if stream not in self._of_topics:
+            self._of_topics[stream] = self.add(times, node, index)
+        return self._of_topics[stream]
 
     def add(self, times: ExecutionTime, node: str, index: int) -> int:
         """The place of a new stream of CPU times or delays (ns)."""
@@ -335,7 +343,6 @@ class Machine:
         self._system, self._handles, self._plan, self._timing = system, handles, plan, timing
         self._rows = rows = Rows([0] * X.COLUMNS)
         self._streams = Streams(system.application.seed, rows)
-        self._deliveries: dict[tuple[str, str, int], int] = {}
         self._cores = rows.add(len(system.cores), C.COLUMNS)
         self._threads = rows.add(len(system.threads), T.COLUMNS, NONE)
         self._first_threads = {
@@ -597,10 +604,7 @@ class Machine:
         # A sequence is of the topic's messages in the order of their sending, by whichever node.
         sender = publisher.process if times.sequence_ns is None else 0
         number = FIRST_DELIVERY + (sender << 32) + (reader.index << 16) + reader.number
-        stream = process.node, publisher.topic, number
-        if stream not in self._deliveries:
-            self._deliveries[stream] = self._streams.add(times, process.node, number)
-        return self._deliveries[stream]
+        return self._streams.of_topic(publisher.topic, times, process.node, number)
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
