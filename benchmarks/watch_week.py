@@ -263,7 +263,9 @@ class Application:
                 self.running[process].write(ring, parts[which], shifts)
                 self.events += parts[which].records.size
 
-    def memories(self, _: object, known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
+    def memories(
+        self, _: object, known: Collection[int], refused: object = None
+    ) -> Iterator[tuple[int, TracedProcess]]:
         for one in self.running:
             if one.pid not in known:
                 yield one.pid, TracedProcess(one.file, one.pid)

@@ -29,11 +29,16 @@ def field_trace(name: str) -> Path:
     return folder
 
 
-def chain_tables(cycles: int = 20, period: int = 50 * MS) -> dict[str, pl.DataFrame]:
-    """/camera (timer, /image) → /detector (/image, /objects), 5 ms from start to publication."""
+def chain_tables(
+    cycles: int = 20, period: int = 50 * MS, declared: int | None = None
+) -> dict[str, pl.DataFrame]:
+    """/camera (timer, /image) → /detector (/image, /objects), 5 ms from start to publication.
+
+    The timer is created with the period ``declared``, where that is another one.
+    """
     story = Story()
     camera, detector = story.node("/camera", 100), story.node("/detector", 200)
-    timer = story.timer(camera, period=period, symbol="Camera::tick()")
+    timer = story.timer(camera, period=declared or period, symbol="Camera::tick()")
     reader = story.subscription(detector, "/image", symbol="Detector::on_image()")
     image, objects = story.publisher(camera, "/image"), story.publisher(detector, "/objects")
     for cycle in range(cycles):

@@ -42,6 +42,12 @@ def test_importing_the_command_line_loads_nothing_heavy() -> None:
     assert _modules_after(statement).isdisjoint(HEAVY)
 
 
+def test_a_plan_without_a_recording_is_applied_without_what_reads_recordings() -> None:
+    """Robots, and guests of other kernels, have Pydantic and NumPy alone."""
+    statement = "from chainshaper.flow import apply; apply.threads.evidence_of(None)"
+    assert _modules_after(statement).isdisjoint({"polars", "matplotlib", "cyclonedds", "rich"})
+
+
 def test_the_gate_needs_the_standard_library_only() -> None:
     # It also runs inside a ROS 2 node, where nothing of ours may be installed.
     statement = (

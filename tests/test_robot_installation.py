@@ -135,6 +135,68 @@ def test_the_unit_is_one_that_systemd_takes(tmp_path: Path) -> None:
     assert (said.returncode, said.stderr) == (0, "")
 
 
+SYSTEMCTL = """#!/bin/sh
+# Keeps the services that run in a file, and writes down how it was called.
+echo "$*" >> "$0.calls"
+case $1 in
+list-units) while read -r unit; do printf '%s loaded active\\n' "$unit"; done < "$0.running" ;;
+stop) : > "$0.running" ;;
+start) case $2 in *broken*) exit 1 ;; esac; printf '%s\\n' "$2" >> "$0.running" ;;
+esac
+"""
+
+
+def _maintained(root: Path, script: str, *arguments: str) -> str:
+    """A script of the package, run as dpkg runs it, on a machine whose `systemctl` is ours."""
+    environment = {"PATH": f"{root}:/usr/bin:/bin", "DPKG_ROOT": str(root)}
+    words = ["sh", str(ROOT / "scripts/debian" / script), *arguments]
+    done = subprocess.run(words, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stderr
+
+
+def test_an_upgrade_starts_exactly_the_services_again_that_were_running(tmp_path: Path) -> None:
+    """The order is dpkg's: old prerm, files, old postrm, new postinst."""
+    running, memory = tmp_path / "systemctl.running", tmp_path / "run/chainshaper-to-start"
+    (tmp_path / "run/systemd/system").mkdir(parents=True)
+    (tmp_path / "systemctl").write_text(SYSTEMCTL)
+    (tmp_path / "systemctl").chmod(0o755)
+    units = [rf"chainshaper@{name}.service" for name in ("robot", r"left\x2darm", "broken")]
+    running.write_text("".join(f"{unit}\n" for unit in units))
+    _maintained(tmp_path, "prerm", "upgrade", "0.2.0")
+    assert running.read_text() == "", "nothing runs while its files are replaced"
+    _maintained(tmp_path, "postrm", "upgrade", "0.2.0")
+    said = _maintained(tmp_path, "postinst", "configure", "0.1.0")
+    assert running.read_text().split() == units[:2]
+    assert "chainshaper@broken.service was running and does not start" in said
+    assert not memory.exists()
+    # Nothing was running: nothing starts, at an upgrade as at the first installation.
+    running.write_text("")
+    for script, *arguments in (("prerm", "upgrade", "3"), ("postinst", "configure", "2")):
+        _maintained(tmp_path, script, *arguments)
+    assert running.read_text() == ""
+    # What was removed does not start with a later installation; a removal that failed undoes that.
+    for last in (("postrm", "remove"), ("postinst", "abort-remove")):
+        running.write_text(f"{units[0]}\n")
+        assert "start the application again" in _maintained(tmp_path, "prerm", "remove")
+        _maintained(tmp_path, *last)
+        assert not memory.exists()
+    assert running.read_text().split() == units[:1]
+
+
+def test_the_packages_scripts_do_nothing_where_systemd_does_not_run(tmp_path: Path) -> None:
+    (tmp_path / "run").mkdir()
+    (tmp_path / "systemctl").write_text(SYSTEMCTL)
+    (tmp_path / "systemctl").chmod(0o755)
+    for script, argument in (
+        ("prerm", "upgrade"),
+        ("postrm", "upgrade"),
+        ("postinst", "configure"),
+    ):
+        assert _maintained(tmp_path, script, argument) == ""
+    assert not (tmp_path / "systemctl.calls").exists()
+
+
 IN_A_COPY = """
 mount --make-rprivate /
 mount -t tmpfs none "$0" && mkdir "$0/changed" "$0/work" "$0/root"

@@ -114,6 +114,10 @@ def test_a_contradiction_is_said_and_nothing_is_planned_from_it(
     assert any(note in one for one in json_of("latency", *of_chain)["notes"])
     assert note in called("callbacks", folder).err
     assert note in called("callbacks", folder, "--json").err
+    assert note in called("info", folder).err
+    (about,) = json_of("info", folder)["contradictions"]
+    assert note in about["note"]
+    assert about["refused"]
     output = tmp_path / "budget.yaml"
     assert note in refused(2, "plan", *of_chain)
     assert note in refused(2, "budget", *of_chain, "-o", output)
@@ -126,6 +130,7 @@ def test_a_trace_without_contradictions_has_no_note(tmp_path: Path) -> None:
     folder = trace(tmp_path, story)
     plan = json_of("plan", folder, "--chain", "/image../objects")
     assert plan["cycle_ns"] == 50 * MS
+    assert json_of("info", folder)["contradictions"] == []
 
 
 def test_where_nothing_was_lost_a_callback_spins_an_executor_itself(tmp_path: Path) -> None:
@@ -143,8 +148,10 @@ def test_a_plan_has_the_period_that_starts_show(tmp_path: Path, every: int) -> N
     assert plan["cycle_ns"] == every * MS
     said = f"created with a period of 50 ms, but its callback starts every {every} ms"
     assert any(said in one for one in plan["warnings"])
-    printed = called("callbacks", folder)
-    assert said in printed.err
+    for verb in ("callbacks", "info"):
+        assert said in called(verb, folder).err
+    (about,) = json_of("info", folder)["contradictions"]
+    assert not about["refused"]
     assert refused(2, "plan", folder, "--chain", "/image../objects", "--period", "50ms")
 
 

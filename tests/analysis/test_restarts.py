@@ -10,6 +10,7 @@ import json
 from pathlib import Path
 
 import pytest
+import yaml
 from command_line import called
 from ctf_writing import write_lttng_trace
 from reference_traces import DATA
@@ -172,6 +173,39 @@ def test_of_two_nodes_of_one_name_a_way_point_names_the_process(
     file = trace(tmp_path, namesakes())
     found = json.loads(run("latency", file, "--chain", chain, "--json"))
     assert (found["count"], found["min_ns"], found["max_ns"]) == (20, *[latency_ms * MS] * 2)
+
+
+@pytest.mark.parametrize(("pid", "latency_ms"), [(100, 3), (101, 7)])
+def test_a_chain_through_a_node_of_a_process_is_described(
+    tmp_path: Path, pid: int, latency_ms: int
+) -> None:
+    """Both talkers are in the description, and the chain is that of the process."""
+    file, described = trace(tmp_path, namesakes()), tmp_path / "app.yaml"
+    run("describe", file, "--chain", f"/talker@{pid}../out", "-o", str(described))
+    text = described.read_text()
+    assert f"chain: /talker_{pid}../out" in text
+    assert "in process 100 is talker_100 in the" in text
+    assert {"talker_100", "talker_101", "relay"} == yaml.safe_load(text)["nodes"].keys()
+    run("simulate", str(described), "--cycles", "20", "-o", str(tmp_path / "simulated"))
+    found = json.loads(run("latency", str(tmp_path / "simulated"), "--json"))
+    assert found["count"] == 20
+    assert found["mean_ns"] == pytest.approx(latency_ms * MS, rel=0.02)
+
+
+def test_nodes_whose_names_become_alike_stay_two(tmp_path: Path) -> None:
+    """A description permits no ~ and no - in a name."""
+    story = Story()
+    camera, image = story.source("/a~b", 100, "/image", 50 * MS)
+    reader, out = story.relay("/a-b", 200, "/image", "/out")
+    for cycle in range(20):
+        begin = (100 + 50 * cycle) * MS
+        story.runs(camera, begin, begin + 2 * MS, writes=((image, begin + MS),))
+        writes = ((out, begin + 4 * MS),)
+        story.runs(reader, begin + 3 * MS, begin + 5 * MS, reads=begin + MS, writes=writes)
+    described = tmp_path / "app.yaml"
+    run("describe", trace(tmp_path, story), "--chain", "/a~b../out", "-o", str(described))
+    values = yaml.safe_load(described.read_text())
+    assert (values["chain"], {*values["nodes"]}) == ("/a_b../out", {"a_b", "a_b_2"})
 
 
 def test_nodes_of_one_name_are_told_apart_wherever_they_are_listed(

@@ -273,6 +273,18 @@ def test_memory_that_runs_out_is_one_message(fails: Callable[[], object], messag
         called("info")  # other mistakes of ours stay tracebacks
 
 
+@pytest.mark.parametrize("plan", [{"1": "x"}, {}, {"chains": [1]}])
+def test_a_recording_whose_plan_is_none_is_refused(
+    tmp_path: Path, simulated: Recording, plan: dict[str, object]
+) -> None:
+    folder = Path(shutil.copytree(simulated.path, tmp_path / "recording"))
+    facts = json.loads((folder / "recording.json").read_text())
+    (folder / "recording.json").write_text(json.dumps({**facts, "plan": plan}))
+    said = refused(2, "latency", folder)
+    assert f"{folder}, its plan in force: " in said
+    assert said.count("\n") == 1
+
+
 @pytest.mark.parametrize("megabytes", [100, 400, 650])
 def test_limited_memory_ends_in_one_message_whoever_wanted_more(
     megabytes: int, simulated: Recording

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 from actors import Actor, acting
 from applied_plans import one_server_plan
+from bare_plans import bare_plan
 from command_line import called
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
@@ -36,7 +37,7 @@ from chainshaper.flow.threads import planned_changes
 from chainshaper.linux.runs import Journal, find_journals, open_journal
 from chainshaper.linux.scheduling import available_cores, state_of
 from chainshaper.planning import save_plan
-from chainshaper.planning.plan import revised
+from chainshaper.planning.plan import Server, Thread, revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 MS = 1_000_000
@@ -89,6 +90,42 @@ def test_printed_commands_open_servers_for_overruns_as_apply_does(
     monkeypatch.setattr(threads, "find_threads", lambda *_, **__: Allocation((), ()))
     _, created, *_ = planned_changes(plan, "litmus").commands
     assert created[-3:] == ("[0,9)", "[9,16)", "[19,50)")
+
+
+def test_printed_commands_close_the_papers_servers_where_the_plan_does(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Table 1: five callbacks in slots of 16 ms, whose timer expires 2 ms before the first. Left
+    open until callbacks are done, all but the first end 1 ms before the timer expires again.
+    """
+    monkeypatch.setattr(threads, "chain_phases", lambda *_: [Phase(98 * MS, 0)])
+    monkeypatch.setattr(threads, "find_threads", lambda *_, **__: Allocation((), ()))
+    servers = [
+        Server(
+            name=f"node{number}",
+            core=1,
+            priority=1,
+            slots=(((number - 1) * 16 * MS, number * 16 * MS),),
+            threads=(Thread(node=f"/node{number}"),),
+        )
+        for number in range(1, 6)
+    ]
+    plan = bare_plan("/t1../t5", 100 * MS, *servers, policy="server-per-callback")
+    closed = planned_changes(revised(plan, slot_ends="closed"), "litmus").commands
+    assert [" ".join(command) for command in closed] == [
+        "setsched P-RES",
+        "resctl -n 1001 -t table-driven -c 1 -m 100 -q 1 [0,16)",
+        "resctl -n 1002 -t table-driven -c 1 -m 100 -q 1 [16,32)",
+        "resctl -n 1003 -t table-driven -c 1 -m 100 -q 1 [32,48)",
+        "resctl -n 1004 -t table-driven -c 1 -m 100 -q 1 [48,64)",
+        "resctl -n 1005 -t table-driven -c 1 -m 100 -q 1 [64,80)",
+        *(f"resctl -a TID:/node{number} -r 100{number} -c 1" for number in range(1, 6)),
+    ]
+    left_open = planned_changes(plan, "litmus").commands
+    assert [one[-1] for one in left_open if "-n" in one] == [
+        "[0,16)",
+        *(f"[{start},97)" for start in (16, 32, 48, 64)),
+    ]
 
 
 @settings(max_examples=2000)

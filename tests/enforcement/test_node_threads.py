@@ -402,6 +402,32 @@ def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> 
     assert _by_tid(missing)[300] == Scheduling(86, (1,)), "there is no core 2"
 
 
+def test_a_gate_inside_the_chain_stands_behind_that_of_its_output() -> None:
+    """LET per callback: 87 and 86 for gates, 85 for who receives the output, 83 for the chain."""
+    place = ReceiverPlace(core=1, priority=1, time_ns=MS)
+    output = GATE.model_copy(update={"receivers": ("/sink",), "receivers_at": place})
+    inner = GATE.model_copy(update={"name": "inner", "input": "/j", "output": "/inside"})
+    servers = (
+        _server("chain", EXECUTOR_A, priority=2),
+        _server("output", output.thread, priority=1, start=1),
+        _server("inside", inner.thread, priority=1, start=2),
+    )
+    nodes = {"shaping_node": output, "further_shaping_nodes": (inner,)}
+    bare = _plan(*servers).chains[0]
+    allocation = _allocation(
+        _node("/gate", 100, "executor"),
+        _node("/inner", 150, "executor"),
+        _node("/a", 200, "executor"),
+        _node("/sink", 300, "executor"),
+    )
+    plan = whole(revised(bare, policy="let-per-callback", **nodes))
+    wanted = _text(plan_scheduling(plan, allocation, (0, 1)))
+    assert wanted == "100:87@1 150:86@1 200:83@1 300:85@1"
+    sinks = whole(revised(bare, **nodes))
+    wanted = _text(plan_scheduling(sinks, allocation, (0, 1)))
+    assert wanted == "100:87@1 150:87@1 200:84@1 300:86@1", "both are outputs"
+
+
 def test_a_gate_in_a_container_is_known_by_its_threads_name() -> None:
     """Of a component, as of a library before rmw: the container's other threads stay its nodes'."""
     main, other = _node("/a", 100, "executor", "unknown")

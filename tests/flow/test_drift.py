@@ -394,7 +394,7 @@ def test_a_first_node_that_is_started_again_without_a_timer_yet_is_looked_at_aga
     monkeypatch.setattr(run, "find", lambda: found(8))
 
     def measure(*_: Any, **__: Any) -> Phase:
-        raise OperationError("thread 8 does not wake up once in every 100 ms")
+        raise OperationError("thread 8 does not wake up at one place of the cycle 100 ms")
 
     with monkeypatch.context() as until:
         until.setattr(threads, "measure_phase", measure)

@@ -4,13 +4,21 @@ its slot, and pipelines of stages.
 
 import sys
 from pathlib import Path
+from typing import Any
 
 import polars as pl
 import pytest
 from applied_plans import MS, leftovers, needs_fifo
 from calm_runs import calm_run
 from gated import needs_cgroups
-from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan, small_chain_text
+from small_chain import (
+    EXECUTOR_CORE,
+    PERIOD_NS,
+    small_chain,
+    small_chain_plan,
+    small_chain_text,
+    with_times,
+)
 
 from chainshaper import (
     apply_plan,
@@ -22,12 +30,19 @@ from chainshaper import (
     shape_application,
 )
 from chainshaper.enforcement.undoing import RunState
+from chainshaper.flow import described
+from chainshaper.flow.described import gated_threads
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning import PlanRequest, save_plan
+from chainshaper.linux.threads import Thread as RunningThread
+from chainshaper.planning import Plan, PlanRequest, save_plan
+from chainshaper.planning.application_plan import whole
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import publish_slots, publisher_servers
+from chainshaper.planning.plan import Thread, publish_slots, publisher_servers, revised, with_slots
+from chainshaper.values.plan_choices import SlotEnds
 from chainshaper.values.recording import Recording
-from chainshaper.workload.description import Application, CallbackDescription
+from chainshaper.workload import live
+from chainshaper.workload.description import Application, CallbackDescription, ExecutionTime
+from chainshaper.workload.launcher import WORKER_NAME
 
 ROOT = Path(__file__).parents[2]
 pytestmark = [needs_fifo, needs_cgroups]
@@ -126,4 +141,67 @@ def test_a_chain_of_1_6_or_2_4_periods_is_constant_once_a_cycle_and_in_order(
     assert (planned < MS).sum() >= 0.9 * latencies.len() > 12
     ends = analysis.traversals["end"].drop_nulls().diff().drop_nulls()
     assert ends.min() > 0  # type: ignore[operator]
+    assert not leftovers()
+
+
+def _overrunning(folder: Path, slot_ends: SlotEnds) -> tuple[Application, Plan]:
+    """A chain of 6, 6, 6, 15 ms, again and again, in [0, 14) of 50 ms; its output in [25, 26).
+
+    What is left of a long one, a late output and the chain have room in the next slot.
+    """
+    times = {name: ExecutionTime(constant_ns=2 * MS) for name in ("first", "second")}
+    third = ExecutionTime(sequence_ns=(2 * MS, 2 * MS, 2 * MS, 11 * MS))
+    application = with_times(small_chain(folder), {**times, "third": third})
+    plan = small_chain_plan(4 * MS, 24 * MS, core=EXECUTOR_CORE)
+    slots = {"chain": [(0, 14 * MS)], "output": [(25 * MS, 26 * MS)]}
+    return application, revised(plan, servers=with_slots(plan.servers, slots), slot_ends=slot_ends)
+
+
+def test_closed_servers_of_a_described_application_gate_its_executors(tmp_path: Path) -> None:
+    """Its gate sees to its slots itself, unless it is to be kept in them too."""
+    _, left_open = _overrunning(tmp_path, "open-until-done")
+    _, closed = _overrunning(tmp_path, "closed")
+    assert gated_threads(whole(left_open)) == []
+    ((server, threads),) = gated_threads(whole(closed))
+    assert (server.name, server.slots) == ("chain", ((0, 14 * MS),))
+    assert [one.node for one in threads] == ["/first", "/second", "/third"]
+    kept = revised(closed, shaping_thread="in-slots")
+    assert [one.name for one, _ in gated_threads(whole(kept))] == ["chain", "output"]
+
+
+def test_every_thread_of_an_executor_is_gated(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A multi-threaded one's others are told by the name that they have."""
+    common: dict[str, Any] = {"pid": 7, "policy": "SCHED_FIFO", "priority": 1, "cores": (0,)}
+    running = (
+        RunningThread(7, comm="filter", role="executor", **common),
+        RunningThread(8, comm=WORKER_NAME, role="unknown", **common),
+        RunningThread(9, comm="recv", role="dds", **common),
+    )
+    monkeypatch.setattr(live, "list_threads", lambda _: running)
+    started = live.StartedNodes({"/filter": 7}, 0, 0)
+    assert described._threads_of(Thread(node="/filter"), started) == [7, 8]
+
+
+def test_a_described_application_overruns_into_the_next_slot_where_servers_are_closed(
+    tmp_path: Path,
+) -> None:
+    """One of four executions ends in the next cycle's slot, so its output leaves a period late;
+    left open, the chain is done at 15 ms, long before its output's slot.
+    """
+    late = {}
+    for slot_ends in ("open-until-done", "closed"):
+        folder = tmp_path / slot_ends
+        folder.mkdir()
+        application, plan = _overrunning(folder, slot_ends)
+        recording = calm_run(
+            lambda place, application=application, plan=plan: shape_application(
+                application, plan, place / "rec", cycles=80
+            ),
+            folder,
+        )
+        measured = measure_latency(recording).analysis
+        calm = measured.traversals.filter(~pl.col("disturbed"))["latency_ns"]
+        late[slot_ends] = (calm > PERIOD_NS).mean()
+    assert late["open-until-done"] < 0.1
+    assert 0.15 < late["closed"] < 0.35, "one of four"
     assert not leftovers()

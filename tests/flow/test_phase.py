@@ -119,7 +119,7 @@ def test_a_process_and_an_executor_of_several_threads_are_measured() -> None:
     with running(TAKING_TURNS, period, first) as (pid, printed):
         tids = [*map(int, printed.split())]
         phase = measure_phase(pid, tids, period)
-        with pytest.raises(OperationError, match="does not wake up once"):
+        with pytest.raises(OperationError, match="does not wake up at one place"):
             measure_phase(pid, tids[:1], period, 6)
     assert circular(phase.at_ns, first, period) < period // 10
 
@@ -128,7 +128,7 @@ def test_a_process_and_an_executor_of_several_threads_are_measured() -> None:
     ("lasts", "cycle", "words"),
     [
         (0.2, CYCLE, "ended while its phase was measured"),
-        (60, 10 * MS, r"does not wake up once .*--phase"),
+        (60, 10 * MS, r"does not wake up: not once in 12 cycles of 10 ms\. .*--phase"),
     ],
 )
 def test_a_thread_that_ends_or_never_wakes_has_no_phase(
@@ -137,6 +137,23 @@ def test_a_thread_that_ends_or_never_wakes_has_no_phase(
     body = f"import time; print(flush=True); time.sleep({lasts})"
     with running(body) as (pid, _), pytest.raises(OperationError, match=words):
         measure_phase(pid, [pid], cycle)
+
+
+def test_what_a_thread_lacks_of_a_beginning_is_counted_by_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Twelve wake-ups in twelve cycles, of which seven have one at 5 ms: ten would have to."""
+    places = (5.0, 5.1, 5.2, 5.3, 5.2, 5.1, 5.0, 8, 9, 11, 13, 17)
+    wake_ups = np.array([n * 20 * MS + int(at * MS) for n, at in enumerate(places)])
+    monkeypatch.setattr(phase, "watch_wake_ups", lambda *_: wake_ups)
+    with pytest.raises(OperationError) as raised:
+        measure_phase(7, [8], 20 * MS)
+    said = (
+        "thread 8 of process 7 does not wake up at one place of the cycle 20 ms: 12 wake-ups in 12"
+    )
+    said += " cycles, of which 7 at most have one within the same 400 us, and 10 have to."
+    assert str(raised.value).startswith(said)
+    assert str(raised.value).endswith("try again when it is calm; or give its --phase")
 
 
 def test_being_stopped_at_a_slots_end_is_no_beginning() -> None:

@@ -28,7 +28,7 @@ from chainshaper.planning import (
 from chainshaper.planning.application_plan import combined, open_until_done
 from chainshaper.planning.overruns import expected
 from chainshaper.planning.plan import with_slots
-from chainshaper.planning.profile import Profile, Rival, interference, with_interference
+from chainshaper.planning.profile import Profile, Rival, alone, interference, with_interference
 from chainshaper.reporting.latency import expected_text
 from chainshaper.values.durations import milliseconds
 from chainshaper.values.errors import InputError, OperationError
@@ -487,3 +487,29 @@ def test_what_else_has_no_plan_together_is_refused(recording: Recording) -> None
     forked = profile_chains(recording, ("/t1../t3", "/t1../forked"))
     with pytest.raises(InputError, match=r"/t1\.\./forked waits for /t1, which the plan for"):
         plan_application(forked, PlanRequest(policy="let-per-callback"))
+
+
+JOINING = """\
+name: a chain that waits for a branch on another core, while another chain has its own
+chain: /a../b../c
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a: {callbacks: [{timer: 100ms, execution: {constant: 8ms}, publishes: [/a]}]}
+  side: {core: 2, callbacks: [{subscription: /a, execution: {constant: 7ms}, publishes: [/side]}]}
+  b: {callbacks: [{subscription: /a, execution: {constant: 2ms}, publishes: [/b]}]}
+  c: {callbacks: [{synchronises: [/b, /side], execution: {constant: 3ms}, publishes: [/c]}]}
+  d: {callbacks: [{timer: 100ms, phase: 4ms, execution: {constant: 5ms}, publishes: [/d]}]}
+"""
+
+
+def test_others_cost_nothing_while_a_chain_waits_for_its_branch(tmp_path: Path) -> None:
+    """d runs from 8 to 13 ms and b behind it, to 15, when the branch is over too: the chain takes
+    18 ms with d and without it, and not 5 ms less.
+    """
+    pytest.importorskip("numba")
+    (tmp_path / "app.yaml").write_text(JOINING)
+    recorded = simulate(load_application(tmp_path / "app.yaml"), tmp_path / "rec", cycles=50)
+    joining, beside = profile_chains(recorded, ("/a../b../c", "/d"))
+    assert 18 * MS <= min(joining.latencies_ns) <= max(joining.latencies_ns) < 19.5 * MS
+    assert 18 * MS <= min(alone(joining).latencies_ns) < 19.5 * MS
+    assert max(alone(beside).latencies_ns) < 5.5 * MS, "d waited for a"

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 from bare_plans import MS
 from known import known
+from small_chain import small_chain_plan
 
 from chainshaper import load_application, simulate
 from chainshaper.flow.plan import plan_recording, profile_chains
@@ -139,3 +140,73 @@ def test_live_nodes_that_receive_stand_between_the_chain_and_its_gate(tmp_path: 
     gate = known(plan.shaping_node)
     assert [*priorities, gate.fifo_priority] == [80, 84, 85]
     assert spliced.scheduling_of("actuator").core == 1
+
+
+THREE = """\
+name: three chains on a core each, and one actuator for all
+chain: /a
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a: {core: 1, callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/a]}]}
+  b: {core: 2, callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/b]}]}
+  c: {core: 3, callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/c]}]}
+  actuator:
+    core: 4
+    callbacks:
+      - {subscription: /a, execution: {constant: 3ms}}
+      - {subscription: /b, execution: {constant: 2ms}}
+      - {subscription: /c, execution: {constant: 1ms}}
+"""
+
+
+def test_outputs_of_several_chains_wait_for_each_other_at_their_receiver(tmp_path: Path) -> None:
+    """Under LET they leave at one time: of 3, 2 and 1 ms the last has waited for 5 ms at most."""
+    pytest.importorskip("numba")
+    application = described(tmp_path, text=THREE)
+    profiles = profile_chains(
+        simulate(application, tmp_path / "rec", cycles=100), ("/a", "/b", "/c")
+    )
+    plan, _ = plan_application(profiles, PlanRequest(policy="let-per-chain"))
+    shaped = simulate(application, tmp_path / "shaped", plan, cycles=300)
+    waits = (3, 4, 5)  # of /a for the others' 2 and 1 ms, and so on
+    for chain, wait_ms in zip(plan.chains, waits, strict=True):
+        promised = known(chain.predicted.receivers)
+        assert wait_ms * MS <= promised.jitter_ns - chain.predicted.jitter_ns < (wait_ms + 0.3) * MS
+        judged = known(measure_latency(shaped, chain.chain.spec).prediction)
+        assert judged.broken == ()
+        assert known(judged.receivers).behind == 0
+
+
+FORK = """\
+name: two outputs of one graph
+chain: /a../b
+scheduling: {executors: {core: 1, priority: 80}, dds: {core: 0, priority: 90}}
+nodes:
+  a: {callbacks: [{timer: 100ms, execution: {constant: 5ms}, publishes: [/a]}]}
+  b: {callbacks: [{subscription: /a, execution: {constant: 10ms}, publishes: [/b]}]}
+  d: {callbacks: [{subscription: /a, execution: {constant: 10ms}, publishes: [/d]}]}
+  actuator: {callbacks: [{subscription: /b}]}
+  display: {callbacks: [{subscription: /d}]}
+"""
+
+
+def test_of_further_sinks_receivers_have_no_place_and_the_plan_says_so(tmp_path: Path) -> None:
+    pytest.importorskip("numba")
+    application = described(tmp_path, text=FORK)
+    recording = simulate(application, tmp_path / "profile", cycles=100)
+    plan = plan_recording(recording, sinks=["/a../d"])
+    (sink,) = plan.further_shaping_nodes
+    assert (sink.receivers, sink.receivers_at) == (("/display",), None)
+    (said,) = (one for one in plan_warnings(plan) if "/display" in one)
+    assert "no place in the plan" in said and "/display run below all servers" in said
+    assert "--chain instead of --sink" in said
+    both, _ = plan_application(profile_chains(recording, ("/a../b", "/a../d")))
+    assert all(known(one.shaping_node).receivers_at for one in both.chains), "as it says"
+    assert not [one for one in plan_warnings(*both.chains) if "no place" in one]
+
+
+def test_behind_an_asynchronous_publisher_receivers_have_no_promise() -> None:
+    plan = small_chain_plan(10 * MS, 20 * MS, publication="asynchronous", overrun="wait")
+    (said,) = (one for one in plan_warnings(plan) if "who receives /t3" in one)
+    assert "--publication synchronous" in said
+    assert not [one for one in plan_warnings(small_chain_plan(10 * MS, 20 * MS)) if "who" in one]

@@ -10,6 +10,7 @@ from bare_plans import MS, slots_ms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from chainshaper.planning.application_plan import combined
 from chainshaper.planning.bands import predict_bands
 from chainshaper.planning.overruns import open_until_done, plan_warnings
 from chainshaper.planning.plan import (
@@ -19,6 +20,7 @@ from chainshaper.planning.plan import (
     publish_slots,
     publishing_servers,
     server_of,
+    shaping_nodes,
 )
 from chainshaper.planning.plan_file import plan_json
 from chainshaper.planning.shaping import (
@@ -30,6 +32,7 @@ from chainshaper.planning.shaping import (
     server_per_callback,
     server_per_chain,
     with_first_node_apart,
+    with_gates_level,
     with_sink,
 )
 from chainshaper.values.errors import InputError, OperationError
@@ -45,12 +48,12 @@ def gated(**options: Any) -> Plan:
     return planned(output="/t5", **{**given, **options})
 
 
-def avp() -> Plan:
+def avp(**options: Any) -> Plan:
     """The paper's chain (table 3): 32.9 … 84.7 ms, here with a margin that ends at 86 ms."""
     nodes = ("/throttler", "/rear_filter", "/fusion", "/voxel_grid", "/localizer")
     given: dict[str, Any] = {"output": "/pose", "publisher": "/localizer", "nodes": nodes}
     latencies = np.array([32_900_000, 67_400_000, 84_700_000])
-    return plan_shaping(latencies, 100 * MS, epsilon_ns=1_300_000, **given)
+    return plan_shaping(latencies, 100 * MS, epsilon_ns=1_300_000, **{**given, **options})
 
 
 def two_nodes(**options: Any) -> Plan:
@@ -219,12 +222,33 @@ def test_let_takes_one_period_for_the_chain_or_for_each_callback() -> None:
     starts = [server.slots[0][0] for server in servers if server is not None]
     assert starts == [4 * MS, 3 * MS, 2 * MS, MS, 0]  # never data through two callbacks a cycle
     assert (publish_slots(plan), slots_ms(plan)["chain"]) == (((0, MS),), [(0, 100)])
+    # What is inside the chain has to be there in time, and need not be exact: no gate of it keeps
+    # the output's from the core.
+    assert [node.spin_ns for node in nodes] == [0, 0, 0, 0, MS]
+    assert [node.fifo_priority for node in nodes] == [83, 83, 83, 83, 84]
+    inner = {one.name for one in servers[:-1] if one is not None}
+    assert combined([plan]).behind_outputs == inner
+    assert combined([chain]).behind_outputs == set()
     # Where threads of asynchronous publishers are gated, there are no nodes.
     plan = let_per_callback(gated(), ["/t1", "/t5"], ["/n1", "/n2"])
     assert (plan.shaping_node, plan.further_shaping_nodes) == (None, ())
     found = [server_of(plan, Thread(node=name, role="publisher")) for name in ("/n1", "/n2")]
     assert [server.slots for server in found if server] == [((MS, 2 * MS),), ((0, MS),)]
     assert (publish_slots(plan), plan.predicted.max_ns) == (((0, MS),), 201 * MS)
+
+
+def test_gates_of_several_chains_run_above_all_executors_of_the_application() -> None:
+    """Executors at 80 and 60: a gate at 65 would wait for the first chain's callbacks."""
+    topics, names = ["/t1", "/t2", "/t3", "/t4", "/pose"], [f"/n{number}" for number in range(5)]
+    low = gated(publication="synchronous", fifo_priority=65)
+    high = let_per_callback(avp(fifo_priority=85), topics, names)
+    plans = with_gates_level([low, high])
+    assert [[node.fifo_priority for node in shaping_nodes(one)] for one in plans] == [
+        [85],
+        [85, 84, 84, 84, 84],
+    ]
+    assert with_gates_level(plans) == plans
+    assert with_gates_level([gated()]) == (gated(),), "there is no node"
 
 
 # More of the graph -----------------------------------------------------------------------------

@@ -20,7 +20,7 @@ import numpy as np
 import pytest
 from command_line import called, json_of
 from lttng_node import required_node
-from processes import in_time_namespace, wait_for
+from processes import children_of, in_time_namespace, wait_for
 from traced_program import (
     Traced,
     assert_everything,
@@ -32,6 +32,7 @@ from traced_program import (
 )
 
 import chainshaper as cs
+from chainshaper.reporting.overviews import watch_tables
 from chainshaper.sources import preload
 from chainshaper.sources.preload import (
     PreloadTracer,
@@ -44,6 +45,7 @@ from chainshaper.sources.preload import (
     preloading,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.verify.watch import Watch
 
 pytestmark = pytest.mark.waiting
 
@@ -371,6 +373,66 @@ def test_a_process_of_another_clock_is_refused_and_named(tmp_path: Path, ahead_s
     assert taken(found) == list(range(5))
     (note,) = (one for one in found.info.notes if one.startswith("nothing of process"))
     assert "another clock, that of a time namespace" in note
+    assert re.match(r"nothing of process \d+ \(python[\d.]*\) is recorded: ", note), "or its end"
+
+
+WAITING = """
+take(1)
+print("ready", flush=True)
+while not sys.stdin.readline().startswith("end"):
+    take(2)
+"""
+
+
+@contextmanager
+def waiting_in_time_namespace() -> Iterator[int]:
+    """A program with the library in front and another clock, that takes a message for each line
+    that it reads; its number here.
+    """
+    environment = {**os.environ, "LD_PRELOAD": str(installed_library())}
+    program = CALLER + WAITING
+    command = in_time_namespace(100_000, sys.executable, "-c", program)
+    with subprocess.Popen(
+        command, env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            assert process.stdout.readline() == "ready\n"
+            yield children_of(process.pid)[0]
+        finally:
+            process.communicate("end\n")
+
+
+def test_a_running_process_of_another_clock_is_named_where_it_is_attached_to(
+    tmp_path: Path,
+) -> None:
+    """By `record`, which says so and records the others, or fails with the reason; and `watch`."""
+    with waiting_in_time_namespace() as pid:
+        left_out = rf"nothing of process {pid} \(python.*\) is recorded: it has another clock, that"
+        left_out += (
+            rf" of a time namespace: record it in there \(`nsenter --time --target {pid} …`\)"
+        )
+        tracer = PreloadTracer(tmp_path / "one", (), (pid,))
+        with pytest.raises(OperationError, match=rf"{left_out}, or attach with"):
+            tracer.start()
+        tracer.remove()
+        with memory_behind("take(7)") as file:
+            (tmp_path / "two").mkdir()
+            here = int(file.parts[2])
+            tracer = PreloadTracer(tmp_path / "two", (), (pid, here))
+            tracer.start()
+            tracer.stop()
+            _, info = tracer.recording()
+            tracer.remove()
+            watched = Watch(["/a../b"], users={os.geteuid()})
+            seen = watched.look()
+        (note,) = info.notes
+        assert re.fullmatch(left_out + r"\.", note)
+        assert [one for one in seen.left_out if re.match(left_out, one)]
+        assert here in seen.processes
+        assert f"process {pid} " in watch_tables(seen)[-1].caption
+    watched._searched_ns = 0  # it looks again, and the process has ended
+    assert not [one for one in watched.look().left_out if re.match(left_out, one)]
 
 
 FLOOD = """

@@ -27,6 +27,7 @@ import pytest
 from command_line import called
 from known import known
 from opentelemetry.proto.collector.metrics.v1.metrics_service_pb2 import ExportMetricsServiceRequest
+from own_memories import follow_only_children_of, program
 from processes import wait_for
 from prometheus_client.parser import text_string_to_metric_families
 from traced_program import built
@@ -52,6 +53,13 @@ pytestmark = pytest.mark.waiting
 
 CHAIN, PERIOD_NS = "/ebpf1../ebpf2", 50_000_000
 LONGEST_NS = SECOND // 5
+
+
+@pytest.fixture(autouse=True)
+def only_our_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Other checkouts' tests may run the same chain as the same user."""
+    monkeypatch.setattr(watch_module, "memories", watch_module.memories)
+    follow_only_children_of(os.getpid())
 
 
 @contextmanager
@@ -148,6 +156,31 @@ def test_a_process_that_ends_or_is_killed_is_left_and_another_is_found(tmp_path:
     watch._latest = dict.fromkeys(watch._latest, 0)  # as twelve seconds later
     watch.read()
     assert not watch.processes
+
+
+def test_processes_of_another_checkout_are_not_watched_here() -> None:
+    """Its tests are no children of ours: as if they ran there, one is started by a process that
+    ends at once."""
+    words = built().command("chain", "100000")
+    variables = {**os.environ, "LD_PRELOAD": str(installed_library())}
+    script = '"$@" >/dev/null </dev/null & echo $!'
+    started = subprocess.run(
+        ["sh", "-c", script, "sh", *words],
+        env=variables,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    stranger = int(started.stdout)
+    try:
+        everyone = {os.geteuid()}
+        wait_for(lambda: stranger in dict(preload.memories(everyone, ())), "the stranger's memory")
+        with running(80) as process:
+            seen = watched(own_watch(), 1.0)[-1]
+        assert {*seen.processes} == {process.pid}
+    finally:
+        with suppress(ProcessLookupError):
+            os.kill(stranger, signal.SIGKILL)
 
 
 def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> None:
@@ -311,7 +344,7 @@ def test_memory_does_not_grow() -> None:
 def test_the_command_shows_and_streams(tmp_path: Path) -> None:
     pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with running(400) as process:
-        words = [sys.executable, "-m", "chainshaper", "watch", "--chain", CHAIN, "--longest"]
+        words = [sys.executable, "-c", program(), "watch", "--chain", CHAIN, "--longest"]
         words += ["200ms", "--every", "500ms"]
         streaming = subprocess.Popen([*words, "--json", "--recorder", str(tmp_path)], **pipes)
         objects = [json.loads(known(streaming.stdout).readline()) for _ in range(3)]
@@ -353,7 +386,7 @@ def test_the_python_example_of_the_documentation_records_again_and_again(tmp_pat
         assert wanted in example
         example = example.replace(wanted, shorter)
     with running(1000):
-        words = [sys.executable, "-c", example]
+        words = [sys.executable, "-c", program(example)]
         run = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     assert len([*tmp_path.glob("slow_*/recording.json")]) > 1

@@ -56,7 +56,7 @@ class Simulated:
         for number in range(2, 6):
             self.application.running[number] = self.application._process(number)
 
-    def memories(self, users: Any, known: Any) -> Iterator[tuple[int, Any]]:
+    def memories(self, users: Any, known: Any, _: Any = None) -> Iterator[tuple[int, Any]]:
         return self.application.memories(users, {*known, *self.gone})  # type: ignore[no-any-return]
 
     def path(self, text: str) -> Any:

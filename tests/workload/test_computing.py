@@ -1,10 +1,14 @@
 """Callbacks that compute: real functions on real messages, over DDS, and what can go wrong."""
 
 import sys
+from itertools import count
 from pathlib import Path
 
 import pytest
 from calm_runs import calm_run
+from cyclonedds.pub import DataWriter
+from cyclonedds.sub import DataReader
+from processes import wait_for
 from small_chain import DDS_CORE, EXECUTOR_CORE
 
 from chainshaper import run_application, simulate
@@ -107,6 +111,25 @@ def test_a_data_message_is_the_message_that_topics_carry() -> None:
     message = dds.data_message(data, 12_345_678_901)
     assert message == serialized + bytes(-len(serialized) % 4)
     assert bytes(dds.data_of(message)) == data
+
+
+def test_counterparts_that_are_discovered_while_they_are_counted_end_no_node(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """At the second look DDS knows one more than at the first."""
+    monkeypatch.setenv("CYCLONEDDS_URI", dds.closed_domain_configuration())
+    participant = dds.Participant(dds.free_domain())
+    publisher = dds.Publisher(participant, "/t", "reliable", 1)
+    subscription = dds.Subscription(participant, "/t", "reliable", 1)
+    known, counts = count(1), ("_get_matched_subscriptions", "_get_matched_publications")
+    monkeypatch.setattr(DataWriter, counts[0], lambda *_: next(known))
+    monkeypatch.setattr(DataReader, counts[1], lambda *_: next(known))
+    assert [publisher.matched(), subscription.matched()] == [1, 2]
+    monkeypatch.undo()
+    wait_for(lambda: publisher.matched() == subscription.matched() == 1, "discovery")
+    monkeypatch.setattr(DataWriter, counts[0], lambda *_: -3)
+    with pytest.raises(OperationError, match="code -3"):
+        publisher.matched()
 
 
 @pytest.mark.timed

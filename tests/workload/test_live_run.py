@@ -15,7 +15,7 @@ from small_chain import DDS_CORE, EXECUTOR_CORE, NODES, small_chain, small_chain
 import chainshaper as cs
 from chainshaper import measure_latency, run_application
 from chainshaper.analysis import data_flow
-from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.planning import Plan, publish_slots
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, ThreadInfo
@@ -176,6 +176,27 @@ def test_shaped_outputs_leave_in_their_slot_or_are_counted(shaped: Recording, pl
     if not overruns:
         # The stamp is read a moment before the callback's start is; 0.1 ms is far above that.
         assert known(measured.analysis.statistics.min_ns) >= start - 100_000
+
+
+@pytest.mark.skipif(len(available_cores()) < 2, reason="needs two cores")
+def test_an_unbound_node_may_run_on_any_core_and_keeps_its_priority(tmp_path: Path) -> None:
+    """Events of its executor have no core, which may have been any; all others have theirs."""
+    text = small_chain_text().replace("  second:\n", "  second:\n    bound: false\n")
+    (tmp_path / "unbound.yaml").write_text(text)
+    application = load_application(tmp_path / "unbound.yaml")
+    recording = run_application(application, tmp_path / "recording", cycles=8)
+    everywhere = tuple(available_cores())
+    executors = {one.node: one for one in _threads(recording, "executor")}
+    assert executors["/second"].cores == everywhere
+    assert {executors[f"/{name}"].cores for name in NODES if name != "second"} == {(EXECUTOR_CORE,)}
+    assert all(one.cores == (DDS_CORE,) for one in _threads(recording, "dds"))
+    if recording.info.realtime:
+        assert {one.priority for one in executors.values()} == {80}
+    started = recording.events["callback_start"]
+    of_second = started["pid"] == executors["/second"].pid
+    assert started.filter(of_second)["cpu"].null_count() == of_second.sum() >= 8
+    assert started.filter(~of_second)["cpu"].unique().to_list() == [EXECUTOR_CORE]
+    assert measure_latency(recording).analysis.traversals.height == 8
 
 
 def test_what_cannot_run_is_refused_before_anything_starts(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ from chainshaper.analysis.periods import OtherPeriod, other_periods
 from chainshaper.analysis.unseen_takes import UnseenTakes
 from chainshaper.analysis.wall_clock import StampedMessages
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS
+from chainshaper.values.application import INTERNAL_TOPICS, trigger_text
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 
@@ -65,11 +65,13 @@ def contradictions(
 ) -> tuple[Contradiction, ...]:
     """All contradictions in a recording whose events have been resolved."""
     nodes = objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
+    periods = tuple(_of_another_period(one) for one in other_periods(nodes, instances, taken))
+    nodes = with_shown_periods(nodes, periods)
     return (
         *_moved_clock(stamped),
         *_before_their_publication(taken, published),
         *(_without_takes(one) for one in unseen),
-        *(_of_another_period(one) for one in other_periods(nodes, instances, taken)),
+        *periods,
         *_longer_than_they_ran(nodes, ends),
         *_inside_themselves(tables, nodes, ends),
     )
@@ -85,14 +87,17 @@ def refuse_contradicted(
             raise InputError(f"{recording}: nothing can be planned from it, {one.note}")
 
 
-def shown_periods(found: Iterable[Contradiction]) -> dict[int, int]:
-    """Timers' callbacks whose starts show another period than the declared one → that period."""
-    return {
+def with_shown_periods(callbacks: pl.DataFrame, found: Iterable[Contradiction]) -> pl.DataFrame:
+    """The frame of callbacks in which ``period_ns`` is what the starts of a timer's callback show,
+    where that is another than the declared one."""
+    shown = {
         callback: one.period_ns
         for one in found
         for callback in one.callbacks
         if one.period_ns is not None
     }
+    period = pl.col("callback_id").replace_strict(shown, default=None, return_dtype=pl.Int64)
+    return callbacks.with_columns(period_ns=pl.coalesce(period, "period_ns"))
 
 
 def clock_text(time_ns: int) -> str:
@@ -236,12 +241,12 @@ def _inside_themselves(
 def _by_callback(rows: pl.DataFrame, nodes: pl.DataFrame) -> Iterator[tuple[int, str, str]]:
     """Callback, what it is in words, and how many rows of it there are, and where the first one
     is; not of what every node has for itself."""
-    about = nodes.select("callback_id", "node", "kind", "topic", "period_ns")
+    about = nodes.select("callback_id", "node", "kind", "topic", "period_ns", "declared_ns")
     for (number,), own in rows.sort("start").group_by("callback_id", maintain_order=True):
-        _, node, kind, topic, period = about.filter(callback_id=number).row(0)
+        _, node, kind, topic, period, declared = about.filter(callback_id=number).row(0)
         if topic in INTERNAL_TOPICS:
             continue
-        trigger = f"for {topic}" if period is None else f"every {duration_text(period)}"
+        trigger = trigger_text(topic and f"for {topic}", period, declared)
         first, tid = own.select("start", "tid").row(0)
         where = f"instances: {own.height}, the first {clock_text(first)} in thread {tid}"
         yield int(str(number)), f"the {kind} callback of {node} {trigger}", where

@@ -28,7 +28,6 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.traversals import Traversals
@@ -98,7 +97,9 @@ def with_punctuality(
     origin = counted_from - _cycles_behind(cycle_ns)
     opens, closes = _last_slot(frame, due)
     place = end - pl.when(gated).then(origin).otherwise(began)
-    overran = pl.col("overrun").is_not_null() | (origin < counted_from)
+    # Under LET per callback, the gates before the last have each kept the message for a cycle.
+    behind = counted_from - origin > (0 if due is None else due.cycles) * pl.lit(cycle_ns or 0)
+    overran = pl.col("overrun").is_not_null() | behind
     late = pl.when(gated).then(overran | (place >= closes).fill_null(False))
     due_at = pl.when(gated).then(pl.min_horizontal("release", origin + opens))
     bound = pl.lit(None, dtype=pl.Int64) if due is None else began + limit
@@ -160,8 +161,7 @@ def due_within(flow: DataFlow, chain: Chain, due: Due | None) -> int | None:
 def timer_period(flow: DataFlow, chain: Chain) -> int | None:
     """The period of the timer that starts a chain, as its starts show it (ns; None: no timer)."""
     first = flow.objects.callbacks.filter(pl.col("callback_id") == chain.callbacks[0])
-    declared: int | None = first["period_ns"].max()  # type: ignore[assignment]
-    return shown_periods(flow.contradictions).get(chain.callbacks[0], declared)
+    return first["period_ns"].max()  # type: ignore[return-value]
 
 
 def lateness_in_cycle(starts: pl.Series, cycle_ns: int) -> pl.Series:

@@ -25,7 +25,11 @@ from dataclasses import dataclass, field, replace
 
 import polars as pl
 
-from chainshaper.analysis.contradictions import Contradiction, contradictions
+from chainshaper.analysis.contradictions import (
+    Contradiction,
+    contradictions,
+    with_shown_periods,
+)
 from chainshaper.analysis.lost_ends import LOOKS, without_disproved_ends
 from chainshaper.analysis.matching import by_number, ends_of_starts, first_after, latest_before
 from chainshaper.analysis.messages import (
@@ -50,7 +54,8 @@ _ACTION = "/_action/"
 class DataFlow:
     """A recording, resolved.
 
-    * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`.
+    * ``objects``: who exists, see :class:`~chainshaper.analysis.objects.Objects`; periods of timers
+      are those that their starts show.
     * ``instances``: see :func:`callback_instances`, with those that no event shows added, and
       without the ends that other events disprove (:mod:`~chainshaper.analysis.lost_ends`: then,
       and where an end was lost, ``until`` is when it had ended at the latest, null if not known).
@@ -136,7 +141,9 @@ def data_flow(
     flow = DataFlow(
         objects, instances, published, taken, tables, notes, seen, untold, followed=followed
     )
-    return _with_restarts(flow)
+    flow = _with_restarts(flow)  # which knows a timer again by its declared period
+    shown = with_shown_periods(flow.objects.callbacks, flow.contradictions)
+    return replace(flow, objects=replace(flow.objects, callbacks=shown))
 
 
 def _notes(

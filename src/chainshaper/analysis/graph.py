@@ -47,7 +47,8 @@ def graph_of(flow: DataFlow) -> ApplicationGraph:
         writes[callback_id].add(topic)
     known = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
     known = known.sort("callback_id").rename({"callback_id": "id"})
-    known = known.select("kind", "node", "pid", "handle", "topic", "period_ns", "symbol", "id")
+    period = ("period_ns", "declared_ns")
+    known = known.select("kind", "node", "pid", "handle", "topic", *period, "symbol", "id")
     last = {(node, pid): last_pid for node, pid, last_pid in flow.followed.iter_rows()}
     earlier = defaultdict[tuple[str, int], tuple[int, ...]](tuple)
     for (node, pid), last_pid in last.items():

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -82,10 +82,11 @@ def summary(times: pl.Expr) -> pl.Expr:
 def callback_statistics(flow: DataFlow) -> pl.DataFrame:
     """Count, response and execution times of every callback that was seen to run, one row each.
 
-    Columns: ``callback_id, node, kind, topic, period_ns, symbol, pid, pids, tids, count,
-    unfinished, response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in ns
-    (means as floats), null where no instance has such a time. ``period_ns`` is the timer's own
-    period, ``pids`` are all processes of a node that was started again, ``pid`` is the last.
+    Columns: ``callback_id, node, kind, topic, period_ns, declared_ns, symbol, pid, pids, tids,
+    count, unfinished, response_ns, execution_ns``. The last two are structs ``{min, mean, max}`` in
+    ns (means as floats), null where no instance has such a time. ``period_ns`` is the period of a
+    timer's starts, ``declared_ns`` that with which it was created, ``pids`` are all
+    processes of a node that was started again, ``pid`` is the last.
     """
     # Of a callback's registrations those of its node's last process come first.
     about = flow.objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
@@ -98,14 +99,15 @@ def callback_statistics(flow: DataFlow) -> pl.DataFrame:
         response_ns=summary(pl.col("end") - pl.col("start")),
         execution_ns=summary(pl.col("execution_ns")),
     )
-    names = ("callback_id", "node", "kind", "topic", "period_ns", "symbol", "pid")
+    names = ("callback_id", "node", "kind", "topic", "period_ns", "declared_ns", "symbol", "pid")
     found = about.select(names).join(figures, on="callback_id")
     return found.sort("callback_id")
 
 
 def named_callbacks(flow: DataFlow) -> pl.DataFrame:
     """Callbacks that ran and are named alike in every run: by node, and ``starts``, what starts
-    them. Several may have one name: two timers of one period, or those of a node started again.
+    them: a topic, or a timer with its declared period. Several may have one name: two timers of one
+    period, or those of a node started again. ``shown`` has the period of the timer's starts, too.
 
     They are rows of :func:`.callback_statistics`, without those that every node has.
     """
@@ -114,22 +116,38 @@ def named_callbacks(flow: DataFlow) -> pl.DataFrame:
         & pl.col("kind").is_in(["timer", "subscription"])
         & ~pl.col("topic").fill_null("").is_in(list(INTERNAL_TOPICS))
     )
-    starts = [trigger_text(*one) for one in found.select("topic", "period_ns").iter_rows()]
-    return found.with_columns(starts=pl.Series(starts, dtype=pl.String))
+    triggers = found.select("topic", "period_ns", "declared_ns").rows()
+    starts = [trigger_text(topic, declared) for topic, _, declared in triggers]
+    shown = [trigger_text(*one) for one in triggers]
+    texts = {"starts": starts, "shown": shown}
+    return found.with_columns(pl.Series(name, own, pl.String) for name, own in texts.items())
 
 
-Longest: TypeAlias = tuple[float | None, float | None]
-"""A response and an execution time (ns; None: not known)."""
+class Longest(NamedTuple):
+    """The longest response and execution time of a callback (ns; None: not known).
+
+    ``shown`` is what starts it, with the period of a timer's starts beside the declared one.
+    """
+
+    response_ns: float | None
+    execution_ns: float | None
+    shown: str
+
+    @property
+    def times(self) -> tuple[float | None, float | None]:
+        """Both, in this order."""
+        return self.response_ns, self.execution_ns
 
 
 def longest_times(flow: DataFlow) -> dict[tuple[str, str], Longest]:
-    """The longest response and execution time (ns) of each name of :func:`named_callbacks`."""
+    """The longest times of each name of :func:`named_callbacks`."""
     named = named_callbacks(flow).group_by("node", "starts", maintain_order=True)
     rows = named.agg(
         response=pl.col("response_ns").struct.field("max").max(),
         execution=pl.col("execution_ns").struct.field("max").max(),
+        shown=pl.col("shown").first(),
     )
-    return {(node, starts): (most, used) for node, starts, most, used in rows.iter_rows()}
+    return {(node, starts): Longest(*longest) for node, starts, *longest in rows.iter_rows()}
 
 
 class Executor(NamedTuple):
@@ -162,14 +180,15 @@ def executors(flow: DataFlow) -> list[Executor]:
         ran.group_by("callback_id", "pid").agg(tids=pl.col("tid").sort()),
         on=["callback_id", "pid"],
     )
-    columns = ("callback_id", "node", "kind", "topic", "period_ns", "pid", "tids", "observed")
+    # A timer's declared period names it: it is the same whatever the recording shows.
+    columns = ("callback_id", "node", "kind", "topic", "declared_ns", "pid", "tids", "observed")
     for row in about.sort("callback_id").select(*columns).iter_rows():
-        number, node, kind, topic, period_ns, pid, tids, observed = row
+        number, node, kind, topic, declared_ns, pid, tids, observed = row
         tids = tids if observed else {pid, *tids}
         threads: dict[int, tuple[str, ...]] = dict.fromkeys(tids, (node,))
         callbacks, names = frozenset((number,)), tuple[tuple[str, str], ...]()
         if kind in ("timer", "subscription") and topic not in INTERNAL_TOPICS:
-            names = ((node, trigger_text(topic, period_ns)),)
+            names = ((node, trigger_text(topic, declared_ns)),)
         for one in [one for one in found if one.pid == pid and one.threads.keys() & threads]:
             found.remove(one)
             for tid, nodes in one.threads.items():

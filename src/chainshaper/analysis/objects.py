@@ -28,6 +28,7 @@ CALLBACK_SCHEMA: dict[str, pl.DataType] = {
     "node": pl.String(),
     "topic": pl.String(),
     "period_ns": pl.Int64(),
+    "declared_ns": pl.Int64(),
     "symbol": pl.String(),
     "observed": pl.Boolean(),
     "subscription": pl.UInt32(),
@@ -46,8 +47,10 @@ class Objects:
     * ``callbacks``: :data:`CALLBACK_SCHEMA`, one row per *registration*, the address
       (``pid, handle``) under which a callback ran from ``valid_from`` until that address was
       registered again (``valid_to``, null: never). ``callback_id`` numbers callbacks from 0
-      (:func:`numbered`). ``topic`` is the topic or the service's name. ``observed`` is false for
-      what emits no callback events: subscriptions, services and timers of rclpy, services of
+      (:func:`numbered`). ``topic`` is the topic or the service's name. ``declared_ns`` is the
+      period with which a timer was created, ``period_ns`` the same here, and in a
+      :class:`~chainshaper.analysis.flow.DataFlow` the one its starts show. ``observed`` is false
+      for what emits no callback events: subscriptions, services and timers of rclpy, services of
       actions, and all clients.
     * ``buffers``: ``pid, buffer, valid_from, callback_id``: intra-process ring buffers.
     * ``activity``: ``time, pid, node, active``: when lifecycle nodes became active, or inactive.
@@ -100,7 +103,9 @@ def resolve_objects(tables: events.EventTables) -> Objects:
         nodes=nodes,
         publishers=publishers.with_columns(names),
         subscriptions=subscriptions.with_columns(names),
-        callbacks=callbacks.select(pl.col(name).cast(t) for name, t in CALLBACK_SCHEMA.items()),
+        callbacks=callbacks.with_columns(declared_ns="period_ns").select(
+            pl.col(name).cast(kind) for name, kind in CALLBACK_SCHEMA.items()
+        ),
         buffers=_buffers(tables, callbacks),
         activity=_activity(tables, nodes),
         notes=(*_notes(tables, callbacks), *_notes_of_told(told)),

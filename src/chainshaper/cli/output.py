@@ -157,12 +157,10 @@ def stage_lines(title: str) -> Progress:
 
 
 @contextmanager
-def opened(
-    verb: str, trace: Sequence[Path], *, overview: bool = False
-) -> "Iterator[tuple[cs.Recording, Progress]]":
+def opened(verb: str, trace: Sequence[Path]) -> "Iterator[tuple[cs.Recording, Progress]]":
     """A trace or recording for a verb that reads it, and what reports the verb's progress."""
     with late_progress(verb) as report:
-        yield cs.open_source(*trace, progress=report, overview=overview), report
+        yield cs.open_source(*trace, progress=report), report
 
 
 def lost_events(recording: "cs.Recording") -> str:

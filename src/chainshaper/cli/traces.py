@@ -19,14 +19,20 @@ if TYPE_CHECKING:
 
 
 def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
-    """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes."""
+    """Show what is in a trace: events, losses, clock, distribution, RMW, hosts, processes.
+
+    Notes say where its events contradict each other.
+    """
+    from chainshaper.analysis import recorded_flow
     from chainshaper.reporting import overviews
 
-    with out.opened("info", trace, overview=True) as (recording, _):
-        contents = overviews.contents_json(recording)
+    with out.opened("info", trace) as (recording, report):
+        report(0.9, "looking for contradictions")
+        found = recorded_flow(recording).contradictions
+        contents = overviews.contents_json(recording, found)
     if out.present(json, contents, *overviews.contents_table(recording)):
         out.show_line(out.lost_events(recording))
-        out.notes(contents["notes"])
+        out.notes((*contents["notes"], *(one.note for one in found)))
 
 
 def describe(

@@ -447,6 +447,7 @@ def plan_scheduling(
     return scheduling_around(
         *(members, plan.servers, allocation, available_cores),
         order=plan.most_urgent_first,
+        behind=plan.behind_outputs,
         receivers=cores,
         places=plan.receivers_at,
         take_turns=plan.takes_turns,
@@ -515,6 +516,7 @@ def scheduling_around(
     available_cores: Sequence[int],
     *,
     order: Sequence[str] = (),
+    behind: Collection[str] = (),
     receivers: Mapping[str, int] = MappingProxyType({}),
     places: Mapping[str, ReceiverPlace] = MappingProxyType({}),
     take_turns: bool = False,
@@ -523,12 +525,13 @@ def scheduling_around(
     """What the threads of servers, and the others of their processes, shall get.
 
     ``members`` are by server's name, within a server in the ``order`` of their nodes, the most
-    urgent first; others come behind these, and share a priority. ``receivers`` are nodes that
-    receive an output, and the core for their executors; one that is real-time already, on cores of
-    no server, stays as it is: its other callbacks were placed there. Some of them have ``places``
-    in the plan, with another priority, and core, if it is available. With ``take_turns``, servers
-    of one priority share it by turns. DDS threads leave the cores of all servers or, where these
-    are all that there are, those to be ``clear``.
+    urgent first; others come behind these, and share a priority. Threads of servers that are
+    ``behind``, by name, come behind the first of each server of their priority. ``receivers`` are
+    nodes that receive an output, and the core for their executors; one that is real-time already,
+    on cores of no server, stays as it is: its other callbacks were placed there. Some of them have
+    ``places`` in the plan, with another priority, and core, if it is available. With
+    ``take_turns``, servers of one priority share it by turns. DDS threads leave the cores of all
+    servers or, where these are all that there are, those to be ``clear``.
 
     Raises OperationError: a thread cannot leave the core of a publisher that would outrank it.
     InputError: see :func:`server_priorities`.
@@ -536,7 +539,8 @@ def scheduling_around(
     taken = {name: sorted({place_of(one, order) for one in own}) for name, own in members.items()}
     sizes: dict[int, int] = {}
     for its in (one for one in servers if not getattr(one, "best_effort", False)):
-        sizes[its.priority] = max(1, sizes.get(its.priority, 0), len(taken[its.name]))
+        size = len(taken[its.name]) + (its.name in behind)
+        sizes[its.priority] = max(1, sizes.get(its.priority, 0), size)
     for rank in {place.priority for place in places.values()} & sizes.keys():
         sizes[rank] += 1  # behind all of it
     priorities = server_priorities(sizes)
@@ -545,6 +549,7 @@ def scheduling_around(
         if getattr(server, "best_effort", False):
             return Scheduling(0, (server.core,))
         own, place = priorities[server.priority], taken[server.name].index(place_of(one, order))
+        place += server.name in behind
         return Scheduling(own[min(place, len(own) - 1)], (server.core,), take_turns)
 
     own = [

@@ -13,7 +13,6 @@ from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.threads import followed_chains, table_of
-from chainshaper.linux.threads import list_threads
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.plan import Server, Thread
@@ -25,7 +24,13 @@ from chainshaper.values.files import write_whole
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 from chainshaper.workload.description import Application, load_application
-from chainshaper.workload.live import Enforcement, Progress, StartedNodes, run_application
+from chainshaper.workload.live import (
+    Enforcement,
+    Progress,
+    StartedNodes,
+    node_threads,
+    run_application,
+)
 
 _STANDARD = PlanRequest()
 
@@ -45,9 +50,9 @@ def shape_application(
 ) -> Recording:
     """Splice the plan's shaping nodes into an application, run it and record it.
 
-    ``enforcement`` puts the plan's servers in force while it runs; without, the thread of an
-    asynchronous publisher and the stages of a pipeline are gated. With ``adapt`` slots follow the
-    latencies, to no later end than ``max_latency_ns`` (None: as the plan says).
+    ``enforcement`` puts the plan's servers in force while it runs; without, the
+    :func:`gated_threads` are gated. With ``adapt`` slots follow the latencies, to no later end than
+    ``max_latency_ns`` (None: as the plan says).
 
     Raises InputError: the plan does not fit the application, or no slot can follow; PlatformError:
     threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
@@ -71,15 +76,28 @@ def shape_application(
 
 
 def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
-    """The servers without which a plan does not work, and whom they gate (publishers, stages)."""
+    """The servers without which a plan does not do what it says, and whom they gate: publishers,
+    stages of pipelines, and where servers close at their slots' ends all that is in them, but for
+    shaping nodes that see to their slots themselves.
+    """
     gates = {node.thread for node in plan.shaping_nodes}
-    pipelines = [chain for chain in plan.chains if chain.policy == "pipelined"]
-    staged = {one for chain in pipelines for server in chain.servers for one in server.threads}
+    closed, staged = (
+        {thread for one in chains for server in one.servers for thread in server.threads}
+        for chains in (
+            [chain for chain in plan.chains if chain.slot_ends == "closed"],
+            [chain for chain in plan.chains if chain.policy == "pipelined"],
+        )
+    )
+    closed -= plan.free_threads
+
+    def is_gated(one: Thread, server: Server) -> bool:
+        needed = one.role == "publisher" or one in staged
+        return one in closed or (needed and gates.isdisjoint(server.threads))
+
     return [
-        (server, own)
+        (server, gated)
         for server in open_until_done(plan).servers
-        if gates.isdisjoint(server.threads)
-        if (own := [one for one in server.threads if one.role == "publisher" or one in staged])
+        if (gated := [one for one in server.threads if is_gated(one, server)])
     ]
 
 
@@ -140,7 +158,7 @@ def slots_followed(
 
 def _threads_of(wanted: Thread, nodes: StartedNodes) -> list[int]:
     pid = nodes.pids.get(wanted.node)
-    found = [t.tid for t in list_threads(pid) if t.role == wanted.role] if pid is not None else []
+    found = [t.tid for t in node_threads(pid) if t.role == wanted.role] if pid is not None else []
     if not found and wanted.role == "executor":
         raise OperationError(f"{wanted.node} of the plan is no node of the application")
     if not found:

@@ -24,7 +24,6 @@ import yaml
 
 from chainshaper.analysis import DataFlow, analyse_latency, graph_of, recorded_flow
 from chainshaper.analysis.chains import find_chain, parse_chain
-from chainshaper.analysis.contradictions import shown_periods
 from chainshaper.analysis.graph import MESSAGE_FILTER
 from chainshaper.analysis.occupation import (
     Occupation,
@@ -38,7 +37,7 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.values import events
-from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
+from chainshaper.values.application import INTERNAL_TOPICS, Callback
 from chainshaper.values.durations import duration_text, format_duration, milliseconds
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
@@ -72,8 +71,6 @@ class _Evidence:
 
     recording: Recording
     flow: DataFlow
-    graph: ApplicationGraph
-    chain: Chain
     callbacks: dict[int, Callback]
     found: Occupation
     hops: pl.DataFrame
@@ -120,14 +117,14 @@ def application_file(
     it, or no description can be made of it.
     """
     recording = opened(recording)
-    evidence = _evidence(recording, chain)
+    evidence, spec = _evidence(recording, chain)
     nodes = _nodes(evidence)
     if not nodes:
         raise InputError(f"{recording.path}: no callback of it ran twice: record longer")
     scheduling = _scheduling(evidence, nodes)
     values: dict[str, Any] = {
         "name": recording.path.name,
-        "chain": _chain_described(evidence),
+        "chain": _described_chain(evidence, spec, nodes),
         "scheduling": scheduling,
         "topics": _topics(evidence, nodes),
         "simulation": _costs(evidence, nodes),
@@ -141,15 +138,15 @@ def application_file(
     values = _written_out(values, _chosen(evidence, values))
     with wrong_values_refused(Application, f"{recording.path}: "):
         application = Application.model_validate(values, context=AS_YAML, strict=False)
-    compared = _simulated_back(evidence, application)
+    compared = _simulated_back(evidence, spec, application)
     notes = tuple(dict.fromkeys((*evidence.notes, compared)))
     body = yaml.safe_dump(values, sort_keys=False, default_flow_style=None, width=100)
     return "".join((*map(_comment, notes), body)), notes
 
 
-def _simulated_back(evidence: _Evidence, application: Application) -> str:
+def _simulated_back(evidence: _Evidence, spec: str, application: Application) -> str:
     """How near the description comes to the recording: latencies simulated and recorded."""
-    recorded = analyse_latency(evidence.flow, evidence.chain.spec)
+    recorded = analyse_latency(evidence.flow, spec)
     complete = recorded.traversals.drop_nulls("latency_ns").sort("latency_ns")
     if complete.is_empty():
         return "No cycle completes: the description cannot be compared with the recording."
@@ -175,13 +172,14 @@ def _comment(note: str) -> str:
     return fill(note, 98, initial_indent="# ", subsequent_indent="#   ") + "\n"
 
 
-def _evidence(recording: Recording, chain: str | None) -> _Evidence:
-    """What a recording's description is made from."""
+def _evidence(recording: Recording, chain: str | None) -> tuple[_Evidence, str]:
+    """What a recording's description is made from, and the chain as it will be written."""
     flow = recorded_flow(recording)
     graph, heaviest = graph_of(flow), list_chains(flow).heaviest
     if heaviest is None:
         raise InputError(f"{recording.path}: no chain is in it, see `chainshaper graph`")
-    path = find_chain(graph, chain or recording.info.chain or heaviest.spec)
+    spec = chain or recording.info.chain or heaviest.spec
+    path = find_chain(graph, spec)
     counting = publication_that_counts(flow, frozenset(path.topics))
     found = occupation(flow, recording.info, counting)
     timers = [one.id for one in graph.callbacks if one.kind == "timer"]
@@ -200,8 +198,6 @@ def _evidence(recording: Recording, chain: str | None) -> _Evidence:
     evidence = _Evidence(
         recording=recording,
         flow=flow,
-        graph=graph,
-        chain=path,
         callbacks=callbacks,
         found=found,
         hops=deliveries(flow, found),
@@ -235,7 +231,7 @@ def _evidence(recording: Recording, chain: str | None) -> _Evidence:
             "The recording is of a shaped application: a shaping node is described as one that"
             " computes while it holds a message. Describe a recording without it."
         )
-    return evidence
+    return evidence, spec
 
 
 def _latencies(application: Application, cycles: int) -> Numbers:
@@ -266,10 +262,11 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
             chosen.append(members)
     ran = [evidence.callbacks[number] for members in chosen for number in members]
     published = {topic for one in ran for topic in _written(one)}
+    names = _names(evidence, ran)
     nodes: dict[str, _Node] = {}
     for members in chosen:
-        name = _name(evidence, evidence.callbacks[members[0]])
-        node = nodes.setdefault(name, _Node())
+        first = evidence.callbacks[members[0]]
+        node = nodes.setdefault(names[first.node, first.pid], _Node())
         node.callbacks.append(_described(evidence, node, members, published))
     for node in nodes.values():
         _in_turn(evidence, node)
@@ -286,31 +283,45 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
     return nodes
 
 
-def _name(evidence: _Evidence, callback: Callback) -> str:
-    """The name of a callback's node as descriptions permit it, of its own for each process."""
-    node = evidence.graph.node_text(callback)
-    name = re.sub(r"[^A-Za-z0-9_/]", "_", node).strip("/")
-    if not re.match(r"[A-Za-z_]", name):
-        name = f"node_{name}"
-    if name != node.strip("/"):
-        evidence.notes.append(f"{node} is no name of a node in a description: it is {name} there.")
-    return name
+def _names(evidence: _Evidence, ran: Sequence[Callback]) -> dict[tuple[str, int], str]:
+    """The name in the description of each node and process: as permitted there, and its own."""
+    nodes = dict.fromkeys((one.node, one.pid) for one in ran)
+    processes = Counter(node for node, _ in nodes)
+    found: dict[tuple[str, int], str] = {}
+    for node, pid in nodes:
+        name = re.sub(r"[^A-Za-z0-9_/]", "_", node).strip("/")
+        if not re.match(r"[A-Za-z_]", name):
+            name = f"node_{name}"
+        if processes[node] > 1:
+            name = f"{name}_{pid}"
+            evidence.notes.append(
+                f"{node} ran in {processes[node]} processes at once: that in process {pid} is"
+                f" {name} in the description."
+            )
+        alike = name
+        for number in count(2):
+            if name not in found.values():
+                break
+            name = f"{alike}_{number}"
+        if processes[node] == 1 and name != node.strip("/"):
+            said = f"{node} is no name of a node in a description: it is {name} there."
+            evidence.notes.append(said)
+        found[node, pid] = name
+    return found
 
 
-def _chain_described(evidence: _Evidence) -> str:
-    """The text of the chain with the names that its nodes have in the description."""
-    names = dict[str, str]()
-    for callback in evidence.graph.path(evidence.chain):
-        described = f"/{_name(evidence, callback)}"
-        processes = [f"{callback.node}@{pid}" for pid in callback.processes]
-        names |= dict.fromkeys((callback.node, *processes), described)
-    topics = {*evidence.graph.topics}
-    way_points = []
-    for way_point in parse_chain(evidence.chain.spec):
-        is_topic = not topics.isdisjoint((way_point, f"/{way_point}"))
-        node = f"/{way_point.removeprefix('/')}"
-        way_points.append(way_point if is_topic else names.get(node, way_point))
-    return "..".join(way_points)
+def _described_chain(evidence: _Evidence, spec: str, nodes: Mapping[str, _Node]) -> str:
+    """A chain by the names that its nodes have in the description."""
+    named = dict[str, str]()
+    for name, node in nodes.items():
+        first = evidence.callbacks[node.ids[0]]
+        for known_by in (first.node, *(f"{first.node}@{pid}" for pid in first.processes)):
+            named |= {known_by: f"/{name}", known_by.removeprefix("/"): f"/{name}"}
+    topics = {topic for one in evidence.callbacks.values() for topic in one.publishes}
+    points = parse_chain(spec)
+    return "..".join(
+        point if {point, f"/{point}"} & topics else named.get(point, point) for point in points
+    )
 
 
 def _describable(callback: Callback) -> bool:
@@ -474,13 +485,13 @@ def _expiry(evidence: _Evidence, callback: Callback, own: pl.DataFrame) -> tuple
     """A timer's period, and an instant at which it expired (ns)."""
     starts = own["start"].sort().to_numpy().astype(np.int64)
     apart = int(np.median(np.diff(starts))) if len(starts) > 1 else 0
-    shown = shown_periods(evidence.flow.contradictions).get(callback.id)
-    if shown is not None:
+    period = callback.period_ns or max(1_000, round(apart, -3))
+    if callback.declared_ns not in (None, callback.period_ns):
         evidence.notes.append(
-            f"{callback.label} started every {duration_text(round(shown, -3))}: that is its period"
-            " in the description."
+            f"{callback.node} has a timer that was declared with a period of"
+            f" {duration_text(callback.declared_ns or 0)} and started every"
+            f" {duration_text(period)}: that is its period in the description."
         )
-    period = shown or callback.period_ns or max(1_000, round(apart, -3))
     number = np.rint((starts - starts[0]) / period).astype(np.int64)
     behind = starts - number * period
     third = len(starts) // 3

@@ -10,6 +10,7 @@ in ROS 2 get it as a parameter, by a process of its own, as the user and in the 
 of them; as whom we may not run, in ours.
 """
 
+import math
 import os
 import threading
 import time
@@ -61,14 +62,27 @@ def measure_phase(
 ) -> Phase:
     """The phase of an executor. Raises OperationError: it ended, or does not wake up regularly."""
     for _ in range(MOST_TRIES):
-        found = watch_wake_ups(pid, tids, cycles * cycle_ns, progress)
-        if (phase := find_phase(found, cycle_ns, cycles)) is not None:
+        wake_ups = watch_wake_ups(pid, tids, cycles * cycle_ns, progress)
+        if (phase := find_phase(wake_ups, cycle_ns, cycles)) is not None:
             return phase
     named = f"thread {', '.join(map(str, tids))} of process {pid}"
-    raise OperationError(
-        f"{named} does not wake up once in every {duration_text(cycle_ns)} ({len(found)} times in"
-        f" {cycles}): is the chain running, with the period of the plan? Or give its --phase"
-    )
+    raise OperationError(f"{named} {_irregular(wake_ups, cycle_ns, cycles)}")
+
+
+def _irregular(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> str:
+    """Why these wake-ups are no beginning of cycles, and what to do: how many there were says
+    nothing of where they lie.
+    """
+    length, width = duration_text(cycle_ns), duration_text(_width(cycle_ns))
+    if not wake_ups.size:
+        said = f"does not wake up: not once in {cycles} cycles of {length}. Start the chain"
+    else:
+        seen = max(seen for _, seen, _ in _places(wake_ups, cycle_ns))
+        said = f"does not wake up at one place of the cycle {length}: {len(wake_ups)} wake-ups in"
+        said += f" {cycles} cycles, of which {seen} at most have one within the same {width}, and"
+        said += f" {math.ceil(SEEN_IN * cycles)} have to. Plan with the period that the chain has;"
+        said += " on a busy machine, whose cores serve others first, try again when it is calm"
+    return f"{said}; or give its --phase"
 
 
 def watch_wake_ups(
@@ -146,22 +160,37 @@ def find_phase(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> P
 
     None when there is no place that has some in four of five cycles.
     """
-    width, places = max(1, cycle_ns // 50), np.sort(wake_ups % cycle_ns)
-    # A circle has no first place: the first two turns of it have every neighbour.
-    turned = np.concatenate([places, places + cycle_ns])
     best, longest_rest = None, -1
-    for number, place in enumerate(places):
-        here = turned[number : int(np.searchsorted(turned, place + width, side="right"))]
-        inside = (wake_ups - place) % cycle_ns <= width
-        seen = len(np.unique((wake_ups[inside] - place) // cycle_ns))
-        before = turned[number - 1 + len(places)] - cycle_ns
-        rest = int(place - before) if len(places) > 1 else cycle_ns
+    for rest, seen, here in _places(wake_ups, cycle_ns):
         if seen >= SEEN_IN * cycles and rest > longest_rest:
             longest_rest = rest
             # The first of each cycle: what follows it is the same thread going on.
             low, at, high = np.percentile(here[: max(1, seen)], (10, 50, 90))
             best = Phase(int(at) % cycle_ns, int(high - low))
     return best
+
+
+def _width(cycle_ns: int) -> int:
+    """How far apart wake-ups of one place may lie."""
+    return max(1, cycle_ns // 50)
+
+
+def _places(
+    wake_ups: npt.NDArray[np.int64], cycle_ns: int
+) -> Iterator[tuple[int, int, npt.NDArray[np.int64]]]:
+    """Each place of the cycle that begins with a wake-up: how long nothing woke up before it, in
+    how many cycles something did there, and where in the cycle.
+    """
+    width, places = _width(cycle_ns), np.sort(wake_ups % cycle_ns)
+    # A circle has no first place: the first two turns of it have every neighbour.
+    turned = np.concatenate([places, places + cycle_ns])
+    for number, place in enumerate(places):
+        here = turned[number : int(np.searchsorted(turned, place + width, side="right"))]
+        inside = (wake_ups - place) % cycle_ns <= width
+        seen = len(np.unique((wake_ups[inside] - place) // cycle_ns))
+        before = turned[number - 1 + len(places)] - cycle_ns
+        rest = int(place - before) if len(places) > 1 else cycle_ns
+        yield rest, seen, here
 
 
 def find_drift(

@@ -26,7 +26,7 @@ from chainshaper.analysis import (
     executors,
     recorded_flow,
 )
-from chainshaper.analysis.contradictions import refuse_contradicted, shown_periods
+from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
@@ -139,7 +139,7 @@ def _profile_of(
     calm = every.filter(~pl.col("disturbed"))
     all_disturbed = calm.height < 2
     disturbed = every.clear() if all_disturbed else every.filter("disturbed")
-    period = _period(flow, analysis, period_ns)
+    period = _period(analysis, period_ns)
     simulated = _simulated(flow, analysis)
     nodes = taking_part(graph, chain, stages)
     running, named, cores, priority = _executors(recording, flow, graph, stages)
@@ -243,7 +243,10 @@ def _reception(
         longest_ns=int(on_its_way.max()),
         time_ns=int(together.max() or 0),  # type: ignore[arg-type]
         beside_ns=int(in_cycle.max() or 0),  # type: ignore[arg-type]
-        longest_beside_ns=int(beside["took"].max() or 0),  # type: ignore[arg-type]
+        # All of them may be ready as the output comes, and be served first.
+        longest_beside_ns=int(
+            beside.group_by("callback_id").agg(pl.col("took").max())["took"].sum()
+        ),
     )
 
 
@@ -273,9 +276,9 @@ def _modes_in_force(
     return pl.Series([modes.default, *(mode for _, mode in known)]).gather(place)
 
 
-def _period(flow: DataFlow, analysis: LatencyAnalysis, given: int | None) -> int:
+def _period(analysis: LatencyAnalysis, given: int | None) -> int:
     first, spec = analysis.graph.callbacks[analysis.chain.callbacks[0]], analysis.chain.spec
-    of_timer = shown_periods(flow.contradictions).get(first.id, first.period_ns)
+    of_timer = first.period_ns
     if of_timer is not None and given not in (None, of_timer):
         raise InputError(
             "--period goes with --latencies, or with a chain that no timer starts, which"

@@ -125,14 +125,14 @@ def evidence_of(
     """
     if recording is not None:
         return (recording,), ()
-    from chainshaper.sources import open_source  # only who has a recording pays for this
-
     recordings, notes = list["Recording"](), list[str]()
     chains = () if plan is None else plan.chains
     for path in dict.fromkeys(one.evidence.recording for one in chains if one.evidence.recording):
         if not Path(path).is_dir():
             notes.append(f"the plan's recording {shown(path)} is not here")
             continue
+        from chainshaper.sources import open_source  # only who has a recording pays for this
+
         try:
             recordings.append(open_source(path))
         except ChainshaperError as error:

@@ -145,8 +145,8 @@ class ApplicationPlan(Part):
 
         None has where they take turns, and only that which begins the chain where slots are made of
         what single callbacks took: one that is interrupted by another takes longer. In a pipeline
-        those downstream come first: they work on the older instance. Shaping nodes have none: the
-        one that wakes first publishes first, and watches the clock until then.
+        those downstream come first: they work on the older instance. Shaping nodes of outputs have
+        none: the one that wakes first publishes first, and watches the clock until then.
         """
         found: dict[str, None] = {}
         gates = {node.thread for node in self.shaping_nodes}
@@ -159,6 +159,16 @@ class ApplicationPlan(Part):
                 nodes = nodes[:1]
             found |= dict.fromkeys(nodes)
         return tuple(found)
+
+    @property
+    def behind_outputs(self) -> set[str]:
+        """The names of servers whose threads run behind the first of each server of their priority:
+        those of shaping nodes inside a chain, which delay no output. None where they take turns.
+        """
+        if self.takes_turns:
+            return set()
+        inner = {node.thread for chain in self.chains for node in plans.inner_gates(chain)}
+        return {server.name for server in self.servers if not inner.isdisjoint(server.threads)}
 
     @property
     def free_threads(self) -> set[Thread]:

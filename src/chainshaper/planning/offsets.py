@@ -41,7 +41,7 @@ from chainshaper.planning.plan import (
     server_of,
     shaping_nodes,
 )
-from chainshaper.planning.shaping import BOUNDARY_NS, OUTPUT_PRIORITY
+from chainshaper.planning.shaping import BOUNDARY_NS, OUTPUT_PRIORITY, with_gates_level
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 
@@ -120,7 +120,8 @@ def place_chains(
     plans them again, with the latencies that they have when they run at the same time: the chain
     with the shorter period at the better priority, and only their publish slots stay apart. None
     begins while a better one runs, where that can be, for slots count from when a chain begins.
-    Where it cannot, ``at_once`` plans for stamps that shift (it is given True).
+    Where it cannot, ``at_once`` plans for stamps that shift (it is given True). The shaping nodes
+    of all run above the executors of all.
 
     Raises: as :func:`with_offsets`; OperationError also where chains that cannot take turns may not
     run at the same time, nothing says how long they delay each other then, or stamps shift so far
@@ -145,7 +146,7 @@ def place_chains(
     else:
         remarks = []
     _refuse_outputs_behind_others(turns)
-    return turns, remarks
+    return with_gates_level(turns), remarks
 
 
 def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...] | None:

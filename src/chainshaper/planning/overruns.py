@@ -367,12 +367,29 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
 
 
 def _about_receivers(plan: Plan) -> Iterator[str]:
-    """Who receives an output without a place in the plan."""
+    """Who receives an output without a place in the plan, or a promise."""
     node = plan.shaping_node
     if node is not None and node.receivers and node.receivers_at is None:
         said = f"{', '.join(node.receivers)}, which get {node.output}, run below all servers, and"
         said += " when their callbacks start is not promised: the plan has no room for them, or the"
         yield f"{said} recording does not say how long they take. A core without servers helps."
+    placed = () if node is None or node.receivers_at is None else node.receivers
+    for sink in plan.further_shaping_nodes:
+        if not sink.receivers:
+            continue
+        said = (
+            f"{', '.join(sink.receivers)}, which get {sink.output}, have no place in the plan, as"
+        )
+        said += " those that receive a further sink have none: when their callbacks start is not"
+        if waiting := [name for name in sink.receivers if name not in placed]:
+            said += f" promised, and {', '.join(waiting)} run below all servers"
+        else:
+            said += f" promised, although they run where those that get {plan.chain.output} do"
+        yield f"{said}. Planned as a chain of its own (--chain instead of --sink) it has a place."
+    if node is None and plan.chain.output is not None and any(plans.publisher_servers(plan)):
+        said = f"who receives {plan.chain.output} has no place in the plan, since the publisher's"
+        said += " own thread is gated: callbacks of receivers start when their core is free, which"
+        yield f"{said} is not promised. With --publication synchronous they have a place."
 
 
 def modes_with_one_slot(plan: Plan) -> Iterator[tuple[tuple[str, ...], Slot]]:

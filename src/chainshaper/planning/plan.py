@@ -385,6 +385,13 @@ def shaping_nodes(plan: Plan) -> list[ShapingNode]:
     return [*([plan.shaping_node] if plan.shaping_node else []), *plan.further_shaping_nodes]
 
 
+def inner_gates(plan: Plan) -> tuple[ShapingNode, ...]:
+    """The shaping nodes of topics inside the chain, whose messages have only to be there when the
+    next callback is to start: under LET per callback all but that of the output.
+    """
+    return plan.further_shaping_nodes if plan.policy == "let-per-callback" else ()
+
+
 def output_server(plan: Plan) -> Server | None:
     """The server in whose slots the chain's output is published; None without shaping. A plan from
     bare latencies names no threads: its server ``output`` is meant.

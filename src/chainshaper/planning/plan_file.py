@@ -18,7 +18,7 @@ from chainshaper.planning.overruns import expected
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import new_file, write_whole
-from chainshaper.values.yaml_file import AS_YAML, read_model
+from chainshaper.values.yaml_file import AS_YAML, read_model, wrong_values_refused
 
 _HEADER = """\
 # A chainshaper plan: the reservation servers that give a ROS 2 chain a constant latency.
@@ -184,11 +184,15 @@ def load_application_plan(path: str | Path) -> ApplicationPlan:
     return whole(read_model(path, Plan, made_by=made_by, otherwise=("chains", ApplicationPlan)))
 
 
-def plan_in(values: Mapping[str, Any]) -> ApplicationPlan:
-    """A plan from what a recording or a run has of it, of either format."""
-    if "chains" in values:
-        return ApplicationPlan.model_validate(values, strict=False)
-    return whole(Plan.model_validate(values, strict=False))
+def plan_in(values: Mapping[str, Any], where: object = "the plan") -> ApplicationPlan:
+    """A plan from what a recording or a run has of it, of either format.
+
+    Raises InputError: it is none, which begins with ``where`` it stands.
+    """
+    model: type[Plan | ApplicationPlan] = ApplicationPlan if "chains" in values else Plan
+    with wrong_values_refused(model, f"{where}: "):
+        found = model.model_validate(values, strict=False)
+    return whole(found)
 
 
 def plan_values(plan: ApplicationPlan) -> dict[str, Any]:

@@ -62,7 +62,8 @@ class Reception(NamedTuple):
 
     ``core`` is theirs (None: several, or not known). A message is on its way for ``shortest_ns`` to
     ``longest_ns``, without the time for which others had that core. Its callbacks take ``time_ns``
-    at most, and others of their executors ``beside_ns`` in a cycle, each ``longest_beside_ns``.
+    at most, and others of their executors ``beside_ns`` in a cycle; ``longest_beside_ns`` is the
+    sum of the longest execution of each other callback, for which an output may have to wait.
     """
 
     core: int | None
@@ -410,15 +411,37 @@ def planned_cores(profiles: Sequence[Profile]) -> set[int]:
 
 
 def alone(profile: Profile) -> Profile:
-    """The profile with what its callbacks took, in sum; bare latencies as they are."""
-    if not profile.steps_ns.size:
+    """The profile with what its callbacks took when nothing else ran; bare latencies as they are.
+
+    That is their sum, or, where branches join, the longest way: a callback of another chain that
+    delayed this one while it would have waited for its branch anyway has cost it nothing. Where a
+    branch begins by itself, at any time, nothing says what it would have waited for: then what
+    was measured stands.
+    """
+    if not profile.steps_ns.size or UNKNOWN in profile.begins_ns:
         return profile
     return replace(
         profile,
-        latencies_ns=profile.steps_ns.sum(axis=1),
-        every_latency_ns=profile.every_step_ns.sum(axis=1),
+        latencies_ns=_on_longest_way(profile, profile.steps_ns, profile.graph_steps_ns),
+        every_latency_ns=_on_longest_way(
+            profile, profile.every_step_ns, profile.every_graph_step_ns
+        ),
         of_modes={mode: alone(one) for mode, one in profile.of_modes.items()},
     )
+
+
+def _on_longest_way(
+    profile: Profile, steps_ns: NDArray[np.int64], graph_steps_ns: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """When the output is done in each cycle, from what each callback took (a row per cycle)."""
+    if not graph_steps_ns.size:
+        return steps_ns.sum(axis=1)
+    done = np.zeros_like(graph_steps_ns)
+    for place, callback in enumerate(profile.callbacks):
+        inputs = [done[:, before] for before in callback.after]
+        begins = np.max(inputs, axis=0) if inputs else profile.begins_ns[place]
+        done[:, place] = begins + graph_steps_ns[:, place]
+    return done[:, -1]
 
 
 def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> Profile:

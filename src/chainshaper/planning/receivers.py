@@ -129,9 +129,10 @@ def _has_room(plan: Plan, profile: Profile, time_ns: int) -> bool:
     if plan.policy == "let-per-chain":
         return plan.evidence.max_latency_ns + work_ns < period
     if plan.policy == "let-per-callback":
-        nodes = len(shaping_nodes(plan))
+        nodes = shaping_nodes(plan)
         took_ns = sum(one.max_response_ns for one in profile.callbacks)
-        return took_ns + nodes * work_ns < period
+        gates_ns = sum(node_work_ns(plan, one) for one in nodes)
+        return took_ns + gates_ns + len(nodes) * time_ns < period
     if plan.policy == "pipelined":  # its stages have that room
         return True
     delivery_ns = 0 if profile.reception is None else profile.reception.longest_ns

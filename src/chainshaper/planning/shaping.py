@@ -161,6 +161,35 @@ def _node_like(
     return ShapingNode.model_validate({**node.model_dump(), **_names(output), **others})
 
 
+def _inside(node: ShapingNode) -> ShapingNode:
+    """The same for a topic inside the chain: how exactly it leaves is of no consequence there, so
+    it neither watches the clock nor keeps the gate of an output from its core.
+    """
+    behind = max(1, node.fifo_priority - 1)
+    return node.model_copy(update={"spin_ns": 0, "fifo_priority": behind})
+
+
+def with_gates_level(chains: Sequence[Plan]) -> tuple[Plan, ...]:
+    """The plans of several chains whose shaping nodes run above the executors of all: those of
+    outputs at one priority, so that the one that wakes first publishes first.
+    """
+    every = [node.fifo_priority for plan in chains for node in plans.shaping_nodes(plan)]
+    return tuple(_with_gates_at(plan, max(every, default=0)) for plan in chains)
+
+
+def _with_gates_at(plan: Plan, priority: int) -> Plan:
+    node = plan.shaping_node
+    if node is None or node.fifo_priority == priority:
+        return plan
+    level = node.model_copy(update={"fifo_priority": priority})
+    further = [
+        one.model_copy(update={"fifo_priority": priority}) for one in plan.further_shaping_nodes
+    ]
+    if plans.inner_gates(plan):
+        further = [_inside(one) for one in further]
+    return plans.revised(plan, shaping_node=level, further_shaping_nodes=tuple(further))
+
+
 def evidence_of(latencies_ns: NDArray[np.int64], **conditions: Any) -> Evidence:
     """The latencies' statistics, with the conditions they were taken under: Evidence's fields.
     Others may delay a cycle, but need not: the shortest is without that.
@@ -477,7 +506,7 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     threads = [Thread(node=name, role="publisher") for name in publishers]
     if last is not None:
         known = zip_longest(topics[:-1], publishers[: len(topics) - 1])
-        inside = tuple(_node_like(last, topic, publisher) for topic, publisher in known)
+        inside = tuple(_inside(_node_like(last, topic, publisher)) for topic, publisher in known)
         threads = [node.thread for node in (*inside, last)]
     gates = []
     # Backwards: whatever a fast callback makes of the data of one slot, that of its output is over.

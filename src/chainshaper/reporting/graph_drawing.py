@@ -29,8 +29,12 @@ from chainshaper.analysis.chains import depth_first_order
 from chainshaper.analysis.graph import ApplicationDescription
 from chainshaper.planning.offsets import linked
 from chainshaper.reporting.tables import Column, ResultTable, listed, words
-from chainshaper.values.application import INTERNAL_SERVICES, INTERNAL_TOPICS, Callback
-from chainshaper.values.durations import format_duration
+from chainshaper.values.application import (
+    INTERNAL_SERVICES,
+    INTERNAL_TOPICS,
+    Callback,
+    period_text,
+)
 from chainshaper.values.errors import escape, shown
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.recording import lost_text
@@ -101,9 +105,10 @@ def without_internals(application: ApplicationDescription) -> ApplicationDescrip
 def application_json(application: ApplicationDescription) -> dict[str, Any]:
     """Nodes, callbacks, topics and services as plain data."""
     graph = application.graph
-    names = ("id", "node", "pid", "kind", "topic", "period_ns", "symbol", "publishes", "passes_on")
+    names = ("id", "node", "pid", "kind", "topic", "period_ns", "declared_ns")
+    written = ("symbol", "publishes", "passes_on")
     callbacks = [
-        {name: getattr(one, name) for name in names}
+        {name: getattr(one, name) for name in (*names, *written)}
         | {"pids": list(one.processes), "internal": is_internal(one.topic)}
         for one in graph.callbacks
     ]
@@ -147,7 +152,7 @@ def application_table(application: ApplicationDescription) -> ResultTable:
 def callback_text(callback: Callback) -> str:
     """What triggers a callback, in few words."""
     if callback.kind == "timer":
-        return f"timer {format_duration(callback.period_ns or 0)}"
+        return f"timer {period_text(callback.period_ns or 0, callback.declared_ns)}"
     if callback.kind == "unknown":
         return "not known" if callback.handle else "outside callbacks"
     return f"{callback.kind} {callback.topic or ''}".rstrip()

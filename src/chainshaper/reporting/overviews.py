@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import polars as pl
 
 from chainshaper.analysis import ChainEnumeration
+from chainshaper.analysis.contradictions import Contradiction
 from chainshaper.enforcement.threads import Allocation, NodeThread, WantedScheduling
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.linux.runs import Journal
@@ -66,8 +67,9 @@ SWEEP_FIGURES = {
 PROMISE = {True: "met", False: "broken", None: ABSENT}
 
 
-def contents_json(recording: Recording) -> dict[str, Any]:
-    """Counts per event, what was lost, the clock, and the system that was recorded."""
+def contents_json(recording: Recording, found: Sequence[Contradiction] = ()) -> dict[str, Any]:
+    """Counts per event, what was lost, the clock, the system that was recorded, and what
+    contradictions were ``found`` in it."""
     info = recording.info
     notes = list(info.notes)
     # A recording from before there were checksums; a tracer's trace never has any.
@@ -87,6 +89,7 @@ def contents_json(recording: Recording) -> dict[str, Any]:
         "kernel": info.kernel,
         "processes": {str(pid): name for pid, name in info.processes.items()},
         "notes": notes,
+        "contradictions": [{"note": one.note, "refused": one.refused} for one in found],
     }
 
 
@@ -113,8 +116,9 @@ def contents_table(recording: Recording) -> tuple[ResultTable, ResultTable]:
 
 def callback_rows(statistics: pl.DataFrame) -> list[dict[str, Any]]:
     """Callback statistics as plain data: response and execution times in ns; ``pid`` is the last
-    of ``pids``, the processes of a node that was started again."""
-    columns = ("node", "kind", "topic", "period_ns", "pid", "pids", "tids", "count")
+    of ``pids``, the processes of a node that was started again; ``declared_ns`` is a timer's
+    declared period, ``period_ns`` that of its starts."""
+    columns = ("node", "kind", "topic", "period_ns", "declared_ns", "pid", "pids", "tids", "count")
     return statistics.select(*columns, "response_ns", "execution_ns").to_dicts()
 
 
@@ -132,7 +136,8 @@ def callback_table(statistics: pl.DataFrame) -> ResultTable:
     table = ResultTable("Callbacks [ms]", columns)
     rows = []
     for row in statistics.to_dicts():
-        trigger = f"{row['kind']} {trigger_text(row['topic'], row['period_ns'])}".rstrip()
+        starts = trigger_text(row["topic"], row["period_ns"], row["declared_ns"])
+        trigger = f"{row['kind']} {starts}".rstrip()
         rows.append(((row["pid"], row["node"], trigger), row))
     alike = Counter(key for key, _ in rows)
     for key, row in rows:
@@ -529,7 +534,9 @@ def watch_tables(seen: "Seen") -> list[ResultTable]:
         lost += f"; {unclear} cycles unclear: the clock was set"
     if unused := sum(one.counted["not_used"] for one in seen.chains):
         lost += f"; {unused} messages not used: newer ones were stored"
-    tables[-1].caption = tables[-1].caption or f"{nodes}{lost}"
+    lost += "".join(f"; {one.rstrip('.')}" for one in seen.left_out)
+    problem = tables[-1].caption
+    tables[-1].caption = f"{problem}; {nodes}{lost}" if problem else f"{nodes}{lost}"
     return tables
 
 

@@ -127,7 +127,8 @@ def export_mcap(source: Recording | Measurement, path: str | Path) -> Path:
     took = flow.instances.drop_nulls("end").select("callback_id", "start", "end", "execution_ns")
     for number, start, end, used in took.iter_rows():
         one = about[number]
-        values: dict[str, Value | float] = {"callback": trigger_text(one.topic, one.period_ns)}
+        starts = trigger_text(one.topic, one.period_ns, one.declared_ns)
+        values: dict[str, Value | float] = {"callback": starts}
         values |= {"response_ms": (end - start) / 1e6, "execution_ms": used and used / 1e6}
         rows.append((end, start, one.node or "/unknown", values))
     if isinstance(source, Measurement):

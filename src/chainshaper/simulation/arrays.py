@@ -269,21 +269,15 @@ class Rows(list[int]):
 class Streams:
     """All streams of a simulation: drawn in Python, consumed by the engine.
 
-    A callback's stream is that of the live workload, value for value.
+    A callback's stream is that of the live workload, value for value. ``deliveries`` are the places
+    of those by which messages reach an entity: by process, callback and input.
     """
 
     def __init__(self, seed: int, rows: Rows) -> None:
         self._seed, self._rows = seed, rows
         self._drawn: list[tuple[int, Iterator[Int64s]]] = []
-        self._of_topics: dict[tuple[str, str, int], int] = {}
+        self.deliveries: dict[tuple[int, int, int], int] = {}
         self._first = 0
-
-    def of_topic(self, topic: str, times: ExecutionTime, node: str, index: int) -> int:
-        """The place of a reader's stream of delays, which publishers of a topic may share."""
-        stream = topic, node, index
-        if stream not in self._of_topics:
-            self._of_topics[stream] = self.add(times, node, index)
-        return self._of_topics[stream]
 
     def add(self, times: ExecutionTime, node: str, index: int) -> int:
         """The place of a new stream of CPU times or delays (ns)."""
@@ -459,8 +453,12 @@ class Machine:
             server.name: sorted({named[n] for n, one in governed.items() if one is server})
             for server in ranked
         }
+        behind_outputs = plan.behind_outputs
         urgency = {
-            number: (server.priority, taken[server.name].index(named[number]))
+            number: (
+                server.priority,
+                taken[server.name].index(named[number]) + (server.name in behind_outputs),
+            )
             for number, server in governed.items()
         }
         behind = {number: (one.priority, len(governed)) for number, one in receiving.items()}
@@ -595,16 +593,19 @@ class Machine:
             rows[row + P.ENDS_CHAIN] = ends and publisher.topic == system.chain.topics[-1]
 
     def _delivery(self, reader: Entity, publisher: Publisher) -> int:
-        """The stream of a reader's own times of delivery from a publisher; NONE: it has none."""
+        """The stream of a reader's own times of delivery, from all publishers of its topic in the
+        order of their publications; NONE: it has none."""
         process = self._system.processes[reader.process]
         described = self._system.application.simulation.deliveries.get(process.key, {})
         if publisher.topic not in described:
             return NONE
-        times = described[publisher.topic]
-        # A sequence is of the topic's messages in the order of their sending, by whichever node.
-        sender = publisher.process if times.sequence_ns is None else 0
-        number = FIRST_DELIVERY + (sender << 32) + (reader.index << 16) + reader.number
-        return self._streams.of_topic(publisher.topic, times, process.node, number)
+        place = (reader.process, reader.index, reader.number)
+        if place not in self._streams.deliveries:
+            number = FIRST_DELIVERY + (publisher.process << 32)
+            number += (reader.index << 16) + reader.number
+            stream = self._streams.add(described[publisher.topic], process.node, number)
+            self._streams.deliveries[place] = stream
+        return self._streams.deliveries[place]
 
 
 def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:

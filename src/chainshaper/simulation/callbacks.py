@@ -506,7 +506,7 @@ def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `releas
     mode = _mode_at(m, gate, origin)
     first, last, policy = _open_to(m, gate, mode)
     ready = max(arrival, ready)
-    cycle = max(0, (ready - origin) // cycle_ns)
+    cycle = max(due, (ready - origin) // cycle_ns)
     due_from = origin + due * cycle_ns
     m[row + G.MOVED] = _moved_at(m, gate, due_from)
     due_from += m[row + G.MOVED]
@@ -523,7 +523,6 @@ def _release(m, gate, row, arrival, stamp, ready):  # noqa: PLR0917 - as `releas
         m[row + G.TREATED] = at.WAIT
     elif mode != NONE and not _lets_out(m, gate, first, due_from, arrival, ready):
         m[row + G.TREATED] = at.NEXT_SLOT
-    m[row + G.CYCLES] = max(due, cycle)
     while True:
         start = origin + m[row + G.CYCLES] * cycle_ns
         m[row + G.MOVED] = _moved_at(m, gate, start)

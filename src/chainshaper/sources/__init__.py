@@ -15,11 +15,10 @@ from chainshaper.values.recording import INFO_FILE, Recording, RecordingInfo, op
 
 
 def open_source(
-    *paths: str | Path, progress: Callable[[float, str], None] | None = None, overview: bool = False
+    *paths: str | Path, progress: Callable[[float, str], None] | None = None
 ) -> Recording:
     """Open a recording folder, or an LTTng trace (CTF 1.8): one folder, or several of one trace.
 
-    ``overview``: a trace's callbacks and messages are not decoded before they are used.
     ``progress`` gets the share that is done, from 0 to 1, and what is being done.
     Raises InputError: there is nothing that can be read.
     """
@@ -36,7 +35,7 @@ def open_source(
     # The decoder is slow to import: only who opens a trace pays for it.
     from chainshaper.sources.lttng.trace import open_lttng_trace
 
-    return open_lttng_trace(folders, progress, overview=overview)
+    return open_lttng_trace(folders, progress)
 
 
 class Tracer(Protocol):

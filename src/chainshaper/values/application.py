@@ -22,9 +22,20 @@ CallbackKind: TypeAlias = Literal["timer", "subscription", "service", "client", 
 publications were seen (``handle`` 0: a thread of the node's own)."""
 
 
-def trigger_text(topic: str | None, period_ns: int | None) -> str:
-    """What starts a callback, in every run alike: its topic, or ``every 100ms``; else empty."""
-    return topic or "" if period_ns is None else f"every {format_duration(period_ns)}"
+def trigger_text(topic: str | None, period_ns: int | None, declared_ns: int | None = None) -> str:
+    """What starts a callback: its topic, or ``every 100ms``; else empty.
+
+    Where a timer was declared with another period than its starts show, both are there:
+    ``every 50ms (declared 100ms)``.
+    """
+    return topic or "" if period_ns is None else f"every {period_text(period_ns, declared_ns)}"
+
+
+def period_text(period_ns: int, declared_ns: int | None) -> str:
+    """The period of a timer, and the declared one where its starts show another than that."""
+    if declared_ns in (None, period_ns):
+        return format_duration(period_ns)
+    return f"{format_duration(period_ns)} (declared {format_duration(declared_ns)})"
 
 
 @dataclass(frozen=True)
@@ -52,6 +63,7 @@ class Callback:
     ``id`` numbers the callbacks of one graph from 0 and is the key that analysis tables use;
     ``handle`` is its address in the traced process, which other processes may use as well.
     ``earlier_pids`` are the processes before ``pid`` of a node that was started again.
+    ``period_ns`` is that of a timer's starts, which may be another than the declared one.
     """
 
     id: int
@@ -66,6 +78,7 @@ class Callback:
     passes_on: tuple[str, ...] = ()  # those of `publishes` that another callback writes for it
     in_turns: tuple[str, ...] = ()  # those that it or another writes, whichever has the last input
     earlier_pids: tuple[int, ...] = ()
+    declared_ns: int | None = None  # the period with which the timer was created, always the same
 
     @property
     def processes(self) -> tuple[int, ...]:
@@ -82,7 +95,7 @@ class Callback:
     def label(self) -> str:
         """A short text that tells callbacks apart: ``/node2 ← /t1`` or ``/node1 every 100ms``."""
         if self.kind == "timer":
-            return f"{self.node} {trigger_text(None, self.period_ns or 0)}"
+            return f"{self.node} {trigger_text(None, self.period_ns or 0, self.declared_ns)}"
         if self.kind == "unknown" and not self.handle:
             return f"{self.node} outside callbacks"
         if self.kind == "unknown":

@@ -9,7 +9,8 @@
 
 Limits are of all cycles, those that the machine disturbed included: a limit that is broken by these
 alone is broken, and says so. ``missing`` is the share of outputs that were late or never came;
-``starts`` is the topic or period that starts a callback, as `chainshaper callbacks` shows it.
+``starts`` is the topic that starts a callback, or the declared period of its timer, as
+`chainshaper callbacks` shows it.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -197,7 +198,7 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
         )
     callbacks = tuple(
         CallbackBudget(node=node, starts=starts, response_ns=limit(took), execution_ns=limit(used))
-        for (node, starts), (took, used) in longest_times(flow).items()
+        for (node, starts), (took, used, _) in longest_times(flow).items()
     )
     return Budget(chains=tuple(of_chains), callbacks=callbacks)
 
@@ -337,10 +338,11 @@ def _judged_callbacks(
 ) -> Iterator[Judged]:
     """Their limits; ``longest`` are response and execution times by node and what starts it."""
     for one in callbacks:
-        times = longest.get((one.node, one.starts))
+        found = longest.get((one.node, one.starts))
         limits = {"response": one.response_ns, "execution": one.execution_ns}
+        starts, times = (found.shown, found.times) if found else (one.starts, None)
         why = f"the recording has no such {'time' if times else 'callback'}"
-        yield from _judged(name, f"{one.node} ({one.starts})", limits, times, why)
+        yield from _judged(name, f"{one.node} ({starts})", limits, times, why)
 
 
 def _judged(

@@ -162,7 +162,8 @@ def _plan_of(recording: Recording, plan: Plan | ApplicationPlan | None) -> Appli
     """The plan in force: the given one, or that of the recording."""
     if plan is not None:
         return whole(plan)
-    return None if recording.info.plan is None else plan_in(recording.info.plan)
+    known = recording.info.plan
+    return None if known is None else plan_in(known, f"{recording.path}, its plan in force")
 
 
 def _measured(
@@ -223,10 +224,15 @@ def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recor
 
 
 def _in_front(chain: str, plan: ApplicationPlan | None) -> str:
-    """A chain whose first topic is shaped, under LET, from in front of that shaping node."""
+    """A chain whose first topic is shaped, from in front of that shaping node.
+
+    So is a chain of one callback, and the first topic under LET per callback.
+    """
     first, *others = chain.split("..")
-    inputs = {node.output: node.input for node in plan.shaping_nodes} if plan and others else {}
-    return "..".join([inputs.get(first, first), *others])
+    inputs = {} if plan is None else {node.output: node.input for node in plan.shaping_nodes}
+    if first not in inputs:
+        return chain
+    return "..".join([inputs[first], *(others or [first])])
 
 
 def _in_force(recording: Recording) -> tuple[tuple[int, int | None] | None, LeftOut]:

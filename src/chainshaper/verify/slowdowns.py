@@ -68,12 +68,14 @@ class Taken(NamedTuple):
 @dataclass(frozen=True)
 class Sample:
     """What a recording has for a comparison: callbacks by node and trigger, of ``chains`` the
-    median undisturbed latency (ns) and the callbacks on the way.
+    median undisturbed latency (ns) and the callbacks on the way. ``shown`` is what starts callbacks
+    in words, with the periods that starts of timers show.
     """
 
     recording: str
     callbacks: Mapping[Name, Taken]
     chains: Mapping[str, tuple[float, frozenset[Name]]]
+    shown: Mapping[Name, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -152,8 +154,9 @@ def _read(
 def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None = None) -> Sample:
     """What counts of a recording, and of the ``chains`` that it has (none: its own)."""
     flow = recorded_flow(recording)
-    named = named_callbacks(flow).select("callback_id", "node", "starts")
-    names = {number: (node, starts) for number, node, starts in named.iter_rows()}
+    named = named_callbacks(flow).select("callback_id", "node", "starts", "shown")
+    names = {number: (node, starts) for number, node, starts, _ in named.iter_rows()}
+    shown = {(node, starts): text for _, node, starts, text in named.iter_rows()}
     ended = flow.instances.filter(pl.col("callback_id").is_in([*names]) & ~pl.col("assumed"))
     ended = ended.drop_nulls("end").with_columns(response=pl.col("end") - pl.col("start"))
     hit = pl.Series(stalled_after(flow, ended["start"].to_numpy(), ended["end"].to_numpy()))
@@ -171,7 +174,7 @@ def sample_of(recording: Recording, chains: Sequence[str] = (), name: str | None
             median = analysis.undisturbed.percentiles_ns.get("50", np.nan)
             on_the_way = frozenset(names[n] for n in analysis.chain.callbacks if n in names)
             found[analysis.chain.spec] = (float(median), on_the_way)
-    return Sample(name or str(recording.path), callbacks, found)
+    return Sample(name or str(recording.path), callbacks, found, shown)
 
 
 def find_slowdowns(
@@ -221,7 +224,7 @@ def find_slowdowns(
             Compared(
                 recording=samples[0].recording + more,
                 node=name[0],
-                starts=name[1],
+                starts=samples[-1].shown.get(name, name[1]),
                 time=time,
                 before_ns=float(np.median([np.nanmedian(one) for one in own[: len(before)]])),
                 change=expm1(change),

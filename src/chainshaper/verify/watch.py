@@ -138,7 +138,8 @@ class Seen:
     """One look: its instant (CLOCK_MONOTONIC, ns), the nodes by process, and the chains.
 
     ``lost`` counts events that were overwritten before we read them, or found no room.
-    ``callbacks`` are there where they are asked for.
+    ``callbacks`` are there where they are asked for. ``left_out`` are sentences: which processes
+    have the library in front, and are not seen all the same, and why.
     """
 
     at_ns: int
@@ -146,6 +147,7 @@ class Seen:
     lost: int
     chains: tuple[ChainNow, ...]
     callbacks: tuple[CallbackNow, ...] = ()
+    left_out: tuple[str, ...] = ()
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -173,7 +175,8 @@ class Seen:
         return statuses
 
 
-_SAME = ("node", "kind", "topic", "period_ns")  # a callback, also of a node that was started again
+# A callback, also of a node that was started again, or whose timer is seen at another period.
+_SAME = ("node", "kind", "topic", "declared_ns")
 _CYCLE = pl.Schema(
     {"start": pl.Int64, "latency_ns": pl.Int64, "late": pl.Boolean, "place_ns": pl.Int64}
 )
@@ -245,6 +248,10 @@ class _Chain:
         return None
 
 
+def _is_running(pid: int) -> bool:
+    return Path(f"/proc/{pid}").exists()
+
+
 def _forget(seen: deque[tuple[int, Any]], before_ns: int) -> None:
     while seen and seen[0][0] < before_ns:
         seen.popleft()
@@ -274,6 +281,7 @@ class Watch:
         ends = [(text, text.rpartition("..")[2]) for text in chains]
         self.chains = [_Chain(text, end, self._slots(end)) for text, end in ends]
         self.processes: dict[int, TracedProcess] = {}
+        self._left_out: dict[int, str] = {}  # why nothing is seen of these, in sentences
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
         self._fresh: list[tuple[int, NDArray[Any]]] = []  # of a process, not yet in a table
         self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # and their last instant
@@ -307,7 +315,9 @@ class Watch:
         searches = now - self._searched_ns > (_SEARCH_NS if self.processes else _FIRST_SEARCH_NS)
         if searches:
             self._searched_ns = now
-            for pid, memory in memories(self.users, self.processes):
+            self._left_out = {p: why for p, why in self._left_out.items() if _is_running(p)}
+            known = {*self.processes, *self._left_out}
+            for pid, memory in memories(self.users, known, self._left_out.__setitem__):
                 self.processes[pid], self._latest[pid] = memory, 0
                 created, _ = memory.objects()
                 if created.size and created["time"][0] < self._began_ns:
@@ -333,7 +343,7 @@ class Watch:
                 self._latest[pid] = max(self._latest[pid], int(new["time"][-1]))
 
     def _ended(self) -> list[int]:
-        return [one for one in self.processes if not Path(f"/proc/{one}").exists()]
+        return [one for one in self.processes if not _is_running(one)]
 
     def _needed_ns(self, now_ns: int) -> int:
         """From when on events may be asked for: by the flight recorder, or by a late look."""
@@ -383,6 +393,7 @@ class Watch:
             lost=self.lost,
             chains=tuple(self._now(one, over, moved) for one in self.chains),
             callbacks=tuple(_callbacks([own for _, own in self.callbacks or ()])),
+            left_out=tuple(self._left_out.values()),
         )
 
     def _judged(
@@ -393,7 +404,8 @@ class Watch:
         try:
             chain = find_chain(graph, one.text)
         except InputError as error:
-            one.problem = str(error) if self.processes else NO_PROCESS
+            nobody = " ".join(self._left_out.values()) or NO_PROCESS
+            one.problem = str(error) if self.processes else nobody
             # Every cycle that is over had its events here: none of them has arrived.
             if not isinstance(error, SeveralPathsError):
                 chain = one.beginning(graph)
@@ -503,6 +515,7 @@ class Watch:
             "notes": (
                 "the last seconds before it was asked for; objects from before them are there",
                 *reasons,
+                *self._left_out.values(),
             ),
             "worst_ns": tuple(at for one in self.chains for at in one.worst_ns(since)),
         }
@@ -530,9 +543,9 @@ def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[C
         found = [own[node, starts] for own in looks if (node, starts) in own]
         response, execution = (
             max((one for one in times if one is not None), default=None)
-            for times in zip(*found, strict=True)
+            for times in zip(*(one.times for one in found), strict=True)
         )
-        yield CallbackNow(node, starts, (response, execution))
+        yield CallbackNow(node, starts, Longest(response, execution, found[-1].shown))
 
 
 @contextlib.contextmanager

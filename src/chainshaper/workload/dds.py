@@ -145,6 +145,17 @@ def _topic(participant: Any, name: str, carries_text: bool) -> Any:
     return Topic(participant, "rt" + name, String if carries_text else Stamped)  # ROS 2's prefix
 
 
+def _counted(matched: int) -> int:
+    """How many counterparts DDS counts. Raises OperationError: DDS refused to.
+
+    The package's own lists of them ask twice, for the number and for the list, and fail where a
+    counterpart is discovered between the two.
+    """
+    if matched < 0:
+        raise OperationError(f"DDS does not say who was found, code {matched}")
+    return matched
+
+
 class Publisher:
     """A writer of one topic that takes serialized messages.
 
@@ -172,7 +183,7 @@ class Publisher:
 
     def matched(self) -> int:
         """Number of subscriptions that have found this publisher."""
-        return len(self._writer.get_matched_subscriptions())
+        return _counted(self._writer._get_matched_subscriptions(self._handle, None, 0))
 
 
 class Subscription:
@@ -200,4 +211,4 @@ class Subscription:
 
     def matched(self) -> int:
         """Number of publishers that have found this subscription."""
-        return len(self._reader.get_matched_publications())
+        return _counted(self._reader._get_matched_publications(self._handle, None, 0))

@@ -298,7 +298,7 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
     for name, child in nodes.items():
         executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
         cores = iter(application.cores_of(name))
-        for thread in _threads_of(child):
+        for thread in node_threads(child.pid):
             core, priority = dds.core, dds.priority
             if thread.role == "executor":
                 core, priority = next(cores), executor.priority
@@ -346,7 +346,9 @@ def _watch(
 
 
 def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[ThreadInfo, ...]:
-    found = [(node_name(name), one) for name, child in nodes.items() for one in _threads_of(child)]
+    found = [
+        (node_name(name), one) for name, child in nodes.items() for one in node_threads(child.pid)
+    ]
     found += [("", one) for child in meters.values() for one in list_threads(child.pid)]
     return tuple(
         ThreadInfo(
@@ -358,11 +360,13 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
     )
 
 
-def _threads_of(child: Child) -> list[Thread]:
-    """Its threads. What a callback's module starts executes nothing, and has its thread's name."""
+def node_threads(pid: int) -> list[Thread]:
+    """The threads of a node's process. What a callback's module starts executes nothing, and has
+    its thread's name.
+    """
     return [
         replace(one, role="executor") if one.comm == launcher.WORKER_NAME else one
-        for one in list_threads(child.pid)
+        for one in list_threads(pid)
     ]
 
 

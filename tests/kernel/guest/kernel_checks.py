@@ -43,6 +43,7 @@ from scenes import (
 )
 
 from chainshaper.enforcement.servers import ServerTable
+from chainshaper.planning.offsets import LEAD_NS
 
 RUN_MS = 1200
 SLOT = 10 * MS
@@ -306,6 +307,33 @@ def slots_follow_a_timer_that_drifts() -> str:
     return text
 
 
+def closed_servers_let_nobody_run_behind_their_slots() -> str:
+    """By `apply`, `slot_ends: closed`: a callback that always overruns [12, 22) of 50 ms stops at
+    22, and goes on at 62; with the servers that stay open it runs on (so the check would see it).
+    """
+    named = ("--ros-args", "-r")
+    beyond = []
+    for slot_ends in ("closed", "open-until-done"):
+        with scene() as s:
+            sensor = (0, CYCLE, 0, 4 * MS, *named, "__node:=sensor")
+            s.spinner("sensor", job=sensor)
+            endless = (0, CYCLE, 0, 3600_000 * MS, *named, "__node:=worker")
+            worker, hog = s.spinner("worker", job=endless), s.spinner("hog")
+            s.applied(CYCLE, 10 * MS, 0, slot_ends)
+            start = time.monotonic_ns()
+            wait(RUN_MS)
+            end = time.monotonic_ns()
+            ran, others = cut(worker.windows(), start, end), cut(hog.windows(), start, end)
+        planned = (10 * MS + LEAD_NS, 20 * MS + LEAD_NS)
+        slots = slots_between((planned,), CYCLE, 0, start, end)
+        beyond.append((length(ran) - overlap(ran, slots)) / length(slots))
+        if slot_ends == "closed":
+            text = _exact(ran, slots)
+            assert length(others) > 0.5 * (end - start), "best effort was starved"
+    assert beyond[1] > 1, f"left open, the server gave {beyond[1]:.1%} beyond its slots"
+    return f"{text}; left open until done {beyond[1]:.0%} of the slots' time beyond them"
+
+
 def two_cores_are_governed_independently() -> str:
     """What can be said without virtual time: each thread runs in its slots, mostly."""
     b = server("B", 25, 45, core=1)
@@ -354,6 +382,7 @@ VIRTUAL_TIME = (
     threads_that_cannot_be_governed_are_refused,
     a_thread_without_a_slot_for_half_a_minute_ends_the_policy,
     slots_follow_a_timer_that_drifts,
+    closed_servers_let_nobody_run_behind_their_slots,
 )
 REAL_TIME_KERNEL = (
     a_kicker_that_is_killed_or_stopped_fails_open,

@@ -60,7 +60,8 @@ def wait_for_phase(phase_ms: int) -> int:
 
 
 class Spinner:
-    """A process with one thread that wants the core; `job` is (anchor, period, offset, work).
+    """A process with one thread that wants the core; `job` is (anchor, period, offset, work), and
+    behind these what else is to stand on its command line.
 
     As a ``gate`` it is `gate_process.py`, whose job and log are its own.
     """
@@ -69,7 +70,7 @@ class Spinner:
         self,
         name: str,
         core: int = 0,
-        job: tuple[int, int, int, int] | None = None,
+        job: tuple[int | str, ...] | None = None,
         gate: bool = False,
     ):
         self.log = Path(f"/tmp/{name}.log")
@@ -140,13 +141,15 @@ class Scene:
                 made.ask("assign", thread.tid, name)
         return made
 
-    def applied(self, *arguments: int) -> subprocess.Popen[bytes]:
+    def applied(self, *arguments: int | str) -> subprocess.Popen[bytes]:
         """`apply_process.py`, in force."""
         command = [sys.executable, str(HERE / "apply_process.py"), *map(str, arguments)]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE)
+        said = Path("/tmp/apply_process.err")
+        with said.open("wb") as errors:
+            process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=errors)
         self._processes.append(process)
         assert process.stdout is not None
-        assert process.stdout.readline() == b"in force\n"
+        assert process.stdout.readline() == b"in force\n", said.read_text()
         return process
 
     def close(self) -> None:

@@ -53,13 +53,11 @@ _GROUPS = (CREATION, _MESSAGES, _UPPER_LAYERS, _EXECUTOR, _SWITCHES)
 _WHO_RUNS = ("callback_start", "rmw_publish", "rmw_take", "rclcpp_publish")
 
 
-def open_lttng_trace(
-    paths: Sequence[str | Path], progress: Progress | None = None, *, overview: bool = False
-) -> Recording:
+def open_lttng_trace(paths: Sequence[str | Path], progress: Progress | None = None) -> Recording:
     """Open the LTTng trace in ``paths``: folders of one recording, searched recursively.
 
-    ``overview`` leaves callbacks and messages undecoded until their first use. Raises InputError:
-    no trace there, metadata that cannot be understood, or times that cannot be compared.
+    Raises InputError: no trace there, metadata that cannot be understood, or times that cannot be
+    compared.
     """
     progress = progress or (lambda _, __: None)
     progress(0.0, "opening the trace (the first time on a machine, its decoder is compiled)")
@@ -78,7 +76,7 @@ def open_lttng_trace(
                 "boot): their times cannot be compared; give the folders of one recording"
             )
     refuse_same_events(trace)
-    tables = TraceTables(_by_host(trace, paths), progress, overview)
+    tables = TraceTables(_by_host(trace, paths), progress)
     creation, hosts = tables.creation(), {_fact(folder, "hostname") for folder in trace.folders}
     kernels = (_fact(folder, "kernel_release") for folder in trace.folders)
     lost = {"discarded_events": trace.discarded_events, "lost_packets": trace.lost_packets}
@@ -109,7 +107,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
     so many packets are ``damaged``.
     """
 
-    def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress, overview: bool) -> None:
+    def __init__(self, hosts: Mapping[str, CtfTrace], progress: Progress) -> None:
         self._hosts, self._progress, trace = hosts, progress, next(iter(hosts.values()))
         self.fields = _declared_fields(trace)
         self._read: dict[str, pl.DataFrame] = {}
@@ -126,8 +124,7 @@ class TraceTables(Mapping[str, pl.DataFrame]):
         self._pids: set[int] = set()
         self._moved: dict[str, int] = {}
         # Where numbers may collide, those of all hosts have to be seen first.
-        everything = not overview or len(self._hosts) > 1
-        self._decode(CREATION | {CARET_INIT} | (_MESSAGES if everything else frozenset()))
+        self._decode(CREATION | {CARET_INIT} | _MESSAGES)
 
     def creation(self) -> events.EventTables:
         """The tables of the objects' creation, and CARET's `caret_init`; empty ones included."""

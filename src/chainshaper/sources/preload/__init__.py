@@ -121,6 +121,14 @@ def _events_of_objects() -> NDArray[np.bool_]:
     return known
 
 
+class RefusedMemoryError(InputError):
+    """The memory of a process, ``inner_pid`` as that calls itself, that says nothing to us."""
+
+    def __init__(self, why: str, inner_pid: int) -> None:
+        super().__init__(why)
+        self.inner_pid = inner_pid
+
+
 class TracedProcess:
     """The memory of one process; ``lost`` counts what was overwritten, and what is not used since
     there is ``damage``: why, as half a sentence.
@@ -129,8 +137,8 @@ class TracedProcess:
     written, and counts as lost what may have been overwritten meanwhile. ``pid`` is the process's
     number here, ``inner_pid`` what it calls itself in its container.
 
-    Raises InputError: the descriptor is of no such memory, of one that may shrink, or of a process
-    whose times are of another clock.
+    Raises InputError: the descriptor is of no such memory, or of one that may shrink.
+    RefusedMemoryError: it is of another version, or of a process whose times are of another clock.
     """
 
     def __init__(self, descriptor: int, pid: int = 0) -> None:
@@ -145,7 +153,10 @@ class TracedProcess:
         # Whatever a process says, no more is read than a memory of this version has.
         known = [_RINGS, _RING_RECORDS, _OBJECT_RECORDS]
         if (magic, form, counts) != (_MAGIC, _FORMAT, known) or size != _SIZE:
-            raise InputError("what was sent is the memory of another version of chainshaper")
+            why = (
+                "its memory is that of another version of chainshaper: start it again with this one"
+            )
+            raise RefusedMemoryError(why, self.inner_pid)
         memory = mmap.mmap(descriptor, size, prot=mmap.PROT_READ)
         self.header: NDArray[Any] = np.frombuffer(memory, _HEADER, 1)
         self.pid = pid or self.inner_pid
@@ -153,7 +164,11 @@ class TracedProcess:
             raise InputError(f"what was sent says that it is of process {self.inner_pid}")
         clock = int(header["clock"][0])  # what it said counts, for it may have ended since
         if clock not in (0, time_namespace()) or (not clock and of_another_clock(self.pid)):
-            raise InputError("it has another clock, that of a time namespace: record it in there")
+            raise RefusedMemoryError(
+                "it has another clock, that of a time namespace: record it in there"
+                f" (`nsenter --time --target {self.pid} …`)",
+                self.inner_pid,
+            )
         self.damage: str | None = None
         self._tids: dict[int, int] = {}
         self._rings = np.frombuffer(memory, _RING, _RINGS, _HEADER.itemsize)
@@ -416,8 +431,16 @@ NO_PROCESS = (
 _MEMORY = re.compile(rb"/memfd:chainshaper-trace\b")
 
 
-def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[int, TracedProcess]]:
-    """Processes of some users that have the library in front, but for those that are ``known``."""
+def memories(
+    users: Collection[int],
+    known: Collection[int],
+    refused: Callable[[int, str], None] = lambda *_: None,
+) -> Iterator[tuple[int, TracedProcess]]:
+    """Processes of some users that have the library in front, but for those that are ``known``.
+
+    ``refused`` gets those whose memory says nothing to us, and a sentence that names one and says
+    why.
+    """
     running = (int(name) for name in os.listdir("/proc") if name.isdigit())  # noqa: PTH208
     for pid in {*running}.difference(known):
         with suppress(OSError):  # it has ended, or may not be looked into
@@ -428,12 +451,29 @@ def memories(users: Collection[int], known: Collection[int]) -> Iterator[tuple[i
                 with suppress(OSError):  # it is closed meanwhile, or may not be opened
                     memory = _memory_of(descriptor, pid)
                     # Another process's memory is open in one that reads it, as we do.
-                    if memory is not None and memory.inner_pid == inner_pid:
+                    if memory is None or memory.inner_pid != inner_pid:
+                        continue
+                    if isinstance(memory, RefusedMemoryError):
+                        refused(pid, _left_out(pid, memory))
+                    else:
                         yield pid, memory
-                        break
+                    break
 
 
-def _memory_of(descriptor: Path, pid: int) -> TracedProcess | None:
+def _name_of(pid: int) -> str:
+    """The name of a program that runs. Raises OSError: it has ended."""
+    return text_of(read_proc(f"/proc/{pid}/comm").removesuffix(b"\n"))
+
+
+def _left_out(pid: int, why: Exception) -> str:
+    """A sentence that names a process of which nothing is recorded."""
+    name = ""
+    with suppress(OSError):  # it has ended
+        name = f" ({_name_of(pid)})"
+    return f"nothing of process {pid}{name} is recorded: {why}."
+
+
+def _memory_of(descriptor: Path, pid: int) -> TracedProcess | RefusedMemoryError | None:
     """The memory behind an open file of a process, in `/proc`; None: it is another kind of file.
 
     Anything may have the name of a memory, and opening a pipe or a device may wait for ever or do
@@ -445,11 +485,14 @@ def _memory_of(descriptor: Path, pid: int) -> TracedProcess | None:
     try:
         if not stat.S_ISREG(os.fstat(place).st_mode):
             return None
-        with Path(f"/proc/self/fd/{place}").open("rb") as file, suppress(InputError):
+        with Path(f"/proc/self/fd/{place}").open("rb") as file:
             return TracedProcess(file.fileno(), pid)
+    except RefusedMemoryError as refused:
+        return refused
+    except InputError:
+        return None
     finally:
         os.close(place)
-    return None
 
 
 class PreloadTracer:
@@ -471,7 +514,7 @@ class PreloadTracer:
         self._clock_offset_ns = 0
         self._processes: list[TracedProcess] = []
         self._names: dict[int, str] = {}
-        self._refused: list[str] = []
+        self._refused: list[str] = []  # sentences: nothing of these is recorded, and why
         self._found: set[int] = set()  # attached to, by the ids that they have here
         self._searched_ns = 0
 
@@ -481,7 +524,8 @@ class PreloadTracer:
         if self._attaches:
             self._search()
             if not self._processes:
-                raise OperationError(f"{NO_PROCESS}, or attach with `--source ebpf`")
+                why = "; ".join(one.rstrip(".") for one in self._refused) or NO_PROCESS
+                raise OperationError(f"{why}, or attach with `--source ebpf`")
             for process in self._processes:  # what happened until now is none of this recording
                 process.new_records()
                 process.lost = 0
@@ -576,7 +620,13 @@ class PreloadTracer:
             return
         self._searched_ns = time.monotonic_ns()
         family = descendants(parents(), *self._pids)
-        for pid, process in memories(self._users, self._found):
+
+        def refuse(pid: int, why: str) -> None:
+            if not self._pids or pid in family:
+                self._found.add(pid)
+                self._refused.append(why)
+
+        for pid, process in memories(self._users, self._found, refuse):
             if not self._pids or pid in family:
                 self._found.add(pid)
                 self._processes.append(process)
@@ -596,12 +646,11 @@ class PreloadTracer:
             try:
                 process = TracedProcess(descriptor, pid)
             except (InputError, OSError) as error:
-                self._refused.append(f"nothing of process {pid} is recorded: {error}.")
+                self._refused.append(_left_out(pid, error))
             else:
                 self._processes.append(process)
                 with suppress(OSError):
-                    name = text_of(read_proc(f"/proc/{pid}/comm").removesuffix(b"\n"))
-                    self._names[process.pid] = name
+                    self._names[process.pid] = _name_of(pid)
             os.close(descriptor)
 
     def _read_all(self) -> None:
