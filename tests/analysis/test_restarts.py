@@ -20,7 +20,6 @@ from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_o
 from chainshaper.analysis.chains import SeveralPathsError
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import RecordingInfo, write_recording
-from chainshaper.workload.description import load_application
 
 MS = 1_000_000
 CHAIN = "/image../objects"
@@ -226,27 +225,6 @@ def test_nodes_of_one_name_are_told_apart_wherever_they_are_listed(
         "latency", file, "--chain", "/talker@7../out", code=2
     )
     assert run("graph", file).count("/talker") == 2
-
-
-@pytest.mark.parametrize(("process", "latency_ms"), [(100, 3), (101, 7)])
-@pytest.mark.parametrize("chain", ["/talker@{}../out", "talker@{}../chatter../relay"])
-def test_nodes_of_one_name_are_described_as_two(
-    tmp_path: Path, process: int, latency_ms: int, chain: str
-) -> None:
-    file, described, again = (str(tmp_path / name) for name in ("trace", "app.yaml", "again"))
-    trace(tmp_path, namesakes())
-    run("describe", file, "--chain", chain.format(process), "-o", described)
-    text = Path(described).read_text()
-    assert (
-        f"/talker@{process} is no name of a node in a description: it is talker_{process}" in text
-    )
-    application = load_application(described)
-    assert [*application.nodes] == ["talker_100", "talker_101", "relay"]
-    assert f"/talker_{process}.." in application.chain
-    run("simulate", described, "-o", again, "--cycles", "20")
-    simulated = json.loads(run("latency", again, "--json"))
-    assert simulated["count"] == 20
-    assert simulated["mean_ns"] == pytest.approx(latency_ms * MS, rel=0.02)
 
 
 def test_paths_that_no_way_point_tells_apart_are_named_by_their_function() -> None:

@@ -278,16 +278,6 @@ def test_columns_that_are_not_the_events_are_named(
     assert said in text
 
 
-@pytest.mark.parametrize(("column", "said"), [("time", "a time"), ("pid", "a process")])
-def test_events_of_no_time_or_no_process_are_refused(whole: Path, column: str, said: str) -> None:
-    """Handles are looked up by process: such an event is of no object."""
-    file = _without_checksums(whole)
-    frame = pl.read_parquet(file)
-    of_none = frame.with_columns(pl.when(pl.int_range(pl.len()) > 0).then(column).alias(column))
-    of_none.write_parquet(file)
-    assert f"rows without {said}" in _refused(whole, "callback_end")
-
-
 def test_integers_of_another_width_and_tables_without_cores_are_taken(whole: Path) -> None:
     file = _without_checksums(whole)
     frame = pl.read_parquet(file).with_columns(pl.col("callback", "pid").cast(pl.Int64))

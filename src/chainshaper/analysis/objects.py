@@ -403,7 +403,8 @@ def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     second began: its address was reused, or its last instance started before.
     """
     missing = pl.format("unknown (process {})", "pid")
-    callbacks = callbacks.sort("valid_from", "handle", maintain_order=True).with_columns(
+    # An address means nothing without its process; whole traces of threads only have none.
+    callbacks = callbacks.drop_nulls("pid").sort("valid_from", "handle", maintain_order=True).with_columns(
         named=pl.col("node").is_not_null(), node=pl.col("node").fill_null(missing)
     )
     identity = ["pid", "kind", "node", "topic", "period_ns", "symbol"]

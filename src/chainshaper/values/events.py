@@ -240,7 +240,7 @@ def castable(found: pl.DataType | None, wanted: pl.DataType) -> bool:
 
 def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
     """A frame with the types of its event's table. Raises PolarsError: a value does not fit, or a
-    row has no time, or no process (sched_switch names its threads itself).
+    row has no time.
     """
     if "cpu" not in frame.columns:
         frame = frame.with_columns(cpu=pl.lit(None, COMMON_COLUMNS["cpu"]))
@@ -251,6 +251,4 @@ def as_table(frame: pl.DataFrame, name: str) -> pl.DataFrame:
     )
     if frame["time"].null_count():
         raise pl.exceptions.InvalidOperationError("rows without a time")
-    if name != "sched_switch" and "pid" in frame.columns and frame["pid"].null_count():
-        raise pl.exceptions.InvalidOperationError("rows without a process")
     return frame
