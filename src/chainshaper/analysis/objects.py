@@ -404,8 +404,10 @@ def numbered(tables: events.EventTables, callbacks: pl.DataFrame) -> pl.DataFram
     """
     missing = pl.format("unknown (process {})", "pid")
     # An address means nothing without its process; whole traces of threads only have none.
-    callbacks = callbacks.drop_nulls("pid").sort("valid_from", "handle", maintain_order=True).with_columns(
-        named=pl.col("node").is_not_null(), node=pl.col("node").fill_null(missing)
+    callbacks = (
+        callbacks.drop_nulls("pid")
+        .sort("valid_from", "handle", maintain_order=True)
+        .with_columns(named=pl.col("node").is_not_null(), node=pl.col("node").fill_null(missing))
     )
     identity = ["pid", "kind", "node", "topic", "period_ns", "symbol"]
     last_start = _last_starts(tables, callbacks, identity)
