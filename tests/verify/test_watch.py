@@ -168,7 +168,7 @@ def test_processes_of_another_checkout_are_not_watched_here() -> None:
     ends at once."""
     words = built().command("chain", "100000")
     variables = {**os.environ, "LD_PRELOAD": str(installed_library())}
-    script = '"$@" >/dev/null </dev/null & echo $!'
+    script = '"$@" >/dev/null 2>&1 </dev/null & echo $!'
     started = subprocess.run(
         ["sh", "-c", script, "sh", *words],
         env=variables,
