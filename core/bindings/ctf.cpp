@@ -13,6 +13,7 @@
 #include "ctf/events.hpp"
 #include "ctf/layout.hpp"
 #include "ctf/packets.hpp"
+#include "ctf/sorting.hpp"
 #include "ctf/types.hpp"
 
 namespace chainshaper::bindings {
@@ -337,7 +338,9 @@ void bind_events(nb::module_ & module) {
               self->arrays.push_back(nb::cast(column));
             }
           },
-          nb::kw_only(), nb::arg("times_ns"), nb::arg("cpus").none(), nb::arg("columns"));
+          nb::kw_only(), nb::arg("times_ns"), nb::arg("cpus").none(), nb::arg("columns"))
+      .def("sort_by_time",
+           [](const EventTable & self) { without_lock([&] { ctf::sort_by_time(self.columns); }); });
 
   nb::class_<EventFile>(module, "CtfEventReader", "Reads the events of a stream file.")
       .def(

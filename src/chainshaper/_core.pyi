@@ -280,6 +280,8 @@ class CtfTable:
         cpus: NDArray[np.int32] | None,
         columns: Sequence[NDArray[Any]],
     ) -> None: ...
+    def sort_by_time(self) -> None:
+        """Sort the rows by time, in place; rows of equal times stay in their order."""
 
 class CtfEventReader:
     """Reads the events of a stream file, which must not be written to meanwhile.

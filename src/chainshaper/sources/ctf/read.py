@@ -231,6 +231,8 @@ def _filled(
                 rows = slice(before[table.number], after[table.number])
                 table.recode(rows, np.array(others, np.uint32))
         progress((1 + 2 * done / len(chunks)) / 3)
+    # Rows stand file by file, each in order of time but for clocks that went back.
+    list(pool.map(_core.CtfTable.sort_by_time, tables))
     return list(codes)
 
 
@@ -270,21 +272,11 @@ class _Columns:
                 _core.recode(array[rows], codes)
 
     def frame(self, known: list[bytes], strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
-        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts.
-
-        Rows stand file by file, each in order of time but for clocks that went back.
-        """
-        time, cpu, *values = self.time, self.cpu, *self.values
-        if (time[1:] < time[:-1]).any():
-            order = np.argsort(time, kind="stable")
-            time, cpu, *values = (
-                array.take(order, mode="clip") if array.size else array
-                for array in (time, cpu, *values)
-            )
-        found = {"time": pl.Series("time", time)}
+        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts."""
+        found = {"time": pl.Series("time", self.time)}
         if self.table.has_cpu:
-            found["cpu"] = pl.Series("cpu", cpu)
-        for (name, kind), column in zip(self.table.columns, values, strict=True):
+            found["cpu"] = pl.Series("cpu", self.cpu)
+        for (name, kind), column in zip(self.table.columns, self.values, strict=True):
             if tsdl.is_text(kind):
                 texts = categories if name == "procname" else strings
                 found[name] = texts.gather(pl.Series(column)).alias(name)
