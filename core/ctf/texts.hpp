@@ -23,12 +23,16 @@ inline Text text_at(Bytes bytes, std::int64_t at, std::int64_t limit, bool is_te
   constexpr std::uint64_t ones = 0x0101010101010101, highs = 0x8080808080808080;
   constexpr std::uint64_t factor = 0x9E3779B97F4A7C15;
   Text text{bytes.data() + at, limit - at, factor, 0};
-  std::uint64_t zeros = 0;  // the top bit of each byte that is 0; others only behind the first
-  for (auto place = at; is_text ? zeros == 0 : place < limit; place += 8) {
+  // The last word is the first one that is not full, be it empty.
+  bool is_last = false;
+  for (auto place = at; !is_last; place += 8) {
     auto word = word_at(bytes, place);
-    if (place + 8 > limit) word = low_bits(word, 8 * (limit - place));
-    if (is_text) zeros = (word - ones) & ~word & highs;
+    is_last = place + 8 > limit;
+    if (is_last) word = low_bits(word, 8 * (limit - place));
+    // The top bit of each byte that is 0, and of others only behind the first of these.
+    const auto zeros = is_text ? (word - ones) & ~word & highs : 0;
     if (zeros != 0) {
+      is_last = true;
       word &= ((zeros & (0 - zeros)) >> 7) - 1;
       text.length = place - at + (std::countr_zero(zeros) >> 3);
     }
