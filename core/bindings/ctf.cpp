@@ -306,7 +306,7 @@ void bind_bad_events(nb::module_ & module) {
 
 void bind_events(nb::module_ & module) {
   module.attr("CTF_BUDGET_PER_BYTE") = ctf::budget_per_byte;
-  nb::exception<ctf::FileChanged>(module, "CtfFileChanged");
+  nb::exception<ctf::FileChanged>(module, "CtfFileChangedError");
   bind_bad_events(module);
 
   nb::class_<ctf::Chunk>(module, "CtfChunk", "Packets of a file that are written together.")

@@ -252,7 +252,7 @@ class CtfBadEvent:
     @property
     def failure(self) -> CtfFailure: ...
 
-class CtfFileChanged(Exception):
+class CtfFileChangedError(Exception):
     """A file has not the events that were counted."""
 
 class CtfChunk:
@@ -312,7 +312,7 @@ class CtfEventReader:
         """Write a chunk's events to tables, whose rows of this file begin at ``first_rows``.
 
         Returns the texts by their code. Threads may write different chunks at once. Raises
-        CtfFileChanged, and ValueError for tables that are not those of the layout.
+        CtfFileChangedError, and ValueError for tables that are not those of the layout.
         """
 
     @property

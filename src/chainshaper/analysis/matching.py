@@ -2,8 +2,9 @@
 
 An event rarely names what it belongs to. It carries an address, which means whatever was last
 created there, or it belongs to whatever its thread was doing then: "the latest row before this one
-with the same key" (or the next after it), an asof join. Events come sorted by time, so one walk over
-both tables that remembers the latest row of each key is enough (core/matching): some ten ns a row.
+with the same key" (or the next after it), an asof join. Events come sorted by time, so one walk
+over both tables that remembers the latest row of each key is enough (core/matching): some ten ns a
+row.
 """
 
 from collections.abc import Callable

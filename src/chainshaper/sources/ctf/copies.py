@@ -69,12 +69,12 @@ def without_copies(
         left_out[file][packet] = True
         counts[file, before] += 1
     left = [
-        replace(stream, packets=stream.packets.filter(~copies))
+        replace(stream, packets=stream.packets.filter(~copies)) if copies.any() else stream
         for stream, copies in zip(streams, left_out, strict=True)
     ]
     warnings = [
-        f"{paths[file]}: {count} of its {len(packets[file])} packets are in {paths[before]} as well;"
-        " they count once"
+        f"{paths[file]}: {count} of its {len(packets[file])} packets are in {paths[before]} as"
+        " well; they count once"
         for (file, before), count in sorted(counts.items())
     ]
     return [stream for stream in left if len(stream.packets)], warnings

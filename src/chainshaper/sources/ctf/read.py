@@ -1,12 +1,10 @@
 """Counting events and reading them into data frames.
 
 Pass 1 (`_File.count`) steps over every event of a file and counts, so that each has its row. Pass 2
-(`_filled`) writes the wanted events of a chunk of a file to their rows, which are sorted in the end.
-Both are C++ (core/ctf), and run on several threads; of a large trace only some chunks are in memory
-at once.
+(`_filled`) writes the wanted events of a chunk of a file to their rows, and these are sorted. Both
+are C++ (core/ctf), and run on several threads; of a large trace only some chunks are in memory at
+once.
 """
-
-# ruff: noqa: PLR0917 - the parts of one pass
 
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
@@ -174,7 +172,7 @@ class _File:
         """Write a chunk's events to their tables; the texts that text columns have codes of."""
         try:
             texts = self.reader.write(chunk, tables, first_rows)
-        except _core.CtfFileChanged:
+        except _core.CtfFileChangedError:
             raise _changed(self.path) from None
         self.map.forget(self.packets[chunk.first : chunk.end])
         return texts

@@ -10,6 +10,7 @@ from uuid import UUID
 
 import numpy as np
 import polars as pl
+from numpy.typing import NDArray
 
 from chainshaper import _core
 from chainshaper.sources.ctf.copies import CtfStream, stream_classes, without_copies
@@ -88,7 +89,7 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     warnings += copied
     groups: dict[object, list[CtfStream]] = {}
     for stream in streams:
-        kind, instance = stream.packets.select("stream_class", "instance").row(0)
+        kind, instance = (stream.packets[name][0] for name in ("stream_class", "instance"))
         name = stream.path if instance < 0 else instance
         groups.setdefault((classes_of_streams[kind], name), []).append(stream)
     losses = [(group[0].path, *_losses(group)) for group in groups.values()]
@@ -137,13 +138,17 @@ def _losses(files: list[CtfStream]) -> tuple[int, int]:
     begins anywhere, and what was lost before it is not its own.
     """
     # Files of one stream follow each other (tracefile rotation), not always by name.
-    packets = pl.concat([file.packets for file in files]).sort("begin", maintain_order=True)
-    counter, sequence = packets["discarded"].to_numpy(), packets["sequence"].to_numpy()
+    order = np.argsort(_column(files, "begin"), kind="stable")
+    counter, sequence = (_column(files, name)[order] for name in ("discarded", "sequence"))
     steps = np.diff(counter, prepend=0 if sequence[0] <= 0 else counter[0])
     steps[steps < 0] += 1 << 32
     discarded = int(steps[steps > 0].sum()) if (counter >= 0).all() else 0
     gaps = np.diff(sequence) - 1
     return discarded, int(gaps[gaps > 0].sum()) if (sequence >= 0).all() else 0
+
+
+def _column(files: list[CtfStream], name: str) -> NDArray[np.int64]:
+    return np.concatenate([file.packets[name].to_numpy() for file in files])
 
 
 # Stream files
@@ -189,7 +194,8 @@ def _packets_of(path: Path, layout: _core.CtfLayout, number: int, folder: TraceC
         return _Packets(pl.DataFrame())
     file = MappedFile(path)
     found = _core.find_packets(layout, number, file.bytes, beginning=_beginning(folder))
-    packets = _with_times_of_events(pl.DataFrame(found.columns), folder, layout.traces[number][0])
+    times = _times_of_events(found.columns, folder, layout.traces[number][0])
+    packets = pl.DataFrame({**found.columns, **times})
     places = [_damage(path, file, place) for place in found.damaged[:_MOST_WARNINGS]]
     # A file without any packet is another program's, but for one that has nothing but zeros.
     ours = len(packets) > 0 or file.begins_with_zeros(0)
@@ -228,32 +234,30 @@ def _beginning(folder: TraceClass) -> bytes:
     return b""
 
 
-def _with_times_of_events(
-    packets: pl.DataFrame, folder: TraceClass, first_class: int
-) -> pl.DataFrame:
-    """Packets with the earliest and the latest time that an event of each can have.
+def _times_of_events(
+    packets: dict[str, NDArray[np.int64]], folder: TraceClass, first_class: int
+) -> dict[str, NDArray[np.int64]]:
+    """The earliest and the latest time that an event of each packet can have.
 
     ``first_class`` is the number of the folder's first stream class.
     Tracers of LTTng before 2.11 closed a packet without the events that were being written, which
     the next packet's beginning bounds; so do packets of a crash, which say no end.
     """
-    times = np.full((len(packets), 2), _ALWAYS, np.int64)
+    begin, end, stream_class = packets["begin"], packets["end"], packets["stream_class"]
+    earliest, latest = (np.full(len(begin), time, np.int64) for time in _ALWAYS)
     major, minor = (folder.env.get(f"tracer_{part}") for part in ("major", "minor"))
     known_version = isinstance(major, int) and isinstance(minor, int)
     late = known_version and (major, minor) < (2, 11)
-    begin, end = packets["begin"].to_numpy(), packets["end"].to_numpy()
     following = np.append(begin[1:], -1)[: len(begin)]
     following[following < begin] = _ALWAYS[1]
-    latest = np.where((end < begin) | late, np.maximum(end, following), end)
+    last = np.where((end < begin) | late, np.maximum(end, following), end)
     for number, stream in enumerate(folder.streams.values(), first_class):
         context = dict(stream.packet_context.fields) if stream.packet_context is not None else {}
         stamps = (context.get(name) for name in ("timestamp_begin", "timestamp_end"))
         if all(isinstance(one, IntegerType) and one.clock and one.size == 64 for one in stamps):
-            known = (packets["stream_class"].to_numpy() == number) & (begin > 0)
-            times[known, 0], times[known, 1] = begin[known], latest[known]
-    return packets.with_columns(
-        pl.Series("earliest", times[:, 0].copy()), pl.Series("latest", times[:, 1].copy())
-    )
+            known = (stream_class == number) & (begin > 0)
+            earliest[known], latest[known] = begin[known], last[known]
+    return {"earliest": earliest, "latest": latest}
 
 
 # The metadata file
