@@ -7,15 +7,22 @@
 #include <cstdint>
 #include <cstring>
 #include <span>
-#include <tuple>
 #include <vector>
 
 namespace chainshaper::matching {
 
 // Up to three numbers: a process, a thread, an address. Unused ones are 0.
-using Key = std::array<std::int64_t, 3>;
+struct Key {
+  std::int64_t first{0};
+  std::int64_t second{0};
+  std::int64_t third{0};
 
-inline constexpr std::size_t most_key_columns = std::tuple_size_v<Key>;
+  bool operator==(const Key & other) const {
+    return first == other.first && second == other.second && third == other.third;
+  }
+};
+
+inline constexpr std::size_t most_key_columns = 3;
 
 // The keys of a table's rows, read where their columns lie. Numbers are compared by their bits,
 // whatever their sign; those of 32 bits are extended by 0s.
@@ -59,13 +66,13 @@ template <typename Value>
 class KeyTable {
 public:
   // What is known of a key; nullptr where it was never added.
-  Value * find(const Key & key) {
+  Value * find(Key key) {
     Place & place = place_of(key);
     return place.taken ? &place.value : nullptr;
   }
 
   // The value of a key, a new one where the key was never added. Valid until the next call.
-  Value & operator[](const Key & key) {
+  Value & operator[](Key key) {
     Place * place = &place_of(key);
     if (!place->taken) {
       if (2 * ++count_ > places_.size()) {
@@ -84,18 +91,18 @@ private:
     bool taken{false};
   };
 
-  static std::size_t hash(const Key & key) {
-    auto mixed = (static_cast<std::uint64_t>(key[0]) * 0x9E3779B97F4A7C15) ^
-                 (static_cast<std::uint64_t>(key[1]) * 0xC2B2AE3D27D4EB4F);
-    mixed = (mixed ^ (mixed >> 29)) + static_cast<std::uint64_t>(key[2]) * 0x165667B19E3779F9;
+  static std::size_t hash(Key key) {
+    auto mixed = (static_cast<std::uint64_t>(key.first) * 0x9E3779B97F4A7C15) ^
+                 (static_cast<std::uint64_t>(key.second) * 0xC2B2AE3D27D4EB4F);
+    mixed = (mixed ^ (mixed >> 29)) + static_cast<std::uint64_t>(key.third) * 0x165667B19E3779F9;
     return static_cast<std::size_t>(mixed >> 17);
   }
 
   // Where a key is, or else the free place where it would be; there always is a free one.
-  Place & place_of(const Key & key) {
+  Place & place_of(Key key) {
     const auto mask = places_.size() - 1;
     auto index = hash(key) & mask;
-    while (places_[index].taken && places_[index].key != key) index = (index + 1) & mask;
+    while (places_[index].taken && !(places_[index].key == key)) index = (index + 1) & mask;
     return places_[index];
   }
 
