@@ -23,7 +23,7 @@ namespace chainshaper::ctf {
 
 // Numbers that a run of steps notes for later steps or for the decoder. The first ones are those of
 // packet header and packet context; lengths and tags that types refer to follow.
-enum Variable : std::int32_t {
+enum Variable : std::uint8_t {
   event_id,
   magic,
   stream_id,

@@ -22,7 +22,7 @@ from chainshaper.sources.ctf.copies import CtfStream
 from chainshaper.sources.ctf.layout import Table, lay_out, select
 from chainshaper.sources.ctf.trace import CtfTrace, MappedFile
 
-_CHUNK_BYTES = 128 << 20
+_CHUNK_BYTES = 32 << 20
 _SMALL_BYTES = 4 << 20
 _LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
