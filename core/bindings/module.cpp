@@ -5,10 +5,12 @@
 namespace chainshaper::bindings {
 
 void bind_bands(nanobind::module_ & module);
+void bind_simulation(nanobind::module_ & module);
 
 }  // namespace chainshaper::bindings
 
 NB_MODULE(_core, module) {
   module.doc() = "What must be fast: trace decoder, joins, band placement, simulator (C++).";
   chainshaper::bindings::bind_bands(module);
+  chainshaper::bindings::bind_simulation(module);
 }

@@ -1,0 +1,33 @@
+#include "simulation/event_log.hpp"
+
+#include <utility>
+
+namespace chainshaper::simulation {
+
+const std::vector<EntryNames> & log_layout() {
+  static const std::vector<EntryNames> names{
+      {"callback_start", {"callback", "thread_time", "is_intra_process"}},
+      {"callback_end", {"callback", "thread_time"}},
+      {"publish", {"publisher_handle", "rmw_publisher_handle", "message", "timestamp"}},
+      {"take", {"rmw_subscription_handle", "message", "source_timestamp", "taken"}},
+      {"execute", {"handle"}},
+      {"rclcpp_executor_wait_for_work", {"timeout"}},
+      {"gate_release",
+       {"callback", "source_timestamp", "arrival", "origin", "release", "slot", "cycles_waited",
+        "anchor", "overrun", "mode", "dropped", "moved"}},
+      {"asynchronous_send", {"rmw_publisher_handle", "timestamp", "outcome", "duration"}},
+      {"context_switch", {"core", "previous", "runnable"}},
+  };
+  return names;
+}
+
+EventLog::EventLog() {
+  for (const auto & names : log_layout())
+    entries_.push_back({{}, {}, std::vector<std::vector<std::int64_t>>(names.fields.size())});
+}
+
+std::vector<EntryColumns> EventLog::take_all() {
+  return std::exchange(entries_, EventLog().entries_);
+}
+
+}  // namespace chainshaper::simulation

@@ -1,0 +1,71 @@
+// What happened, as columns of numbers: an entry for each trace point that a process passes.
+//
+// Entries and fields have the names of chainshaper/workload/event_log.py, as have those of live runs.
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <initializer_list>
+#include <vector>
+
+#include "simulation/description.hpp"
+
+namespace chainshaper::simulation {
+
+// In fields that say nothing.
+inline constexpr std::int64_t absent = -1;
+
+enum class Entry : std::size_t {
+  callback_start,
+  callback_end,
+  publish,
+  take,
+  execute,
+  wait,
+  release,
+  send,
+  context_switch,
+};
+
+struct EntryNames {
+  const char * entry;
+  std::vector<const char *> fields;  // behind time and thread
+};
+
+// The names of all entries, in the order of `Entry`.
+const std::vector<EntryNames> & log_layout();
+
+// Entries of one kind, column by column.
+struct EntryColumns {
+  std::vector<Nanoseconds> times;
+  std::vector<std::int32_t> threads;  // places; `absent`: the idle thread
+  std::vector<std::vector<std::int64_t>> fields;
+};
+
+class EventLog {
+public:
+  EventLog();
+
+  // How many entries it has of the kind that was added.
+  std::size_t add(Entry entry, Nanoseconds time, std::int32_t thread,
+                  std::initializer_list<std::int64_t> fields) {
+    EntryColumns & columns = entries_[static_cast<std::size_t>(entry)];
+    columns.times.push_back(time);
+    columns.threads.push_back(thread);
+    auto column = columns.fields.begin();
+    for (const auto field : fields) (column++)->push_back(field);
+    return columns.times.size();
+  }
+
+  // All entries, in the order of `Entry`; the log is empty then.
+  std::vector<EntryColumns> take_all();
+
+private:
+  std::vector<EntryColumns> entries_;
+};
+
+// Outcomes of an asynchronous publication, as `WORDS["outcome"]` there numbers them.
+enum class Outcome : std::int64_t { sent, expired, overwritten };
+
+}  // namespace chainshaper::simulation
