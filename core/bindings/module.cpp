@@ -5,6 +5,7 @@
 namespace chainshaper::bindings {
 
 void bind_bands(nanobind::module_ & module);
+void bind_columns(nanobind::module_ & module);
 void bind_simulation(nanobind::module_ & module);
 
 }  // namespace chainshaper::bindings
@@ -12,5 +13,6 @@ void bind_simulation(nanobind::module_ & module);
 NB_MODULE(_core, module) {
   module.doc() = "What must be fast: trace decoder, joins, band placement, simulator (C++).";
   chainshaper::bindings::bind_bands(module);
+  chainshaper::bindings::bind_columns(module);
   chainshaper::bindings::bind_simulation(module);
 }

@@ -40,6 +40,7 @@ void bind_kinds(nb::module_ & module) {
       .value("none", Pause::none)
       .value("log_full", Pause::log_full)
       .value("messages_full", Pause::messages_full)
+      .value("endless", Pause::endless)
       .value("over", Pause::over);
 }
 

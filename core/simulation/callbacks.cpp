@@ -43,14 +43,17 @@ bool Engine::go_on_publishing(Thread & thread) {
 
 // So long it takes with the interrupts that come meanwhile.
 Nanoseconds Engine::computing_time(Stream & stream) {
-  const Nanoseconds time = draw(stream);
   constexpr Nanoseconds million = 1'000'000;
-  const auto product = static_cast<__int128>(time) * given_.interrupts_ppm / million;
-  return later(time, product < forever ? static_cast<Nanoseconds>(product) : forever);
+  const Nanoseconds time = draw(stream);
+  Nanoseconds product = 0;
+  if (!__builtin_mul_overflow(time, given_.interrupts_ppm, &product))
+    return later(time, product / million);
+  const auto longer = static_cast<__int128>(time) * given_.interrupts_ppm / million;
+  return later(time, longer < forever ? static_cast<Nanoseconds>(longer) : forever);
 }
 
 bool Engine::end(Thread & thread) {
-  log(Entry::callback_end, now_, &thread, {thread.entity->given->callback, thread.used});
+  log(TracePoint::callback_end, now_, &thread, {thread.entity->given->callback, thread.used});
   return false;
 }
 

@@ -128,6 +128,7 @@ void check(const Description & all) {
   for (const auto & stream : all.streams)
     require(!stream.constant_ns || is_time(*stream.constant_ns), "a negative time");
   check_processes(all);
+  require(all.log_rows > 0 && all.log_rows <= std::size_t{1} << 24, "a log of that size");
   require(is_time(all.quantum_ns) && all.quantum_ns > 0, "turns of no time");
   require(is_time(all.context_switch_ns) && is_time(all.preemption_ns), "switches of no time");
   require(is_time(all.interrupts_ppm), "negative interrupts");

@@ -5,12 +5,14 @@
 namespace chainshaper::simulation {
 
 Pause Engine::run(std::uint64_t most_instants) {
-  if (pause_ == Pause::messages_full) return pause_;
+  if (pause_ == Pause::messages_full || pause_ == Pause::endless) return pause_;
   pause_ = Pause::none;
   for (std::uint64_t instants = 0; instants < most_instants && pause_ == Pause::none; ++instants) {
     const Nanoseconds instant = next_instant();
     if (instant > given_.stop_ns) return Pause::over;
+    if (instant > now_) steps_ = 0;
     now_ = instant;
+    count_step();
     while (agenda_.next_time() <= now_) happen(agenda_.take_next());
     // A thread that goes on may cause something that happens now: one goes on at a time.
     if (let_one_thread_go_on()) continue;
@@ -25,6 +27,11 @@ Pause Engine::run(std::uint64_t most_instants) {
 std::vector<Nanoseconds> Engine::latencies() const {
   const auto count = std::min(started_, latencies_.size());
   return {latencies_.begin(), latencies_.begin() + static_cast<std::ptrdiff_t>(count)};
+}
+
+void Engine::count_step() {
+  constexpr std::uint64_t most = 1 << 22;  // as no application needs at an instant
+  if (++steps_ > most) pause_ = Pause::endless;
 }
 
 void Engine::happen(const Happening & what) {
@@ -68,8 +75,8 @@ bool Engine::let_one_thread_go_on() {
 void Engine::run_until_next_step(Core & core) const {
   core.until = forever;
   if (core.running == nullptr || !core.running->runnable) return;
-  const bool takes_turns = core.running->given->server.has_value();
   const Nanoseconds left = core.running->left;
+  const bool takes_turns = core.running->server != 0;
   core.until = later(now_, takes_turns ? std::min(left, core.quantum) : left);
 }
 
@@ -99,13 +106,12 @@ void Engine::cross_boundary(Core & core) const {
 namespace {
 
 bool is_eligible(const Core & core, const Thread & thread) {
-  const auto & server = thread.given->server;
-  return thread.runnable && (!server || ((core.open_servers >> *server) & 1) == 1);
+  return thread.runnable && (thread.server == 0 || (core.open_servers & thread.server) != 0);
 }
 
 bool goes_before(const Thread & thread, const Thread * best) {
   if (best == nullptr) return true;
-  if (thread.given->rank != best->given->rank) return thread.given->rank < best->given->rank;
+  if (thread.rank != best->rank) return thread.rank < best->rank;
   return thread.sequence < best->sequence;
 }
 
@@ -127,7 +133,7 @@ void Engine::switch_to(Core & core, Thread * thread) {
   const bool was_runnable = before != nullptr && before->runnable;
   if (was_runnable) before->preempted = true;
   if (given_.switches)
-    log(Entry::context_switch, now_, thread,
+    log(TracePoint::context_switch, now_, thread,
         {&core - cores_.data(), before == nullptr ? absent : before->place, was_runnable});
   core.running = thread;
   if (thread == nullptr) return;
@@ -159,11 +165,11 @@ void Engine::sleep(Thread & thread, Nanoseconds until) {
   agenda_.plan(until, SleepOver{&thread});
 }
 
-void Engine::log(Entry entry, Nanoseconds time, const Thread * thread,
+void Engine::log(TracePoint point, Nanoseconds time, const Thread * thread,
                  std::initializer_list<std::int64_t> fields) {
   if (!given_.events || time < given_.record_from_ns) return;
   const auto place = thread == nullptr ? static_cast<std::int32_t>(absent) : thread->place;
-  if (log_.add(entry, time, place, fields) >= given_.log_rows && pause_ == Pause::none)
+  if (log_.add(point, time, place, fields) >= given_.log_rows && pause_ == Pause::none)
     pause_ = Pause::log_full;
 }
 

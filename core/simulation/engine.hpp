@@ -44,6 +44,7 @@ enum class Pause {
   none,           // so many instants have passed: the caller may do something else
   log_full,       // the caller takes the log
   messages_full,  // messages pile up without end: it cannot go on
+  endless,        // callbacks have each other called without time passing: it cannot go on
   over,
 };
 
@@ -132,9 +133,10 @@ private:
   void mark_event(Entity & entity);
   Message & new_message();
   void count_in_use();
+  void count_step();
 
   Nanoseconds draw(Stream & stream) const { return stream.next(source_); }
-  void log(Entry entry, Nanoseconds time, const Thread * thread,
+  void log(TracePoint point, Nanoseconds time, const Thread * thread,
            std::initializer_list<std::int64_t> fields);
 
   // setup.cpp: from the description
@@ -161,6 +163,7 @@ private:
   std::size_t marks_{0};  // events of executors, and what waits for publisher threads
   EventLog log_;
   Pause pause_{Pause::none};
+  std::uint64_t steps_{0};  // of threads and of the engine, at the present instant
   std::vector<Nanoseconds> latencies_;
   std::size_t started_{0};  // recorded instances of the chain
 };

@@ -21,13 +21,19 @@ const std::vector<EntryNames> & log_layout() {
   return names;
 }
 
-EventLog::EventLog() {
+EventLog::EventLog(std::size_t rows) : rows_(rows) {
   for (const auto & names : log_layout())
     entries_.push_back({{}, {}, std::vector<std::vector<std::int64_t>>(names.fields.size())});
 }
 
 std::vector<EntryColumns> EventLog::take_all() {
-  return std::exchange(entries_, EventLog().entries_);
+  return std::exchange(entries_, EventLog(rows_).entries_);
+}
+
+void EventLog::reserve(EntryColumns & columns) const {
+  columns.times.reserve(rows_);
+  columns.threads.reserve(rows_);
+  for (auto & field : columns.fields) field.reserve(rows_);
 }
 
 }  // namespace chainshaper::simulation

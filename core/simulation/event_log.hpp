@@ -16,7 +16,7 @@ namespace chainshaper::simulation {
 // In fields that say nothing.
 inline constexpr std::int64_t absent = -1;
 
-enum class Entry : std::size_t {
+enum class TracePoint : std::size_t {
   callback_start,
   callback_end,
   publish,
@@ -33,7 +33,7 @@ struct EntryNames {
   std::vector<const char *> fields;  // behind time and thread
 };
 
-// The names of all entries, in the order of `Entry`.
+// The names of all entries, in the order of `TracePoint`.
 const std::vector<EntryNames> & log_layout();
 
 // Entries of one kind, column by column.
@@ -45,12 +45,14 @@ struct EntryColumns {
 
 class EventLog {
 public:
-  EventLog();
+  // With room for so many entries of a kind, until there are more.
+  explicit EventLog(std::size_t rows);
 
   // How many entries it has of the kind that was added.
-  std::size_t add(Entry entry, Nanoseconds time, std::int32_t thread,
+  std::size_t add(TracePoint point, Nanoseconds time, std::int32_t thread,
                   std::initializer_list<std::int64_t> fields) {
-    EntryColumns & columns = entries_[static_cast<std::size_t>(entry)];
+    EntryColumns & columns = entries_[static_cast<std::size_t>(point)];
+    if (columns.times.capacity() == 0) reserve(columns);
     columns.times.push_back(time);
     columns.threads.push_back(thread);
     auto column = columns.fields.begin();
@@ -58,10 +60,13 @@ public:
     return columns.times.size();
   }
 
-  // All entries, in the order of `Entry`; the log is empty then.
+  // All entries, in the order of `TracePoint`; the log is empty then.
   std::vector<EntryColumns> take_all();
 
 private:
+  void reserve(EntryColumns & columns) const;
+
+  std::size_t rows_;
   std::vector<EntryColumns> entries_;
 };
 

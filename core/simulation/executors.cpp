@@ -8,7 +8,8 @@ namespace chainshaper::simulation {
 
 // Goes on with a running thread that needs no more CPU time for its step.
 void Engine::advance(Thread & thread) {
-  while (thread.runnable && thread.left == 0) {
+  while (thread.runnable && thread.left == 0 && pause_ != Pause::endless) {
+    count_step();
     switch (thread.step) {
       case Step::collect:
         collect(thread);
@@ -123,7 +124,7 @@ void Engine::choose(Thread & thread) {
 
 void Engine::begin(Thread & thread, Entity & chosen) {
   Executor & executor = *thread.executor;
-  log(Entry::execute, now_, &thread, {chosen.given->handle});
+  log(TracePoint::execute, now_, &thread, {chosen.given->handle});
   thread.entity = &chosen;
   thread.step = Step::take;
   if (chosen.given->kind != EntityKind::timer)
@@ -166,7 +167,7 @@ void Engine::refill(Thread & thread) {
   for (const Entity & entity : thread.executor->entities)
     if (entity.given->kind == EntityKind::timer && entity.due <= given_.last_timer_ns)
       due = std::min(due, entity.due);
-  log(Entry::wait, now_, &thread, {std::max<Nanoseconds>(0, due - now_)});
+  log(TracePoint::wait, now_, &thread, {std::max<Nanoseconds>(0, due - now_)});
 }
 
 // Takes the message of the chosen entity and starts its callback; false if it is over.
@@ -182,7 +183,7 @@ bool Engine::take(Thread & thread) {
     thread.carried.chain_start = now_;
     thread.carried.instance = started_++;
   }
-  log(Entry::callback_start, now_, &thread, {entity.given->callback, thread.used, 0});
+  log(TracePoint::callback_start, now_, &thread, {entity.given->callback, thread.used, 0});
   return begin_body(thread);
 }
 
@@ -190,13 +191,13 @@ bool Engine::take_message(Thread & thread, Entity & entity) {
   drop_expired(entity);
   if (entity.history.size() == 0) {
     thread.carried.chain_start.reset();
-    log(Entry::take, now_, &thread, {entity.given->rmw_handle, 0, 0, 0});
+    log(TracePoint::take, now_, &thread, {entity.given->rmw_handle, 0, 0, 0});
     return false;
   }
   Message & message = entity.history.take_oldest();
   thread.carried = message.carried;
   if (!entity.given->on_chain) thread.carried.chain_start.reset();
-  log(Entry::take, now_, &thread,
+  log(TracePoint::take, now_, &thread,
       {entity.given->rmw_handle, message.address, message.carried.source, 1});
   messages_.give_back(message);
   return true;

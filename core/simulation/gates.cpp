@@ -104,7 +104,7 @@ void Engine::overflow(Entity & entity) {
 void Engine::log_release(const Entity & entity, Nanoseconds time, const Thread & thread,
                          Nanoseconds source, Nanoseconds arrival, const Release & release) {
   const std::int64_t mode = release.mode ? entity.gate->modes[*release.mode] : absent;
-  log(Entry::release, time, &thread,
+  log(TracePoint::release, time, &thread,
       {entity.given->callback, source, arrival, release.origin_ns, number_of(release.at_ns),
        number_of(release.slot), release.cycles_waited, static_cast<std::int64_t>(release.anchor),
        number_of(release.overrun), mode, number_of(release.dropped), release.moved_ns});

@@ -29,6 +29,7 @@ Engine::Engine(Description description, Source source)
     : given_(checked(std::move(description))),
       source_(std::move(source)),
       groups_(given_.groups, false),
+      log_(given_.log_rows),
       latencies_(given_.instances, absent) {
   for (Place place = 0; place < given_.streams.size(); ++place)
     streams_.emplace_back(given_.streams[place], place);
@@ -55,7 +56,8 @@ void Engine::set_up_threads() {
     Thread & thread = threads_[place];
     const ThreadDescription & given = given_.threads[place];
     Executor & executor = executors_[given.process];
-    thread.given = &given;
+    thread.rank = given.rank;
+    thread.server = given.server ? std::uint64_t{1} << *given.server : 0;
     thread.place = static_cast<std::int32_t>(place);
     thread.core = &cores_[given.core];
     thread.executor = &executor;

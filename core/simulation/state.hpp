@@ -56,7 +56,8 @@ enum class Step {
 };
 
 struct Thread {
-  const ThreadDescription * given;
+  std::int64_t rank;     // the smaller one runs
+  std::uint64_t server;  // its bit among those that are open; 0: it runs at any time
   std::int32_t place;  // in the list of threads
   Core * core;
   Executor * executor;  // of its process, also where others than callbacks run in it

@@ -31,7 +31,7 @@ void Engine::publish(Thread & thread, Publisher & publisher) {
   if (!given.modes.empty())
     message.carried.mode = given.modes[publisher.published % given.modes.size()];
   ++publisher.published;
-  log(Entry::publish, now_, &thread, {given.handle, given.rmw_handle, message.address, now_});
+  log(TracePoint::publish, now_, &thread, {given.handle, given.rmw_handle, message.address, now_});
   if (given.asynchronous)
     hand_over(*thread.executor->publisher_thread, publisher, message);
   else
@@ -45,7 +45,7 @@ void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message
     ++marks_;
     count_in_use();
   } else {  // the newer ones move up by one place
-    log(Entry::send, now_, &sender,
+    log(TracePoint::send, now_, &sender,
         {publisher.given->rmw_handle, publisher.history.oldest().carried.source,
          static_cast<std::int64_t>(Outcome::overwritten), 0});
   }
@@ -106,7 +106,7 @@ void Engine::work_for_executor(Thread & thread) {
   switch (thread.step) {
     case Step::sent: {
       const Nanoseconds began = thread.began.value_or(now_);
-      log(Entry::send, began, &thread,
+      log(TracePoint::send, began, &thread,
           {thread.sending->given->rmw_handle, thread.carried.source,
            static_cast<std::int64_t>(Outcome::sent), now_ - began});
       thread.step = Step::send;
@@ -135,7 +135,7 @@ void Engine::send_next(Thread & thread) {
   const Nanoseconds source = message.carried.source;
   const auto & lifespan = publisher.given->lifespan_ns;
   if (lifespan && now_ - source > *lifespan) {
-    log(Entry::send, now_, &thread,
+    log(TracePoint::send, now_, &thread,
         {publisher.given->rmw_handle, source, static_cast<std::int64_t>(Outcome::expired), 0});
     messages_.give_back(message);
     return;

@@ -213,7 +213,8 @@ class Pause(Enum):
     none = 0
     log_full = 1
     messages_full = 2
-    over = 3
+    endless = 3
+    over = 4
 
 class Simulation:
     """A simulated application, from its start on."""
@@ -236,3 +237,6 @@ class Simulation:
     @property
     def now_ns(self) -> int:
         """The present instant."""
+
+def delta_packed(numbers: NDArray[np.int32] | NDArray[np.int64]) -> bytes:
+    """A column, which must be contiguous, in Parquet's encoding DELTA_BINARY_PACKED."""

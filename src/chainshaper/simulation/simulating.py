@@ -175,6 +175,11 @@ def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[_
                 " to run, or a delivery that takes far longer than a period; correct the"
                 " description, or the plan's slots"
             )
+        if reason == _core.Pause.endless:
+            raise OperationError(
+                "callbacks have each other called without end while no time passes: give one of"
+                " them an execution time, or a topic on the way a delivery time"
+            )
         yield reason
         if progress is not None:
             elapsed, whole_run = simulation.now_ns - START_NS, described.stop_ns - START_NS

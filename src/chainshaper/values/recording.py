@@ -27,6 +27,7 @@ from chainshaper.values.files import (
     rename_output,
     write_whole,
 )
+from chainshaper.values.parquet import is_packable, packed
 from chainshaper.values.yaml_file import wrong_values_refused
 
 INFO_FILE = "recording.json"
@@ -300,13 +301,18 @@ def _next_part(file: Path, checksums: dict[str, str]) -> Path:
 
 def _write_table(file: Path, frame: pl.DataFrame) -> str:
     """Write a file; its checksum."""
-    content = io.BytesIO()  # written directly, Polars reports a full disk as a wrong file
-    frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
+    content = packed(frame) if is_packable(frame) else _written_by_polars(frame)
     with os.fdopen(open_output(file), "wb") as stream:
-        stream.write(content.getbuffer())
+        stream.write(content)
         stream.flush()
         os.fsync(stream.fileno())
-    return _checksum(content.getbuffer())
+    return _checksum(content)
+
+
+def _written_by_polars(frame: pl.DataFrame) -> memoryview:
+    content = io.BytesIO()  # written directly, Polars reports a full disk as a wrong file
+    frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
+    return content.getbuffer()
 
 
 State: TypeAlias = Literal["good", "limited", "absent"]
