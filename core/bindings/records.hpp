@@ -4,6 +4,7 @@
 
 #include <nanobind/nanobind.h>
 
+#include <memory>
 #include <new>
 #include <stdexcept>
 #include <string>
@@ -40,6 +41,15 @@ nb::object column_of(std::vector<Number> && numbers) {
   const nb::capsule owner(
       kept, [](void * column) noexcept { delete static_cast<std::vector<Number> *>(column); });
   return nb::cast(nb::ndarray<nb::numpy, Number, nb::ndim<1>>(kept->data(), {kept->size()}, owner));
+}
+
+// The same, of the first numbers of an array.
+template <typename Number>
+nb::object column_of(std::unique_ptr<Number[]> && numbers, std::size_t count) {
+  Number * kept = numbers.release();
+  const nb::capsule owner(kept,
+                          [](void * column) noexcept { delete[] static_cast<Number *>(column); });
+  return nb::cast(nb::ndarray<nb::numpy, Number, nb::ndim<1>>(kept, {count}, owner));
 }
 
 }  // namespace chainshaper::bindings

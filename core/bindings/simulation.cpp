@@ -178,7 +178,8 @@ void bind_gate(nb::module_ & module) {
 }
 
 void bind_description(nb::module_ & module) {
-  record<Description>(module, "Description", "What is simulated; parts refer to each other by place.")
+  record<Description>(module, "Description",
+                      "What is simulated; parts refer to each other by place.")
       .def_rw("cores", &Description::cores)
       .def_rw("threads", &Description::threads)
       .def_rw("processes", &Description::processes)
@@ -224,16 +225,16 @@ Source source_from(nb::callable draw) {
 
 // Columns `pid`, `tid` and `cpu` of entries, by their threads; 0 for the idle thread.
 void add_threads(nb::dict & columns, const Description & description,
-                 const std::vector<std::int32_t> & threads) {
+                 const EntryColumns & entries) {
   static const std::vector<std::pair<const char *, std::int32_t ThreadDescription::*>> fields{
       {"pid", &ThreadDescription::pid},
       {"tid", &ThreadDescription::tid},
       {"cpu", &ThreadDescription::cpu}};
   for (const auto & [name, field] : fields) {
-    std::vector<std::int32_t> column(threads.size());
-    for (std::size_t row = 0; row < threads.size(); ++row)
-      if (threads[row] != absent)
-        column[row] = description.threads[static_cast<Place>(threads[row])].*field;
+    std::vector<std::int32_t> column(entries.count);
+    for (std::size_t row = 0; row < entries.count; ++row)
+      if (entries.threads[row] != absent)
+        column[row] = description.threads[static_cast<Place>(entries.threads[row])].*field;
     columns[name] = column_of(std::move(column));
   }
 }
@@ -243,12 +244,13 @@ nb::dict take_log(Engine & engine) {
   auto entries = engine.take_log();
   for (std::size_t number = 0; number < entries.size(); ++number) {
     const auto & [name, fields] = log_layout()[number];
+    EntryColumns & taken = entries[number];
     nb::dict columns;
-    columns["time"] = column_of(std::move(entries[number].times));
-    add_threads(columns, engine.description(), entries[number].threads);
-    columns["thread"] = column_of(std::move(entries[number].threads));
+    columns["time"] = column_of(std::move(taken.times), taken.count);
+    add_threads(columns, engine.description(), taken);
+    columns["thread"] = column_of(std::move(taken.threads), taken.count);
     for (std::size_t field = 0; field < fields.size(); ++field)
-      columns[fields[field]] = column_of(std::move(entries[number].fields[field]));
+      columns[fields[field]] = column_of(std::move(taken.fields[field]), taken.count);
     log[name] = columns;
   }
   return log;
@@ -270,12 +272,14 @@ void bind_simulation(nb::module_ & module) {
             new (place) Engine(description, source_from(std::move(draw)));
           },
           nb::arg("description"), nb::arg("draw"),
-          "`draw(stream)` gives the next numbers of a stream. Raises ValueError: it makes no sense.")
+          "`draw(stream)` gives the next numbers of a stream. Raises ValueError: it makes no "
+          "sense.")
       .def("run", &Engine::run, nb::arg("most_instants"), nb::call_guard<nb::gil_scoped_release>(),
            "Go on until the end, until the log is full, or for so many instants.")
       .def("take_log", &take_log, "What was logged: columns by the names of entries and of fields.")
-      .def("latencies", [](const Engine & engine) { return column_of(engine.latencies()); },
-           "Of each instance of the chain (ns); -1: it did not complete.")
+      .def(
+          "latencies", [](const Engine & engine) { return column_of(engine.latencies()); },
+          "Of each instance of the chain (ns); -1: it did not complete.")
       .def_prop_ro("now_ns", &Engine::now);
 }
 

@@ -27,18 +27,20 @@ void add_zigzag(std::string & bytes, std::int64_t value) {
 // Numbers of `width` bits each, the lowest bits first: a miniblock fills whole bytes.
 void add_packed(std::string & bytes, std::span<const std::uint64_t> numbers, unsigned width) {
   static_assert(std::endian::native == std::endian::little);
-  std::array<std::uint64_t, miniblock_size + 1> words{};
-  std::size_t word = 0;
+  std::array<std::uint64_t, miniblock_size + 1> words;
+  std::size_t full = 0;
+  std::uint64_t word = 0;
   unsigned used = 0;  // bits of the word
   for (const auto number : numbers) {
-    words[word] |= number << used;
+    word |= number << used;
     used += width;
     if (used < 64) continue;
-    ++word;
+    words[full++] = word;
     used -= 64;
     // A shift by all 64 bits would have no meaning.
-    if (used > 0) words[word] = number >> (width - used);
+    word = used > 0 ? number >> (width - used) : 0;
   }
+  words[full] = word;
   bytes.append(reinterpret_cast<const char *>(words.data()), numbers.size() * width / 8);
 }
 
@@ -64,8 +66,9 @@ void add_block(std::string & bytes, std::span<const std::make_unsigned_t<Number>
   }
   // Behind the last difference, whole parts are left out.
   for (std::size_t part = 0; part * miniblock_size < differences.size(); ++part)
-    if (widths[part] > 0) add_packed(bytes, std::span(above).subspan(part * miniblock_size, miniblock_size),
-               widths[part]);
+    if (widths[part] > 0)
+      add_packed(bytes, std::span(above).subspan(part * miniblock_size, miniblock_size),
+                 widths[part]);
 }
 
 }  // namespace

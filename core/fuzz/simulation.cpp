@@ -132,8 +132,8 @@ Description chosen(Choices & choose) {
   all.gates = {chosen_gate(choose)};
   all.synchronisers = {{{{choose.yes(), 1}, {choose.yes(), 2}}, choose.maybe(2)}};
   for (Place process = 0, count = 1 + choose.below(3); process < count; ++process) {
-    ProcessDescription described{static_cast<ExecutorKind>(choose.below(4)),
-                                 all.entities.size(), choose.below(4)};
+    ProcessDescription described{static_cast<ExecutorKind>(choose.below(4)), all.entities.size(),
+                                 choose.below(4)};
     for (Place place = 0; place < described.entity_count; ++place) {
       all.entities.push_back(chosen_entity(choose, process, all.publishers.size()));
       for (auto left = all.entities.back().publisher_count; left > 0; --left)

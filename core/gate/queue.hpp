@@ -81,8 +81,8 @@ private:
     return start_ns && 2 * std::abs(release.start_ns(gate.cycle_ns) - *start_ns) < gate.cycle_ns;
   }
 
-  // When cycles start: the one that the oldest message, or another for it, leaves in, and the one in
-  // which the last has left.
+  // When cycles start: the one that the oldest message, or another for it, leaves in, and the one
+  // in which the last has left.
   Maybe leaving_;
   Maybe left_;
 };
@@ -118,11 +118,8 @@ public:
   std::optional<Outcome<Message>> arrive(Message message, std::int64_t arrival_ns, Maybe stamp_ns,
                                          Maybe source_timestamp = {}, Maybe lost = {}) {
     if (arrival_ns < unsure_until_ns_) stamp_ns.reset();
-    waiting.push_back({{arrival_ns, stamp_ns, phase_ns},
-                       std::move(message),
-                       source_timestamp,
-                       lost,
-                       number_++});
+    waiting.push_back(
+        {{arrival_ns, stamp_ns, phase_ns}, std::move(message), source_timestamp, lost, number_++});
     if (gate.counts_from(stamp_ns, arrival_ns)) phase_ns = *stamp_ns % gate.cycle_ns;
     if (waiting.size() <= gate.depth) return std::nullopt;
     Release release = release_at(waiting.front(), arrival_ns);
@@ -133,9 +130,8 @@ public:
   Release decide() { return Turns::decide(waiting.front()); }
 
   bool replaced(const Release & release, std::int64_t now_ns) const {
-    return std::any_of(waiting.begin() + 1, waiting.end(), [&](const Arrival & newer) {
-      return is_replaced(release, newer, now_ns);
-    });
+    return std::any_of(waiting.begin() + 1, waiting.end(),
+                       [&](const Arrival & newer) { return is_replaced(release, newer, now_ns); });
   }
 
   // The oldest message leaves, or is dropped; no release: it is not this gate's to decide.

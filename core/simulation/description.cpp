@@ -105,9 +105,9 @@ void check_processes(const Description & all) {
   for (const auto & entity : all.entities) {
     require(executing[entity.process], "a callback without a thread");
     for (Place place = 0; place < entity.publisher_count; ++place)
-      require(!all.publishers[entity.first_publisher + place].asynchronous ||
-                  sending[entity.process],
-              "an asynchronous publisher without a thread");
+      require(
+          !all.publishers[entity.first_publisher + place].asynchronous || sending[entity.process],
+          "an asynchronous publisher without a thread");
   }
 }
 

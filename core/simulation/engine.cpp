@@ -30,7 +30,7 @@ std::vector<Nanoseconds> Engine::latencies() const {
 }
 
 void Engine::count_step() {
-  constexpr std::uint64_t most = 1 << 22;  // as no application needs at an instant
+  constexpr std::uint64_t most = 1 << 20;  // as no application needs at an instant
   if (++steps_ > most) pause_ = Pause::endless;
 }
 

@@ -8,17 +8,18 @@
 //
 // At one instant, first what was to come happens (expiries, deliveries, ends of sleeps), so that an
 // executor's snapshot has all that happened up to that instant; then running threads that have used
-// what they needed go on; and only then slots open and close: work that fills a slot exactly is done.
+// what they needed go on; and only then slots open and close: work that fills a slot exactly is
+// done.
 //
 // Executors. Single-threaded (rclcpp/src/rclcpp/executor.cpp) and multi-threaded
-// (multi_threaded_executor.cpp) ones are as chainshaper/workload/executor.py has them, with services
-// and clients behind subscriptions. Static ones (static_single_threaded_executor.cpp):
+// (multi_threaded_executor.cpp) ones are as chainshaper/workload/executor.py has them, with
+// services and clients behind subscriptions. Static ones (static_single_threaded_executor.cpp):
 // subscriptions first, then timers, clients and services, and one callback per wait set. Events
 // executors (events_executor.cpp): in the order in which things happened, every message and every
 // expiry an event of its own. Entities stand in the order in which their executor looks at them.
 //
-// A publication reaches every reader of its topic after a delay, in order, where a DDS thread of the
-// reader's process may have to work for it first. An asynchronous publisher hands it to the
+// A publication reaches every reader of its topic after a delay, in order, where a DDS thread of
+// the reader's process may have to work for it first. An asynchronous publisher hands it to the
 // publisher thread of its process before.
 
 #pragma once
@@ -100,8 +101,8 @@ private:
   bool take_message(Thread & thread, Entity & entity);
   void wake_owner(const Executor & executor);
 
-  // callbacks.cpp: what callbacks do. They leave in their thread how much CPU time it needs next and
-  // what follows, or let it wait; and return whether the callback goes on.
+  // callbacks.cpp: what callbacks do. They leave in their thread how much CPU time it needs next
+  // and what follows, or let it wait; and return whether the callback goes on.
   bool begin_body(Thread & thread);
   bool go_on_publishing(Thread & thread);
   bool end(Thread & thread);

@@ -1,5 +1,6 @@
 #include "simulation/event_log.hpp"
 
+#include <algorithm>
 #include <utility>
 
 namespace chainshaper::simulation {
@@ -22,18 +23,33 @@ const std::vector<EntryNames> & log_layout() {
 }
 
 EventLog::EventLog(std::size_t rows) : rows_(rows) {
-  for (const auto & names : log_layout())
-    entries_.push_back({{}, {}, std::vector<std::vector<std::int64_t>>(names.fields.size())});
+  for (const auto & names : log_layout()) {
+    entries_.emplace_back();
+    entries_.back().fields.resize(names.fields.size());
+  }
 }
 
 std::vector<EntryColumns> EventLog::take_all() {
   return std::exchange(entries_, EventLog(rows_).entries_);
 }
 
-void EventLog::reserve(EntryColumns & columns) const {
-  columns.times.reserve(rows_);
-  columns.threads.reserve(rows_);
-  for (auto & field : columns.fields) field.reserve(rows_);
+namespace {
+
+template <typename Number>
+void move_to_larger(Column<Number> & column, std::size_t count, std::size_t room) {
+  auto larger = std::make_unique_for_overwrite<Number[]>(room);
+  std::copy_n(column.get(), count, larger.get());
+  column = std::move(larger);
+}
+
+}  // namespace
+
+void EventLog::grow(EntryColumns & columns) const {
+  constexpr std::size_t spare = 1024;  // what may come until the caller takes the log
+  columns.room = columns.room == 0 ? rows_ + spare : 2 * columns.room;
+  move_to_larger(columns.times, columns.count, columns.room);
+  move_to_larger(columns.threads, columns.count, columns.room);
+  for (auto & field : columns.fields) move_to_larger(field, columns.count, columns.room);
 }
 
 }  // namespace chainshaper::simulation

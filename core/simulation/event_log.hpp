@@ -1,12 +1,14 @@
 // What happened, as columns of numbers: an entry for each trace point that a process passes.
 //
-// Entries and fields have the names of chainshaper/workload/event_log.py, as have those of live runs.
+// Entries and fields have the names of chainshaper/workload/event_log.py, as have those of live
+// runs.
 
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
 #include <initializer_list>
+#include <memory>
 #include <vector>
 
 #include "simulation/description.hpp"
@@ -36,11 +38,17 @@ struct EntryNames {
 // The names of all entries, in the order of `TracePoint`.
 const std::vector<EntryNames> & log_layout();
 
-// Entries of one kind, column by column.
+// Numbers that are Python's later on, without being copied.
+template <typename Number>
+using Column = std::unique_ptr<Number[]>;
+
+// Entries of one kind, column by column; each has room for so many.
 struct EntryColumns {
-  std::vector<Nanoseconds> times;
-  std::vector<std::int32_t> threads;  // places; `absent`: the idle thread
-  std::vector<std::vector<std::int64_t>> fields;
+  std::size_t count{0};
+  std::size_t room{0};
+  Column<Nanoseconds> times;
+  Column<std::int32_t> threads;  // places; `absent`: the idle thread
+  std::vector<Column<std::int64_t>> fields;
 };
 
 class EventLog {
@@ -52,19 +60,20 @@ public:
   std::size_t add(TracePoint point, Nanoseconds time, std::int32_t thread,
                   std::initializer_list<std::int64_t> fields) {
     EntryColumns & columns = entries_[static_cast<std::size_t>(point)];
-    if (columns.times.capacity() == 0) reserve(columns);
-    columns.times.push_back(time);
-    columns.threads.push_back(thread);
+    if (columns.count == columns.room) grow(columns);
+    const std::size_t row = columns.count++;
+    columns.times[row] = time;
+    columns.threads[row] = thread;
     auto column = columns.fields.begin();
-    for (const auto field : fields) (column++)->push_back(field);
-    return columns.times.size();
+    for (const auto field : fields) (*column++)[row] = field;
+    return columns.count;
   }
 
   // All entries, in the order of `TracePoint`; the log is empty then.
   std::vector<EntryColumns> take_all();
 
 private:
-  void reserve(EntryColumns & columns) const;
+  void grow(EntryColumns & columns) const;
 
   std::size_t rows_;
   std::vector<EntryColumns> entries_;

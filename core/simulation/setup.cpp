@@ -82,8 +82,8 @@ void Engine::set_up_entities() {
   for (Place place = 0; place < executors_.size(); ++place) {
     const ProcessDescription & given = given_.processes[place];
     executors_[place].kind = given.executor;
-    executors_[place].entities = std::span(entities_).subspan(given.first_entity,
-                                                             given.entity_count);
+    executors_[place].entities =
+        std::span(entities_).subspan(given.first_entity, given.entity_count);
   }
   std::vector<std::pair<Nanoseconds, Entity *>> expiries;
   for (Place place = 0; place < entities_.size(); ++place) {

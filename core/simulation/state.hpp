@@ -33,11 +33,11 @@ struct Core {
   Place next;            // the row of the table that comes into force
   Nanoseconds boundary;  // then
   Thread * running{nullptr};
-  Thread * ran_last{nullptr};   // before it idled, perhaps
-  Nanoseconds since{0};         // what the running thread has used up to then is accounted for
-  Nanoseconds until{forever};   // then the running thread has to be looked at
-  Nanoseconds quantum{0};       // what is left of its turn
-  bool changed{true};           // another thread may have to run
+  Thread * ran_last{nullptr};  // before it idled, perhaps
+  Nanoseconds since{0};        // what the running thread has used up to then is accounted for
+  Nanoseconds until{forever};  // then the running thread has to be looked at
+  Nanoseconds quantum{0};      // what is left of its turn
+  bool changed{true};          // another thread may have to run
 };
 
 // What a thread does next, when it has used the CPU time that is left to it.
@@ -58,7 +58,7 @@ enum class Step {
 struct Thread {
   std::int64_t rank;     // the smaller one runs
   std::uint64_t server;  // its bit among those that are open; 0: it runs at any time
-  std::int32_t place;  // in the list of threads
+  std::int32_t place;    // in the list of threads
   Core * core;
   Executor * executor;  // of its process, also where others than callbacks run in it
   Stream * wake_up;
@@ -70,16 +70,16 @@ struct Thread {
 
   bool runnable{false};
   bool preempted{false};
-  Nanoseconds left{0};         // CPU time to the next step
-  Nanoseconds used{0};         // CPU time so far
-  std::uint64_t sequence{0};   // the smaller one goes first among those of its rank
-  Entity * entity{nullptr};    // whose callback runs
-  std::size_t publication{0};  // how many of its publishers have published; one more: all is done
-  Publisher * sending{nullptr};        // of a publisher thread
-  std::deque<Publisher *> to_send;     // of a publisher thread
-  MessageQueue to_receive;             // of a thread of DDS
-  Carried carried;                     // by its present message
-  std::optional<Nanoseconds> began;    // sending, or the gate woke
+  Nanoseconds left{0};           // CPU time to the next step
+  Nanoseconds used{0};           // CPU time so far
+  std::uint64_t sequence{0};     // the smaller one goes first among those of its rank
+  Entity * entity{nullptr};      // whose callback runs
+  std::size_t publication{0};    // how many of its publishers have published; one more: all is done
+  Publisher * sending{nullptr};  // of a publisher thread
+  std::deque<Publisher *> to_send;   // of a publisher thread
+  MessageQueue to_receive;           // of a thread of DDS
+  Carried carried;                   // by its present message
+  std::optional<Nanoseconds> began;  // sending, or the gate woke
 };
 
 struct Executor {
@@ -107,9 +107,9 @@ struct GateAtWork {
   std::vector<std::int64_t> modes;  // the number of each in the application
   Nanoseconds spin;
   Nanoseconds pause;
-  Nanoseconds phase;          // where cycles begin for messages without a good stamp
-  Nanoseconds arrival{0};     // of the message that it holds
-  Release release{};          // what was decided about it
+  Nanoseconds phase;       // where cycles begin for messages without a good stamp
+  Nanoseconds arrival{0};  // of the message that it holds
+  Release release{};       // what was decided about it
 };
 
 struct Synchroniser {
@@ -141,8 +141,8 @@ struct Entity {
 
 struct ReaderOf {
   Entity * entity;
-  Stream * delivery;                // none: that of the sending thread
-  Nanoseconds last_arrival{0};      // DDS delivers what comes from one publisher in order
+  Stream * delivery;            // none: that of the sending thread
+  Nanoseconds last_arrival{0};  // DDS delivers what comes from one publisher in order
 };
 
 struct Publisher {

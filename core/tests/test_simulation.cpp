@@ -1,4 +1,5 @@
-// Small applications whose schedules are worked by hand. Times are ns; what is not named costs none.
+// Small applications whose schedules are worked by hand. Times are ns; what is not named costs
+// none.
 
 #include <algorithm>
 #include <map>
@@ -72,11 +73,15 @@ struct Built {
 
 Times none_drawn(Place) { throw std::logic_error("all streams are constant"); }
 
+Times column(const Column<Nanoseconds> & numbers, std::size_t count) {
+  return {numbers.get(), numbers.get() + count};
+}
+
 // When callbacks with that number ended.
 Times ends_of(const std::vector<EntryColumns> & log, std::int64_t callback) {
   const auto & ended = log[static_cast<std::size_t>(TracePoint::callback_end)];
   Times times;
-  for (std::size_t row = 0; row < ended.times.size(); ++row)
+  for (std::size_t row = 0; row < ended.count; ++row)
     if (ended.fields[0][row] == callback) times.push_back(ended.times[row]);
   return times;
 }
@@ -158,10 +163,10 @@ void a_gate_holds_a_message_until_its_slot() {
   gate.gate.cycle_ns = 100;
   built.all.gates = {gate};
   const auto log = run(built.all);
-  const auto & published = log[static_cast<std::size_t>(TracePoint::publish)].times;
-  EXPECT((published == Times{105, 130, 505, 530, 905, 930}));
-  const auto & released = log[static_cast<std::size_t>(TracePoint::release)].fields;
-  EXPECT((released[4] == Times{130, 530, 930}));  // `release`
+  const auto & published = log[static_cast<std::size_t>(TracePoint::publish)];
+  EXPECT((column(published.times, published.count) == Times{105, 130, 505, 530, 905, 930}));
+  const auto & released = log[static_cast<std::size_t>(TracePoint::release)];
+  EXPECT((column(released.fields[4], released.count) == Times{130, 530, 930}));  // `release`
 }
 
 void a_full_history_loses_its_oldest_message() {

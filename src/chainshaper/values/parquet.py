@@ -7,8 +7,10 @@ of a file and its pages are in Thrift's compact protocol).
 """
 
 from collections.abc import Iterator
+from typing import Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import polars as pl
 
 from chainshaper import _core
@@ -28,14 +30,22 @@ def is_packable(frame: pl.DataFrame) -> bool:
     return packable and frame.height > 0 and not any(column.null_count() for column in frame)
 
 
-def packed(frame: pl.DataFrame) -> bytes:
-    """The Parquet file of a table that :func:`is_packable`."""
+Pages: TypeAlias = dict[tuple[int, int, str], bytes]
+"""Columns that are packed already, by their place in memory, length and type."""
+
+
+def packed(frame: pl.DataFrame, known: Pages) -> bytes:
+    """The Parquet file of a table that :func:`is_packable`.
+
+    Events of the same instants have columns in common: what is ``known`` is not packed again, and
+    has to stay in memory as long as that is in use.
+    """
     parts, size, groups = [MAGIC], len(MAGIC), []
     for first in range(0, frame.height, GROUP_ROWS):
         rows = frame.slice(first, GROUP_ROWS)
         chunks = []
         for column in rows:
-            page = _page(column)
+            page = _page(column, known)
             chunks.append(_chunk(column, size, len(page)))
             parts.append(page)
             size += len(page)
@@ -57,9 +67,18 @@ def packed(frame: pl.DataFrame) -> bytes:
     return b"".join([*parts, about, len(about).to_bytes(4, "little"), MAGIC])
 
 
-def _page(column: pl.Series) -> bytes:
+def _page(column: pl.Series, known: Pages) -> bytes:
     """A column's values, with their description in front."""
-    values = np.ascontiguousarray(column.rechunk().to_numpy())
+    if column.n_chunks() > 1:  # a copy, whose place in memory is soon that of another one
+        return _packed_page(column.rechunk().to_numpy())
+    values = column.to_numpy(allow_copy=False)
+    key = (values.__array_interface__["data"][0], len(values), values.dtype.str)
+    if key not in known:
+        known[key] = _packed_page(values)
+    return known[key]
+
+
+def _packed_page(values: npt.NDArray[Any]) -> bytes:
     content = _core.delta_packed(values.view(np.int64) if values.dtype == np.uint64 else values)
     header = _struct(
         (1, _I32, _int(0)),  # a page of data
@@ -69,7 +88,7 @@ def _page(column: pl.Series) -> bytes:
             5,
             _STRUCT,
             _struct(
-                (1, _I32, _int(len(column))),
+                (1, _I32, _int(len(values))),
                 (2, _I32, _int(_DELTA_BINARY_PACKED)),
                 (3, _I32, _int(_RLE)),
                 (4, _I32, _int(_RLE)),

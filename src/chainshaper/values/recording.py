@@ -27,7 +27,7 @@ from chainshaper.values.files import (
     rename_output,
     write_whole,
 )
-from chainshaper.values.parquet import is_packable, packed
+from chainshaper.values.parquet import Pages, is_packable, packed
 from chainshaper.values.yaml_file import wrong_values_refused
 
 INFO_FILE = "recording.json"
@@ -275,9 +275,10 @@ def write_recording(
         with folder_beside(path) as made:
             partial, checksums = Path(made), dict[str, str]()
             for part in [tables] if isinstance(tables, Mapping) else tables:
+                pages: Pages = {}  # while the part's tables are there
                 for name, frame in part.items():
                     file = _next_part(partial / f"{name}.parquet", checksums)
-                    checksums[str(file.relative_to(partial))] = _write_table(file, frame)
+                    checksums[str(file.relative_to(partial))] = _write_table(file, frame, pages)
             info = info.model_copy(update={"checksums": checksums})
             values = storable(info.model_dump(mode="json"))
             text = json.dumps(values, indent=2, ensure_ascii=False) + "\n"
@@ -299,9 +300,9 @@ def _next_part(file: Path, checksums: dict[str, str]) -> Path:
     return file / f"{len(list(file.iterdir())):06}.parquet" if file.is_dir() else file
 
 
-def _write_table(file: Path, frame: pl.DataFrame) -> str:
+def _write_table(file: Path, frame: pl.DataFrame, pages: Pages) -> str:
     """Write a file; its checksum."""
-    content = packed(frame) if is_packable(frame) else _written_by_polars(frame)
+    content = packed(frame, pages) if is_packable(frame) else _written_by_polars(frame)
     with os.fdopen(open_output(file), "wb") as stream:
         stream.write(content)
         stream.flush()
