@@ -17,8 +17,8 @@ LIMITS = {
 }
 
 
-def read(content: bytes) -> pl.DataFrame:
-    return pl.read_parquet(io.BytesIO(content))
+def read(parts: list[bytes]) -> pl.DataFrame:
+    return pl.read_parquet(io.BytesIO(b"".join(parts)))
 
 
 @pytest.mark.parametrize("rows", [1, 2, 32, 33, 128, 129, 130, 1000, 4097])
@@ -47,7 +47,7 @@ def test_groups_of_rows_and_chunks_are_one_table(monkeypatch: pytest.MonkeyPatch
     content = parquet.packed(part, pages)
     assert read(content).equals(part)
     assert parquet.packed(part.select("time", "µ"), pages) == content
-    assert pl.scan_parquet(io.BytesIO(content)).select("µ").collect().height == 170
+    assert pl.scan_parquet(io.BytesIO(b"".join(content))).select("µ").collect().height == 170
 
 
 def test_other_tables_are_left_to_polars() -> None:

@@ -30,30 +30,30 @@ def is_packable(frame: pl.DataFrame) -> bool:
     return packable and frame.height > 0 and not any(column.null_count() for column in frame)
 
 
-Pages: TypeAlias = dict[tuple[int, int, str], bytes]
+Pages: TypeAlias = dict[tuple[int, int, str], tuple[bytes, bytes]]
 """Columns that are packed already, by their place in memory, length and type."""
 
 
-def packed(frame: pl.DataFrame, known: Pages) -> bytes:
-    """The Parquet file of a table that :func:`is_packable`.
+def packed(frame: pl.DataFrame, known: Pages) -> list[bytes]:
+    """The Parquet file of a table that :func:`is_packable`, in parts.
 
     Events of the same instants have columns in common: what is ``known`` is not packed again, and
     has to stay in memory as long as that is in use.
     """
     parts, size, groups = [MAGIC], len(MAGIC), []
     for first in range(0, frame.height, GROUP_ROWS):
-        rows = frame.slice(first, GROUP_ROWS)
+        rows, before = frame.slice(first, GROUP_ROWS), size
         chunks = []
         for column in rows:
             page = _page(column, known)
-            chunks.append(_chunk(column, size, len(page)))
-            parts.append(page)
-            size += len(page)
-        total = sum(map(len, parts[-len(chunks) :]))
+            length = sum(map(len, page))
+            chunks.append(_chunk(column, size, length))
+            parts += page
+            size += length
         groups.append(
             _struct(
                 (1, _LIST, _list(_STRUCT, chunks)),
-                (2, _I64, _int(total)),
+                (2, _I64, _int(size - before)),
                 (3, _I64, _int(rows.height)),
             )
         )
@@ -64,11 +64,11 @@ def packed(frame: pl.DataFrame, known: Pages) -> bytes:
         (4, _LIST, _list(_STRUCT, groups)),
         (6, _BINARY, _text("chainshaper")),
     )
-    return b"".join([*parts, about, len(about).to_bytes(4, "little"), MAGIC])
+    return [*parts, about, len(about).to_bytes(4, "little"), MAGIC]
 
 
-def _page(column: pl.Series, known: Pages) -> bytes:
-    """A column's values, with their description in front."""
+def _page(column: pl.Series, known: Pages) -> tuple[bytes, bytes]:
+    """A column's values, and in front what is said of them."""
     if column.n_chunks() > 1:  # a copy, whose place in memory is soon that of another one
         return _packed_page(column.rechunk().to_numpy())
     values = column.to_numpy(allow_copy=False)
@@ -78,7 +78,7 @@ def _page(column: pl.Series, known: Pages) -> bytes:
     return known[key]
 
 
-def _packed_page(values: npt.NDArray[Any]) -> bytes:
+def _packed_page(values: npt.NDArray[Any]) -> tuple[bytes, bytes]:
     content = _core.delta_packed(values.view(np.int64) if values.dtype == np.uint64 else values)
     header = _struct(
         (1, _I32, _int(0)),  # a page of data
@@ -95,7 +95,7 @@ def _packed_page(values: npt.NDArray[Any]) -> bytes:
             ),
         ),
     )
-    return header + content
+    return header, content
 
 
 def _chunk(column: pl.Series, offset: int, size: int) -> bytes:

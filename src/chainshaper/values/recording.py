@@ -199,8 +199,11 @@ def _readable(file: Path) -> Iterator[Path]:
         raise InputError(f"{file}: {reason}; record the run again") from error
 
 
-def _checksum(content: bytes | memoryview) -> str:
-    return f"crc32:{zlib.crc32(content):08x}"
+def _checksum(*parts: bytes | memoryview) -> str:
+    found = 0
+    for part in parts:
+        found = zlib.crc32(part, found)
+    return f"crc32:{found:08x}"
 
 
 def event_counts(recording: Recording) -> pl.DataFrame:
@@ -302,12 +305,12 @@ def _next_part(file: Path, checksums: dict[str, str]) -> Path:
 
 def _write_table(file: Path, frame: pl.DataFrame, pages: Pages) -> str:
     """Write a file; its checksum."""
-    content = packed(frame, pages) if is_packable(frame) else _written_by_polars(frame)
+    parts = packed(frame, pages) if is_packable(frame) else [_written_by_polars(frame)]
     with os.fdopen(open_output(file), "wb") as stream:
-        stream.write(content)
+        stream.writelines(parts)
         stream.flush()
         os.fsync(stream.fileno())
-    return _checksum(content)
+    return _checksum(*parts)
 
 
 def _written_by_polars(frame: pl.DataFrame) -> memoryview:
