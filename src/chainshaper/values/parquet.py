@@ -20,7 +20,7 @@ MAGIC = b"PAR1"
 
 # Of Thrift, and of Parquet: types, a repetition, encodings, a converted type.
 _BOOL_FALSE, _BYTE, _I32, _I64, _BINARY, _LIST, _STRUCT = 2, 3, 5, 6, 8, 9, 12
-_PARQUET_TYPES = {pl.Int32(): 1, pl.Int64(): 2, pl.UInt64(): 2}
+_PARQUET_TYPES: dict[pl.DataType, int] = {pl.Int32(): 1, pl.Int64(): 2, pl.UInt64(): 2}
 _REQUIRED, _RLE, _DELTA_BINARY_PACKED, _UINT_64 = 0, 3, 5, 14
 
 
