@@ -50,6 +50,14 @@ def test_groups_of_rows_and_chunks_are_one_table(monkeypatch: pytest.MonkeyPatch
     assert pl.scan_parquet(io.BytesIO(b"".join(content))).select("µ").collect().height == 170
 
 
+def test_columns_that_come_and_go_are_not_taken_for_each_other() -> None:
+    pages: parquet.Pages = {}
+    for number in range(200):  # as Polars has it, a constant is an array only while it is looked at
+        frame = pl.DataFrame({"time": range(5), "pid": number})
+        assert read(parquet.packed(frame, pages)).equals(frame)
+        del frame
+
+
 def test_other_tables_are_left_to_polars() -> None:
     assert not parquet.is_packable(pl.DataFrame({"a": [1, None]}))
     assert not parquet.is_packable(pl.DataFrame({"a": ["1"]}))

@@ -30,15 +30,16 @@ def is_packable(frame: pl.DataFrame) -> bool:
     return packable and frame.height > 0 and not any(column.null_count() for column in frame)
 
 
-Pages: TypeAlias = dict[tuple[int, int, str], tuple[bytes, bytes]]
-"""Columns that are packed already, by their place in memory, length and type."""
+Page: TypeAlias = tuple[bytes, bytes]  # what is said of values, and the values
+Pages: TypeAlias = dict[tuple[int, int, str], tuple[npt.NDArray[Any], Page]]
+"""Columns that are packed already, by their place in memory, length and type; they are kept, since
+their place would be another's as soon as nobody had them."""
 
 
 def packed(frame: pl.DataFrame, known: Pages) -> list[bytes]:
     """The Parquet file of a table that :func:`is_packable`, in parts.
 
-    Events of the same instants have columns in common: what is ``known`` is not packed again, and
-    has to stay in memory as long as that is in use.
+    Events of the same instants have columns in common: what is ``known`` is not packed again.
     """
     parts, size, groups = [MAGIC], len(MAGIC), []
     for first in range(0, frame.height, GROUP_ROWS):
@@ -67,18 +68,18 @@ def packed(frame: pl.DataFrame, known: Pages) -> list[bytes]:
     return [*parts, about, len(about).to_bytes(4, "little"), MAGIC]
 
 
-def _page(column: pl.Series, known: Pages) -> tuple[bytes, bytes]:
+def _page(column: pl.Series, known: Pages) -> Page:
     """A column's values, and in front what is said of them."""
-    if column.n_chunks() > 1:  # a copy, whose place in memory is soon that of another one
+    if column.n_chunks() > 1:  # their copy is nobody else's
         return _packed_page(column.rechunk().to_numpy())
     values = column.to_numpy(allow_copy=False)
     key = (values.__array_interface__["data"][0], len(values), values.dtype.str)
     if key not in known:
-        known[key] = _packed_page(values)
-    return known[key]
+        known[key] = values, _packed_page(values)
+    return known[key][1]
 
 
-def _packed_page(values: npt.NDArray[Any]) -> tuple[bytes, bytes]:
+def _packed_page(values: npt.NDArray[Any]) -> Page:
     content = _core.delta_packed(values.view(np.int64) if values.dtype == np.uint64 else values)
     header = _struct(
         (1, _I32, _int(0)),  # a page of data

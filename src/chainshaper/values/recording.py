@@ -278,7 +278,7 @@ def write_recording(
         with folder_beside(path) as made:
             partial, checksums = Path(made), dict[str, str]()
             for part in [tables] if isinstance(tables, Mapping) else tables:
-                pages: Pages = {}  # while the part's tables are there
+                pages: Pages = {}
                 for name, frame in part.items():
                     file = _next_part(partial / f"{name}.parquet", checksums)
                     checksums[str(file.relative_to(partial))] = _write_table(file, frame, pages)
