@@ -14,7 +14,7 @@ constexpr std::size_t miniblocks = 4;
 constexpr std::size_t miniblock_size = block_size / miniblocks;
 
 void add_varint(std::string & bytes, std::uint64_t value) {
-  for (; value >= 128; value >>= 7) bytes.push_back(static_cast<char>(value | 128));
+  for (; value >= 128; value >>= 7) bytes.push_back(static_cast<char>(value | 128U));
   bytes.push_back(static_cast<char>(value));
 }
 
@@ -52,9 +52,10 @@ void add_block(std::string & bytes, std::span<const std::make_unsigned_t<Number>
   for (const auto difference : differences)
     least = std::min(least, static_cast<Number>(difference));
   std::array<std::uint64_t, block_size> above{};  // each difference's distance from the least
-  for (std::size_t place = 0; place < differences.size(); ++place)
+  for (std::size_t place = 0; place < differences.size(); ++place) {
     above[place] = static_cast<std::make_unsigned_t<Number>>(
         differences[place] - static_cast<std::make_unsigned_t<Number>>(least));
+  }
   add_zigzag(bytes, least);
   std::array<unsigned, miniblocks> widths{};
   for (std::size_t part = 0; part < miniblocks; ++part) {
@@ -65,10 +66,12 @@ void add_block(std::string & bytes, std::span<const std::make_unsigned_t<Number>
     bytes.push_back(static_cast<char>(widths[part]));
   }
   // Behind the last difference, whole parts are left out.
-  for (std::size_t part = 0; part * miniblock_size < differences.size(); ++part)
-    if (widths[part] > 0)
+  for (std::size_t part = 0; part * miniblock_size < differences.size(); ++part) {
+    if (widths[part] > 0) {
       add_packed(bytes, std::span(above).subspan(part * miniblock_size, miniblock_size),
                  widths[part]);
+    }
+  }
 }
 
 }  // namespace
@@ -85,9 +88,10 @@ std::string delta_packed(std::span<const Number> numbers) {
   std::array<Unsigned, block_size> differences{};
   for (std::size_t first = 1; first < numbers.size(); first += block_size) {
     const auto count = std::min(block_size, numbers.size() - first);
-    for (std::size_t place = 0; place < count; ++place)
+    for (std::size_t place = 0; place < count; ++place) {
       differences[place] = static_cast<Unsigned>(static_cast<Unsigned>(numbers[first + place]) -
                                                  static_cast<Unsigned>(numbers[first + place - 1]));
+    }
     add_block<Number>(bytes, std::span<const Unsigned>(differences).first(count));
   }
   return bytes;

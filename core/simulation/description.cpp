@@ -64,17 +64,19 @@ void check_entity(const Description & all, const EntityDescription & entity) {
   if (entity.body == Body::gate || entity.body == Body::mode_listener)
     require(has(all.gates, entity.gate), "a callback of an unknown gate");
   require(entity.body != Body::gate || entity.publisher_count > 0, "a gate that leads nowhere");
-  if (entity.body == Body::synchronise)
+  if (entity.body == Body::synchronise) {
     require(has(all.synchronisers, entity.synchroniser) &&
                 has(all.synchronisers[entity.synchroniser].inputs, entity.input),
             "an input of an unknown synchroniser");
+  }
 }
 
 void check_publisher(const Description & all, const PublisherDescription & publisher) {
-  for (const auto & reader : publisher.readers)
+  for (const auto & reader : publisher.readers) {
     require(has(all.entities, reader.entity) && has(all.streams, reader.delivery) &&
                 all.entities[reader.entity].kind != EntityKind::timer,
             "a publisher with an unknown reader");
+  }
   require(publisher.depth > 0, "a history without room");
   require(!publisher.lifespan_ns || is_time(*publisher.lifespan_ns), "a negative lifespan");
 }
@@ -83,9 +85,10 @@ void check_gate(const GateDescription & described) {
   check(described.gate);
   require(described.modes.size() == described.gate.modes.size(), "a gate with unknown modes");
   require(is_time(described.spin_ns) && is_time(described.pause_ns), "a gate that rests for ever");
-  for (const auto & [since_ns, by_ns] : described.moves)
+  for (const auto & [since_ns, by_ns] : described.moves) {
     require(is_time(since_ns) && described.gate.may_move(by_ns),
             "a gate whose slots leave the cycle");
+  }
 }
 
 // Every process has threads where something is to be done in them.
@@ -98,16 +101,18 @@ void check_processes(const Description & all) {
   for (const auto & process : all.processes) {
     require(has_range(all.entities, process.first_entity, process.entity_count),
             "a process with unknown callbacks");
-    for (Place place = 0; place < process.entity_count; ++place)
+    for (Place place = 0; place < process.entity_count; ++place) {
       require(&all.processes[all.entities[process.first_entity + place].process] == &process,
               "a callback of two processes");
+    }
   }
   for (const auto & entity : all.entities) {
     require(executing[entity.process], "a callback without a thread");
-    for (Place place = 0; place < entity.publisher_count; ++place)
+    for (Place place = 0; place < entity.publisher_count; ++place) {
       require(
           !all.publishers[entity.first_publisher + place].asynchronous || sending[entity.process],
           "an asynchronous publisher without a thread");
+    }
   }
 }
 

@@ -20,7 +20,7 @@ using Place = std::size_t;
 using MaybePlace = std::optional<Place>;
 
 // Later than anything that happens.
-inline constexpr Nanoseconds forever = Nanoseconds{1} << 62;
+inline constexpr Nanoseconds forever = 0x4000'0000'0000'0000;
 
 // From an offset in the cycle on, these servers of a core are open; bit n stands for server n.
 struct OpenServers {
@@ -154,7 +154,7 @@ struct Description {
   bool events{true};                // they are logged
   bool switches{false};             // and so is every context switch
   std::size_t instances{0};         // the latencies of so many instances of the chain are kept
-  std::size_t log_rows{1 << 17};    // the engine pauses when it has so many entries of a kind
+  std::size_t log_rows{131'072};    // the engine pauses when it has so many entries of a kind
   std::size_t most_messages{4096};  // more under way: messages pile up without end
 };
 

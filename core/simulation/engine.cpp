@@ -30,7 +30,7 @@ std::vector<Nanoseconds> Engine::latencies() const {
 }
 
 void Engine::count_step() {
-  constexpr std::uint64_t most = 1 << 20;  // as no application needs at an instant
+  constexpr std::uint64_t most = 1'000'000;  // as no application needs at an instant
   if (++steps_ > most) pause_ = Pause::endless;
 }
 
@@ -132,9 +132,10 @@ void Engine::switch_to(Core & core, Thread * thread) {
   Thread * before = core.running;
   const bool was_runnable = before != nullptr && before->runnable;
   if (was_runnable) before->preempted = true;
-  if (given_.switches)
+  if (given_.switches) {
     log(TracePoint::context_switch, now_, thread,
-        {&core - cores_.data(), before == nullptr ? absent : before->place, was_runnable});
+        {&core - cores_.data(), before == nullptr ? absent : before->place, was_runnable ? 1 : 0});
+  }
   core.running = thread;
   if (thread == nullptr) return;
   if (thread->preempted) thread->left = later(thread->left, given_.preemption_ns);

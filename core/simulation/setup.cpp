@@ -112,9 +112,10 @@ void Engine::set_up_publishers() {
     Publisher & publisher = publishers_[place];
     publisher.given = &given_.publishers[place];
     publisher.place = static_cast<std::int64_t>(place);
-    for (const auto & reader : publisher.given->readers)
+    for (const auto & reader : publisher.given->readers) {
       publisher.readers.push_back(
           {&entities_[reader.entity], reader.delivery ? &streams_[*reader.delivery] : nullptr});
+    }
   }
 }
 
