@@ -7,7 +7,6 @@ namespace chainshaper::bindings {
 void bind_bands(nanobind::module_ & module);
 void bind_ctf(nanobind::module_ & module);
 void bind_matching(nanobind::module_ & module);
-void bind_columns(nanobind::module_ & module);
 void bind_simulation(nanobind::module_ & module);
 
 }  // namespace chainshaper::bindings
@@ -17,6 +16,5 @@ NB_MODULE(_core, module) {
   chainshaper::bindings::bind_bands(module);
   chainshaper::bindings::bind_ctf(module);
   chainshaper::bindings::bind_matching(module);
-  chainshaper::bindings::bind_columns(module);
   chainshaper::bindings::bind_simulation(module);
 }

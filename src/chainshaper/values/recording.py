@@ -27,7 +27,6 @@ from chainshaper.values.files import (
     rename_output,
     write_whole,
 )
-from chainshaper.values.parquet import Pages, is_packable, packed
 from chainshaper.values.yaml_file import wrong_values_refused
 
 INFO_FILE = "recording.json"
@@ -199,11 +198,8 @@ def _readable(file: Path) -> Iterator[Path]:
         raise InputError(f"{file}: {reason}; record the run again") from error
 
 
-def _checksum(*parts: bytes | memoryview) -> str:
-    found = 0
-    for part in parts:
-        found = zlib.crc32(part, found)
-    return f"crc32:{found:08x}"
+def _checksum(content: bytes | memoryview) -> str:
+    return f"crc32:{zlib.crc32(content):08x}"
 
 
 def event_counts(recording: Recording) -> pl.DataFrame:
@@ -278,10 +274,9 @@ def write_recording(
         with folder_beside(path) as made:
             partial, checksums = Path(made), dict[str, str]()
             for part in [tables] if isinstance(tables, Mapping) else tables:
-                pages: Pages = {}
                 for name, frame in part.items():
                     file = _next_part(partial / f"{name}.parquet", checksums)
-                    checksums[str(file.relative_to(partial))] = _write_table(file, frame, pages)
+                    checksums[str(file.relative_to(partial))] = _write_table(file, frame)
             info = info.model_copy(update={"checksums": checksums})
             values = storable(info.model_dump(mode="json"))
             text = json.dumps(values, indent=2, ensure_ascii=False) + "\n"
@@ -303,20 +298,15 @@ def _next_part(file: Path, checksums: dict[str, str]) -> Path:
     return file / f"{len(list(file.iterdir())):06}.parquet" if file.is_dir() else file
 
 
-def _write_table(file: Path, frame: pl.DataFrame, pages: Pages) -> str:
+def _write_table(file: Path, frame: pl.DataFrame) -> str:
     """Write a file; its checksum."""
-    parts = packed(frame, pages) if is_packable(frame) else [_written_by_polars(frame)]
-    with os.fdopen(open_output(file), "wb") as stream:
-        stream.writelines(parts)
-        stream.flush()
-        os.fsync(stream.fileno())
-    return _checksum(*parts)
-
-
-def _written_by_polars(frame: pl.DataFrame) -> memoryview:
     content = io.BytesIO()  # written directly, Polars reports a full disk as a wrong file
     frame.write_parquet(content, compression="zstd", compression_level=1, statistics=False)
-    return content.getbuffer()
+    with os.fdopen(open_output(file), "wb") as stream:
+        stream.write(content.getbuffer())
+        stream.flush()
+        os.fsync(stream.fileno())
+    return _checksum(content.getbuffer())
 
 
 State: TypeAlias = Literal["good", "limited", "absent"]
