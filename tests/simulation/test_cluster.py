@@ -104,6 +104,11 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
     monkeypatch.setattr(computing, "WITHOUT_WORKERS_S", 1)
     (tmp_path / "other" / "chainshaper").mkdir(parents=True)
     (tmp_path / "other" / "chainshaper" / "__init__.py").touch()
+    # An editable installation goes before PYTHONPATH.
+    (tmp_path / "other" / "sitecustomize.py").write_text(
+        "import sys\n"
+        "sys.meta_path = [one for one in sys.meta_path if 'editable' not in type(one).__module__]\n"
+    )
     ended = worker(start, scheduler, path=tmp_path / "other")
     with distributed.Client(scheduler, set_as_default=False) as client:
         client.wait_for_workers(1, timeout=60)
