@@ -32,6 +32,7 @@ public:
 
   // The position of the packet's first event.
   Reached open() const {
+    run_.forget_variables();
     if (content_.end == 0) return 0;
     const auto header = run_.steps(stream_.packet_header, content_, 0);
     if (header.failed()) return header;
@@ -275,7 +276,6 @@ Chunk EventReader::count(std::size_t end) {
   if (end < counted_ || end > packets_.size())
     throw std::invalid_argument("packets are counted once, in their order");
   Chunk chunk{counted_, end, run_.clock(), rows_, {}};
-  run_.begin(chunk.clock);
   for (; counted_ < end; ++counted_) count_packet(counted_);
   chunk.rows_after = rows_;
   return chunk;
@@ -330,7 +330,7 @@ std::vector<Text> EventReader::write(const Chunk & chunk, std::span<const TableC
     check(layout_.tables[table], tables[table], ends[table]);
   }
   Run run(layout_);
-  run.begin(chunk.clock);
+  run.set_whole_clock(chunk.clock);
   RowWriter writer(layout_, file_, tables, std::move(rows), std::move(ends));
   for (auto number = chunk.first; number < chunk.end; ++number) {
     const PacketEvents & packet = packets_[number];

@@ -18,6 +18,7 @@ public:
       : streams_(layout.streams_of(trace)),
         first_stream_(layout.traces[trace].first),
         file_(file),
+        variables_cost_(layout.variables / 8),
         run_(layout) {
     run_.set_budget(budget_per_byte * static_cast<std::int64_t>(file.size()));
   }
@@ -44,6 +45,7 @@ private:
     const auto bytes = file_.subspan(static_cast<std::size_t>(offset));
     const Content content{bytes, static_cast<std::int64_t>(8 * bytes.size())};
     const StreamLayout & leading = streams_.front();
+    run_.forget_variables();
     run_.set_variable(stream_id, leading.id);
     const auto header = run_.steps(leading.packet_header, content, 0);
     if (header.failed()) return Damage::bad_header;
@@ -57,7 +59,7 @@ private:
     });
     if (stream == streams_.end()) return Damage::bad_stream;
     const auto passed = stream - streams_.begin();
-    if (!run_.afford(stream->packet_cost + passed)) return Damage::costly;
+    if (!run_.afford(stream->packet_cost + passed + variables_cost_)) return Damage::costly;
     const auto context = run_.steps(stream->packet_context, content, header.bits());
     if (context.failed()) return Damage::bad_header;
     const auto bits = known_or(*stream, packet_size, content.end);
@@ -84,6 +86,7 @@ private:
   std::span<const StreamLayout> streams_;
   std::size_t first_stream_;
   Bytes file_;
+  std::int64_t variables_cost_;  // of forgetting them at the beginning of a packet
   Run run_;
 };
 

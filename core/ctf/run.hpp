@@ -117,11 +117,9 @@ public:
     return budget_ >= 0;
   }
 
-  // Begins at another place of a file: nothing is known but the clock.
-  void begin(std::uint64_t clock) {
-    clock_ = clock;
-    std::fill(variables_.begin(), variables_.end(), 0);
-  }
+  // Forgets what was read. A packet begins with this: a length or tag in an option that was not
+  // chosen must not depend on what stood in other packets, of which not all are read each time.
+  void forget_variables() { std::fill(variables_.begin(), variables_.end(), 0); }
 
   std::uint64_t clock() const { return clock_; }
   void set_whole_clock(std::uint64_t clock) { clock_ = clock; }
