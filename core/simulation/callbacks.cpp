@@ -6,7 +6,7 @@ namespace chainshaper::simulation {
 
 // Begins the callback of the thread's entity.
 bool Engine::begin_body(Thread & thread) {
-  Entity & entity = *thread.entity;
+  const Entity & entity = *thread.entity;
   thread.publication = 0;
   thread.step = Step::publish;
   switch (entity.given->body) {

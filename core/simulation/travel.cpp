@@ -60,7 +60,8 @@ void Engine::send(Thread & thread, Message & message) {
     Message & copy = new_message();
     copy = message;
     copy.entity = reader.entity;
-    const Nanoseconds duration = draw(*(reader.delivery ? reader.delivery : thread.delivery));
+    const Nanoseconds duration =
+        draw(reader.delivery != nullptr ? *reader.delivery : *thread.delivery);
     reader.last_arrival = std::max(later(now_, duration), reader.last_arrival);
     if (reader.last_arrival == now_)
       deliver(copy);
