@@ -46,7 +46,7 @@ lint: .venv/.ready-dev
 	nice .venv/bin/lint-imports --no-cache
 	.venv/bin/clang-format --dry-run --Werror $(core)
 	nice .venv/bin/clang-tidy --quiet -p $(dir $(firstword $(shell ls -t build/cp*/compile_commands.json))) \
-		$(filter %.cpp,$(core))
+		$(filter-out core/tests/% core/fuzz/%,$(filter %.cpp,$(core)))
 
 # Needs a quiet machine and about a quarter of an hour; prints tables, asserts nothing.
 benchmark: .venv/.ready-dev

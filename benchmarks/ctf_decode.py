@@ -7,6 +7,21 @@ prints a table: seconds and processor seconds of each way of reading, events per
 ratio to babeltrace2 by either (medians over interleaved runs), and peak memory of a process that
 does only that.  babeltrace2 runs as
 ``babeltrace2 FOLDER --component sink.utils.counter`` where it is installed.
+
+Processor seconds for 2,000,000 events, the decoder of before (Numba) and this one in turns in one
+run, on two cores that others kept busy (so wall-clock times say nothing there); in brackets
+babeltrace2's 1.58 s divided by them:
+
+    =============  =============  =============
+    way            Numba          C++
+    =============  =============  =============
+    count          0.054  (29)    0.030  (53)
+    one event      0.105  (15)    0.068  (23)
+    all fields     0.195  (8.1)   0.142  (11.1)
+    =============  =============  =============
+
+All but a tenth of the work runs on as many threads as there are cores; Numba's sorted the rows, a
+quarter of its work, on one. Its wall-clock ratio for all fields on two quiet cores was 16 to 17.
 """
 
 from __future__ import annotations

@@ -4,11 +4,14 @@
 
 Scales a trace (by default the one of examples/write_trace.py) to each number of events and prints
 a table. Every row is a fresh process of ours from its start to its end: Python's own start,
-importing, opening, decoding, data flow, traversals, the statistics of one chain; compiled code
-comes from the disk. The reference is a Python loop over ``bt2.TraceCollectionMessageIterator`` that
-looks at every event's name, time and payload, which every other analysis begins with; it runs over
-the first events of the same trace, in between, and its rate is taken for all. Ratios are of
-wall-clock time and of processor time; the memory is the process's peak.
+importing, opening, decoding, data flow, traversals, the statistics of one chain. The reference is
+a Python loop over ``bt2.TraceCollectionMessageIterator`` that looks at every event's name, time and
+payload, which every other analysis begins with; it runs over the first events of the same trace, in
+between, and its rate is taken for all. Ratios are of wall-clock time and of processor time; the
+memory is the process's peak.
+
+With decoder and joins compiled by Numba before, and in C++ now, in turns in one run on two busy
+cores: 20,000,000 events in 8.0 and 5.5 s of processor time, with peaks of 1,897 and 1,831 MiB.
 """
 
 from __future__ import annotations

@@ -12,7 +12,6 @@ from ctf_writing import write_lttng_trace
 from reference_traces import DATA
 from story import Story
 
-from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf import open_trace
 
 MS = 1_000_000
@@ -81,7 +80,7 @@ def packets_of(folder: Path) -> list[bytes]:
     data = stream.path.read_bytes()
     return [
         data[begin : begin + size]
-        for begin, size in stream.table[:, [tb.P_BYTE, tb.P_BYTES]].tolist()
+        for begin, size in stream.packets.select("offset", "size").iter_rows()
     ]
 
 

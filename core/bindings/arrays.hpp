@@ -8,6 +8,8 @@
 #include <span>
 #include <stdexcept>
 #include <string>
+#include <utility>
+#include <vector>
 
 namespace chainshaper::bindings {
 
@@ -27,6 +29,23 @@ inline void check_length(const char * name, std::size_t length, std::size_t expe
   if (length != expected)
     throw std::invalid_argument(std::string(name) + " has " + std::to_string(length) +
                                 " entries where " + std::to_string(expected) + " are needed");
+}
+
+// A vector as a NumPy array, which owns its memory.
+template <typename T>
+nb::ndarray<nb::numpy, T, nb::ndim<1>> array_of(std::vector<T> && rows) {
+  auto * owned = new std::vector<T>(std::move(rows));
+  const nb::capsule owner(owned, [](void * kept) noexcept {
+    delete static_cast<std::vector<T> *>(kept);  // NOLINT(cppcoreguidelines-owning-memory)
+  });
+  return {owned->data(), {owned->size()}, owner};
+}
+
+// What `work` returns. It runs without Python's lock, so that other threads run beside it.
+template <typename Work>
+auto without_lock(Work && work) {
+  const nb::gil_scoped_release released;
+  return std::forward<Work>(work)();
 }
 
 }  // namespace chainshaper::bindings

@@ -92,10 +92,11 @@ inline void check(const Gate & gate) {
     previous_end = end;
   }
   for (const auto band : gate.bands) sound = sound && band < slots.size();
-  if (!sound)
+  if (!sound) {
     throw std::invalid_argument(
         "a gate needs a cycle, slots in it that ascend and do not overlap, one of them for each "
         "mode, no negative delay, and room for a message");
+  }
 }
 
 // From when on which mode is in force.
@@ -127,8 +128,8 @@ struct Release {
   Anchor anchor;
   std::optional<Policy> overrun;
   std::optional<std::size_t> mode;
-  std::int64_t moved_ns{0};  // the slots of the cycle in which it leaves
-  std::optional<Dropped> dropped{};
+  std::int64_t moved_ns{0};          // the slots of the cycle in which it leaves
+  std::optional<Dropped> dropped{};  // NOLINT(readability-redundant-member-init): of an aggregate
 
   std::int64_t start_ns(std::int64_t cycle_ns) const {
     return origin_ns + cycles_waited * cycle_ns;

@@ -25,7 +25,7 @@ struct Arrival {
 // (`Queue` has the messages as well; in a simulation they stay in the history of their reader.)
 class Turns {
 public:
-  explicit Turns(Gate gate) : gate(std::move(gate)) { check(this->gate); }
+  explicit Turns(Gate served) : gate(std::move(served)) { check(gate); }
 
   // When a message would leave, whatever left before it.
   Release release_at(const Arrival & message, std::int64_t ready_ns) const {
@@ -107,7 +107,7 @@ struct Outcome {
 template <typename Message>
 class Queue : public Turns {
 public:
-  explicit Queue(Gate gate) : Turns(std::move(gate)), phase_ns(this->gate.phase_ns) {}
+  explicit Queue(Gate served) : Turns(std::move(served)), phase_ns(gate.phase_ns) {}
 
   // The wall clock was stepped: stamps of messages under way are of no use until the last has come.
   void doubt_stamps(std::int64_t now_ns) {

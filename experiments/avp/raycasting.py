@@ -5,7 +5,6 @@ horizontal distances; which beams of the azimuth meet it follows from the height
 """
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from .lidar import Lidar
@@ -28,42 +27,33 @@ def cast(lidar: Lidar, pose: Floats, boxes: Floats) -> Floats:
     x, y, yaw = pose
     azimuth, elevation = lidar.angles()
     origin = np.array([x + lidar.x * np.cos(yaw), y + lidar.x * np.sin(yaw), lidar.height])
-    flat = np.empty((lidar.azimuths, lidar.beams))
-    _cast(origin, azimuth + lidar.yaw + yaw, np.tan(elevation), boxes, flat)
+    flat = _cast(origin, azimuth + lidar.yaw + yaw, np.tan(elevation), boxes)
     ranges: Floats = (flat / np.cos(elevation)).ravel()
     ranges[ranges > RANGE_M] = np.inf
     return ranges
 
 
-@njit(error_model="numpy")  # used once: a cache would be loaded without a look at who wrote it
-def _cast(origin: Floats, azimuths: Floats, slopes: Floats, boxes: Floats, nearest: Floats) -> None:
-    """Horizontal distances, (azimuths, beams), into ``nearest``."""
+def _cast(origin: Floats, azimuths: Floats, slopes: Floats, boxes: Floats) -> Floats:
+    """Horizontal distances to the nearest thing, (azimuths, beams)."""
     x, y, z = origin
-    for column in range(azimuths.size):
-        for beam in range(slopes.size):
-            down = slopes[beam] < 0
-            nearest[column, beam] = -z / slopes[beam] if down else np.inf  # the floor
-        along_x, along_y = np.cos(azimuths[column]), np.sin(azimuths[column])
-        for box in range(boxes.shape[0]):
-            x0, y0, z0, x1, y1, z1 = boxes[box]
-            enter_x, leave_x = (x0 - x) / along_x, (x1 - x) / along_x
-            enter_y, leave_y = (y0 - y) / along_y, (y1 - y) / along_y
-            enter = max(min(enter_x, leave_x), min(enter_y, leave_y))
-            leave = min(max(enter_x, leave_x), max(enter_y, leave_y))
-            if leave <= max(enter, 0.0):
-                continue
-            for beam in range(slopes.size):
-                slope = slopes[beam]
-                height = z + slope * enter
-                if z0 <= height <= z1:
-                    met = enter
-                elif slope < 0 and height > z1 and z + slope * leave <= z1:
-                    met = (z1 - z) / slope  # through its top
-                elif slope > 0 and height < z0 and z + slope * leave >= z0:
-                    met = (z0 - z) / slope  # from below
-                else:
-                    continue
-                nearest[column, beam] = min(nearest[column, beam], max(met, 0.0))
+    with np.errstate(divide="ignore", invalid="ignore"):  # along an axis, or level: never met
+        floor = np.where(slopes < 0, -z / slopes, np.inf)
+        nearest = np.tile(floor, (azimuths.size, 1))
+        along_x, along_y = np.cos(azimuths), np.sin(azimuths)
+        for x0, y0, z0, x1, y1, z1 in boxes:
+            sides_x = np.sort([(x0 - x) / along_x, (x1 - x) / along_x], axis=0)
+            sides_y = np.sort([(y0 - y) / along_y, (y1 - y) / along_y], axis=0)
+            enter, leave = np.maximum(sides_x[0], sides_y[0]), np.minimum(sides_x[1], sides_y[1])
+            columns = np.flatnonzero(leave > np.maximum(enter, 0.0))
+            entered, left = enter[columns, np.newaxis], leave[columns, np.newaxis]
+            height, behind = z + slopes * entered, z + slopes * left
+            through_side = (z0 <= height) & (height <= z1)
+            through_top = (slopes < 0) & (height > z1) & (behind <= z1)
+            from_below = (slopes > 0) & (height < z0) & (behind >= z0)
+            ways = [through_side, through_top, from_below]
+            met = np.select(ways, [entered, (z1 - z) / slopes, (z0 - z) / slopes], np.inf)
+            nearest[columns] = np.minimum(nearest[columns], np.maximum(met, 0.0))
+    return nearest
 
 
 def measured(ranges: Floats, lost: float, random: np.random.Generator) -> NDArray[np.float32]:

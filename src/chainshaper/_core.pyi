@@ -1,7 +1,14 @@
 """What must be fast: trace decoder, joins, band placement, simulator (C++, in core/)."""
 
+from collections.abc import Callable, Sequence
+from enum import Enum
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+from typing_extensions import Buffer
+
+# Bands
 
 UNREACHABLE: int
 """The cost of bands that no placement reaches."""
@@ -21,3 +28,515 @@ def add_band(
     See `chainshaper.planning.bands`. Raises ValueError for arrays of different lengths,
     and for places or windows that do not ascend.
     """
+
+# Joins: rows of one table matched to rows of another by key and time
+
+_KeyColumn = NDArray[np.int64] | NDArray[np.uint64] | NDArray[np.int32] | NDArray[np.uint32]
+
+NO_ROW: int
+"""The number of a row that matches nothing."""
+
+def latest_before(
+    *,
+    left_keys: Sequence[_KeyColumn],
+    left_times_ns: NDArray[np.int64],
+    right_keys: Sequence[_KeyColumn],
+    right_times_ns: NDArray[np.int64],
+    strictly: bool = False,
+) -> NDArray[np.uint32]:
+    """For each row of the left table the latest row of the right one with its key; NO_ROW for none.
+
+    Times ascend; up to three columns of keys have an entry for each row. Of rows of the right table
+    with equal times the last counts; ``strictly`` leaves out rows at the very time of the left one.
+    Raises ValueError for columns of different lengths or other types.
+    """
+
+def first_after(
+    *,
+    left_keys: Sequence[_KeyColumn],
+    left_times_ns: NDArray[np.int64],
+    right_keys: Sequence[_KeyColumn],
+    right_times_ns: NDArray[np.int64],
+    strictly: bool = False,
+) -> NDArray[np.uint32]:
+    """As :func:`latest_before`, but the first row at or after the left one's time."""
+
+def ends_of_starts(
+    *,
+    start_keys: Sequence[_KeyColumn],
+    start_times_ns: NDArray[np.int64],
+    end_keys: Sequence[_KeyColumn],
+    end_times_ns: NDArray[np.int64],
+) -> NDArray[np.uint32]:
+    """For each start the row of its end; NO_ROW for none.
+
+    An instance ends with the next event of the same key, if that is an end. Arrays as for
+    :func:`latest_before`.
+    """
+
+# Traces in the Common Trace Format: types of their metadata. Sizes and alignments are in bits.
+
+CTF_MAGIC: int
+"""The number that each packet begins with."""
+CTF_BUDGET_PER_BYTE: int
+"""What decoding may cost for each byte of a packet; a step costs 1, a byte of a column as well."""
+
+class CtfType:
+    """A type of a trace's metadata."""
+
+    @staticmethod
+    def integer(
+        *,
+        size: int,
+        align: int,
+        is_signed: bool,
+        big_endian: bool,
+        maps_clock: bool,
+        labels: Sequence[tuple[str, int, int]],
+    ) -> CtfType:
+        """An integer or an enumeration.
+
+        ``labels`` are its labels with the lowest and the highest value, counted from the least
+        number of 64 bits with its sign. Raises ValueError for sizes that cannot be.
+        """
+
+    @staticmethod
+    def string() -> CtfType:
+        """Bytes up to and with the first NUL."""
+
+    @staticmethod
+    def array(*, element: CtfType, length: int | str, is_text: bool) -> CtfType:
+        """An array, or a sequence where the length is the path of a field before it."""
+
+    @staticmethod
+    def structure(*, fields: Sequence[tuple[str, CtfType]], align: int) -> CtfType:
+        """Fields that follow each other."""
+
+    @staticmethod
+    def variant(*, tag: str | None, options: Sequence[tuple[str, CtfType]]) -> CtfType:
+        """What an enumeration before it, whose path is the ``tag``, chooses."""
+
+class CtfEventClass:
+    """What an event class declares; ``context`` and ``fields`` are structures."""
+
+    def __init__(self, *, id: int, context: CtfType | None, fields: CtfType | None) -> None: ...
+
+class CtfStreamClass:
+    """What a stream class declares, all scopes being structures."""
+
+    def __init__(
+        self,
+        *,
+        id: int,
+        packet_context: CtfType | None,
+        event_header: CtfType | None,
+        event_context: CtfType | None,
+        events: Sequence[CtfEventClass],
+        frequency_hz: int,
+    ) -> None: ...
+
+class CtfTraceClass:
+    """What a trace's metadata declares.
+
+    ``uuid`` are its bytes as two little-endian numbers, ``referenced`` the names of the fields that
+    lengths and tags refer to.
+    """
+
+    def __init__(
+        self,
+        *,
+        big_endian: bool,
+        of_kernel: bool,
+        uuid: tuple[int, int] | None,
+        packet_header: CtfType | None,
+        referenced: set[str],
+        streams: Sequence[CtfStreamClass],
+    ) -> None: ...
+
+# How their packets lie
+
+class CtfScope(Enum):
+    """Where behind an event's header a field stands."""
+
+    STREAM_EVENT_CONTEXT = ...
+    EVENT_CONTEXT = ...
+    EVENT_FIELDS = ...
+
+class CtfWantedEvent:
+    """An event class, counted over all traces, that is asked for.
+
+    ``columns`` are the scopes and numbers of its fields that get one, in order. Tables are counted
+    from 0 in order of their first event; events of one table have the same types of columns.
+    """
+
+    def __init__(
+        self, *, event: int, table: int, columns: Sequence[tuple[CtfScope, int]]
+    ) -> None: ...
+
+class CtfLayout:
+    """How the bits of some traces' packets lie.
+
+    Raises ValueError, whose ``args`` are the reason and which of the traces it is.
+    """
+
+    def __init__(
+        self, traces: Sequence[CtfTraceClass], wanted: Sequence[CtfWantedEvent]
+    ) -> None: ...
+    @property
+    def traces(self) -> list[tuple[int, int]]:
+        """The stream classes of each trace, counted over all: the first and the one behind."""
+
+# Finding packets
+
+class CtfDamage(Enum):
+    """What is wrong at a place where a packet should be."""
+
+    BAD_MAGIC = ...
+    BAD_UUID = ...
+    BAD_STREAM = ...
+    BAD_SIZE = ...
+    BAD_HEADER = ...
+    CUT = ...
+    COSTLY = ...
+
+class CtfDamagedPlace:
+    """Damage at an ``offset`` (bytes) of a file; the packet ``following`` it, or -1 for none."""
+
+    @property
+    def damage(self) -> CtfDamage: ...
+    @property
+    def offset(self) -> int: ...
+    @property
+    def following(self) -> int: ...
+
+class CtfPackets:
+    """The packets of a stream file."""
+
+    @property
+    def columns(self) -> dict[str, NDArray[np.int64]]:
+        """See :class:`chainshaper.sources.ctf.copies.CtfStream`; without earliest and latest."""
+
+    @property
+    def damaged(self) -> list[CtfDamagedPlace]: ...
+
+def find_packets(layout: CtfLayout, trace: int, file: Buffer, *, beginning: bytes) -> CtfPackets:
+    """Find the packets of a stream file of a trace.
+
+    Behind damage the file is read on where the bytes come that each packet has at its
+    ``beginning``; these may be none.
+    """
+
+# Reading events
+
+class CtfFailure(Enum):
+    """Why an event cannot be read."""
+
+    TRUNCATED = ...
+    NO_OPTION = ...
+    BAD_LENGTH = ...
+    UNTERMINATED = ...
+    UNKNOWN_EVENT = ...
+    OVER_BUDGET = ...
+    OTHER_TIME = ...
+    NO_PROCESS = ...
+    ALL_ZEROS = ...
+    TABLE_FULL = ...
+
+class CtfBadEvent:
+    """An event at an ``offset`` (bytes) of a file that ends its ``packet``."""
+
+    @property
+    def packet(self) -> int: ...
+    @property
+    def offset(self) -> int: ...
+    @property
+    def failure(self) -> CtfFailure: ...
+
+class CtfFileChangedError(Exception):
+    """A file has not the events that were counted."""
+
+class CtfChunk:
+    """Packets [``first``, ``end``) of a file; rows of each table before them and behind them."""
+
+    @property
+    def first(self) -> int: ...
+    @property
+    def end(self) -> int: ...
+    @property
+    def rows_before(self) -> NDArray[np.int64]: ...
+    @property
+    def rows_after(self) -> NDArray[np.int64]: ...
+
+class CtfTable:
+    """The arrays of one length that events of a table are written to; they live as long.
+
+    ``columns`` are integers of the width of their field's, or uint32, the codes of texts.
+    """
+
+    def __init__(
+        self,
+        *,
+        times_ns: NDArray[np.int64],
+        cpus: NDArray[np.int32] | None,
+        columns: Sequence[NDArray[Any]],
+    ) -> None: ...
+    def sort_by_time(self) -> None:
+        """Sort the rows by time, in place; rows of equal times stay in their order."""
+
+class CtfEventReader:
+    """Reads the events of a stream file, which must not be written to meanwhile.
+
+    The arrays have an entry for each packet: bytes from the file's beginning, bits, the stream
+    class, the core, and the earliest and latest time of its events (clock cycles). Raises
+    ValueError for packets that are not in the file.
+    """
+
+    def __init__(
+        self,
+        layout: CtfLayout,
+        file: Buffer,
+        *,
+        offset: NDArray[np.int64],
+        content_bits: NDArray[np.int64],
+        stream_class: NDArray[np.int64],
+        cpu: NDArray[np.int64],
+        earliest: NDArray[np.int64],
+        latest: NDArray[np.int64],
+    ) -> None: ...
+    def count(self, end: int) -> CtfChunk:
+        """Count the events of the packets before ``end`` that were not counted yet."""
+
+    def write(
+        self, chunk: CtfChunk, tables: Sequence[CtfTable], first_rows: NDArray[np.int64]
+    ) -> list[bytes]:
+        """Write a chunk's events to tables, whose rows of this file begin at ``first_rows``.
+
+        Returns the texts by their code. Threads may write different chunks at once. Raises
+        CtfFileChangedError, and ValueError for tables that are not those of the layout.
+        """
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Events per event class, zeros included."""
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Rows per table."""
+
+    @property
+    def bad_events(self) -> list[CtfBadEvent]: ...
+
+def recode(codes: NDArray[np.uint32], others: NDArray[np.uint32]) -> None:
+    """Replace each of the ``codes`` by the one that ``others`` has for it."""
+
+# What is simulated (core/simulation/description.hpp). Parts are made with the fields that differ
+# from the default, and refer to each other by their places in the lists of a `Description`. Times
+# are ns; lists are copied, in both directions.
+
+FOREVER_NS: int
+"""Later than anything that happens in a simulation."""
+
+class Role(Enum):
+    """Who works in a thread."""
+
+    executor = 0
+    publisher = 1
+    dds = 2
+
+class ExecutorKind(Enum):
+    """In which order an executor does what is ready."""
+
+    single_threaded = 0
+    static_single_threaded = 1
+    events = 2
+    multi_threaded = 3
+
+class EntityKind(Enum):
+    """What an executor waits for."""
+
+    timer = 0
+    subscription = 1
+    service = 2
+    client = 3
+
+class Body(Enum):
+    """What a callback does."""
+
+    compute = 0
+    gate = 1
+    mode_listener = 2
+    synchronise = 3
+
+class CoreDescription:
+    """A core; ``table`` has offsets in the cycle, and from each on a bit for each open server."""
+
+    table: list[tuple[int, int]]
+    open_servers: int
+    next: int
+    boundary_ns: int
+    def __init__(self, **fields: Any) -> None: ...
+
+class ThreadDescription:
+    """A thread of a process; ``wake_up`` to ``delivery`` are places of streams."""
+
+    core: int
+    rank: int
+    server: int | None
+    role: Role
+    process: int
+    wake_up: int
+    take: int
+    publish: int
+    receive: int | None
+    delivery: int
+    pid: int
+    tid: int
+    cpu: int
+    def __init__(self, **fields: Any) -> None: ...
+
+class ProcessDescription:
+    """A process: its executor, and its entities in the order in which that looks at them."""
+
+    executor: ExecutorKind
+    first_entity: int
+    entity_count: int
+    def __init__(self, **fields: Any) -> None: ...
+
+class EntityDescription:
+    """A timer, subscription, service or client with its callback."""
+
+    callback: int
+    handle: int
+    rmw_handle: int
+    process: int
+    kind: EntityKind
+    group: int | None
+    body: Body
+    gate: int
+    synchroniser: int
+    input: int
+    period_ns: int
+    due_ns: int
+    execution: int
+    afterwards: int | None
+    first_publisher: int
+    publisher_count: int
+    lifespan_ns: int | None
+    depth: int
+    starts_chain: bool
+    on_chain: bool
+    def __init__(self, **fields: Any) -> None: ...
+
+class ReaderDescription:
+    """An entity that reads a topic; ``delivery`` is the stream of its delivery times."""
+
+    entity: int
+    delivery: int | None
+    def __init__(self, **fields: Any) -> None: ...
+
+class PublisherDescription:
+    """A callback's publisher of a topic."""
+
+    handle: int
+    rmw_handle: int
+    readers: list[ReaderDescription]
+    asynchronous: bool
+    depth: int
+    lifespan_ns: int | None
+    ends_chain: bool
+    modes: list[int]
+    def __init__(self, **fields: Any) -> None: ...
+
+class GateDescription:
+    """A gate in a callback: a `chainshaper.gate.decision.Gate`; ``modes`` are their numbers."""
+
+    slots: list[tuple[int, int]]
+    cycle_ns: int
+    anchor: str
+    phase_ns: int
+    overrun: str
+    due_cycles: int
+    mode_names: list[str]
+    bands: list[int]
+    first_mode: int
+    late: str
+    messages: str
+    depth: int
+    into_open_slot: str
+    modes: list[int]
+    moves: list[tuple[int, int]]
+    spin_ns: int
+    pause_ns: int
+    def __init__(self, **fields: Any) -> None: ...
+
+class InputDescription:
+    """An input of a synchroniser."""
+
+    on_chain: bool
+    depth: int
+    def __init__(self, **fields: Any) -> None: ...
+
+class SynchroniserDescription:
+    """Inputs that come together; ``trigger`` is the place of the one that completes sets."""
+
+    inputs: list[InputDescription]
+    trigger: int | None
+    def __init__(self, **fields: Any) -> None: ...
+
+class Description:
+    """All of a simulation; ``streams`` are constants, or None for one that is drawn."""
+
+    cores: list[CoreDescription]
+    threads: list[ThreadDescription]
+    processes: list[ProcessDescription]
+    entities: list[EntityDescription]
+    publishers: list[PublisherDescription]
+    gates: list[GateDescription]
+    synchronisers: list[SynchroniserDescription]
+    streams: list[int | None]
+    groups: int
+    cycle_ns: int
+    quantum_ns: int
+    context_switch_ns: int
+    preemption_ns: int
+    interrupts_ppm: int
+    last_timer_ns: int
+    stop_ns: int
+    record_from_ns: int
+    events: bool
+    switches: bool
+    instances: int
+    log_rows: int
+    most_messages: int
+    def __init__(self, **fields: Any) -> None: ...
+
+class Pause(Enum):
+    """Why the engine was left."""
+
+    none = 0
+    log_full = 1
+    messages_full = 2
+    endless = 3
+    over = 4
+
+class Simulation:
+    """A simulated application, from its start on."""
+
+    def __init__(self, description: Description, draw: Callable[[int], NDArray[np.int64]]) -> None:
+        """``draw(stream)`` gives the next numbers of a stream. ValueError: it makes no sense."""
+
+    def run(self, most_instants: int) -> Pause:
+        """Go on until the end, until the log is full, or for so many instants."""
+
+    def take_log(self) -> dict[str, dict[str, NDArray[Any]]]:
+        """What was logged: columns by the names of entries and of fields; the log is empty then.
+
+        Fields and `time` are int64; `thread`, its place, `pid`, `tid` and `cpu` are int32.
+        """
+
+    def latencies(self) -> NDArray[np.int64]:
+        """Of each recorded instance of the chain that has started (ns); -1: it is incomplete."""
+
+    @property
+    def now_ns(self) -> int:
+        """The present instant."""

@@ -292,6 +292,9 @@ def test_limited_memory_ends_in_one_message_whoever_wanted_more(
     limited = ("sh", "-c", f'ulimit -v {megabytes * 1000}; exec "$@"', "sh")
     finished = chainshaper("latency", simulated.path, prefix=limited)
     assert "Traceback" not in finished.err
+    if finished.code == 0 and megabytes > 100:  # it needs less than that since nothing is compiled
+        assert "End-to-end latency" in finished.out
+        return
     # OpenBLAS ends the process by itself, with its own message.
     last = finished.err.strip().splitlines()[-1]
     assert finished.code == 1

@@ -93,7 +93,6 @@ def recorded(
     text: str, chains: Sequence[str], folder: Path, cycles: int
 ) -> tuple[Application, tuple[Profile, ...]]:
     """A described application, and what a simulation of it says of its chains."""
-    pytest.importorskip("numba")
     (folder / "app.yaml").write_text(text)
     application = load_application(folder / "app.yaml")
     recording = simulate(application, folder / "rec", cycles=cycles)
@@ -393,7 +392,6 @@ def application(tmp_path_factory: pytest.TempPathFactory) -> Application:
 
 @pytest.fixture(scope="module")
 def recording(application: Application, tmp_path_factory: pytest.TempPathFactory) -> Recording:
-    pytest.importorskip("numba")
     return simulate(application, tmp_path_factory.mktemp("unshaped") / "rec", cycles=200)
 
 
@@ -506,7 +504,6 @@ def test_others_cost_nothing_while_a_chain_waits_for_its_branch(tmp_path: Path) 
     """d runs from 8 to 13 ms and b behind it, to 15, when the branch is over too: the chain takes
     18 ms with d and without it, and not 5 ms less.
     """
-    pytest.importorskip("numba")
     (tmp_path / "app.yaml").write_text(JOINING)
     recorded = simulate(load_application(tmp_path / "app.yaml"), tmp_path / "rec", cycles=50)
     joining, beside = profile_chains(recorded, ("/a../b../c", "/d"))

@@ -46,7 +46,6 @@ def received(application: Application, plan: Plan, folder: Path) -> tuple[float,
 @pytest.mark.parametrize("policy", ["shaped", "let-per-chain", "let-per-callback"])
 def test_receivers_are_not_behind_the_next_cycle(policy: Policy, tmp_path: Path) -> None:
     """Under LET outputs leave as the next cycle begins to compute, for 50 to 70 ms."""
-    pytest.importorskip("numba")
     application = described(tmp_path)
     profile = simulate(application, tmp_path / "profile", cycles=300)
     plan = plan_recording(profile, request=PlanRequest(policy=policy))
@@ -69,7 +68,6 @@ def test_receivers_are_not_behind_the_next_cycle(policy: Policy, tmp_path: Path)
 
 
 def test_receivers_stay_on_a_core_without_servers(tmp_path: Path) -> None:
-    pytest.importorskip("numba")
     application = described(tmp_path, core=2, time="30ms")
     profile = simulate(application, tmp_path / "profile", cycles=100)
     plan = plan_recording(profile, request=PlanRequest(policy="let-per-chain"))
@@ -81,7 +79,6 @@ def test_receivers_stay_on_a_core_without_servers(tmp_path: Path) -> None:
 
 def test_receivers_that_take_too_long_have_no_place_and_no_promise(tmp_path: Path) -> None:
     """45 ms of the actuator and 70 of the chain are more than a cycle of 100."""
-    pytest.importorskip("numba")
     application = described(tmp_path, time="45ms")
     profile = simulate(application, tmp_path / "profile", cycles=100)
     plan = plan_recording(profile, request=PlanRequest(policy="let-per-chain"))
@@ -110,7 +107,6 @@ nodes:
 
 
 def test_what_receivers_take_is_what_other_chains_wait_for(tmp_path: Path) -> None:
-    pytest.importorskip("numba")
     added = []
     for time in ("0ms", "3ms"):
         folder = tmp_path / time
@@ -132,7 +128,6 @@ def test_what_receivers_take_is_what_other_chains_wait_for(tmp_path: Path) -> No
 
 def test_live_nodes_that_receive_stand_between_the_chain_and_its_gate(tmp_path: Path) -> None:
     """80 for the chain, 85 for the shaping node."""
-    pytest.importorskip("numba")
     application = described(tmp_path)
     plan = plan_recording(simulate(application, tmp_path / "profile", cycles=100))
     spliced = splice_application(application, plan)
@@ -161,7 +156,6 @@ nodes:
 
 def test_outputs_of_several_chains_wait_for_each_other_at_their_receiver(tmp_path: Path) -> None:
     """Under LET they leave at one time: of 3, 2 and 1 ms the last has waited for 5 ms at most."""
-    pytest.importorskip("numba")
     application = described(tmp_path, text=THREE)
     profiles = profile_chains(
         simulate(application, tmp_path / "rec", cycles=100), ("/a", "/b", "/c")
@@ -191,7 +185,6 @@ nodes:
 
 
 def test_of_further_sinks_receivers_have_no_place_and_the_plan_says_so(tmp_path: Path) -> None:
-    pytest.importorskip("numba")
     application = described(tmp_path, text=FORK)
     recording = simulate(application, tmp_path / "profile", cycles=100)
     plan = plan_recording(recording, sinks=["/a../d"])

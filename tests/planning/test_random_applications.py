@@ -17,7 +17,6 @@ ONCE_BROKEN = (
 
 @pytest.mark.parametrize("number", [*ONCE_BROKEN, 1, 2, 3, 5, 12, 21])
 def test_no_promise_to_several_chains_is_broken(number: int, tmp_path: Path) -> None:
-    pytest.importorskip("numba")
     row = judged(number, 300, tmp_path)
     assert drawn(number) == drawn(number), "an application is known by its number"
     if "refused" in row:

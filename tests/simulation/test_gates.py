@@ -1,113 +1,22 @@
 """The gate: its decisions against the live one's, and what it does to messages and time."""
 
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
 
-import numpy as np
 import polars as pl
 import pytest
 import yaml
 from gate_table import PUBLISHING_NS, Case, cases
-from hypothesis import given
-from hypothesis import strategies as st
 from schedules import MS, application, begin_of, ran, simulated
 from small_chain import small_chain, small_chain_plan
 
 from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.gate.decision import INTO_OPEN_SLOT, Gate, Modes, Overrun, missed, release_of
+from chainshaper.gate.decision import Overrun
 from chainshaper.planning import PlanRequest
-from chainshaper.simulation import layout as at
 from chainshaper.simulation import simulate_latencies
-from chainshaper.simulation.arrays import Rows, _add_gate
-from chainshaper.simulation.callbacks import decide, missed_slot, switch_mode
-from chainshaper.simulation.layout import G, X
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
-from chainshaper.workload.event_log import WORDS
 from chainshaper.workload.live import WARM_UP_CYCLES
-
-NAMES = ("city", "highway", "parking")
-
-
-@st.composite
-def gates(draw: st.DrawFn) -> Gate:
-    cycle = draw(st.integers(10, 200))
-    edges = sorted(draw(st.sets(st.integers(0, cycle), min_size=2, max_size=8)))
-    edges = edges[: len(edges) // 2 * 2]
-    slots = tuple(zip(edges[::2], edges[1::2], strict=True))
-    modes = None
-    if draw(st.booleans()):
-        known = draw(st.lists(st.sampled_from(NAMES), min_size=1, unique=True))
-        bands = {name: draw(st.integers(0, len(slots) - 1)) for name in known}
-        late = draw(st.sampled_from(("wait", "discard", "publish", "next-slot")))
-        modes = Modes(bands, draw(st.sampled_from(known)), late)
-    return Gate(
-        slots=slots,
-        cycle_ns=cycle,
-        anchor=draw(st.sampled_from(("stamp", "cycle"))),
-        phase_ns=draw(st.integers(0, 300)),
-        overrun=draw(st.sampled_from(("wait", "discard", "publish"))),
-        due_cycles=draw(st.integers(0, 2)),
-        into_open_slot=draw(st.sampled_from(INTO_OPEN_SLOT)),
-        modes=modes,
-    )
-
-
-def as_array(gate: Gate, moves: list[tuple[int, int]]) -> tuple[at.Int64s, int]:
-    """The gate as the engine has it: an array, and where its row stands there."""
-    some: Any = SimpleNamespace
-    described = some(gate=some(**vars(gate), spin_ns=0, pause_ns=0, moved=lambda _: moves))
-    rows = Rows([0] * X.COLUMNS)
-    place = _add_gate(rows, some(modes=NAMES), described, some(start_ns=0))
-    return np.array(rows, dtype=np.int64), place
-
-
-@given(
-    gate=gates(),
-    arrival=st.integers(3_000, 6_000),
-    age=st.integers(-50, 2_500),
-    announced=st.lists(st.tuples(st.integers(2_000, 6_000), st.sampled_from(NAMES)), max_size=4),
-    late_by=st.integers(0, 400),
-    moves=st.lists(st.tuples(st.integers(2_000, 7_000), st.integers(-20, 20)), max_size=3).map(
-        sorted
-    ),
-)
-def test_the_compiled_gate_decides_as_the_live_one(  # noqa: PLR0917 - hypothesis names them
-    gate: Gate,
-    arrival: int,
-    age: int,
-    announced: list[tuple[int, str]],
-    late_by: int,
-    moves: list[tuple[int, int]],
-) -> None:
-    memory, place = as_array(gate, moves)
-    changes: list[tuple[int, str]] = []
-    current = None if gate.modes is None else gate.modes.default
-    for time, name in sorted(announced, key=lambda change: change[0]):
-        if gate.modes is None:
-            continue
-        memory[X.NOW] = time
-        switch_mode(memory, place, NAMES.index(name))
-        if name in gate.modes.bands and name != current:
-            changes.append((time, name))
-            current = name
-    expected = release_of(gate, arrival, arrival - age, changes, moves=moves)
-    decide(memory, place, arrival, arrival - age)
-    found = {column: None if (n := int(memory[place + column])) == at.NONE else n for column in G}
-    assert (found[G.AT], found[G.ORIGIN]) == (expected.at_ns, expected.origin_ns)
-    assert (found[G.SLOT], found[G.CYCLES]) == (expected.slot, expected.cycles_waited)
-    assert memory[place + G.MOVED] == expected.moved_ns  # which may be that of NONE
-    assert found[G.BY_STAMP] == (expected.anchor == "stamp")
-    assert found[G.TREATED] == (expected.overrun and WORDS["overrun"].index(expected.overrun))
-    assert found[G.MODE] == (expected.mode and NAMES.index(expected.mode))
-    memory[X.NOW] = arrival + late_by
-    policy = gate.overrun
-    if gate.modes is not None and gate.modes.late != "next-slot":
-        policy = gate.modes.late
-    over = policy == "discard" and missed(gate, expected, arrival + late_by)
-    assert missed_slot(memory, place) == over
 
 
 def as_application(case: Case) -> Application:

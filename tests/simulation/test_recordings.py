@@ -15,7 +15,7 @@ from small_chain import small_chain
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.flow.plan import plan_recording
 from chainshaper.planning import Plan
-from chainshaper.simulation import arrays, simulate, simulate_latencies
+from chainshaper.simulation import machine, simulate, simulate_latencies
 from chainshaper.simulation.simulating import with_recorded_times
 from chainshaper.values.durations import parse_duration
 from chainshaper.values.errors import InputError, OperationError
@@ -123,7 +123,7 @@ def test_a_long_simulation_is_written_in_parts_that_read_as_one(
     tmp_path: Path, chain: Application, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = simulate(chain, tmp_path / "whole", cycles=2000)
-    monkeypatch.setattr(arrays, "LOG_ROWS", 4096)
+    monkeypatch.setattr(machine, "LOG_ROWS", 4096)
     parts = simulate(chain, tmp_path / "parts", cycles=2000)
     assert len(list((parts.path / "rmw_take.parquet").iterdir())) > 3
     assert parts.events.keys() == whole.events.keys()

@@ -2,23 +2,20 @@
 
 An event rarely names what it belongs to. It carries an address, which means whatever was last
 created there, or it belongs to whatever its thread was doing then: "the latest row before this one
-with the same key" (or the next after it), an asof join. Events come sorted by time, so one compiled
-walk over both tables that remembers the latest row of each key is enough: some ten ns a row.
+with the same key" (or the next after it), an asof join. Events come sorted by time, so one walk
+over both tables that remembers the latest row of each key is enough (core/matching): some ten ns a
+row.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.values.compiled import kernel
-
-_walk = kernel("chainshaper.analysis.matching_kernels", "walk")
-_walk_pairs = kernel("chainshaper.analysis.matching_kernels", "walk_pairs")
-NONE, FULL = 0xFFFFFFFF, -1  # no row matches; a table of keys is too small
+from chainshaper import _core
 
 
 def _asof(
@@ -28,7 +25,7 @@ def _asof(
     left_on: str,
     right_on: str,
     *,
-    step: Literal[1, -1],
+    rows_of: Callable[..., npt.NDArray[np.uint32]],
     strictly: bool = False,
 ) -> pl.DataFrame:
     """``left`` with the columns of the matching row of ``right``, else nulls.
@@ -44,17 +41,15 @@ def _asof(
     left = _sorted(left, left_on)
     timeless = left[left_on].null_count()  # sorted, they come first
     known = left.slice(timeless)
-    (keys, _own), (others, _its) = _keys(known, by), _keys(right, by)
-    at, times = _as_array(known[left_on]), _as_array(right[right_on])
-    found = np.empty(len(at), np.uint32)
-
-    def walk_over(slots: int, table: npt.NDArray[np.int64]) -> int:
-        return _walk(
-            keys.ctypes.data, at.ctypes.data, len(at), others.ctypes.data, times.ctypes.data,
-            len(times), step, strictly, found.ctypes.data, table.ctypes.data, slots,
-        )  # fmt: skip
-
-    index = _rows(found) if _with_room(walk_over) else pl.Series(found)
+    index = _rows(
+        rows_of(
+            left_keys=_keys(known, by),
+            left_times_ns=_as_array(known[left_on]),
+            right_keys=_keys(right, by),
+            right_times_ns=_as_array(right[right_on]),
+            strictly=strictly,
+        )
+    )
     for key in by:
         if known[key].null_count():
             index = index.set(known[key].is_null(), None)
@@ -64,8 +59,8 @@ def _asof(
     return left.hstack(columns.rename({n: f"{n}_right" for n in columns.columns if n in left}))
 
 
-latest_before = partial(_asof, step=1)
-first_after = partial(_asof, step=-1)
+latest_before = partial(_asof, rows_of=_core.latest_before)
+first_after = partial(_asof, rows_of=_core.first_after)
 
 
 def nearest(
@@ -93,46 +88,28 @@ def ends_of_starts(starts: pl.DataFrame, ends: pl.DataFrame) -> pl.Series:
     thread, if that is an end. It may begin in the nanosecond in which the one before ended (end
     first), or last no time at all (start first): the former when one was open before.
     """
-    (keys, _own), (others, _its) = (_keys(t, ["pid", "tid", "callback"]) for t in (starts, ends))
-    began, ended = _as_array(starts["time"]), _as_array(ends["time"])
-    found = np.empty(len(began), np.uint32)
-
-    def walk_over(slots: int, table: npt.NDArray[np.int64]) -> int:
-        found.fill(NONE)
-        states = np.zeros((slots, 4), np.int64)
-        return _walk_pairs(
-            keys.ctypes.data, began.ctypes.data, len(began), others.ctypes.data, ended.ctypes.data,
-            len(ended), found.ctypes.data, table.ctypes.data, states.ctypes.data, slots,
-        )  # fmt: skip
-
-    _with_room(walk_over)
-    return _rows(found)
+    key = ["pid", "tid", "callback"]
+    return _rows(
+        _core.ends_of_starts(
+            start_keys=_keys(starts, key),
+            start_times_ns=_as_array(starts["time"]),
+            end_keys=_keys(ends, key),
+            end_times_ns=_as_array(ends["time"]),
+        )
+    )
 
 
-def _with_room(walk_over: Callable[[int, npt.NDArray[np.int64]], int]) -> int:
-    """What a compiled walk returns, given an empty table that has room for all keys."""
-    slots, result = 1024, FULL
-    while result == FULL:
-        result = walk_over(slots, np.zeros((slots + 1, 5), np.int64))
-        slots *= 8
-    return result
+def _rows(numbers: npt.NDArray[np.uint32]) -> pl.Series:
+    """Numbers of rows, null for none."""
+    index = pl.Series(numbers)
+    none = index == _core.NO_ROW
+    return index.set(none, None) if none.any() else index
 
 
-def _rows(found: npt.NDArray[np.uint32]) -> pl.Series:
-    index = pl.Series(found)
-    return index.set(index == NONE, None) if (found == NONE).any() else index
-
-
-def _keys(
-    frame: pl.DataFrame, by: list[str]
-) -> tuple[npt.NDArray[np.int64], list[npt.NDArray[Any]]]:
-    """Key columns as compiled walks read them, and what has to stay alive meanwhile."""
+def _keys(frame: pl.DataFrame, by: list[str]) -> list[npt.NDArray[Any]]:
+    """Key columns as integers of 32 or 64 bits."""
     columns = [_as_array(frame[key].to_physical()) for key in by]
-    columns = [values if values.itemsize >= 4 else values.astype(np.uint32) for values in columns]
-    table = np.zeros((3, 2), np.int64)
-    for row, values in zip(table, columns, strict=False):
-        row[:] = values.ctypes.data, values.itemsize
-    return table, columns
+    return [values if values.itemsize >= 4 else values.astype(np.uint32) for values in columns]
 
 
 def _as_array(column: pl.Series) -> npt.NDArray[Any]:

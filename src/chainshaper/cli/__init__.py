@@ -23,7 +23,6 @@ OF_ANALYSIS = ("matplotlib",)
 _LACK_OF_MEMORY = (
     "cannot allocate memory",
     "failed to map segment",  # the loader, of a library
-    "could not find/load shared object file",  # llvmlite, of its own
     "can't start new thread",
     "could not spawn threads",
     "capacity overflow",

@@ -43,7 +43,7 @@ from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.simulation import simulate, simulate_latencies
-from chainshaper.simulation.arrays import build_system
+from chainshaper.simulation.system import build_system
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import new_file, open_output, scratch_folder, write_whole

@@ -30,7 +30,7 @@ from chainshaper.linux.threads import all_stats, open_process, read_proc
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.files import why_distrusted
 
-LIBRARIES = ("cyclonedds", "llvmlite", "numba", "numpy", "polars", "pydantic", "yaml")
+LIBRARIES = ("cyclonedds", "numpy", "polars", "pydantic", "yaml")
 """What processes import that simulate, or have DDS; all others need Python alone."""
 
 PATIENCE_S = 15.0

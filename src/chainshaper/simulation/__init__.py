@@ -1,8 +1,8 @@
 """An application run by a discrete-event simulation instead of by the machine.
 
 The same description, the same execution times for the same seed, the same event tables:
-a simulated recording differs from a live one in its `source` only. `arrays` and `layout` say what
-runs, in words and in integers; `engine` and `callbacks` are compiled by Numba and run it.
+a simulated recording differs from a live one in its `source` only. `system` and `machine` say what
+runs, in words and as the engine has it, which is in C++ (core/simulation).
 """
 
 from chainshaper.simulation.simulating import simulate, simulate_latencies

@@ -9,23 +9,22 @@ is not in them: a callback computes before it publishes.
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 import polars as pl
 
+from chainshaper import _core
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.plan import Plan, publisher_servers
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.simulation import layout as at
-from chainshaper.simulation.arrays import Handles, Machine, System, build_system
-from chainshaper.simulation.layout import Int64s, X
+from chainshaper.simulation.machine import INSTANTS, Handles, Int64s, Machine
+from chainshaper.simulation.system import System, build_system
 from chainshaper.sources import open_source
 from chainshaper.splicing.application import at_offsets, splice_application
-from chainshaper.values.compiled import kernel
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import (
@@ -45,8 +44,6 @@ from chainshaper.workload.description import (
     node_name,
 )
 from chainshaper.workload.event_log import EventLog
-
-_run_engine = kernel("chainshaper.simulation.engine", "run")
 
 START_NS = 1_000_000_000
 LONGEST_NS = 1 << 62
@@ -118,7 +115,7 @@ def simulate_latencies(
     _, _, machine = _built(application, joint, timing, latencies=cycles)
     for _ in _runs(machine, progress):
         pass
-    return machine.latencies[: machine.array[X.STARTED]]
+    return machine.simulation.latencies()
 
 
 def _checked(
@@ -168,21 +165,26 @@ def _built(
     return system, objects, machine
 
 
-def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[int]:
+def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[_core.Pause]:
     """Run to the end; why the engine stopped, each time that it did."""
-    m = machine.array
-    while (reason := _run_engine(m.ctypes.data)) != at.OVER:
-        if reason == at.MESSAGES_FULL:
+    simulation, described = machine.simulation, machine.description
+    while (reason := simulation.run(INSTANTS)) != _core.Pause.over:
+        if reason == _core.Pause.messages_full:
             raise OperationError(
                 "messages pile up without end: an executor or a publisher thread that never gets"
                 " to run, or a delivery that takes far longer than a period; correct the"
                 " description, or the plan's slots"
             )
-        machine.draw_more()
+        if reason == _core.Pause.endless:
+            raise OperationError(
+                "callbacks have each other called without end while no time passes: give one of"
+                " them an execution time, or a topic on the way a delivery time"
+            )
         yield reason
         if progress is not None:
-            progress(float((m[X.NOW] - START_NS) / (m[X.STOP] - START_NS)), "simulating")
-    yield at.LOG_FULL
+            elapsed, whole_run = simulation.now_ns - START_NS, described.stop_ns - START_NS
+            progress(elapsed / whole_run, "simulating")
+    yield _core.Pause.over
 
 
 def _event_tables(
@@ -194,8 +196,8 @@ def _event_tables(
     """The event tables part by part as the log fills up, the objects' first."""
     yield live.event_tables(objects, from_ns=0)
     for reason in _runs(machine, progress):
-        if reason == at.LOG_FULL:
-            yield _logged(system, machine.take_log())
+        if reason != _core.Pause.none:
+            yield _logged(system, machine.simulation.take_log())
 
 
 def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
@@ -226,29 +228,36 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     return created, Handles(entities, publishers)
 
 
-def _logged(system: System, log: Sequence[Int64s]) -> dict[str, pl.DataFrame]:
+def _logged(
+    system: System, log: Mapping[str, Mapping[str, npt.NDArray[Any]]]
+) -> dict[str, pl.DataFrame]:
     """What is in the log, as event tables: those in which there is something."""
-    # By the number of the thread, of which NONE, the last one, is the idle thread.
-    pids = np.array([*(info.pid for info in system.threads), 0], dtype=np.int32)
-    tids = np.array([*(info.tid for info in system.threads), 0], dtype=np.int32)
-    cpus = np.array([*(info.cores[0] for info in system.threads), 0], dtype=np.int32)
-
-    def process(threads: Int64s) -> dict[str, npt.NDArray[np.int32]]:
-        return {"pid": pids[threads], "tid": tids[threads], "cpu": cpus[threads]}
-
-    tables = dict(live.logged_tables(log, process, system.modes))
+    tables = dict(live.logged_tables(log, system.modes))
     for name in {"asynchronous_send", "gate_release"} & tables.keys():  # of when they began
         tables[name] = tables[name].sort("time", maintain_order=True)
-    times, following, core, before, runnable, *_ = log[at.L_SWITCH]
-    if times.size:
-        comms = np.array([*(info.comm for info in system.threads), "swapper"])
-        priorities = np.array([*(99 - info.priority for info in system.threads), 120])
-        columns = {"time": times, "cpu": np.array(system.cores)[core], "prev_state": 1 - runnable}
-        columns |= {"pid": pids[before], "tid": tids[before]}
-        for key, values in (("comm", comms), ("tid", tids), ("prio", priorities)):
-            columns |= {f"prev_{key}": values[before], f"next_{key}": values[following]}
-        tables["sched_switch"] = live.typed_table("sched_switch", pl.DataFrame(columns))
+    switches = log["context_switch"]
+    if switches["time"].size:
+        tables["sched_switch"] = _switches(system, switches)
     return tables
+
+
+def _switches(system: System, switches: Mapping[str, npt.NDArray[Any]]) -> pl.DataFrame:
+    """The table of context switches, of threads by their numbers: -1, the last, is the idle one."""
+    pids = np.array([*(info.pid for info in system.threads), 0], dtype=np.int32)
+    tids = np.array([*(info.tid for info in system.threads), 0], dtype=np.int32)
+    comms = np.array([*(info.comm for info in system.threads), "swapper"])
+    priorities = np.array([*(99 - info.priority for info in system.threads), 120])
+    before, following = switches["previous"], switches["thread"]
+    columns = {
+        "time": switches["time"],
+        "cpu": np.array(system.cores)[switches["core"]],
+        "prev_state": 1 - switches["runnable"],
+        "pid": pids[before],
+        "tid": tids[before],
+    }
+    for key, values in (("comm", comms), ("tid", tids), ("prio", priorities)):
+        columns |= {f"prev_{key}": values[before], f"next_{key}": values[following]}
+    return live.typed_table("sched_switch", pl.DataFrame(columns))
 
 
 def with_recorded_times(

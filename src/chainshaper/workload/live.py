@@ -380,7 +380,7 @@ class ProcessLog:
     objects: tuple[dict[str, Any], ...]
     modes: tuple[str, ...] = ()  # that its gate knows
 
-    def process(self, _: object = None) -> dict[str, int | None]:
+    def process(self) -> dict[str, Any]:
         """What all its events have."""
         return {"pid": self.pid, "cpu": self.core}
 
@@ -391,8 +391,12 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
     for log in logs:
         rows = np.frombuffer(log.rows, dtype=np.int64).reshape(-1, WIDTH)
         rows = rows[rows[:, 1] >= from_ns]
-        entries = [rows[rows[:, 0] == number, 1:].T for number in range(len(LAYOUT))]
-        found = list(logged_tables(entries, log.process, log.modes))
+        entries = {
+            entry: dict(zip(("time", "tid", *fields), columns.T, strict=False)) | log.process()
+            for number, (entry, fields) in enumerate(LAYOUT.items())
+            if (columns := rows[rows[:, 0] == number, 1:]).size
+        }
+        found = list(logged_tables(entries, log.modes))
         own = {**log.process(), "tid": log.pid}
         for name in dict.fromkeys(created["event"] for created in log.objects):
             created = pl.DataFrame([one | own for one in log.objects if one["event"] == name])
@@ -406,23 +410,21 @@ def event_tables(logs: Sequence[ProcessLog], from_ns: int) -> dict[str, pl.DataF
 
 
 def logged_tables(
-    entries: Sequence[Numbers],
-    process: Callable[[Numbers], Mapping[str, Any]],
-    modes: Sequence[str],
+    entries: Mapping[str, Mapping[str, npt.NDArray[Any]]], modes: Sequence[str]
 ) -> Iterator[tuple[str, pl.DataFrame]]:
-    """The events that entries of a log stand for: for each of :data:`LAYOUT` its columns.
-
-    ``process`` gives pid and core of threads.
+    """The events that entries of a log stand for, of which :data:`LAYOUT` says the fields: columns
+    by their names, beside time and thread.
     """
-    for (entry, fields), columns in zip(LAYOUT.items(), entries, strict=False):
-        if not columns.size:
+    for entry in LAYOUT:
+        columns = entries.get(entry, {})
+        if not columns or not columns["time"].size:
             continue
-        own = dict(zip(("time", "tid", *fields), columns, strict=False))
-        frame = pl.DataFrame(own | dict(process(own["tid"])))
+        frame = pl.DataFrame(columns)
+        taken = frame.filter(taken=1) if entry == "take" else frame
         for name in EVENTS[entry]:
-            taken = frame.filter(taken=1) if name in ALSO_TAKEN else frame
-            if taken.height:
-                yield name, typed_table(name, taken, modes)
+            named = taken if name in ALSO_TAKEN else frame
+            if named.height:
+                yield name, typed_table(name, named, modes)
 
 
 def typed_table(name: str, frame: pl.DataFrame, modes: Sequence[str] = ()) -> pl.DataFrame:

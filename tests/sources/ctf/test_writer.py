@@ -16,7 +16,6 @@ from made import START, USER_CONTEXT, USER_EVENTS, make_trace, records
 from reference import actual_rows, assert_equal_to_babeltrace, lean
 
 from chainshaper.sources.ctf import count_events, open_trace, read_events
-from chainshaper.sources.ctf.layout import BATCH
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 
 
@@ -70,7 +69,7 @@ def test_kernel_beside_user_space_and_per_process_folders(tmp_path: Path) -> Non
     assert both["callback"][1:].to_list() == frames["ros2:callback_end"]["callback"].to_list()
     # Naming a folder twice does not read it twice.
     twice = open_trace(tmp_path, tmp_path / "kernel")
-    packets = [sum(len(one.table) for one in found.streams) for found in (twice, trace)]
+    packets = [sum(len(one.packets) for one in found.streams) for found in (twice, trace)]
     assert packets[0] == packets[1] + 1
 
 
@@ -128,6 +127,7 @@ def test_many_different_strings(tmp_path: Path) -> None:
         assert frame[name].to_list() == [payload[name] for payload in payloads]
 
 
+BATCH = 128  # so many events of one class are written together (core/ctf/events.cpp)
 EVENTS = {"ros2:number": {"place": "u64"}, "ros2:text": {"place": "u64", "text": "string"}}
 
 

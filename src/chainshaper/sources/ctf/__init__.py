@@ -4,9 +4,8 @@
     count_events(trace)                       # {"ros2:callback_start": 4711, …}, what is damaged
     read_events(trace, {"ros2:callback_start"})["ros2:callback_start"]
 
-From a folder to frames: `tsdl` reads the metadata, `layout` makes operations and tables of it,
-`trace` finds packets, and `read` runs the operations (`kernels`, `interpreter`) over the files and
-makes columns of what they write.
+From a folder to frames: `tsdl` reads the metadata, `layout` hands its types to the decoder in C++
+(core/ctf), `trace` has it find packets, and `read` has it write columns.
 """
 
 from chainshaper.sources.ctf.read import Events, count_events, read_events

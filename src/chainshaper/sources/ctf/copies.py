@@ -13,25 +13,38 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf import layout as tb
 from chainshaper.sources.ctf.tsdl import CtfError, TraceClass
 
-_KEY = (tb.P_STREAM, tb.P_INSTANCE, tb.P_SEQUENCE, tb.P_BEGIN, tb.P_LAST)
+_KEY = ("stream_class", "instance", "sequence", "begin", "end")
 
 
 @dataclass(frozen=True)
 class CtfStream:
-    """One stream file of a folder (by number) and the table of its packets (see `layout`)."""
+    """One stream file of a folder (by number) and its packets, in order of the file.
+
+    Columns of ``packets``, all Int64; -1 where a packet does not say a number:
+
+    * ``offset``: bytes from the file's beginning; ``size``: bytes, not more than the file has
+    * ``content_bits``: of header, context and events
+    * ``stream_class``: counted over all folders, in order of declaration
+    * ``instance``: which stream of that class
+    * ``begin``, ``end``: clock cycles, as the packet says
+    * ``sequence``: its number in the stream
+    * ``discarded``: events that the tracer dropped so far
+    * ``cpu``: the core that it is of
+    * ``earliest``, ``latest``: clock cycles, what its events' times can be
+    """
 
     path: Path
     folder: int
-    table: NDArray[np.int64] = field(repr=False, compare=False)
+    packets: pl.DataFrame = field(repr=False, compare=False)
 
 
 def stream_classes(folders: Sequence[TraceClass]) -> NDArray[np.int64]:
-    """For each row of `layout`'s stream classes a number, the same in all folders of one trace."""
+    """For each stream class of all folders a number, the same in all folders of one trace."""
     numbers: dict[tuple[object, int], int] = {}
     keys = [
         (folder.uuid or folder.path, identifier)
@@ -48,61 +61,66 @@ def without_copies(
 
     ``classes`` as :func:`stream_classes` has them. Raises `CtfError`: a packet has two contents.
     """
-    paths, tables = [stream.path for stream in streams], [stream.table for stream in streams]
-    left_out = [np.zeros(len(table), bool) for table in tables]
+    paths = [stream.path for stream in streams]
+    packets = [stream.packets for stream in streams]
+    left_out = [np.zeros(len(frame), bool) for frame in packets]
     counts = Counter[tuple[int, int]]()
-    for file, packet, before in _copies(paths, tables, classes):
+    for file, packet, before in _copies(paths, packets, classes):
         left_out[file][packet] = True
         counts[file, before] += 1
     left = [
-        replace(one, table=one.table[~copies])
-        for one, copies in zip(streams, left_out, strict=True)
+        replace(stream, packets=stream.packets.filter(~copies)) if copies.any() else stream
+        for stream, copies in zip(streams, left_out, strict=True)
     ]
     warnings = [
-        f"{paths[file]}: {count} of its {len(tables[file])} packets are in {paths[before]} as well;"
-        " they count once"
+        f"{paths[file]}: {count} of its {len(packets[file])} packets are in {paths[before]} as"
+        " well; they count once"
         for (file, before), count in sorted(counts.items())
     ]
-    return [stream for stream in left if len(stream.table)], warnings
+    return [stream for stream in left if len(stream.packets)], warnings
 
 
 def _copies(
-    paths: Sequence[Path], tables: Sequence[NDArray[np.int64]], classes: NDArray[np.int64]
+    paths: Sequence[Path], packets: Sequence[pl.DataFrame], classes: NDArray[np.int64]
 ) -> list[tuple[int, int, int]]:
     """Packets that are there already: file and number of the copy, file of the one that counts."""
-    if not tables:
+    if not packets:
         return []
-    sizes = [len(table) for table in tables]
-    keys = np.concatenate([table[:, _KEY] for table in tables])
-    keys[:, 0] = classes[keys[:, 0]]
-    lengths = np.concatenate([table[:, tb.P_END] for table in tables])
-    files = np.repeat(np.arange(len(tables)), sizes)
-    packets = np.concatenate([np.arange(size) for size in sizes])
-    known = np.flatnonzero((keys[:, 2] >= 0) & (keys[:, 3] >= 0))
+    files = np.repeat(np.arange(len(packets)), [len(frame) for frame in packets])
+    numbers = np.concatenate([np.arange(len(frame)) for frame in packets])
+    columns = pl.concat(packets)
+    lengths, offsets = columns["content_bits"].to_numpy(), columns["offset"].to_numpy()
+    keys = {name: columns[name].to_numpy() for name in _KEY}
+    keys["stream_class"] = classes[keys["stream_class"]]
+    known = np.flatnonzero((keys["sequence"] >= 0) & (keys["begin"] >= 0))
     # Alike ones in a row, the longest first: a copy may have been cut short.
-    order = known[np.lexsort((packets[known], files[known], -lengths[known], *keys[known].T))]
-    alike = (keys[order[1:]] == keys[order[:-1]]).all(axis=1)
+    orders = [keys[name][known] for name in _KEY]
+    order = known[np.lexsort((numbers[known], files[known], -lengths[known], *orders))]
+    alike = np.logical_and.reduce(
+        [keys[name][order[1:]] == keys[name][order[:-1]] for name in _KEY]
+    )
     # Of each place in that row, where the ones alike begin.
     begins = np.maximum.accumulate(np.where(np.append([False], alike), 0, np.arange(len(order))))
     found: list[tuple[int, int, int]] = []
     with ExitStack() as opened:
         descriptors = [-1] * len(paths)
 
-        def content(which: int, bits: int) -> bytes:
+        def content(packet: int, bits: int) -> bytes:
             """The bytes of a packet."""
-            file = int(files[which])
+            file = int(files[packet])
             if descriptors[file] < 0:
                 descriptors[file] = opened.enter_context(paths[file].open("rb")).fileno()
-            offset = int(tables[file][int(packets[which]), tb.P_BYTE])
-            return os.pread(descriptors[file], bits >> 3, offset)
+            return os.pread(descriptors[file], bits >> 3, int(offsets[packet]))
 
         for place in (np.flatnonzero(alike) + 1).tolist():
             copy, counted = int(order[place]), int(order[begins[place]])
             file, before, bits = int(files[copy]), int(files[counted]), int(lengths[copy])
             if content(copy, bits) != content(counted, bits):
-                offset = int(tables[file][int(packets[copy]), tb.P_BYTE])
-                same = f"packet {keys[copy, 2]} of this stream is in {paths[before]} too"
+                number = keys["sequence"][copy]
+                same = f"packet {number} of this stream is in {paths[before]} too"
                 remedy = "one of them is damaged, or was being overwritten: give one folder alone"
-                raise CtfError(paths[file], offset, f"{same}, with another content", remedy)
-            found.append((file, int(packets[copy]), before))
+                raise CtfError(
+                    paths[file], int(offsets[copy]), f"{same}, with another content", remedy
+                )
+            found.append((file, int(numbers[copy]), before))
     return found

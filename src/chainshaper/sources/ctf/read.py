@@ -1,45 +1,45 @@
 """Counting events and reading them into data frames.
 
-Pass 1 (`_File.walk`) steps over every event of a file and counts, so that each has its row. Pass 2
-(`_fill`) writes the wanted events of a chunk of a file to their rows, which are sorted in the end.
-Chunks run on several threads; of a large trace only some are in memory at once.
+Pass 1 (`_File.count`) steps over every event of a file and counts, so that each has its row. Pass 2
+(`_filled`) writes the wanted events of a chunk of a file to their rows, and these are sorted. Both
+are C++ (core/ctf), and run on several threads; of a large trace only some chunks are in memory at
+once.
 """
-
-# ruff: noqa: PLR0917 - the parts of one pass
 
 import os
 from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf import layout as tb
+from chainshaper import _core
 from chainshaper.sources.ctf import tsdl
 from chainshaper.sources.ctf.copies import CtfStream
-from chainshaper.sources.ctf.layout import Layout, Table, lay_out
-from chainshaper.sources.ctf.trace import CtfTrace, MappedFile, Scratch
-from chainshaper.values.compiled import kernel
+from chainshaper.sources.ctf.layout import Table, lay_out, select
+from chainshaper.sources.ctf.trace import CtfTrace, MappedFile
 
-_run_events = kernel("chainshaper.sources.ctf.kernels", "run_events")
-_CHUNK_BYTES = 128 << 20
+_CHUNK_BYTES = 32 << 20
 _SMALL_BYTES = 4 << 20
 _LARGE_BYTES = 512 << 20
 _HUGE_PAGE = 2 << 20
 _MOST_WARNINGS = 20
 _FAILURES = {
-    tb.OTHER_TIME: "an event outside the time that its packet says it was open",
-    tb.NO_PROCESS: "an event of process or thread 0: there are zeros instead of what was recorded",
-    tb.ALL_ZEROS: "zeros instead of events",
-    tb.TRUNCATED: "an event reaches past the end of its packet's content",
-    tb.NO_OPTION: "a variant's tag names none of its options",
-    tb.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
-    tb.UNTERMINATED: "a string does not end within its packet",
-    tb.UNKNOWN_EVENT: "an event id that the metadata does not declare: perhaps it ends too early",
-    tb.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory than its size"
-    f" warrants ({tb.BUDGET} times)",
+    _core.CtfFailure.OTHER_TIME: "an event outside the time that its packet says it was open",
+    _core.CtfFailure.NO_PROCESS: "an event of process or thread 0: there are zeros instead of what"
+    " was recorded",
+    _core.CtfFailure.ALL_ZEROS: "zeros instead of events",
+    _core.CtfFailure.TRUNCATED: "an event reaches past the end of its packet's content",
+    _core.CtfFailure.NO_OPTION: "a variant's tag names none of its options",
+    _core.CtfFailure.BAD_LENGTH: "an array or sequence is longer than the rest of its packet",
+    _core.CtfFailure.UNTERMINATED: "a string does not end within its packet",
+    _core.CtfFailure.UNKNOWN_EVENT: "an event id that the metadata does not declare: perhaps it"
+    " ends too early",
+    _core.CtfFailure.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory"
+    f" than its size warrants ({_core.CTF_BUDGET_PER_BYTE} times)",
 }
 _Progress = Callable[[float], None]
 
@@ -96,27 +96,29 @@ def read_events(
     Raises `CtfError` where a file is gone or changes while it is read.
     """
     asked = trace.event_names if names is None else names
-    layout = lay_out(trace.folders, {name: name not in nameless for name in asked})
-    rows = {event.stream for event in layout.events if event.row[tb.E_COUNTER] >= 0}
+    wanted = select(trace.folders, {name: name not in nameless for name in asked})
+    layout = lay_out(trace.folders, trace.described, wanted.events)
     used = [
         stream
         for stream in trace.streams
-        if counted or not rows.isdisjoint(stream.table[:, tb.P_STREAM].tolist())
+        if counted or not wanted.stream_classes.isdisjoint(stream.packets["stream_class"])
     ]
-    files, workers = [_File(stream) for stream in used], threads or len(os.sched_getaffinity(0))
+    files = [_File(stream, layout) for stream in used]
+    workers = threads or len(os.sched_getaffinity(0))
     size = sum(file.map.size for file in files)
     chunk = min(_CHUNK_BYTES, max(_SMALL_BYTES, size // workers))
     with ThreadPoolExecutor(workers) as pool:
         # Read twice, a trace that fits into memory had better stay there in between.
-        walks = pool.map(lambda file: file.walk(layout, chunk, size > _LARGE_BYTES), files)
+        walks = pool.map(lambda file: file.count(chunk, size > _LARGE_BYTES), files)
         for done, _ in enumerate(walks, 1):
             progress(done / len(files) / 3)
-        ends = np.cumsum([file.rows for file in files], axis=0)
+        rows = [np.zeros(len(wanted.tables), np.int64), *(file.rows for file in files)]
+        first_rows = np.cumsum(rows, axis=0)
         columns = [
-            _Columns(layout, number, table, int(ends[-1][number]) if files else 0)
-            for number, table in enumerate(layout.tables)
+            _Columns(number, table, int(first_rows[-1][number]) if files else 0)
+            for number, table in enumerate(wanted.tables)
         ]
-        texts = _filled(pool, files, layout, ends, columns, progress)
+        texts = _filled(pool, files, first_rows, columns, progress)
     try:
         events = Events(_frames(columns, texts))
     except pl.exceptions.PolarsError as error:
@@ -124,68 +126,76 @@ def read_events(
         folder = trace.folders[0].path
         raise tsdl.CtfError(folder, None, reason, "read its folders one by one") from None
     events.warnings = tuple(_warnings(files))
-    events.damaged = sum(int((file.packets[:, tb.P_ERROR] < 0).sum()) for file in files)
+    events.damaged = sum(len(file.reader.bad_events) for file in files)
     events.counts = dict.fromkeys(trace.event_names, 0)
+    classes = [stream for folder in trace.folders for stream in folder.streams.values()]
+    declared = [event.name for stream in classes for event in stream.events.values()]
     for file in files:
-        for event, number in zip(layout.events, file.counts.tolist(), strict=False):
-            events.counts[event.name] += number
+        for name, number in zip(declared, file.reader.counts.tolist(), strict=True):
+            events.counts[name] += number
     return events
 
 
 # Pass 1
 
 
-class _Chunk(NamedTuple):
-    """Packets [first, last) of a file, clock and rows of the tables before them, rows behind."""
-
-    first: int
-    last: int
-    clock: int
-    before: NDArray[np.int64]
-    after: NDArray[np.int64]
-
-
 class _File:
-    """A stream file that is being read, and what pass 1 finds in it.
+    """A stream file that is being read, in ``chunks``; ``rows`` of each table are in it."""
 
-    ``counts`` are per event class, ``rows`` per table.
-    """
-
-    def __init__(self, stream: CtfStream) -> None:
-        self.path, self.packets = stream.path, stream.table.copy()
+    def __init__(self, stream: CtfStream, layout: _core.CtfLayout) -> None:
+        self.path, self.packets = stream.path, stream.packets
         self.map = MappedFile(stream.path)
-        self.counts = self.rows = np.zeros(0, np.int64)
-        self.chunks: list[_Chunk] = []
+        names = ("offset", "content_bits", "stream_class", "cpu", "earliest", "latest")
+        columns = {name: self.packets[name].to_numpy() for name in names}
+        try:
+            self.reader = _core.CtfEventReader(layout, self.map.bytes, **columns)
+        except ValueError:  # a packet is not in the file
+            raise _changed(self.path) from None
+        self.rows: NDArray[np.int64] = np.zeros(0, np.int64)
+        self.chunks: list[_core.CtfChunk] = []
 
-    def walk(self, layout: Layout, chunk_bytes: int, lean: bool) -> None:
+    def count(self, chunk_bytes: int, lean: bool) -> None:
         """Step over all events, and shorten packets to what can be read; ``lean`` on memory."""
-        scratch, packets = Scratch(layout), self.packets
-        self.counts = np.zeros(max(len(layout.events), 1), np.int64)
+        offsets = self.packets["offset"].to_numpy()
         first = 0
-        while first < len(packets):
-            limit = packets[first, tb.P_BYTE] + chunk_bytes
-            last = max(int(np.searchsorted(packets[:, tb.P_BYTE], limit)), first + 1)
-            clock, before = int(scratch.state[tb.X_CLOCK]), scratch.rows.copy()
-            scratch.run(_run_events, self.map, packets, first, last, self.counts.ctypes.data, 0)
-            self.chunks.append(_Chunk(first, last, clock, before, scratch.rows.copy()))
+        while first < len(offsets):
+            end = max(int(np.searchsorted(offsets, offsets[first] + chunk_bytes)), first + 1)
+            self.chunks.append(self.reader.count(end))
             if lean:
-                self.map.forget(packets[first:last])
-            first = last
-        self.rows = scratch.rows
+                self.map.forget(self.packets[first:end])
+            first = end
+        self.rows = self.reader.rows
+
+    def write(
+        self, chunk: _core.CtfChunk, tables: list[_core.CtfTable], first_rows: NDArray[np.int64]
+    ) -> list[bytes]:
+        """Write a chunk's events to their tables; the texts that text columns have codes of."""
+        try:
+            texts = self.reader.write(chunk, tables, first_rows)
+        except _core.CtfFileChangedError:
+            raise _changed(self.path) from None
+        self.map.forget(self.packets[chunk.first : chunk.end])
+        return texts
+
+
+def _changed(path: Path) -> tsdl.CtfError:
+    reason = "it has not the events that were counted: it changed while it was read"
+    return tsdl.CtfError(path, None, reason, "stop the recording first")
 
 
 def _warnings(files: Sequence[_File]) -> Iterator[str]:
     """What cannot be read, packet by packet, the first ones of very many."""
     for file in files:
-        damaged = file.packets[file.packets[:, tb.P_ERROR] < 0]
-        for packet in damaged[:_MOST_WARNINGS]:
-            place = int(packet[tb.P_BYTE] + (packet[tb.P_ERROR_AT] >> 3))
-            reason = _FAILURES[int(packet[tb.P_ERROR])]
+        bad_events = file.reader.bad_events
+        for event in bad_events[:_MOST_WARNINGS]:
+            reason = _FAILURES[event.failure]
             yield str(
-                tsdl.CtfError(file.path, place, reason, "the rest of this packet is not read")
+                tsdl.CtfError(
+                    file.path, event.offset, reason, "the rest of this packet is not read"
+                )
             )
-        if len(damaged) > _MOST_WARNINGS:
-            yield f"{file.path}: {len(damaged) - _MOST_WARNINGS} more packets are like that"
+        if len(bad_events) > _MOST_WARNINGS:
+            yield f"{file.path}: {len(bad_events) - _MOST_WARNINGS} more packets are like that"
 
 
 # Pass 2
@@ -194,110 +204,86 @@ def _warnings(files: Sequence[_File]) -> Iterator[str]:
 def _filled(
     pool: ThreadPoolExecutor,
     files: list[_File],
-    layout: Layout,
-    ends: NDArray[np.int64],
+    first_rows: NDArray[np.int64],
     columns: list["_Columns"],
     progress: _Progress,
 ) -> list[bytes]:
-    """Pass 2 over all chunks; returns the texts and bytes that slots then have codes of.
+    """Pass 2 over all chunks; returns the texts and bytes that text columns then have codes of.
 
-    ``ends`` are the tables' rows behind those of each file.
+    ``first_rows`` are the tables' rows at which those of each file begin.
     """
+    tables = [table.arrays() for table in columns]
     chunks = [
-        (file, one._replace(before=end - file.rows + one.before, after=end - file.rows + one.after))
-        for file, end in zip(files, ends, strict=True)
-        for one in file.chunks
-        if (one.after > one.before).any()
+        (file, first, chunk)
+        for file, first in zip(files, first_rows, strict=False)
+        for chunk in file.chunks
+        if (chunk.rows_after > chunk.rows_before).any()
     ]
     codes: dict[bytes, int] = {}
-    found = pool.map(lambda one: _fill(one[0], one[1], layout), chunks)
-    for done, ((_, chunk), strings) in enumerate(zip(chunks, found, strict=True), 1):
-        own = [codes.setdefault(string, len(codes)) for string in strings]
-        if own != list(range(len(own))):
+    written = pool.map(lambda part: part[0].write(part[2], tables, part[1]), chunks)
+    for done, ((_, first, chunk), texts) in enumerate(zip(chunks, written, strict=True), 1):
+        others = [codes.setdefault(text, len(codes)) for text in texts]
+        if others != list(range(len(others))):
             for table in columns:
-                table.recode(chunk, np.array(own, np.uint32))
+                before, after = first + chunk.rows_before, first + chunk.rows_after
+                rows = slice(before[table.number], after[table.number])
+                table.recode(rows, np.array(others, np.uint32))
         progress((1 + 2 * done / len(chunks)) / 3)
+    # Rows stand file by file, each in order of time but for clocks that went back.
+    list(pool.map(_core.CtfTable.sort_by_time, tables))
     return list(codes)
-
-
-def _fill(file: _File, chunk: _Chunk, layout: Layout) -> list[bytes]:
-    """Pass 2 over one chunk; the strings of its text slots."""
-    scratch = Scratch(layout)
-    scratch.caps[:] = chunk.after
-    status = tb.FULL_DICTIONARY
-    while status == tb.FULL_DICTIONARY:
-        scratch.rows[:], scratch.batches[:, 0] = chunk.before, 0
-        scratch.state[tb.X_CLOCK] = chunk.clock
-        numbers = (chunk.first, chunk.last, 0, len(layout.events))
-        status = scratch.run(_run_events, file.map, file.packets, *numbers)
-        if status == tb.FULL_DICTIONARY:
-            scratch.grow()
-    if status < 0 or (scratch.rows != scratch.caps).any():
-        reason = "it has not the events that were counted: it changed while it was read"
-        raise tsdl.CtfError(file.path, None, reason, "stop the recording first")
-    strings = scratch.strings()
-    file.map.forget(file.packets[chunk.first : chunk.last])
-    return strings
 
 
 # Columns
 
 
 class _Columns:
-    """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its slots.
+    """The arrays of one table of so many ``rows``: time, cpu (or nothing) and its columns' values.
 
     They are parts of one piece of memory, large enough for huge pages: page faults would else be a
     third of all work.
     """
 
-    def __init__(self, layout: Layout, number: int, table: Table, rows: int) -> None:
+    def __init__(self, number: int, table: Table, rows: int) -> None:
         self.number, self.table, self.rows = number, table, rows
         wanted: list[tuple[int, np.dtype[Any]]] = [(rows, np.dtype("i8"))]
         wanted += [(rows * table.has_cpu, np.dtype("i4"))]
-        wanted += [(rows, kind) for kind in table.slot_types()]
+        wanted += [(rows, kind) for kind in table.column_types()]
         # Columns side by side must not begin alike in their pages, or they would compete for
         # the same few lines of the processor's cache.
         sizes = [-(-count * kind.itemsize // 4096) * 4096 + 320 for count, kind in wanted]
         parts = np.split(_memory(sum(sizes)), np.cumsum(sizes))
-        self.time, self.cpu, *self.slots = (
+        self.time, self.cpu, *self.values = (
             part[: count * kind.itemsize].view(kind)
             for part, (count, kind) in zip(parts, wanted, strict=False)
         )
-        cpu = self.cpu.ctypes.data if table.has_cpu else 0
-        slots = [(array.ctypes.data, array.itemsize) for array in self.slots]
-        layout.attach(table, self.time.ctypes.data, cpu, slots)
 
-    def recode(self, chunk: _Chunk, codes: NDArray[np.uint32]) -> None:
-        """Replace one chunk's own codes of strings by those of the whole."""
-        rows = slice(chunk.before[self.number], chunk.after[self.number])
-        for (_, kind), array in zip(self.table.columns, self.slots, strict=True):
+    def arrays(self) -> _core.CtfTable:
+        """The arrays for the decoder to write to."""
+        cpus = self.cpu if self.table.has_cpu else None
+        return _core.CtfTable(times_ns=self.time, cpus=cpus, columns=self.values)
+
+    def recode(self, rows: slice, codes: NDArray[np.uint32]) -> None:
+        """Replace one chunk's own codes of texts by those of the whole."""
+        for (_, kind), array in zip(self.table.columns, self.values, strict=True):
             if not isinstance(kind, tsdl.IntegerType):
-                array[rows] = codes[array[rows]]
+                _core.recode(array[rows], codes)
 
     def frame(self, known: list[bytes], strings: pl.Series, categories: pl.Series) -> pl.DataFrame:
-        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts.
-
-        Rows stand file by file, each in order of time but for clocks that went back.
-        """
-        time, cpu, *slots = self.time, self.cpu, *self.slots
-        if (time[1:] < time[:-1]).any():
-            order = np.argsort(time, kind="stable")
-            time, cpu, *slots = (
-                one.take(order, mode="clip") if one.size else one for one in (time, cpu, *slots)
-            )
-        found = {"time": pl.Series("time", time)}
+        """The table's frame; codes are of what is ``known``, which are ``strings`` as texts."""
+        found = {"time": pl.Series("time", self.time)}
         if self.table.has_cpu:
-            found["cpu"] = pl.Series("cpu", cpu)
-        for (name, kind), values in zip(self.table.columns, slots, strict=True):
+            found["cpu"] = pl.Series("cpu", self.cpu)
+        for (name, kind), column in zip(self.table.columns, self.values, strict=True):
             if tsdl.is_text(kind):
                 texts = categories if name == "procname" else strings
-                found[name] = texts.gather(pl.Series(values)).alias(name)
+                found[name] = texts.gather(pl.Series(column)).alias(name)
             elif isinstance(kind, tsdl.ArrayType):
-                codes, places = np.unique(values, return_inverse=True)
+                codes, places = np.unique(column, return_inverse=True)
                 lists = [list(known[code]) for code in codes]
                 found[name] = pl.Series(name, lists, pl.List(pl.UInt8)).gather(places)
             else:
-                found[name] = pl.Series(name, values)
+                found[name] = pl.Series(name, column)
         for name in ("cpu", "pid", "tid"):
             if name not in found:
                 found[name] = pl.Series(name, [None], pl.Int32).new_from_index(0, self.rows)

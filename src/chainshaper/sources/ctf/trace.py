@@ -1,20 +1,20 @@
 """Opening CTF traces: metadata files, packets, what was recorded by which clock, what was lost."""
 
-import ctypes
 import mmap
 import struct
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 from uuid import UUID
 
 import numpy as np
+import polars as pl
 from numpy.typing import NDArray
 
-from chainshaper.sources.ctf import layout as tb
+from chainshaper import _core
 from chainshaper.sources.ctf.copies import CtfStream, stream_classes, without_copies
-from chainshaper.sources.ctf.layout import Layout, lay_out
+from chainshaper.sources.ctf.layout import MAGIC, describe, lay_out
 from chainshaper.sources.ctf.tsdl import (
     ArrayType,
     CtfError,
@@ -23,20 +23,19 @@ from chainshaper.sources.ctf.tsdl import (
     TsdlError,
     parse_tsdl,
 )
-from chainshaper.values.compiled import kernel
 
-_scan_packets = kernel("chainshaper.sources.ctf.kernels", "scan_packets")
-_MOST_DAMAGED = 1000
-"""Places in a file behind which it is read on."""
 _MOST_WARNINGS = 20
+_ALWAYS = (-(1 << 63), (1 << 63) - 1)
+"""Earliest and latest time of the events of a packet that says no times."""
 _REASONS = {
-    tb.BAD_MAGIC: "packet does not begin with the CTF magic number",
-    tb.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
-    tb.BAD_STREAM: "packet of a stream class that the metadata does not declare (or no more)",
-    tb.BAD_SIZE: "packet with impossible content or packet size",
-    tb.BAD_HEADER: "packet header cut short",
-    tb.COSTLY: "packet headers that take far more work than their size warrants",
-    tb.CUT: "last packet cut short by the end of the file",
+    _core.CtfDamage.BAD_MAGIC: "packet does not begin with the CTF magic number",
+    _core.CtfDamage.BAD_UUID: "packet belongs to another trace (uuid differs from the metadata's)",
+    _core.CtfDamage.BAD_STREAM: "packet of a stream class that the metadata does not declare (or"
+    " no more)",
+    _core.CtfDamage.BAD_SIZE: "packet with impossible content or packet size",
+    _core.CtfDamage.BAD_HEADER: "packet header cut short",
+    _core.CtfDamage.COSTLY: "packet headers that take far more work than their size warrants",
+    _core.CtfDamage.CUT: "last packet cut short by the end of the file",
 }
 
 
@@ -46,7 +45,7 @@ class CtfTrace:
 
     ``clock_offset_ns`` added to an event's time gives ns since the Epoch; ``discarded_events`` and
     ``lost_packets`` are what the tracer says that it dropped, ``damaged_places`` the parts of
-    stream files that are no packets.
+    stream files that are no packets; ``described`` are the folders' types, for the decoder.
     """
 
     folders: tuple[TraceClass, ...]
@@ -57,6 +56,7 @@ class CtfTrace:
     lost_packets: int
     damaged_places: int
     warnings: tuple[str, ...]
+    described: tuple[_core.CtfTraceClass, ...] = field(repr=False, compare=False)
 
 
 def open_trace(*paths: Path | str) -> CtfTrace:
@@ -66,7 +66,8 @@ def open_trace(*paths: Path | str) -> CtfTrace:
     metadata cannot be understood; stream files with damage give ``warnings`` instead.
     """
     folders = [read_metadata(path / "metadata") for path in _find(paths)]
-    layout = lay_out(folders, {})
+    described = [describe(folder) for folder in folders]
+    layout = lay_out(folders, described)
     first = folders[0].clock
     warnings = [
         f"{one.path}: clock {one.clock.name!r} is not the clock of {folders[0].path};"
@@ -81,14 +82,14 @@ def open_trace(*paths: Path | str) -> CtfTrace:
             packets = _packets_of(path, layout, number, folder)
             warnings += packets.warnings
             damaged += packets.damaged
-            if len(packets.table):
-                streams.append(CtfStream(path, number, packets.table))
+            if len(packets.packets):
+                streams.append(CtfStream(path, number, packets.packets))
     classes_of_streams = stream_classes(folders)
     streams, copied = without_copies(streams, classes_of_streams)
     warnings += copied
     groups: dict[object, list[CtfStream]] = {}
     for stream in streams:
-        kind, instance = stream.table[0, [tb.P_STREAM, tb.P_INSTANCE]].tolist()
+        kind, instance = (stream.packets[name][0] for name in ("stream_class", "instance"))
         name = stream.path if instance < 0 else instance
         groups.setdefault((classes_of_streams[kind], name), []).append(stream)
     losses = [(group[0].path, *_losses(group)) for group in groups.values()]
@@ -109,6 +110,7 @@ def open_trace(*paths: Path | str) -> CtfTrace:
         lost_packets=sum(lost for *_, lost in losses),
         damaged_places=damaged,
         warnings=tuple(warnings),
+        described=tuple(described),
     )
 
 
@@ -135,10 +137,9 @@ def _losses(files: list[CtfStream]) -> tuple[int, int]:
     What the first packet says counts where it is the stream's first; a snapshot or a rotated trace
     begins anywhere, and what was lost before it is not its own.
     """
-    table = np.concatenate([file.table for file in files])
     # Files of one stream follow each other (tracefile rotation), not always by name.
-    table = table[np.argsort(table[:, tb.P_BEGIN], kind="stable")]
-    counter, sequence = table[:, tb.P_DISCARDED], table[:, tb.P_SEQUENCE]
+    order = np.argsort(_column(files, "begin"), kind="stable")
+    counter, sequence = (_column(files, name)[order] for name in ("discarded", "sequence"))
     steps = np.diff(counter, prepend=0 if sequence[0] <= 0 else counter[0])
     steps[steps < 0] += 1 << 32
     discarded = int(steps[steps > 0].sum()) if (counter >= 0).all() else 0
@@ -146,139 +147,78 @@ def _losses(files: list[CtfStream]) -> tuple[int, int]:
     return discarded, int(gaps[gaps > 0].sum()) if (sequence >= 0).all() else 0
 
 
-# Stream files and the kernels' memory
+def _column(files: list[CtfStream], name: str) -> NDArray[np.int64]:
+    return np.concatenate([file.packets[name].to_numpy() for file in files])
+
+
+# Stream files
 
 
 class MappedFile:
-    """A file mapped for reading: ``address`` and ``size`` in bytes, valid as long as this lives."""
+    """A file mapped for reading: its ``bytes``, of so many the ``size``."""
 
     def __init__(self, path: Path) -> None:
         try:
             with path.open("rb") as file:
-                self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+                self.bytes = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         except (OSError, ValueError) as error:
             raise CtfError(path, None, f"cannot map the file: {error}") from error
-        self.address = int(np.frombuffer(self._map, np.uint8).ctypes.data)
-        self.size = len(self._map)
-
-    def find(self, content: bytes, start: int) -> int:
-        """Where ``content`` lies from ``start`` on, -1 for nowhere."""
-        return self._map.find(content, start)
+        self.size = len(self.bytes)
 
     def begins_with_zeros(self, start: int) -> bool:
         """Whether nothing but zeros is where a packet would have its magic number."""
-        return not any(self._map[start : start + 4])
+        return not any(self.bytes[start : start + 4])
 
-    def forget(self, packets: NDArray[np.int64]) -> None:
+    def forget(self, packets: pl.DataFrame) -> None:
         """Give back the memory of packets in a row; the file's pages stay cached."""
-        first = -(-int(packets[0, tb.P_BYTE]) // mmap.PAGESIZE) * mmap.PAGESIZE
-        last = int(packets[-1, tb.P_BYTE] + packets[-1, tb.P_BYTES])
+        first = -(-packets["offset"][0] // mmap.PAGESIZE) * mmap.PAGESIZE
+        last = packets["offset"][-1] + packets["size"][-1]
         if last - first >= mmap.PAGESIZE:
-            self._map.madvise(mmap.MADV_DONTNEED, first, last - first)
-
-
-class Scratch:
-    """The tables that kernels work with in one thread, and the ``address`` of that of addresses."""
-
-    def __init__(self, layout: Layout) -> None:
-        counters = max(len(layout.tables), 1)
-        self.state = np.zeros(tb.STATE_WORDS, np.int64)
-        self.state[tb.X_BUDGET] = 1 << 62
-        self.rows = np.zeros(counters, np.int64)
-        self.caps = np.full(counters, 1 << 62, np.int64)
-        self.registers = np.zeros(layout.registers, np.int64)
-        self.batches = np.zeros((len(layout.events), 1 + 2 * tb.BATCH), np.int64)
-        self._tables = {**layout.arrays(), tb.M_STATE: self.state, tb.M_ROWS: self.rows}
-        self._tables |= {tb.M_CAPS: self.caps, tb.M_BATCHES: self.batches}
-        self._words = np.zeros(tb.MACHINE_WORDS, np.int64)
-        self._words[list(self._tables)] = [table.ctypes.data for table in self._tables.values()]
-        self.address = int(self._words.ctypes.data)
-        self.entries = np.zeros((0, 4), np.int64)
-        self.grow()
-
-    def run(
-        self, run: Callable[..., int], file: MappedFile, packets: NDArray[np.int64], *numbers: int
-    ) -> int:
-        """Run a kernel over a file's packets."""
-        given = (file.address, file.size, packets.ctypes.data)
-        return run(self.address, self.registers.ctypes.data, *given, *numbers)
-
-    def strings(self) -> list[bytes]:
-        entries = self.entries[: self.state[tb.X_STRINGS]].tolist()
-        return [ctypes.string_at(address, length) for address, length, _, _ in entries]
-
-    def grow(self) -> None:
-        """Begin anew with a dictionary of four times the places."""
-        room = max(512, 4 * len(self.entries))
-        self.entries, self.state[tb.X_STRINGS] = np.zeros((room, 4), np.int64), 0
-        # One place more than used: places are read eight bytes at a time.
-        self._slots = np.zeros(2 * room + 1, np.int32)
-        self._words[tb.M_SLOTS], self._words[tb.M_MASK] = self._slots.ctypes.data, 2 * room - 1
-        self._words[tb.M_ENTRIES], self._words[tb.M_ROOM] = self.entries.ctypes.data, room
+            self.bytes.madvise(mmap.MADV_DONTNEED, first, last - first)
 
 
 class _Packets(NamedTuple):
-    """The packets of a stream file (see `layout`), how many places are damaged, and warnings."""
+    """The packets of a stream file (see `CtfStream`), how many places are damaged, and warnings."""
 
-    table: NDArray[np.int64]
+    packets: pl.DataFrame
     damaged: int = 0
     warnings: tuple[str, ...] = ()
 
 
-def _packets_of(path: Path, layout: Layout, number: int, folder: TraceClass) -> _Packets:
+def _packets_of(path: Path, layout: _core.CtfLayout, number: int, folder: TraceClass) -> _Packets:
     """Find the packets of a stream file.
 
     Behind a part that makes no sense the file is read on from the next packet of its trace.
     """
-    packets = np.zeros((256, tb.PACKET_COLUMNS), np.int64)
     if path.stat().st_size == 0:
-        return _Packets(packets[:0])
-    file, scratch = MappedFile(path), Scratch(layout)
-    scratch.state[tb.X_BUDGET] = tb.BUDGET * file.size
-    reached, beginning = np.zeros(2, np.int64), _beginning(folder)
-    places = list[str]()
-    while True:
-        numbers = (len(packets), reached.ctypes.data, *layout.folders[number])
-        status = scratch.run(_scan_packets, file, packets, *numbers)
-        if status == tb.FULL:
-            packets = np.concatenate([packets, np.zeros_like(packets)])
-            continue
-        if status == tb.DONE:
-            break
-        offset, found = reached.tolist()
-        searched = beginning and status != tb.COSTLY and len(places) < _MOST_DAMAGED
-        following = file.find(beginning, offset + 1) if searched else -1
-        places.append(_damage(path, file, status, offset, following))
-        if following < 0:
-            break
-        if status == tb.CUT:
-            packets[found - 1, tb.P_BYTES] = following - offset
-            most = 8 * (following - offset)
-            packets[found - 1, tb.P_END] = min(int(packets[found - 1, tb.P_END]), most)
-        reached[0] = following
-    table = packets[: int(reached[1])].copy()
-    table[:, [tb.P_EARLIEST, tb.P_LATEST]] = _times_of_events(table, folder, layout, number)
+        return _Packets(pl.DataFrame())
+    file = MappedFile(path)
+    found = _core.find_packets(layout, number, file.bytes, beginning=_beginning(folder))
+    times = _times_of_events(found.columns, folder, layout.traces[number][0])
+    packets = pl.DataFrame({**found.columns, **times})
+    places = [_damage(path, file, place) for place in found.damaged[:_MOST_WARNINGS]]
     # A file without any packet is another program's, but for one that has nothing but zeros.
-    ours = len(table) > 0 or file.begins_with_zeros(0)
-    if (more := len(places) - _MOST_WARNINGS) > 0:
-        places[_MOST_WARNINGS:] = [f"{path}: {more} more places are like that"]
-        return _Packets(table, _MOST_WARNINGS + more, tuple(places))
-    return _Packets(table, len(places) if ours else 0, tuple(places))
+    ours = len(packets) > 0 or file.begins_with_zeros(0)
+    damaged = len(found.damaged)
+    if damaged > _MOST_WARNINGS:
+        places.append(f"{path}: {damaged - _MOST_WARNINGS} more places are like that")
+        return _Packets(packets, damaged, tuple(places))
+    return _Packets(packets, damaged if ours else 0, tuple(places))
 
 
-def _damage(path: Path, file: MappedFile, status: int, offset: int, following: int) -> str:
-    """A warning of what is wrong at an offset; the next packet is at ``following`` (-1: none)."""
-    reason = _REASONS[status]
-    if status == tb.BAD_MAGIC and file.begins_with_zeros(offset):
+def _damage(path: Path, file: MappedFile, place: _core.CtfDamagedPlace) -> str:
+    """A warning of what is wrong at a place."""
+    reason = _REASONS[place.damage]
+    if place.damage == _core.CtfDamage.BAD_MAGIC and file.begins_with_zeros(place.offset):
         reason = "zeros instead of a packet: the disk was full, or the recording was not stopped"
-    unread = f"{following - offset} bytes are not read"
-    if following < 0:
-        unread = f"the last {file.size - offset} bytes of the file are not read"
-    if status == tb.CUT:
+    unread = f"{place.following - place.offset} bytes are not read"
+    if place.following < 0:
+        unread = f"the last {file.size - place.offset} bytes of the file are not read"
+    if place.damage == _core.CtfDamage.CUT:
         unread = "events up to the cut are read"
-        if following >= 0:
+        if place.following >= 0:
             reason = "packet with a size that reaches over the next one"
-    return str(CtfError(path, offset, reason, unread))
+    return str(CtfError(path, place.offset, reason, unread))
 
 
 def _beginning(folder: TraceClass) -> bytes:
@@ -290,33 +230,34 @@ def _beginning(folder: TraceClass) -> bytes:
             ("uuid", ArrayType(IntegerType(8, 8), 16)),
         ] if folder.uuid is not None:
             order: Literal["little", "big"] = "big" if folder.byte_order == "be" else "little"
-            return tb.MAGIC.to_bytes(4, order) + UUID(folder.uuid).bytes
+            return MAGIC.to_bytes(4, order) + UUID(folder.uuid).bytes
     return b""
 
 
 def _times_of_events(
-    table: NDArray[np.int64], folder: TraceClass, layout: Layout, number: int
-) -> NDArray[np.int64]:
-    """The earliest and the latest time (cycles) that an event of each packet can have.
+    packets: dict[str, NDArray[np.int64]], folder: TraceClass, first_class: int
+) -> dict[str, NDArray[np.int64]]:
+    """The earliest and the latest time that an event of each packet can have.
 
+    ``first_class`` is the number of the folder's first stream class.
     Tracers of LTTng before 2.11 closed a packet without the events that were being written, which
     the next packet's beginning bounds; so do packets of a crash, which say no end.
     """
-    times = np.full((len(table), 2), tb.ALWAYS, np.int64)
+    begin, end, stream_class = packets["begin"], packets["end"], packets["stream_class"]
+    earliest, latest = (np.full(len(begin), time, np.int64) for time in _ALWAYS)
     major, minor = (folder.env.get(f"tracer_{part}") for part in ("major", "minor"))
     known_version = isinstance(major, int) and isinstance(minor, int)
     late = known_version and (major, minor) < (2, 11)
-    begin, last = table[:, tb.P_BEGIN], table[:, tb.P_LAST]
-    following = np.append(begin[1:], -1)
-    following[following < begin] = tb.ALWAYS[1]
-    latest = np.where((last < begin) | late, np.maximum(last, following), last)
-    for row, stream in enumerate(folder.streams.values(), layout.folders[number][0]):
+    following = np.append(begin[1:], -1)[: len(begin)]
+    following[following < begin] = _ALWAYS[1]
+    last = np.where((end < begin) | late, np.maximum(end, following), end)
+    for number, stream in enumerate(folder.streams.values(), first_class):
         context = dict(stream.packet_context.fields) if stream.packet_context is not None else {}
         stamps = (context.get(name) for name in ("timestamp_begin", "timestamp_end"))
         if all(isinstance(one, IntegerType) and one.clock and one.size == 64 for one in stamps):
-            known = (table[:, tb.P_STREAM] == row) & (begin > 0)
-            times[known, 0], times[known, 1] = begin[known], latest[known]
-    return times
+            known = (stream_class == number) & (begin > 0)
+            earliest[known], latest[known] = begin[known], last[known]
+    return {"earliest": earliest, "latest": latest}
 
 
 # The metadata file
@@ -365,8 +306,8 @@ def _uuid_in(path: Path) -> UUID | None:
     with path.open("rb") as file:
         head = file.read(20)
     if len(head) == 20 and head[:4] in {
-        tb.MAGIC.to_bytes(4, "little"),
-        tb.MAGIC.to_bytes(4, "big"),
+        MAGIC.to_bytes(4, "little"),
+        MAGIC.to_bytes(4, "big"),
     }:
         return UUID(bytes=head[4:])
     return None

@@ -13,11 +13,9 @@ from itertools import combinations
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
-import numpy as np
 import polars as pl
 
 from chainshaper.sources.ctf import CtfTrace, read_events
-from chainshaper.sources.ctf.layout import P_BEGIN, P_INSTANCE, P_LAST
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 
@@ -96,12 +94,17 @@ def _spans_of_streams(
     spans: dict[tuple[str | None, str, int], _Span] = {}
     for stream in trace.streams:
         if stream.folder in folders:
-            declared, table = trace.folders[stream.folder], stream.table
-            key = declared.uuid, str(declared.env.get("domain")), int(table[0, P_INSTANCE])
-            begin, end = int(table[:, P_BEGIN].min()), int(table[:, P_LAST].max())
+            declared, packets = trace.folders[stream.folder], stream.packets
+            key = declared.uuid, str(declared.env.get("domain")), int(packets["instance"][0])
+            begin, end = _span(packets)
             known = spans.get(key, (begin, end))
             spans[key] = min(begin, known[0]), max(end, known[1])
     return spans
+
+
+def _span(packets: pl.DataFrame) -> _Span:
+    begin, end = packets.select(pl.col("begin").min(), pl.col("end").max()).row(0)
+    return begin, end
 
 
 class _Objects(NamedTuple):
@@ -179,11 +182,10 @@ def _alike(trace: CtfTrace, one: int, another: int) -> bool:
 
 def _time_of(trace: CtfTrace, folder: int) -> _Span:
     """From when to when a folder has packets; for ever, where they do not say so."""
-    tables = [stream.table for stream in trace.streams if stream.folder == folder]
-    if not tables:
+    packets = [stream.packets for stream in trace.streams if stream.folder == folder]
+    if not packets:
         return 0, 0
-    packets = np.concatenate(tables)
-    begin, end = int(packets[:, P_BEGIN].min()), int(packets[:, P_LAST].max())
+    begin, end = _span(pl.concat(packets))
     return (begin, end) if min(begin, end) >= 0 else (-(1 << 63), 1 << 63)
 
 

@@ -60,7 +60,7 @@ def open_lttng_trace(paths: Sequence[str | Path], progress: Progress | None = No
     compared.
     """
     progress = progress or (lambda _, __: None)
-    progress(0.0, "opening the trace (the first time on a machine, its decoder is compiled)")
+    progress(0.0, "opening the trace")
     try:
         trace = open_trace(*paths)
     except PermissionError as error:

@@ -1,0 +1,55 @@
+// Structs of the library as Python classes: made with keyword arguments, one for each field.
+
+#pragma once
+
+#include <nanobind/nanobind.h>
+
+#include <memory>
+#include <new>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "bindings/arrays.hpp"
+
+namespace chainshaper::bindings {
+
+// A class whose constructor takes any of the fields that are bound, by name; others are as usual.
+template <typename Struct>
+nb::class_<Struct> record(nb::module_ & module, const char * name, const char * says) {
+  return nb::class_<Struct>(module, name, says)
+      .def("__init__", [](nb::pointer_and_handle<Struct> self, const nb::kwargs & fields) {
+        new (self.p) Struct();
+        nb::inst_mark_ready(self.h);
+        for (const auto & [field, value] : fields) nb::setattr(self.h, field, value);
+      });
+}
+
+// The value of an enumeration that a word stands for, by its place in the words.
+template <typename Value, typename Words>
+Value value_of(const Words & words, const std::string & word) {
+  for (std::size_t place = 0; place < words.size(); ++place)
+    if (word == words[place]) return static_cast<Value>(place);
+  throw std::invalid_argument("'" + word + "' is not a word that is known here");
+}
+
+// A column that is Python's from now on.
+template <typename Number>
+nb::object column_of(std::vector<Number> && numbers) {
+  auto * kept = new std::vector<Number>(std::move(numbers));  // NOLINT: the capsule owns it
+  const nb::capsule owner(
+      kept, [](void * column) noexcept { delete static_cast<std::vector<Number> *>(column); });
+  return nb::cast(nb::ndarray<nb::numpy, Number, nb::ndim<1>>(kept->data(), {kept->size()}, owner));
+}
+
+// The same, of the first numbers of an array.
+template <typename Number>
+nb::object column_of(std::unique_ptr<Number[]> && numbers, std::size_t count) {
+  Number * kept = numbers.release();
+  const nb::capsule owner(kept,
+                          [](void * column) noexcept { delete[] static_cast<Number *>(column); });
+  return nb::cast(nb::ndarray<nb::numpy, Number, nb::ndim<1>>(kept, {count}, owner));
+}
+
+}  // namespace chainshaper::bindings

@@ -1,0 +1,211 @@
+// How the bits of packets lie: what `lay_out` makes of a trace's types for the decoder to run.
+//
+// The types of a scope (a header, a context, an event's fields) become a list of steps. Runs of
+// fixed size that nobody asked for become one step, and events of constant layout need no steps at
+// all: what is asked for lies at known places in them. Positions are bits from the start of a
+// packet.
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <limits>
+#include <optional>
+#include <span>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "ctf/types.hpp"
+
+namespace chainshaper::ctf {
+
+// Numbers that a run of steps notes for later steps or for the decoder. The first ones are those of
+// packet header and packet context; lengths and tags that types refer to follow.
+enum Variable : std::uint8_t {
+  event_id,
+  magic,
+  stream_id,
+  stream_instance_id,
+  timestamp_begin,
+  timestamp_end,
+  packet_seq_num,
+  events_discarded,
+  cpu_id,
+  content_size,
+  packet_size,
+  uuid_low,
+  uuid_high,
+  well_known_variables,
+};
+
+inline constexpr std::int32_t none = -1;
+
+struct Step {
+  enum class Does : std::uint8_t {
+    skip,        // `size` bits
+    number,      // reads an integer
+    move,        // reads an integer of 8, 16, 32 or 64 bits that lies in the packet as in memory
+    text,        // reads bytes up to a NUL
+    characters,  // reads `count` bytes; of a text only those before a NUL
+    skip_many,   // `count` elements of `size` bits
+    loop,        // runs the steps behind it `count` times, then goes on at `target`
+    again,       // the end of a loop's turn; `target` is its first step
+    choose,      // goes on where the range of a tag says
+    jump,        // goes on at `target`
+  };
+
+  Does does;
+  bool is_signed{false};
+  bool big_endian{false};
+  bool sets_clock{false};
+  bool is_text{false};
+  std::int32_t variable{none};  // that a number sets, or that has the `count` or the tag
+  std::int32_t column{none};    // of the event's table, that the value goes to
+  std::int64_t align{1};
+  std::int64_t size{0};
+  std::int64_t count{0};  // where no variable has it
+  std::size_t target{0};
+  std::size_t first_range{0};  // of `choose`: in Layout::ranges
+  std::size_t ranges{0};
+  std::int64_t least{0};  // bits that an element of a loop takes at least
+  std::int64_t cost{0};   // of an element of a loop
+};
+
+// Steps [first, end) of a layout.
+struct Steps {
+  std::size_t first{0};
+  std::size_t end{0};
+};
+
+// Tags from `low` to `high`, as `Integer::ordered` has them, choose the step `target`.
+struct TagRange {
+  std::uint64_t low;
+  std::uint64_t high;
+  std::size_t target;
+};
+
+// A value that lies at a constant place in an event and goes to a column.
+struct Move {
+  std::int64_t offset;  // bytes from the aligned start of the event's contexts and payload
+  std::int64_t length;  // bytes
+  std::int32_t column;  // of the event's table
+  bool is_characters;   // its column has the code of a text, else the bytes themselves
+  bool is_text;         // characters that end at a NUL
+};
+
+struct EventLayout {
+  // What pass 1 needs of an event of constant layout, whose steps are one:
+  std::int64_t align{0};  // 0 where the layout is not constant
+  std::int64_t size{0};
+  std::int64_t cost{0};      // of header and steps, and the bytes of a row
+  std::int32_t table{none};  // that it goes to
+  bool is_moved{false};      // `moves` say all that is to be done
+  Steps steps;               // of contexts and payload
+  std::vector<Move> moves;
+};
+
+// LTTng's compact and large event headers, which a single load reads: an id of few bits, then the
+// clock's low bits. An id of all ones announces the long form, which is left to the steps.
+struct QuickHeader {
+  std::int64_t align{0};  // 0: the header is another
+  std::int64_t id_bits{0};
+  std::int64_t clock_shift{0};
+  std::int64_t clock_bits{0};
+};
+
+// Where behind an event's header the 32 bits of process and thread lie, bits from its alignment.
+struct ProcessPlace {
+  std::int64_t align{0};  // 0: not known, or a kernel's trace, where 0 is a number too
+  std::int64_t process{0};
+  std::int64_t thread{0};
+};
+
+struct StreamLayout {
+  std::int64_t id;
+  Steps packet_header;
+  Steps packet_context;
+  Steps event_header;
+  QuickHeader quick;
+  ProcessPlace process;
+  std::int64_t frequency_hz;
+  std::int64_t packet_cost;
+  std::int64_t default_event{0};  // where events have no id
+  std::uint32_t known{0};         // bit n: packets say Variable n
+  std::pair<std::int64_t, std::int64_t> uuid{0, 0};
+  std::vector<std::int32_t> events;  // event class by small id, or `none`
+  std::vector<std::pair<std::int64_t, std::int32_t>> rare_events;  // the others, by ascending id
+
+  bool knows(Variable variable) const { return (known >> variable & 1) != 0; }
+
+  // The event class that an id names, in Layout::events; `none` for an undeclared one.
+  std::int32_t event(std::int64_t id_of_event) const {
+    if (static_cast<std::uint64_t>(id_of_event) < events.size())
+      return events[static_cast<std::size_t>(id_of_event)];
+    return rare_event(id_of_event);
+  }
+
+private:
+  std::int32_t rare_event(std::int64_t id_of_event) const;
+};
+
+// The dynamic scopes that steps behind an event's header are of.
+enum class Scope : std::uint8_t { stream_event_context, event_context, event_fields };
+
+// A field that gets a column: which one of its scope's structure.
+struct ColumnField {
+  Scope scope;
+  std::size_t field;
+};
+
+// An event class that is asked for; classes are counted over all traces, in order of declaration.
+struct WantedEvent {
+  std::size_t event;
+  std::int32_t table;
+  std::vector<ColumnField> columns;  // in the order in which the fields lie
+};
+
+// Tables that wanted events go to. `widths` are the bytes of a value of each column: the next power
+// of two for an integer, 4 for the code of a text.
+struct TableLayout {
+  bool has_cpu;
+  std::vector<std::int64_t> widths;
+};
+
+struct Layout {
+  std::vector<Step> steps;
+  std::vector<TagRange> ranges;
+  std::vector<StreamLayout> streams;
+  std::vector<EventLayout> events;
+  std::vector<TableLayout> tables;
+  std::vector<std::pair<std::size_t, std::size_t>> traces;  // [first, end) of each one's streams
+  std::int32_t variables{well_known_variables};
+  std::size_t types{0};  // that were laid out
+
+  std::span<const StreamLayout> streams_of(std::size_t trace) const {
+    const auto [first, end] = traces.at(trace);
+    return std::span(streams).subspan(first, end - first);
+  }
+};
+
+// Sizes from here on are all the same: no packet is so long. Sums of two of them are still numbers.
+inline constexpr std::int64_t endless_bits = std::int64_t{1} << 56;
+
+// Why a trace cannot be laid out: a length or tag that is no number, too deep a nesting, columns
+// that are none.
+struct LayoutError : std::invalid_argument {
+  LayoutError(const std::string & reason, std::size_t number)
+      : std::invalid_argument(reason), trace(number) {}
+
+  std::size_t trace;  // which of them
+};
+
+// Lays out all streams and events of some traces. `wanted` are in order of the events. Throws
+// LayoutError.
+Layout lay_out(std::span<const TraceClass> traces, std::span<const WantedEvent> wanted);
+
+// Whether a field can have a column, and the bytes that a value takes there.
+std::optional<std::int64_t> column_width(const Kind & kind);
+
+}  // namespace chainshaper::ctf

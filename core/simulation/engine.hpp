@@ -1,0 +1,177 @@
+// The discrete-event engine: ROS 2's executors, cores that run threads, and the order of events.
+//
+// On every core the eligible runnable thread of the smallest rank runs; among equals the one that
+// waits for longest, and a pre-empted thread stays in its place (SCHED_FIFO). Where a plan is in
+// force, threads in servers are eligible while a slot of their server is open, ranked by the
+// priority of the server; where the plan says so, equals take turns when their quantum is used up
+// (round-robin). All others come behind them, by their own priority (best effort).
+//
+// At one instant, first what was to come happens (expiries, deliveries, ends of sleeps), so that an
+// executor's snapshot has all that happened up to that instant; then running threads that have used
+// what they needed go on; and only then slots open and close: work that fills a slot exactly is
+// done.
+//
+// Executors. Single-threaded (rclcpp/src/rclcpp/executor.cpp) and multi-threaded
+// (multi_threaded_executor.cpp) ones are as chainshaper/workload/executor.py has them, with
+// services and clients behind subscriptions. Static ones (static_single_threaded_executor.cpp):
+// subscriptions first, then timers, clients and services, and one callback per wait set. Events
+// executors (events_executor.cpp): in the order in which things happened, every message and every
+// expiry an event of its own. Entities stand in the order in which their executor looks at them.
+//
+// A publication reaches every reader of its topic after a delay, in order, where a DDS thread of
+// the reader's process may have to work for it first. An asynchronous publisher hands it to the
+// publisher thread of its process before.
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <deque>
+#include <initializer_list>
+#include <optional>
+#include <vector>
+
+#include "simulation/agenda.hpp"
+#include "simulation/description.hpp"
+#include "simulation/event_log.hpp"
+#include "simulation/messages.hpp"
+#include "simulation/state.hpp"
+#include "simulation/streams.hpp"
+
+namespace chainshaper::simulation {
+
+// Why the engine was left.
+enum class Pause {
+  none,           // so many instants have passed: the caller may do something else
+  log_full,       // the caller takes the log
+  messages_full,  // messages pile up without end: it cannot go on
+  endless,        // callbacks have each other called without time passing: it cannot go on
+  over,
+};
+
+class Engine {
+public:
+  // Throws std::invalid_argument for a description that makes no sense. `source` is asked for
+  // numbers while the engine runs.
+  Engine(Description description, Source source);
+
+  Engine(const Engine &) = delete;
+  Engine & operator=(const Engine &) = delete;
+
+  // Goes on until the end, or until the caller has to do something, or for so many instants.
+  Pause run(std::uint64_t most_instants);
+
+  Nanoseconds now() const { return now_; }
+  const Description & description() const { return given_; }
+
+  // What was logged since it was taken last.
+  std::vector<EntryColumns> take_log() { return log_.take_all(); }
+
+  // The latency of each instance of the chain that has started; `absent`: it did not complete.
+  std::vector<Nanoseconds> latencies() const;
+
+private:
+  // engine.cpp: time, and which thread runs
+  void happen(const Happening & what);
+  Nanoseconds next_instant() const;
+  bool let_one_thread_go_on();
+  void run_until_next_step(Core & core) const;
+  void charge(Core & core) const;
+  void cross_boundary(Core & core) const;
+  void reschedule(Core & core);
+  void switch_to(Core & core, Thread * thread);
+  static void wait(Thread & thread);
+  void wake(Thread & thread, Step step);
+  void sleep(Thread & thread, Nanoseconds until);
+  void queue_up(Thread & thread) { thread.sequence = next_sequence_++; }
+
+  // executors.cpp: what is done next
+  void advance(Thread & thread);
+  bool go_on_with_callback(Thread & thread);
+  void expire(Entity & timer);
+  void call_timer(Entity & timer);
+  bool is_ready(Entity & entity);
+  void collect(Thread & thread);
+  void choose(Thread & thread);
+  void begin(Thread & thread, Entity & chosen);
+  bool takes_turn(Thread & thread);
+  void give_turn(Executor & executor);
+  void refill(Thread & thread);
+  bool take(Thread & thread);
+  bool take_message(Thread & thread, Entity & entity);
+  void wake_owner(const Executor & executor);
+
+  // callbacks.cpp: what callbacks do. They leave in their thread how much CPU time it needs next
+  // and what follows, or let it wait; and return whether the callback goes on.
+  bool begin_body(Thread & thread);
+  bool go_on_publishing(Thread & thread);
+  bool end(Thread & thread);
+  bool complete(Thread & thread);
+  Nanoseconds computing_time(Stream & stream);
+
+  // gates.cpp: callbacks that are gates
+  bool enter_gate(Thread & thread);
+  bool pass_gate(Thread & thread);
+  bool publish_from_gate(Thread & thread);
+  bool leave_gate(Thread & thread);
+  void look_at_waiting(const Entity & entity);
+  void overflow(Entity & entity);
+  void log_release(const Entity & entity, Nanoseconds time, const Thread & thread,
+                   Nanoseconds source, Nanoseconds arrival, const Release & release);
+  void announce(GateAtWork & gate, std::optional<std::int64_t> mode) const;
+
+  // travel.cpp: how messages travel
+  void publish(Thread & thread, Publisher & publisher);
+  void hand_over(Thread & thread, Publisher & publisher, Message & message);
+  void send(Thread & thread, Message & message);
+  void note_latency(const Message & message);
+  void deliver(Message & message);
+  void arrive(Message & message);
+  void work_for_executor(Thread & thread);
+  void send_next(Thread & thread);
+  void put_newest(MessageQueue & queue, std::size_t depth, Message & message);
+  void drop_expired(Entity & entity);
+  void mark_event(Entity & entity);
+  Message & new_message();
+  void count_in_use();
+  void count_step();
+
+  Nanoseconds draw(Stream & stream) const { return stream.next(source_); }
+  void log(TracePoint point, Nanoseconds time, const Thread * thread,
+           std::initializer_list<std::int64_t> fields);
+
+  // setup.cpp: from the description
+  void set_up_threads();
+  void set_up_entities();
+  void set_up_publishers();
+
+  Description given_;
+  Source source_;
+  std::vector<Stream> streams_;
+  std::vector<Core> cores_;
+  std::vector<Thread> threads_;
+  std::vector<Executor> executors_;  // one of each process
+  std::vector<Entity> entities_;
+  std::vector<Publisher> publishers_;
+  std::deque<GateAtWork> gates_;
+  std::vector<Synchroniser> synchronisers_;
+  std::deque<bool> groups_;  // which are busy
+
+  Nanoseconds now_{0};
+  std::uint64_t next_sequence_{0};
+  Agenda agenda_;
+  MessagePool messages_;
+  std::size_t marks_{0};  // events of executors, and what waits for publisher threads
+  EventLog log_;
+  Pause pause_{Pause::none};
+  std::uint64_t steps_{0};  // of threads and of the engine, at the present instant
+  std::vector<Nanoseconds> latencies_;
+  std::size_t started_{0};  // recorded instances of the chain
+};
+
+// A time and a duration, which may be any: no later than `forever`.
+inline Nanoseconds later(Nanoseconds time, Nanoseconds duration) {
+  return duration >= forever - time ? forever : time + duration;
+}
+
+}  // namespace chainshaper::simulation

@@ -1,0 +1,85 @@
+// What happened, as columns of numbers: an entry for each trace point that a process passes.
+//
+// Entries and fields have the names of chainshaper/workload/event_log.py, as have those of live
+// runs.
+
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <initializer_list>
+#include <memory>
+#include <vector>
+
+#include "simulation/description.hpp"
+
+namespace chainshaper::simulation {
+
+// In fields that say nothing.
+inline constexpr std::int64_t absent = -1;
+
+enum class TracePoint : std::size_t {
+  callback_start,
+  callback_end,
+  publish,
+  take,
+  execute,
+  wait,
+  release,
+  send,
+  context_switch,
+};
+
+struct EntryNames {
+  const char * entry;
+  std::vector<const char *> fields;  // behind time and thread
+};
+
+// The names of all entries, in the order of `TracePoint`.
+const std::vector<EntryNames> & log_layout();
+
+// Numbers that are Python's later on, without being copied.
+template <typename Number>
+using Column = std::unique_ptr<Number[]>;
+
+// Entries of one kind, column by column; each has room for so many.
+struct EntryColumns {
+  std::size_t count{0};
+  std::size_t room{0};
+  Column<Nanoseconds> times;
+  Column<std::int32_t> threads;  // places; `absent`: the idle thread
+  std::vector<Column<std::int64_t>> fields;
+};
+
+class EventLog {
+public:
+  // With room for so many entries of a kind, until there are more.
+  explicit EventLog(std::size_t rows);
+
+  // How many entries it has of the kind that was added.
+  std::size_t add(TracePoint point, Nanoseconds time, std::int32_t thread,
+                  std::initializer_list<std::int64_t> fields) {
+    EntryColumns & columns = entries_[static_cast<std::size_t>(point)];
+    if (columns.count == columns.room) grow(columns);
+    const std::size_t row = columns.count++;
+    columns.times[row] = time;
+    columns.threads[row] = thread;
+    auto column = columns.fields.begin();
+    for (const auto field : fields) (*column++)[row] = field;
+    return columns.count;
+  }
+
+  // All entries, in the order of `TracePoint`; the log is empty then.
+  std::vector<EntryColumns> take_all();
+
+private:
+  void grow(EntryColumns & columns) const;
+
+  std::size_t rows_;
+  std::vector<EntryColumns> entries_;
+};
+
+// Outcomes of an asynchronous publication, as `WORDS["outcome"]` there numbers them.
+enum class Outcome : std::int64_t { sent, expired, overwritten };
+
+}  // namespace chainshaper::simulation

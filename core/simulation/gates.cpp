@@ -1,0 +1,119 @@
+// Callbacks that are gates: core/gate decides, and here its thread waits, watches and publishes.
+
+#include "simulation/engine.hpp"
+
+namespace chainshaper::simulation {
+namespace {
+
+template <typename Number>
+std::int64_t number_of(const std::optional<Number> & value) {
+  return value ? static_cast<std::int64_t>(*value) : absent;
+}
+
+}  // namespace
+
+bool Engine::enter_gate(Thread & thread) {
+  GateAtWork & gate = *thread.entity->gate;
+  // A gate at rest knows of a message when it has taken it.
+  const bool rested = thread.carried.arrival >= gate.turns.free_ns;
+  gate.arrival = rested ? now_ : thread.carried.arrival;
+  gate.release = gate.turns.decide({gate.arrival, thread.carried.origin, gate.phase});
+  if (gate.release.anchor == Anchor::stamp)
+    gate.phase = modulo(gate.release.origin_ns, gate.turns.gate.cycle_ns);
+  thread.began = now_;
+  if (!gate.release.at_ns) return leave_gate(thread);
+  thread.step = Step::gate_wake;
+  thread.began.reset();
+  if (*gate.release.at_ns - gate.spin > now_) sleep(thread, *gate.release.at_ns - gate.spin);
+  return true;
+}
+
+// A thread of a gate goes on: awake, watching the clock, having published or paused.
+bool Engine::pass_gate(Thread & thread) {
+  GateAtWork & gate = *thread.entity->gate;
+  if (thread.step == Step::gate_wake) {
+    if (!thread.began) {  // it has just woken
+      thread.began = now_;
+      look_at_waiting(*thread.entity);
+      if (!gate.release.at_ns) return leave_gate(thread);
+    }
+    if (now_ >= *gate.release.at_ns) return publish_from_gate(thread);
+    thread.left = *gate.release.at_ns - now_;  // watching the clock
+    return true;
+  }
+  // Another message that waits already must not become late by the pause.
+  const bool published = thread.step == Step::gate_published;
+  if (published && gate.pause > 0 && thread.entity->history.size() == 0) {
+    thread.step = Step::gate_paused;
+    sleep(thread, later(now_, gate.pause));
+    return true;
+  }
+  return leave_gate(thread);
+}
+
+bool Engine::publish_from_gate(Thread & thread) {
+  GateAtWork & gate = *thread.entity->gate;
+  thread.began = now_;
+  if (gate.turns.gate.policy() == Policy::discard && missed(gate.turns.gate, gate.release, now_)) {
+    gate.release.drop(Dropped::discarded);
+    gate.release.overrun = Policy::discard;
+    return leave_gate(thread);
+  }
+  gate.turns.left(gate.release);
+  thread.step = Step::gate_published;
+  publish(thread, thread.entity->publishers.front());
+  thread.left = draw(*thread.publish);
+  return true;
+}
+
+// What has come meanwhile may leave for the message at the gate, or leave no room for it.
+void Engine::look_at_waiting(const Entity & entity) {
+  GateAtWork & gate = *entity.gate;
+  if (entity.history.size() == entity.given->depth) {
+    gate.release.drop(Dropped::overflowed);
+    return;
+  }
+  if (entity.history.size() == 0) return;
+  for (const Message * newer = &entity.history.oldest(); newer != nullptr; newer = newer->next) {
+    const Arrival arrival{newer->carried.arrival, newer->carried.origin, gate.phase};
+    if (gate.turns.is_replaced(gate.release, arrival, now_)) {
+      gate.release.drop(Dropped::replaced);
+      return;
+    }
+  }
+}
+
+bool Engine::leave_gate(Thread & thread) {
+  GateAtWork & gate = *thread.entity->gate;
+  gate.turns.free_ns = now_;
+  log_release(*thread.entity, thread.began.value_or(now_), thread, thread.carried.source,
+              gate.arrival, gate.release);
+  return end(thread);
+}
+
+// The oldest message that waits has no room any more.
+void Engine::overflow(Entity & entity) {
+  const Carried & oldest = entity.history.oldest().carried;
+  const Arrival arrival{oldest.arrival, oldest.origin, entity.gate->phase};
+  Release release = entity.gate->turns.release_at(arrival, now_);
+  release.drop(Dropped::overflowed);
+  log_release(entity, now_, *entity.executor->threads.front(), oldest.source, oldest.arrival,
+              release);
+}
+
+void Engine::log_release(const Entity & entity, Nanoseconds time, const Thread & thread,
+                         Nanoseconds source, Nanoseconds arrival, const Release & release) {
+  const std::int64_t mode = release.mode ? entity.gate->modes[*release.mode] : absent;
+  log(TracePoint::release, time, &thread,
+      {entity.given->callback, source, arrival, release.origin_ns, number_of(release.at_ns),
+       number_of(release.slot), release.cycles_waited, static_cast<std::int64_t>(release.anchor),
+       number_of(release.overrun), mode, number_of(release.dropped), release.moved_ns});
+}
+
+// A mode of the application is announced; one that the gate does not know changes nothing.
+void Engine::announce(GateAtWork & gate, std::optional<std::int64_t> mode) const {
+  if (!mode) return;
+  if (const auto known = place_of(gate.modes, *mode)) gate.turns.switch_mode(*known, now_);
+}
+
+}  // namespace chainshaper::simulation

@@ -1,0 +1,183 @@
+// How messages travel: from a publication to the histories of its readers.
+
+#include <algorithm>
+
+#include "simulation/engine.hpp"
+
+namespace chainshaper::simulation {
+namespace {
+
+// Addresses of messages repeat, as they do in a real process.
+constexpr std::uint64_t addresses = 64;
+constexpr std::int64_t first_address = 0x7F00'0000'0000;
+constexpr std::int64_t apart = 0x480;
+
+std::int64_t next_address(const Publisher & publisher) {
+  const auto number = static_cast<std::int64_t>(publisher.published % addresses);
+  return first_address + (publisher.place * std::int64_t{addresses} + number) * apart;
+}
+
+}  // namespace
+
+// The executor publishes what its thread carries.
+void Engine::publish(Thread & thread, Publisher & publisher) {
+  const PublisherDescription & given = *publisher.given;
+  Message & message = new_message();
+  message.publisher = &publisher;
+  message.address = next_address(publisher);
+  message.carried = thread.carried;
+  message.carried.source = now_;
+  message.carried.mode.reset();
+  if (!given.modes.empty())
+    message.carried.mode = given.modes[publisher.published % given.modes.size()];
+  ++publisher.published;
+  log(TracePoint::publish, now_, &thread, {given.handle, given.rmw_handle, message.address, now_});
+  if (given.asynchronous)
+    hand_over(*thread.executor->publisher_thread, publisher, message);
+  else
+    send(thread, message);
+}
+
+// An asynchronous publisher's message waits for the publisher thread.
+void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message) {
+  if (publisher.history.size() < publisher.given->depth) {
+    sender.to_send.push_back(&publisher);
+    ++marks_;
+    count_in_use();
+  } else {  // the newer ones move up by one place
+    log(TracePoint::send, now_, &sender,
+        {publisher.given->rmw_handle, publisher.history.oldest().carried.source,
+         static_cast<std::int64_t>(Outcome::overwritten), 0});
+  }
+  put_newest(publisher.history, publisher.given->depth, message);
+  wake(sender, Step::send);
+}
+
+// A message leaves now, sent by a thread; readers get copies.
+void Engine::send(Thread & thread, Message & message) {
+  note_latency(message);
+  for (ReaderOf & reader : message.publisher->readers) {
+    Message & copy = new_message();
+    copy = message;
+    copy.entity = reader.entity;
+    const Nanoseconds duration =
+        draw(reader.delivery != nullptr ? *reader.delivery : *thread.delivery);
+    reader.last_arrival = std::max(later(now_, duration), reader.last_arrival);
+    if (reader.last_arrival == now_)
+      deliver(copy);
+    else
+      agenda_.plan(reader.last_arrival, Delivery{&copy});
+  }
+  messages_.give_back(message);
+}
+
+void Engine::note_latency(const Message & message) {
+  const Carried & carried = message.carried;
+  if (!message.publisher->given->ends_chain || !carried.chain_start) return;
+  if (carried.instance >= latencies_.size()) return;
+  Nanoseconds & latency = latencies_[carried.instance];
+  if (latency == absent) latency = now_ - *carried.chain_start;
+}
+
+// A message reaches its reader's process, where a thread of DDS may have to work for it.
+void Engine::deliver(Message & message) {
+  Thread * receiver = message.entity->executor->dds_thread;
+  if (receiver == nullptr) {
+    arrive(message);
+  } else {
+    receiver->to_receive.append(message);
+    wake(*receiver, Step::receive);
+  }
+}
+
+// A message enters its reader's history, and wakes the executor if it waits for work.
+void Engine::arrive(Message & message) {
+  Entity & entity = *message.entity;
+  const bool overwrites = entity.history.size() == entity.given->depth;
+  message.carried.arrival = now_;
+  if (overwrites && entity.given->body == Body::gate) overflow(entity);
+  put_newest(entity.history, entity.given->depth, message);
+  // The event of the message that was overwritten is still in the queue, for this one to use.
+  if (entity.executor->kind == ExecutorKind::events && !overwrites) mark_event(entity);
+  if (entity.may_run()) wake_owner(*entity.executor);
+}
+
+// The next step of a publisher thread or a thread of DDS.
+void Engine::work_for_executor(Thread & thread) {
+  switch (thread.step) {
+    case Step::sent: {
+      const Nanoseconds began = thread.began.value_or(now_);
+      log(TracePoint::send, began, &thread,
+          {thread.sending->given->rmw_handle, thread.carried.source,
+           static_cast<std::int64_t>(Outcome::sent), now_ - began});
+      thread.step = Step::send;
+      break;
+    }
+    case Step::received:
+      arrive(thread.to_receive.take_oldest());
+      thread.step = Step::receive;
+      break;
+    case Step::receive:
+      if (thread.to_receive.size() == 0) return wait(thread);
+      thread.left = draw(*thread.receive);
+      thread.step = Step::received;
+      break;
+    default:
+      if (thread.to_send.empty()) return wait(thread);
+      send_next(thread);
+  }
+}
+
+void Engine::send_next(Thread & thread) {
+  Publisher & publisher = *thread.to_send.front();
+  thread.to_send.pop_front();
+  --marks_;
+  Message & message = publisher.history.take_oldest();
+  const Nanoseconds source = message.carried.source;
+  const auto & lifespan = publisher.given->lifespan_ns;
+  if (lifespan && now_ - source > *lifespan) {
+    log(TracePoint::send, now_, &thread,
+        {publisher.given->rmw_handle, source, static_cast<std::int64_t>(Outcome::expired), 0});
+    messages_.give_back(message);
+    return;
+  }
+  thread.began = now_;
+  thread.carried.source = source;
+  thread.sending = &publisher;
+  send(thread, message);
+  thread.left = draw(*thread.publish);
+  thread.step = Step::sent;
+}
+
+// A message goes to the end of a queue; the oldest one of a full queue is gone.
+void Engine::put_newest(MessageQueue & queue, std::size_t depth, Message & message) {
+  if (queue.size() == depth) messages_.give_back(queue.take_oldest());
+  queue.append(message);
+}
+
+// Forgets messages that have waited in a history for longer than their lifespan.
+void Engine::drop_expired(Entity & entity) {
+  const auto & lifespan = entity.given->lifespan_ns;
+  if (!lifespan) return;
+  while (entity.history.size() > 0 && now_ - entity.history.oldest().carried.arrival > *lifespan)
+    messages_.give_back(entity.history.take_oldest());
+}
+
+// An events executor has something to do for an entity: to the end of its queue.
+void Engine::mark_event(Entity & entity) {
+  entity.executor->events.push_back(&entity);
+  ++marks_;
+  count_in_use();
+}
+
+Message & Engine::new_message() {
+  Message & message = messages_.take();
+  count_in_use();
+  return message;
+}
+
+void Engine::count_in_use() {
+  if (messages_.in_use() + marks_ >= given_.most_messages) pause_ = Pause::messages_full;
+}
+
+}  // namespace chainshaper::simulation

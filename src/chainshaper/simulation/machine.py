@@ -1,0 +1,428 @@
+"""What is simulated, as the engine has it: a :class:`System` with its times, gates and servers.
+
+The engine (core/simulation) is told everything in one description, by places in lists, and asks for
+numbers while it runs.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from chainshaper import _core
+from chainshaper.gate.decision import SAME
+from chainshaper.planning.application_plan import ApplicationPlan
+from chainshaper.planning.plan import ReceiverPlace, Server
+from chainshaper.simulation.system import ROLES, Entity, Publisher, System
+from chainshaper.values.errors import InputError
+from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
+from chainshaper.workload.execution import FIRST_AFTER, blocks
+from chainshaper.workload.live import Timing
+
+Int64s = npt.NDArray[np.int64]
+
+FIRST_COST = 1 << 20
+"""Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
+FIRST_DELIVERY = 1 << 21  # and deliveries from here, by publishing node, callback and input
+COSTS = ("wake_up", "take", "publish", "receive", "delivery")  # numbered in this order
+BEST_EFFORT = 1000
+LOG_ROWS = 1 << 17  # of a kind, in a part of the log
+INSTANTS = 1 << 18  # after so many the engine is left for a moment: Ctrl-C is heard
+POOL = 4096  # messages under way, besides those in histories
+
+_EXECUTORS = {
+    "single-threaded": _core.ExecutorKind.single_threaded,
+    "static": _core.ExecutorKind.static_single_threaded,
+    "events": _core.ExecutorKind.events,
+}
+
+
+class Streams:
+    """All streams of a simulation: drawn here, block by block, as the engine asks for them.
+
+    A callback's stream is that of the live workload, value for value.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._seed = seed
+        self.constants: list[int | None] = []
+        self._drawn: list[Iterator[Int64s]] = []
+
+    def add(self, times: ExecutionTime, node: str | None, index: int) -> int:
+        """The place of a new stream of CPU times or delays (ns)."""
+        self.constants.append(times.constant_ns)
+        self._drawn.append(blocks(times.model_dump(), self._seed, node or "", index))
+        return len(self.constants) - 1
+
+    def draw(self, stream: int) -> Int64s:
+        """The next values of a stream."""
+        return next(self._drawn[stream])
+
+
+class Handles(NamedTuple):
+    """Of entities: callback, own, rmw; of publishers: own, rmw."""
+
+    entities: Sequence[tuple[int, int, int]]
+    publishers: Sequence[tuple[int, int]]
+
+
+class Machine:
+    """What the engine is told about a system, a plan that is in force, and the instants of a run.
+
+    ``latencies`` is for how many recorded instances of the chain the latency is noted; where it is
+    for none, events are logged, with ``switches`` those of threads as well.
+    """
+
+    def __init__(
+        self,
+        system: System,
+        handles: Handles,
+        plan: ApplicationPlan | None,
+        timing: Timing,
+        *,
+        switches: bool,
+        latencies: int,
+    ) -> None:
+        self._system, self._handles, self._plan, self._timing = system, handles, plan, timing
+        self._numbers = {process.pid: place for place, process in enumerate(system.processes)}
+        self._streams = Streams(system.application.seed)
+        self._deliveries: dict[tuple[str, str, int], int] = {}
+        self._groups: dict[tuple[int, str], int] = {}
+        self._gates: list[_core.GateDescription] = []
+        self._synchronisers: list[_core.SynchroniserDescription] = []
+        threads = self._threads()
+        cores = self._cores(threads)
+        entities = self._entities()
+        publishers = self._publishers()
+        described = system.application.simulation
+        turns = plan is not None and plan.takes_turns
+        away = round(1e6 * described.interrupts / (1 - described.interrupts))
+        self.description = _core.Description(
+            cores=cores,
+            threads=threads,
+            processes=self._processes(),
+            entities=entities,
+            publishers=publishers,
+            gates=self._gates,
+            synchronisers=self._synchronisers,
+            streams=self._streams.constants,
+            groups=len(self._groups),
+            cycle_ns=0 if plan is None else plan.cycle_ns,
+            quantum_ns=described.quantum_ns if turns else _core.FOREVER_NS,
+            context_switch_ns=described.context_switch_ns,
+            preemption_ns=described.preemption_ns,
+            interrupts_ppm=min(away, _core.FOREVER_NS),
+            last_timer_ns=timing.last_timer_ns,
+            stop_ns=timing.stop_ns,
+            record_from_ns=timing.record_from_ns,
+            events=not latencies,
+            switches=switches,
+            instances=latencies,
+            log_rows=LOG_ROWS,
+            most_messages=POOL + self._waiting(entities),
+        )
+        try:
+            self.simulation = _core.Simulation(self.description, self._streams.draw)
+        except ValueError as error:
+            raise InputError(f"{system.application.name}: {error}") from error
+
+    def _waiting(self, entities: Sequence[_core.EntityDescription]) -> int:
+        """How many messages may wait: in a history and for it to be sent, each with its mark."""
+        depth, system = self._system.depth, self._system
+        topics = [entity.topic or "" for entity in system.entities]
+        topics += [publisher.topic for publisher in system.publishers]
+        histories = sum(
+            described.depth
+            for described, entity in zip(entities, system.entities, strict=True)
+            if entity.topic is not None
+        )
+        return 2 * sum(map(depth, topics)) + histories
+
+    def _processes(self) -> list[_core.ProcessDescription]:
+        system, processes = self._system, []
+        several = [0] * len(system.processes)
+        for info in system.threads:
+            several[self._numbers[info.pid]] += info.role == "executor"
+        kind = _EXECUTORS[system.application.simulation.executor]
+        of_process = [entity.process for entity in system.entities]
+        for number, threads in enumerate(several):
+            count = of_process.count(number)
+            processes.append(
+                _core.ProcessDescription(
+                    executor=_core.ExecutorKind.multi_threaded if threads > 1 else kind,
+                    first_entity=of_process.index(number) if count else 0,
+                    entity_count=count,
+                )
+            )
+        return processes
+
+    def _threads(self) -> list[_core.ThreadDescription]:
+        system = self._system
+        described, threads = system.application.simulation, []
+        executing: dict[int, int] = {}  # threads of a process's executor so far
+        for info in system.threads:
+            assert info.role is not None  # noqa: S101 - of a simulated thread it is known
+            worker = executing.get(info.pid, 0) if info.role == "executor" else 0
+            executing[info.pid] = executing.get(info.pid, 0) + (info.role == "executor")
+            first = FIRST_COST + len(COSTS) * (ROLES.index(info.role) + len(ROLES) * worker)
+            costs = {
+                name: self._streams.add(times, info.node, first + place)
+                for place, name in enumerate(COSTS)
+                if (times := getattr(described, name)) is not None
+            }
+            threads.append(
+                _core.ThreadDescription(
+                    core=system.cores.index(info.cores[0]),
+                    rank=BEST_EFFORT - info.priority,
+                    role=getattr(_core.Role, info.role),
+                    process=self._numbers[info.pid],
+                    pid=info.pid,
+                    tid=info.tid,
+                    cpu=info.cores[0],
+                    **costs,
+                )
+            )
+        return threads
+
+    def _cores(self, threads: Sequence[_core.ThreadDescription]) -> list[_core.CoreDescription]:
+        """The cores; threads that a plan governs get their servers and ranks."""
+        system, plan = self._system, self._plan
+        cores = []
+        for core in system.cores:
+            governed = {number: one for number, one in system.servers.items() if one.core == core}
+            if plan is None or not governed:
+                cores.append(_core.CoreDescription())
+                continue
+            ranked = [server for server in plan.servers if server in governed.values()]
+            ranked.sort(key=lambda server: server.priority)
+            receiving = {n: one for n, one in system.receivers.items() if one.core == core}
+            self._rank(threads, plan, governed, ranked, receiving)
+            cores.append(_governed_core(plan, ranked, self._timing))
+        return cores
+
+    def _rank(
+        self,
+        threads: Sequence[_core.ThreadDescription],
+        plan: ApplicationPlan,
+        governed: dict[int, Server],
+        ranked: list[Server],
+        receiving: dict[int, ReceiverPlace],
+    ) -> None:
+        """Server and rank of the threads that are ``governed`` on a core: by the priority of the
+        server and, within one, in the plan's order, as `server_priorities` has them live; and the
+        rank of those ``receiving`` an output, behind all of their priority.
+        """
+        order = plan.most_urgent_first
+        place_of = {node: place for place, node in enumerate(order)}
+        named = {
+            number: place_of.get(self._system.threads[number].node, len(order))
+            for number in governed
+        }
+        taken = {
+            server.name: sorted({named[n] for n, one in governed.items() if one is server})
+            for server in ranked
+        }
+        behind_outputs = plan.behind_outputs
+        urgency = {
+            number: (
+                server.priority,
+                taken[server.name].index(named[number]) + (server.name in behind_outputs),
+            )
+            for number, server in governed.items()
+        }
+        behind = {number: (one.priority, len(governed)) for number, one in receiving.items()}
+        urgent = sorted({*urgency.values(), *behind.values()})
+        for number, key in behind.items():
+            threads[number].rank = urgent.index(key) - len(urgent)
+        for number, server in governed.items():
+            threads[number].server = ranked.index(server)
+            threads[number].rank = urgent.index(urgency[number]) - len(urgent)
+            if server.best_effort:  # under the fair class, behind all real-time threads
+                threads[number].rank = BEST_EFFORT
+
+    def _entities(self) -> list[_core.EntityDescription]:
+        system, entities = self._system, []
+        # What the entities of a callback share: its streams, and its gate or synchroniser.
+        executions: dict[tuple[int, int], dict[str, int]] = {}
+        bodies: dict[tuple[int, int], int] = {}
+        for number, entity in enumerate(system.entities):
+            key, process = (entity.process, entity.index), system.processes[entity.process]
+            if key not in executions:
+                executions[key] = self._executions(entity)
+            if key not in bodies:
+                bodies[key] = self._add_body(entity.described)
+            group = system.application.nodes[process.key].exclusive_group(entity.described)
+            callback, handle, rmw_handle = self._handles.entities[number]
+            described = _core.EntityDescription(
+                callback=callback,
+                handle=handle,
+                rmw_handle=rmw_handle,
+                process=entity.process,
+                kind=getattr(_core.EntityKind, entity.kind),
+                group=None if group is None else self._group(entity.process, group),
+                first_publisher=entity.publishers[0] if entity.publishers else 0,
+                publisher_count=len(entity.publishers),
+                starts_chain=number in system.chain.callbacks[:1],
+                on_chain=number in system.chain.callbacks[1:],
+                **executions[key],
+            )
+            self._set_body(described, entity, bodies[key], number in system.chain.callbacks)
+            self._set_trigger(described, entity)
+            entities.append(described)
+        return entities
+
+    def _executions(self, entity: Entity) -> dict[str, int]:
+        """The streams of a callback's times."""
+        node, described = self._system.processes[entity.process].node, entity.described
+        streams = {"execution": self._streams.add(described.execution, node, entity.index)}
+        if described.afterwards is not None:
+            number = FIRST_AFTER + entity.index
+            streams["afterwards"] = self._streams.add(described.afterwards, node, number)
+        return streams
+
+    def _group(self, process: int, group: str) -> int:
+        return self._groups.setdefault((process, group), len(self._groups))
+
+    def _add_body(self, described: CallbackDescription) -> int:
+        """The place of a callback's gate, or of its synchroniser."""
+        if described.gate is not None:
+            self._gates.append(self._gate(described))
+            return len(self._gates) - 1
+        topics, triggered_by = described.synchronises, described.triggered_by
+        trigger = None if triggered_by is None else topics.index(triggered_by)
+        depths = [1 if triggered_by else self._system.depth(topic) for topic in topics]
+        inputs = [_core.InputDescription(depth=depth) for depth in depths]
+        if topics:
+            synchroniser = _core.SynchroniserDescription(inputs=inputs, trigger=trigger)
+            self._synchronisers.append(synchroniser)
+        return len(self._synchronisers) - 1
+
+    def _set_body(
+        self, described: _core.EntityDescription, entity: Entity, place: int, on_chain: bool
+    ) -> None:
+        if entity.described.gate is not None:
+            described.body = _core.Body.mode_listener if entity.listens else _core.Body.gate
+            described.gate = place
+        elif entity.described.synchronises:
+            described.body, described.synchroniser = _core.Body.synchronise, place
+            described.input = entity.number
+            inputs = self._synchronisers[place].inputs  # a copy of them
+            inputs[entity.number].on_chain = on_chain
+            self._synchronisers[place].inputs = inputs
+
+    def _set_trigger(self, described: _core.EntityDescription, entity: Entity) -> None:
+        """When a timer expires, or how many messages a reader's history has, and for how long."""
+        system, gate = self._system, entity.described.gate
+        if entity.topic is None:
+            key = system.processes[entity.process].key
+            drift = system.application.simulation.drift.get(key, 0)
+            period = (entity.described.timer_ns or 0) * (1 - drift / 1_000_000)
+            described.period_ns = max(1, round(period))
+            described.due_ns = self._timing.start_ns + entity.described.phase_ns
+        else:
+            topic = system.application.topic(entity.topic)
+            described.depth = topic.depth if gate is None or entity.listens else gate.depth
+            described.lifespan_ns = topic.lifespan_ns
+
+    def _gate(self, described: CallbackDescription) -> _core.GateDescription:
+        gate, timing = described.gate, self._timing
+        assert gate is not None  # noqa: S101 - the caller has seen it
+        found = _core.GateDescription(
+            slots=list(gate.slots),
+            depth=gate.depth,
+            moves=gate.moved(timing.start_ns),
+            spin_ns=gate.spin_ns,
+            pause_ns=gate.pause_ns,
+            **{name: getattr(gate, name) for name in SAME if name != "phase_ns"},
+        )
+        found.phase_ns = timing.anchor_ns
+        if gate.phase_ns is not None:
+            found.phase_ns = timing.start_ns + gate.phase_ns
+        if (modes := gate.modes) is not None:
+            found.mode_names, found.bands = list(modes.bands), list(modes.bands.values())
+            found.modes = [self._system.modes.index(mode) for mode in modes.bands]
+            found.first_mode, found.late = found.mode_names.index(modes.default), modes.late
+        return found
+
+    def _publishers(self) -> list[_core.PublisherDescription]:
+        system, publishers = self._system, []
+        owner = {one: entity for entity in system.entities for one in entity.publishers}
+        last = system.chain.callbacks[-1:]
+        reading: dict[str | None, list[int]] = {}
+        for number, entity in enumerate(system.entities):
+            reading.setdefault(entity.topic, []).append(number)
+        for number, publisher in enumerate(system.publishers):
+            topic: TopicDescription = system.application.topic(publisher.topic)
+            handle, rmw_handle = self._handles.publishers[number]
+            ends = any(number in system.entities[one].publishers for one in last)
+            announces = owner[number].described.announces
+            readers = [
+                _core.ReaderDescription(
+                    entity=reader, delivery=self._delivery(system.entities[reader], publisher)
+                )
+                for reader in reading.get(publisher.topic, [])
+            ]
+            publishers.append(
+                _core.PublisherDescription(
+                    handle=handle,
+                    rmw_handle=rmw_handle,
+                    readers=readers,
+                    asynchronous=publisher.asynchronous,
+                    depth=topic.depth,
+                    lifespan_ns=topic.lifespan_ns,
+                    ends_chain=ends and publisher.topic == system.chain.topics[-1],
+                    modes=[system.modes.index(mode) for mode in announces],
+                )
+            )
+        return publishers
+
+    def _delivery(self, reader: Entity, publisher: Publisher) -> int | None:
+        """The stream of a reader's own times of delivery from a publisher; None: it has none."""
+        process = self._system.processes[reader.process]
+        described: Mapping[str, ExecutionTime] = self._system.application.simulation.deliveries.get(
+            process.key, {}
+        )
+        if publisher.topic not in described:
+            return None
+        times = described[publisher.topic]
+        # A sequence is of the topic's messages in the order of their sending, by whichever node.
+        sender = publisher.process if times.sequence_ns is None else 0
+        number = FIRST_DELIVERY + (sender << 32) + (reader.index << 16) + reader.number
+        stream = process.node, publisher.topic, number
+        if stream not in self._deliveries:
+            self._deliveries[stream] = self._streams.add(times, process.node, number)
+        return self._deliveries[stream]
+
+
+def _governed_core(
+    plan: ApplicationPlan, ranked: Sequence[Server], timing: Timing
+) -> _core.CoreDescription:
+    """A core with servers. The run starts anywhere in a cycle."""
+    table = _slot_table(plan, ranked)
+    anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
+    elapsed = (timing.start_ns - anchor) % plan.cycle_ns
+    current = max(number for number, (offset, _) in enumerate(table) if offset <= elapsed)
+    following = (current + 1) % len(table)
+    until = table[following][0] + (plan.cycle_ns if following <= current else 0)
+    return _core.CoreDescription(
+        table=table,
+        open_servers=table[current][1],
+        next=following,
+        boundary_ns=timing.start_ns - elapsed + until,
+    )
+
+
+def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
+    """Rows (offset in the cycle, mask of the servers that are open from then on)."""
+    # A free shaping node times its messages itself: its thread needs no slot to run in.
+    slots = [
+        server.slots if plan.free_threads.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
+        for server in ranked
+    ]
+    offsets = {0} | {instant for own in slots for slot in own for instant in slot}
+    table = []
+    for offset in sorted(offset for offset in offsets if offset < plan.cycle_ns):
+        is_open = [any(start <= offset < end for start, end in own) for own in slots]
+        table.append((offset, sum(1 << bit for bit, one in enumerate(is_open) if one)))
+    return table
