@@ -3,11 +3,10 @@
     python benchmarks/simulator.py [--cycles 200000] [--peers PYTHON...]
 
 The five-node chain of examples/synthetic_chain.yaml on one core, with every event written and with
-latencies only; CPU time of one process. The engine in C++ reaches 1.8 times as many instances a
-second with events, tables of which are packed by ourselves, and 1.35 times as many without, as the
-one before it, compiled by Numba, whose tables Polars compressed (medians of three runs in turns
-beside other work: 269,000 and 1,515,000 instead of 155,000 and 1,114,000; on a quiet machine of
-then 170,000 with events). Peers run in interpreters of their
+latencies only; CPU time of one process. Without events the engine in C++ reaches 1.36 times as many
+instances a second as the one before it, compiled by Numba (medians of three runs in turns beside
+other work: 1,515,000 instead of 1,114,000). With events that one reached 155,000 in the same runs,
+and 170,000 on a quiet machine. Peers run in interpreters of their
 own, such as those of throwaway virtual environments, since SimSo wants an old SimPy:
 
     python -m venv /tmp/simpy && /tmp/simpy/bin/pip install "simpy>=4,<5"
