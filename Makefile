@@ -3,7 +3,7 @@
 # Where it is set, as images of containers like to, every process of a test compiles all it imports.
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo test test-untimed test-timed test-waiting test-kernel lint benchmark experiments docs clean
+.PHONY: demo test test-untimed test-timed test-waiting test-kernel core-tests lint benchmark experiments docs clean
 
 demo: .venv/.ready
 	.venv/bin/chainshaper demo
@@ -38,6 +38,13 @@ test-kernel: .venv/.ready-dev
 
 # The C++ library's sources; how each is compiled is what the last build noted.
 core = $(shell find core -name '*.[ch]pp')
+
+# The native library by itself, without Python, under sanitizers; its fuzz targets run briefly.
+core-tests: .venv/.ready-dev
+	.venv/bin/cmake -S core -B build/core-tests -DCMAKE_BUILD_TYPE=RelWithDebInfo \
+		-DCHAINSHAPER_BINDINGS=OFF -DCHAINSHAPER_TESTS=ON -DCHAINSHAPER_SANITIZE=ON
+	.venv/bin/cmake --build build/core-tests --parallel 2
+	.venv/bin/ctest --test-dir build/core-tests --output-on-failure
 
 lint: .venv/.ready-dev
 	.venv/bin/ruff check .

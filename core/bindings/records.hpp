@@ -37,10 +37,7 @@ Value value_of(const Words & words, const std::string & word) {
 // A column that is Python's from now on.
 template <typename Number>
 nb::object column_of(std::vector<Number> && numbers) {
-  auto * kept = new std::vector<Number>(std::move(numbers));  // NOLINT: the capsule owns it
-  const nb::capsule owner(
-      kept, [](void * column) noexcept { delete static_cast<std::vector<Number> *>(column); });
-  return nb::cast(nb::ndarray<nb::numpy, Number, nb::ndim<1>>(kept->data(), {kept->size()}, owner));
+  return nb::cast(array_of(std::move(numbers)));
 }
 
 // The same, of the first numbers of an array.

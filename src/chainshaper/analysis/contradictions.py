@@ -65,7 +65,7 @@ def contradictions(
 ) -> tuple[Contradiction, ...]:
     """All contradictions in a recording whose events have been resolved."""
     nodes = objects.callbacks.unique("callback_id", keep="first", maintain_order=True)
-    periods = tuple(_of_another_period(one) for one in other_periods(nodes, instances, taken))
+    periods = tuple(map(_of_another_period, other_periods(nodes, instances, taken)))
     nodes = with_shown_periods(nodes, periods)
     return (
         *_moved_clock(stamped),
@@ -88,13 +88,13 @@ def refuse_contradicted(
 
 
 def with_shown_periods(callbacks: pl.DataFrame, found: Iterable[Contradiction]) -> pl.DataFrame:
-    """The frame of callbacks in which ``period_ns`` is what the starts of a timer's callback show,
-    where that is another than the declared one."""
+    """The frame of callbacks, with the period that a timer's starts show as its ``period_ns``,
+    where that differs from the declared one."""
     shown = {
-        callback: one.period_ns
-        for one in found
-        for callback in one.callbacks
-        if one.period_ns is not None
+        callback: contradiction.period_ns
+        for contradiction in found
+        for callback in contradiction.callbacks
+        if contradiction.period_ns is not None
     }
     period = pl.col("callback_id").replace_strict(shown, default=None, return_dtype=pl.Int64)
     return callbacks.with_columns(period_ns=pl.coalesce(period, "period_ns"))

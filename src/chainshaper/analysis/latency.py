@@ -118,9 +118,9 @@ def named_callbacks(flow: DataFlow) -> pl.DataFrame:
     )
     triggers = found.select("topic", "period_ns", "declared_ns").rows()
     starts = [trigger_text(topic, declared) for topic, _, declared in triggers]
-    shown = [trigger_text(*one) for one in triggers]
+    shown = [trigger_text(*trigger) for trigger in triggers]
     texts = {"starts": starts, "shown": shown}
-    return found.with_columns(pl.Series(name, own, pl.String) for name, own in texts.items())
+    return found.with_columns(pl.Series(name, text, pl.String) for name, text in texts.items())
 
 
 class Longest(NamedTuple):

@@ -19,7 +19,7 @@ __all__ = ["main"]
 
 REMEDY = "raise the limit (`ulimit -v`), free memory, or give a smaller input"
 OF_ANALYSIS = ("matplotlib",)
-"""What a robot does without, of the extra `analysis`; and Numba, without which all is slower."""
+"""What the extra `analysis` brings, which a robot does without."""
 _LACK_OF_MEMORY = (
     "cannot allocate memory",
     "failed to map segment",  # the loader, of a library

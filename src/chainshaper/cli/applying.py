@@ -228,9 +228,11 @@ def release(
     removed, stays = clear_killed_runs(Path.cwd()) if run is None else ([], [])
     for line in removed:
         out.show_line(line)
+    notes = [*strangers, *stays]
     pages = remove_abandoned_pages() if run is None else []
-    forgotten = [f"{len(pages)} pages of outputs that no process shapes any more are removed"]
-    out.notes([*strangers, *stays, *(forgotten if pages else ())])
+    if pages:
+        notes.append(f"{len(pages)} pages of outputs that no process shapes any more are removed")
+    out.notes(notes)
     if problems:
         raise OperationError("; ".join(problems))
     if not chosen and not strays and not removed and not stays:

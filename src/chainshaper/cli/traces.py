@@ -28,11 +28,11 @@ def info(trace: list[Path] = opt.TRACE, json: bool = opt.JSON) -> None:
 
     with out.opened("info", trace) as (recording, report):
         report(0.9, "looking for contradictions")
-        found = recorded_flow(recording).contradictions
-        contents = overviews.contents_json(recording, found)
+        contradictions = recorded_flow(recording).contradictions
+        contents = overviews.contents_json(recording, contradictions)
     if out.present(json, contents, *overviews.contents_table(recording)):
         out.show_line(out.lost_events(recording))
-        out.notes((*contents["notes"], *(one.note for one in found)))
+        out.notes((*contents["notes"], *(each.note for each in contradictions)))
 
 
 def describe(

@@ -82,7 +82,7 @@ def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
     """
     gates = {node.thread for node in plan.shaping_nodes}
     closed, staged = (
-        {thread for one in chains for server in one.servers for thread in server.threads}
+        {thread for chain in chains for server in chain.servers for thread in server.threads}
         for chains in (
             [chain for chain in plan.chains if chain.slot_ends == "closed"],
             [chain for chain in plan.chains if chain.policy == "pipelined"],
@@ -90,14 +90,14 @@ def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
     )
     closed -= plan.free_threads
 
-    def is_gated(one: Thread, server: Server) -> bool:
-        needed = one.role == "publisher" or one in staged
-        return one in closed or (needed and gates.isdisjoint(server.threads))
+    def is_gated(thread: Thread, server: Server) -> bool:
+        needed = thread.role == "publisher" or thread in staged
+        return thread in closed or (needed and gates.isdisjoint(server.threads))
 
     return [
         (server, gated)
         for server in open_until_done(plan).servers
-        if (gated := [one for one in server.threads if is_gated(one, server)])
+        if (gated := [thread for thread in server.threads if is_gated(thread, server)])
     ]
 
 

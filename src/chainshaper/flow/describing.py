@@ -288,7 +288,7 @@ def _nodes(evidence: _Evidence) -> dict[str, _Node]:
 
 def _names(evidence: _Evidence, ran: Sequence[Callback]) -> dict[tuple[str, int], str]:
     """The name in the description of each node and process: as permitted there, and its own."""
-    nodes = dict.fromkeys((one.node, one.pid) for one in ran)
+    nodes = dict.fromkeys((callback.node, callback.pid) for callback in ran)
     processes = Counter(node for node, _ in nodes)
     found: dict[tuple[str, int], str] = {}
     for node, pid in nodes:
@@ -320,7 +320,7 @@ def _described_chain(evidence: _Evidence, nodes: Mapping[str, _Node]) -> str:
         first = evidence.callbacks[node.ids[0]]
         for known_by in (first.node, *(f"{first.node}@{pid}" for pid in first.processes)):
             named |= {known_by: f"/{name}", known_by.removeprefix("/"): f"/{name}"}
-    topics = {topic for one in evidence.callbacks.values() for topic in one.publishes}
+    topics = {topic for each in evidence.callbacks.values() for topic in each.publishes}
     points = parse_chain(evidence.chain.spec)
     return "..".join(
         point if {point, f"/{point}"} & topics else named.get(point, point) for point in points

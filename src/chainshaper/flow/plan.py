@@ -244,9 +244,7 @@ def _reception(
         time_ns=int(together.max() or 0),  # type: ignore[arg-type]
         beside_ns=int(in_cycle.max() or 0),  # type: ignore[arg-type]
         # All of them may be ready as the output comes, and be served first.
-        longest_beside_ns=int(
-            beside.group_by("callback_id").agg(pl.col("took").max())["took"].sum()
-        ),
+        beside_once_ns=int(beside.group_by("callback_id").agg(pl.col("took").max())["took"].sum()),
     )
 
 

@@ -10,7 +10,7 @@ import platform
 import re
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -203,22 +203,27 @@ def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
     stamped = [one for one in plan.chains if one.anchor == "stamp" and shaping_nodes(one)]
     servers = [server for one in stamped for server in one.servers]
     nodes = {thread.node for server in servers for thread in server.threads}
-    for one in found.threads:
-        for node in nodes.intersection(one.nodes):
-            if _follows_clock(one.thread.pid):
-                raise InputError(simulated_stamps(node))
+    for node, pid in _processes_of(nodes, found):
+        if _follows_clock(pid):
+            raise InputError(simulated_stamps(node))
 
 
 def refuse_other_clocks(plan: ApplicationPlan, found: Allocation) -> None:
     """Raises PlatformError: a shaping node, which gets its slots in our clock, has another."""
     shaping = {node.thread.node for node in plan.shaping_nodes}
-    for one in found.threads:
-        for node in shaping.intersection(one.nodes):
-            if of_another_clock(pid := one.thread.pid):
-                raise PlatformError(
-                    f"the shaping node {node} (process {pid}) has another clock than we, that of a"
-                    f" time namespace: apply the plan in there (`nsenter --time --target {pid} …`)"
-                )
+    for node, pid in _processes_of(shaping, found):
+        if of_another_clock(pid):
+            raise PlatformError(
+                f"the shaping node {node} (process {pid}) has another clock than we, that of a"
+                f" time namespace: apply the plan in there (`nsenter --time --target {pid} …`)"
+            )
+
+
+def _processes_of(nodes: set[str], found: Allocation) -> Iterator[tuple[str, int]]:
+    """Those of the nodes whose threads were recognised, and the process of each thread."""
+    for allocated in found.threads:
+        for node in nodes.intersection(allocated.nodes):
+            yield node, allocated.thread.pid
 
 
 def _follows_clock(pid: int) -> bool:

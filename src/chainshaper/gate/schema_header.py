@@ -6,7 +6,9 @@ TEMPLATE HEADER`, before any package is installed: so only the standard library 
 
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from chainshaper.gate import decision, handover
@@ -26,20 +28,29 @@ def schema_header(template: str) -> str:
     return re.sub("@([A-Z_]+)@", lambda place: values[place[1]], template)
 
 
-def _values() -> dict[str, str]:
-    """What stands in each place of the template."""
-    numbers = {
+def constants(numbers: Mapping[str, int]) -> str:
+    """Numbers as constants in C++, a line each."""
+    return "\n".join(
+        f"inline constexpr std::int64_t {name} = {value};" for name, value in numbers.items()
+    )
+
+
+def numbers_of(module: ModuleType) -> dict[str, int]:
+    """The public constants of a module that are integers, by their names in C++."""
+    return {
         name.lower(): value
-        for name, value in vars(handover).items()
+        for name, value in vars(module).items()
         if name.isupper() and isinstance(value, int) and not name.startswith("_")
     }
-    numbers["log_columns"] = len(decision.LOG_COLUMNS)
+
+
+def _values() -> dict[str, str]:
+    """What stands in each place of the template."""
+    numbers = numbers_of(handover) | {"log_columns": len(decision.LOG_COLUMNS)}
     usual = vars(NodeParameters())
     types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
     return {
-        "CONSTANTS": "\n".join(
-            f"inline constexpr std::int64_t {name} = {value};" for name, value in numbers.items()
-        ),
+        "CONSTANTS": constants(numbers),
         "LOG_HEADER": '"\n    "'.join(f"{n}," for n in decision.LOG_COLUMNS).removesuffix(","),
         "FIELDS": ", ".join(handover.FIELDS),
         "PARAMETERS": "\n  ".join(f"{types[n]} {n}{{{_in_cpp(usual[n])}}};" for n in types),

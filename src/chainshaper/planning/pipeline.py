@@ -49,6 +49,23 @@ _Key = tuple[int, int, int]  # what is minimal: end, stages, cores
 _Turn = tuple[int, int, int]  # stages a and b of one core, and how many cycles lie between
 
 
+def finished(
+    after: Sequence[Sequence[int]], steps_ns: NDArray[np.int64], begins_ns: Sequence[int]
+) -> NDArray[np.int64]:
+    """When each step of a graph is over, if it waits for no core: a row per instance, as in
+    ``steps_ns``, and a column per step.
+
+    A step comes behind all those ``after`` which it stands; one that stands after none begins
+    ``begins_ns`` behind its instance.
+    """
+    done = np.zeros_like(steps_ns)
+    for step, inputs in enumerate(after):
+        ready = [done[:, before] for before in inputs]
+        start = np.max(ready, axis=0) if ready else begins_ns[step]
+        done[:, step] = start + steps_ns[:, step]
+    return done
+
+
 @dataclass(frozen=True)
 class Work:
     """What is cut: units of callbacks that one thread has to run, each behind what it waits for.
@@ -68,12 +85,7 @@ class Work:
     @cached_property
     def finished_ns(self) -> NDArray[np.int64]:
         """When each unit is over in each instance, if it waits for no core."""
-        done = np.zeros_like(self.steps_ns)
-        for unit, before in enumerate(self.after):
-            ready = [done[:, one] for one in before]
-            start = np.max(ready, axis=0) if ready else self.begins_ns[unit]
-            done[:, unit] = start + self.steps_ns[:, unit]
-        return done
+        return finished(self.after, self.steps_ns, self.begins_ns)
 
     def longest_ns(self, members: Sequence[int]) -> int:
         """The longest that these units took together, in one instance."""

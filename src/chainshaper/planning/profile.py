@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper.planning.margins import check_latencies
+from chainshaper.planning.pipeline import finished
 from chainshaper.planning.plan import PER_CALLBACK, SHORTEST_SLOT_NS, UNSHAPED
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.durations import format_duration, milliseconds
@@ -62,7 +63,7 @@ class Reception(NamedTuple):
 
     ``core`` is theirs (None: several, or not known). A message is on its way for ``shortest_ns`` to
     ``longest_ns``, without the time for which others had that core. Its callbacks take ``time_ns``
-    at most, and others of their executors ``beside_ns`` in a cycle; ``longest_beside_ns`` is the
+    at most, and others of their executors ``beside_ns`` in a cycle; ``beside_once_ns`` is the
     sum of the longest execution of each other callback, for which an output may have to wait.
     """
 
@@ -72,7 +73,7 @@ class Reception(NamedTuple):
     longest_ns: int
     time_ns: int
     beside_ns: int = 0
-    longest_beside_ns: int = 0
+    beside_once_ns: int = 0
 
 
 @dataclass(frozen=True)
@@ -434,15 +435,11 @@ def _on_longest_way(
     profile: Profile, steps_ns: NDArray[np.int64], graph_steps_ns: NDArray[np.int64]
 ) -> NDArray[np.int64]:
     """When the output is done in each cycle, from what each callback took (a row per cycle)."""
-    if not graph_steps_ns.size:
-        along: NDArray[np.int64] = steps_ns.sum(axis=1)
-        return along
-    done = np.zeros_like(graph_steps_ns)
-    for place, callback in enumerate(profile.callbacks):
-        inputs = [done[:, before] for before in callback.after]
-        begins = np.max(inputs, axis=0) if inputs else profile.begins_ns[place]
-        done[:, place] = begins + graph_steps_ns[:, place]
-    return done[:, -1]
+    if graph_steps_ns.size:
+        after = [callback.after for callback in profile.callbacks]
+        return finished(after, graph_steps_ns, profile.begins_ns)[:, -1]
+    along: NDArray[np.int64] = steps_ns.sum(axis=1)
+    return along
 
 
 def _later(profile: Profile, delay_ns: int, measured_ns: NDArray[np.int64]) -> Profile:

@@ -82,7 +82,7 @@ def _placed(
         return plan
     core = node.core if one.core is None or one.core in busy else one.core
     time_ns = one.time_ns + one.beside_ns
-    waits_ns = one.longest_beside_ns
+    waits_ns = one.beside_once_ns
     margin = plan.margin
     if core in busy:
         if not _has_room(plan, profile, time_ns):

@@ -67,9 +67,11 @@ SWEEP_FIGURES = {
 PROMISE = {True: "met", False: "broken", None: ABSENT}
 
 
-def contents_json(recording: Recording, found: Sequence[Contradiction] = ()) -> dict[str, Any]:
-    """Counts per event, what was lost, the clock, the system that was recorded, and what
-    contradictions were ``found`` in it."""
+def contents_json(
+    recording: Recording, contradictions: Sequence[Contradiction] = ()
+) -> dict[str, Any]:
+    """Counts per event, what was lost, the clock, the system that was recorded, and the
+    ``contradictions`` among its events."""
     info = recording.info
     notes = list(info.notes)
     # A recording from before there were checksums; a tracer's trace never has any.
@@ -89,7 +91,7 @@ def contents_json(recording: Recording, found: Sequence[Contradiction] = ()) -> 
         "kernel": info.kernel,
         "processes": {str(pid): name for pid, name in info.processes.items()},
         "notes": notes,
-        "contradictions": [{"note": one.note, "refused": one.refused} for one in found],
+        "contradictions": [{"note": each.note, "refused": each.refused} for each in contradictions],
     }
 
 
