@@ -3,7 +3,7 @@
     python benchmarks/age_of_output.py [RECORDING --chain FIRST..LAST]
 
 Takes the latencies of all cycles of a recording (without one: 20,000 drawn ones, with stalls of
-the machine in 2 % of the cycles), lets them pass the gate (:func:`chainshaper.gate.decision.
+the machine in 2 % of the cycles), lets them pass the gate (:func:`chainshaper.robot.decision.
 release_of`) behind two margins, and prints what arrives: the age of the newest output that the
 actuator has, averaged over time, its 99th percentile and maximum, the jitter of the latency, the
 longest gap between two outputs, and the share of outputs that come more than 1 ms behind their
@@ -19,8 +19,8 @@ from rich.console import Console
 from rich.table import Table
 
 from chainshaper.flow.plan import profile_chains
-from chainshaper.gate.decision import OVERRUNS, Gate, release_of
 from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY, covered_latency
+from chainshaper.robot.decision import OVERRUNS, Gate, release_of
 from chainshaper.values.durations import milliseconds
 
 Times = NDArray[np.int64]

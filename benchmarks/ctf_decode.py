@@ -42,7 +42,7 @@ from chainshaper.sources.ctf import count_events, open_trace, read_events
 from chainshaper.sources.ctf.trace import read_metadata_text
 from chainshaper.sources.ctf.tsdl import parse_tsdl
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests/helpers"))
 from ctf_writing import (
     EncodedPacket,
     EventRecord,

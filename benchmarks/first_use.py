@@ -2,9 +2,9 @@
 
     python benchmarks/first_use.py [ROUNDS]
 
-Each round makes a fresh home and runs every verb in it (those of `tests/every_verb.py`, but the
-live ones, which last as long as they are told), and then all again in the same home. Medians
-are printed (ms of wall time, and of the CPU time of all its processes, which a busy machine changes
+Each round makes a fresh home and runs every verb in it (those of `tests/helpers/every_verb.py`,
+but the live ones, which last as long as they are told), and then all again in the same home.
+Medians are printed (ms of wall time, and of the CPU time of all its processes, which a busy machine changes
 less). The first use is no slower than the second where nothing is compiled or cached at it.
 """
 
@@ -17,7 +17,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-VERBS = Path(__file__).parents[1] / "tests/every_verb.py"
+VERBS = Path(__file__).parents[1] / "tests/helpers/every_verb.py"
 TIMES = ("first", "second")
 
 

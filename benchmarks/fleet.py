@@ -31,14 +31,14 @@ from ctf_decode import read_records, scaled
 from trace_to_latency import example
 
 from chainshaper.linux.scheduling import available_cores
+from chainshaper.monitor.budgets import check_budgets, load_budget, propose_budget, save_budget
 from chainshaper.sources import open_source
-from chainshaper.verify.budgets import check_budgets, load_budget, propose_budget, save_budget
 
 _ALONE = """
 import os, statistics, sys, time
 os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})  # before Polars counts its cores
 from pathlib import Path
-from chainshaper.verify.budgets import check_budgets, load_budget
+from chainshaper.monitor.budgets import check_budgets, load_budget
 trace, budget, taken = [Path(sys.argv[1])], load_budget(sys.argv[2]), []
 for _ in range(9):
     started = time.process_time()

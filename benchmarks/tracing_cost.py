@@ -30,7 +30,7 @@ from chainshaper.sources.lttng import LttngSession
 from chainshaper.sources.preload import PreloadTracer
 from chainshaper.values.errors import ChainshaperError
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests/helpers"))
 from traced_program import built
 
 RUNS = 5

@@ -2,7 +2,7 @@
 
     python benchmarks/watch_week.py [--days 7] [--look 30s] [--rate 10000] [--keep hours.csv]
 
-Feeds the real :class:`~chainshaper.verify.watch.Watch` with a simulated application, in simulated
+Feeds the real :class:`~chainshaper.monitor.watch.Watch` with a simulated application, in simulated
 time: 6.05e9 events of 604,800 s take an hour or so. Events are records in memories as `preload.c`
 lays them out, read by the real :class:`~chainshaper.sources.preload.TracedProcess`; only the clock,
 the offset of CLOCK_REALTIME, the search for memories and `/proc` are simulated.
@@ -43,10 +43,10 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.monitor import watch as watch_module
+from chainshaper.monitor.watch import Watch
 from chainshaper.sources.preload import _HEADER, _RING, RECORD, TracedProcess, event_names
 from chainshaper.values.durations import parse_duration
-from chainshaper.verify import watch as watch_module
-from chainshaper.verify.watch import Watch
 
 US, MS, SECOND = 1_000, 1_000_000, 1_000_000_000
 HOUR, DAY = 3600 * SECOND, 86_400 * SECOND

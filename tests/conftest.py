@@ -27,25 +27,7 @@ settings.register_profile("chainshaper", deadline=None)
 settings.load_profile("chainshaper")
 
 
-# Folders whose tests run live threads against the clock: they need the machine's cores for
-# themselves and follow each other in one process, while `make test` runs all others beside them;
-# and what stands in these folders but looks at no clock.
-TIMED = {"enforcement", "flow", "gate", "linux", "verify", "workload"}
-TIMELESS = {"linux/test_own_processes", "workload/test_computing", "workload/test_launcher"}
-TIMELESS |= {"gate/test_decision", "workload/test_description", "workload/test_execution_times"}
-TIMELESS |= {"enforcement/test_dispatcher", "workload/test_event_log"}
-TIMELESS |= {"flow/test_anchors", "flow/test_describing", "flow/test_drift"}
-TIMELESS |= {"gate/test_throttling"}
-TIMELESS |= {"verify/test_several_chains"}
-TIMELESS |= {"enforcement/test_node_threads", "flow/test_profiles", "linux/test_processes"}
-TIMELESS |= {"verify/test_watch_restarts", "linux/test_threads"}
-TIMELESS |= {"gate/test_gates_in_containers"}
-TIMELESS |= {
-    "verify/test_slowdowns",
-    "verify/test_budgets",
-    "verify/test_predictions",
-    "workload/test_ros_package",
-}
+# Fixtures that run an application live: tests that ask for them are timed.
 LIVE_RUNS = {"unshaped", "shaped"}
 
 Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
@@ -53,14 +35,12 @@ Report = TypeVar("Report", pytest.TestReport, pytest.CollectReport)
 
 @pytest.hookimpl(tryfirst=True)  # before the command line's choice of marks is looked at
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that need the machine's cores for themselves."""
+    """Mark tests of a real ROS 2 or of a live run as timed: they need the machine's cores for
+    themselves, as all tests that are marked so where they stand.
+    """
     for item in items:
-        file = item.path.relative_to(Path(__file__).parent).with_suffix("")
-        timed = file.parent.as_posix() in TIMED and file.as_posix() not in TIMELESS
         live = LIVE_RUNS & set(getattr(item, "fixturenames", ()))
-        # One tracer at a time, but no core for itself: they mostly wait, in a process of their own.
-        waiting = item.get_closest_marker("waiting") and not item.get_closest_marker("ros2")
-        if not waiting and (timed or live or item.get_closest_marker("ros2")):
+        if live or item.get_closest_marker("ros2"):
             item.add_marker("timed")
 
 

@@ -74,8 +74,8 @@ def as_in_a_clone(folder: Path) -> None:
         shutil.copytree(ROOT / name, folder / name, ignore=unread)
     for file in filter(Path.is_file, ROOT.iterdir()):
         shutil.copyfile(file, folder / file.name)
-    (folder / "tests").mkdir()
-    shutil.copyfile(ROOT / "tests/ctf_writing.py", folder / "tests/ctf_writing.py")
+    (folder / "tests/helpers").mkdir(parents=True)
+    shutil.copyfile(ROOT / "tests/helpers/ctf_writing.py", folder / "tests/helpers/ctf_writing.py")
 
 
 @pytest.fixture(scope="session")

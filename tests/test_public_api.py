@@ -6,7 +6,7 @@ import sys
 import pytest
 
 import chainshaper
-from chainshaper.gate import decision as gate
+from chainshaper.robot import decision as gate
 
 HEAVY = ("polars", "matplotlib", "pydantic", "cyclonedds", "numpy", "yaml", "rich")
 

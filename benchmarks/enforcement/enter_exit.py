@@ -28,8 +28,8 @@ from rich.table import Table
 
 from chainshaper.enforcement.back_ends import gates, make_back_end, offered_back_ends
 from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.journal import discard_journal, open_journal
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.workload.stall_meter import measure_stalls
 

@@ -1,5 +1,5 @@
 // The gate: when may a message of the chain's output leave? The same as
-// chainshaper/gate/decision.py, which explains it. Nodes of ROS 2, the gate in a publisher's
+// chainshaper/robot/decision.py, which explains it. Nodes of ROS 2, the gate in a publisher's
 // process and the simulator decide by this file. It knows no clock and asks the operating system
 // for nothing.
 //

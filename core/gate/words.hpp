@@ -1,5 +1,5 @@
 // What the gates in C++ and in Python share: printed by scripts/gate-words from
-// chainshaper/gate/decision.py, which explains it. Do not edit.
+// chainshaper/robot/decision.py, which explains it. Do not edit.
 // clang-format off
 
 #pragma once

@@ -14,15 +14,15 @@ from test_messages import hand_over, intra_process, receive
 
 from chainshaper.analysis import analyse_latency, data_flow, find_chain, graph_of, traverse
 from chainshaper.analysis.traversals import Traversals
-from chainshaper.reporting.latency import breakdown_json, breakdown_table
-from chainshaper.values.recording import RecordingInfo, write_recording
-from chainshaper.verify.budgets import (
+from chainshaper.monitor.budgets import (
     LEAST_MISSING,
     Budget,
     ChainBudget,
     check_budget,
     propose_budget,
 )
+from chainshaper.reporting.latency import breakdown_json, breakdown_table
+from chainshaper.values.recording import RecordingInfo, write_recording
 
 PARTS = ["communication_ns", "computation_ns", "waiting_ns"]
 

@@ -10,7 +10,7 @@ from field_traces import MS, chain_tables, write_chain
 
 from chainshaper import open_source
 from chainshaper.analysis import data_flow, executors, graph_of, recorded_flow
-from chainshaper.verify.budgets import check_budget, load_budget, propose_budget
+from chainshaper.monitor.budgets import check_budget, load_budget, propose_budget
 from chainshaper.verify.slowdowns import sample_of, slowdowns_in
 
 CHAIN = ("--chain", "/image../objects")

@@ -16,10 +16,10 @@ from pathlib import Path
 from chainshaper.enforcement.back_ends import make_back_end
 from chainshaper.enforcement.freezer import Freezer
 from chainshaper.enforcement.guardian import Guardians
+from chainshaper.enforcement.journal import open_journal
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.undoing import undo_run
-from chainshaper.linux.runs import open_journal
 from chainshaper.linux.scheduling import Scheduling
 from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import PlatformError

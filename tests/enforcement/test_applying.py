@@ -48,12 +48,12 @@ from known import known
 from processes import wait_for
 
 from chainshaper import __file__ as package_file
+from chainshaper.enforcement.journal import all_runs_locked, journals_folder
 from chainshaper.linux import cgroups
-from chainshaper.linux.runs import all_runs_locked, journals_folder
 from chainshaper.linux.threads import list_threads, parents
 from chainshaper.planning import Plan, plan_shaping, save_plan
 
-pytestmark = [needs_fifo, needs_cgroups]
+pytestmark = [pytest.mark.timed, needs_fifo, needs_cgroups]
 FIFO = ("--backend", "fifo")
 
 

@@ -30,6 +30,7 @@ from known import known
 from processes import children_of, is_alive, wait_for
 
 from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.journal import discard_journal, open_journal
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.slot_dispatcher import PRIORITY, overrun
 from chainshaper.linux import cgroups
@@ -45,12 +46,11 @@ from chainshaper.linux.cgroups import (
     remount,
     threads_in,
 )
-from chainshaper.linux.runs import discard_journal, open_journal
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.linux.threads import list_threads
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
-pytestmark = needs_cgroups
+pytestmark = [pytest.mark.timed, needs_cgroups]
 CAP_SYS_NICE = 23
 
 CYCLE = 20 * MS

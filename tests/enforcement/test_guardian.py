@@ -29,14 +29,14 @@ from strangers import needs_root
 
 from chainshaper.enforcement.freezer import CoreNumbers, CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, _Watch, let_go
+from chainshaper.enforcement.journal import Journal, find_journals
 from chainshaper.enforcement.threads import _BEST_SERVER_PRIORITY, DDS_PRIORITY
 from chainshaper.enforcement.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
-from chainshaper.linux.runs import Journal, find_journals
 from chainshaper.linux.scheduling import available_cores, state_of
 from chainshaper.linux.threads import list_threads
 
-pytestmark = [needs_cgroups, needs_fifo]
+pytestmark = [pytest.mark.timed, needs_cgroups, needs_fifo]
 
 MINUTE = 60_000
 OWNER = Path(__file__).with_name("servers_owner.py")

@@ -20,6 +20,7 @@ from litmus_stand_in import StandIn, install
 from small_chain import small_chain_plan
 
 from chainshaper.enforcement import litmus
+from chainshaper.enforcement.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.litmus import (
     Litmus,
     create_command,
@@ -34,11 +35,12 @@ from chainshaper.enforcement.threads import Allocation
 from chainshaper.flow import threads
 from chainshaper.flow.phase import Phase
 from chainshaper.flow.threads import planned_changes
-from chainshaper.linux.runs import Journal, find_journals, open_journal
 from chainshaper.linux.scheduling import available_cores, state_of
 from chainshaper.planning import save_plan
 from chainshaper.planning.plan import Server, Thread, revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+
+pytestmark = pytest.mark.timed
 
 MS = 1_000_000
 PAPER_CHAIN = ReservationServer("chain", core=1, priority=2, slots=((0, 86 * MS),))
@@ -347,7 +349,7 @@ _ARMED_AND_KILLED = """
 import os, signal, sys
 from pathlib import Path
 from chainshaper.enforcement import litmus
-from chainshaper.linux.runs import open_journal
+from chainshaper.enforcement.journal import open_journal
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 
 litmus.SCHED_LITMUS = os.SCHED_BATCH

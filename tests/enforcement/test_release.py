@@ -33,13 +33,13 @@ from processes import wait_for
 
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.guardian import GROUP
+from chainshaper.enforcement.journal import find_journals
 from chainshaper.linux import own_processes
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
-from chainshaper.linux.runs import find_journals
 from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import list_threads
 
-pytestmark = [needs_fifo, needs_cgroups]
+pytestmark = [pytest.mark.timed, needs_fifo, needs_cgroups]
 
 
 def ours(run: "subprocess.Popen[str]") -> list[int]:
@@ -157,7 +157,7 @@ def test_killing_a_whole_cgroup_leaves_guardians_to_undo_the_run(tmp_path: Path)
 SLOW = """
 import signal, sys, time
 from pathlib import Path
-from chainshaper.linux.runs import discard_journal, open_journal
+from chainshaper.enforcement.journal import discard_journal, open_journal
 
 journal = open_journal(Path(sys.argv[1]))
 

@@ -15,14 +15,14 @@ from actors import Actor, acting
 from known import known
 from processes import wait_for
 
+from chainshaper.enforcement import journal as journal_module
+from chainshaper.enforcement.journal import Journal, find_journals, open_journal
 from chainshaper.enforcement.scheduling_memory import (
     change_all,
     look_alikes,
     note_descendants,
     release_threads,
 )
-from chainshaper.linux import runs as journal_module
-from chainshaper.linux.runs import Journal, find_journals, open_journal
 from chainshaper.linux.scheduling import (
     Scheduling,
     SchedulingState,
@@ -34,9 +34,13 @@ from chainshaper.linux.scheduling import (
 from chainshaper.linux.threads import RESET_ON_FORK, list_threads
 from chainshaper.values.errors import OperationError
 
-pytestmark = pytest.mark.skipif(
-    not may_use_fifo(), reason="SCHED_FIFO is not permitted here: run as root to have this tested"
-)
+pytestmark = [
+    pytest.mark.timed,
+    pytest.mark.skipif(
+        not may_use_fifo(),
+        reason="SCHED_FIFO is not permitted here: run as root to have this tested",
+    ),
+]
 
 FIRST, LAST = available_cores()[0], available_cores()[-1]
 WANTED = Scheduling(30, (LAST,))
@@ -136,7 +140,7 @@ def test_what_threads_inherited_goes_back_to_what_their_parents_had(
 
 _APPLIER = """
 import random, sys, time
-from chainshaper.linux.runs import open_journal
+from chainshaper.enforcement.journal import open_journal
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.linux.scheduling import Scheduling

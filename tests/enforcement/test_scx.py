@@ -32,6 +32,8 @@ from chainshaper.enforcement.servers import ReservationServer, ServerCounters, S
 from chainshaper.linux.own_processes import what_happened
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
+pytestmark = pytest.mark.timed
+
 ROOT = Path(__file__).parent.parent.parent
 _CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
 CORE = min(os.sched_getaffinity(0))

@@ -23,7 +23,7 @@ from chainshaper.sources.ros import environment_of, own_environment, start_with_
 from chainshaper.values.errors import InputError, OperationError
 
 __all__ = ["open_folder"]
-pytestmark = needs_root
+pytestmark = [pytest.mark.timed, needs_root]
 
 EVIL = """#!/bin/sh
 cat /proc/self/status > {ran}.partial

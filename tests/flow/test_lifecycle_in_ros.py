@@ -14,6 +14,8 @@ from ros2 import ros2_environment
 
 import chainshaper as cs
 
+pytestmark = pytest.mark.timed
+
 LAUNCH = Path(__file__).parents[1] / "roles/managed.launch.py"
 WHILE_SHAPED = """
 set -m

@@ -46,7 +46,7 @@ from chainshaper.workload.description import Application, CallbackDescription, E
 from chainshaper.workload.launcher import WORKER_NAME
 
 ROOT = Path(__file__).parents[2]
-pytestmark = [needs_fifo, needs_cgroups]
+pytestmark = [pytest.mark.timed, needs_fifo, needs_cgroups]
 
 
 def test_a_shaping_node_kept_in_its_server_publishes_when_its_gate_says(tmp_path: Path) -> None:

@@ -38,6 +38,8 @@ from chainshaper.planning import Plan
 from chainshaper.sources.ros import Script
 from chainshaper.values.errors import OperationError
 
+pytestmark = pytest.mark.timed
+
 TICKING = """
 import sys, time
 period, first = int(sys.argv[1]), int(sys.argv[2])

@@ -27,7 +27,10 @@ from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import SchedulingState, available_cores, may_use_fifo, state_of
 from chainshaper.linux.threads import Thread, list_threads
 
-pytestmark = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
+pytestmark = [
+    pytest.mark.timed,
+    pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here"),
+]
 
 
 @pytest.fixture(scope="module")

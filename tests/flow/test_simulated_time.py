@@ -19,6 +19,8 @@ from chainshaper.planning import PlanRequest, Profile, plan_application, plan_ch
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, RecordingInfo
 
+pytestmark = pytest.mark.timed
+
 MS = 1_000_000
 FOLLOWS = r"/source follows /clock \(use_sim_time\): its stamps are of simulated time"
 

@@ -13,7 +13,7 @@ from chainshaper.linux import cgroups
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.values.errors import OperationError, PlatformError
 
-pytestmark = needs_cgroups
+pytestmark = [pytest.mark.timed, needs_cgroups]
 
 
 def kind(folder: Path) -> str:

@@ -18,6 +18,8 @@ from chainshaper.linux.processes import list_processes, read_process, regions_in
 from chainshaper.linux.threads import find_thread, list_threads, read_proc, status_field
 from chainshaper.values.errors import shown, storable, text_of
 
+pytestmark = pytest.mark.timed
+
 CLI = [sys.executable, "-m", "chainshaper"]
 
 

@@ -20,9 +20,6 @@ from small_chain import small_chain_plan
 
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.threads import followed_chains
-from chainshaper.gate import handover
-from chainshaper.gate.decision import Outcome, Release, Waiting
-from chainshaper.gate.handover import Turn
 from chainshaper.planning import margins
 from chainshaper.planning.application_plan import (
     ApplicationPlan,
@@ -35,6 +32,9 @@ from chainshaper.planning.application_plan import (
 from chainshaper.planning.margins import Tail
 from chainshaper.planning.plan import Adaptation, Modes, Plan, Thread, revised, with_slots
 from chainshaper.planning.shaping import let_per_chain
+from chainshaper.robot import handover
+from chainshaper.robot.decision import Outcome, Release, Waiting
+from chainshaper.robot.handover import Turn
 from chainshaper.splicing import shaped_outputs
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 from chainshaper.values.errors import InputError, OperationError

@@ -12,7 +12,6 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 import pytest
 
-from chainshaper.gate.decision import IntoOpenSlot
 from chainshaper.planning.bands import (
     BandProblem,
     Placement,
@@ -28,6 +27,7 @@ from chainshaper.planning.bands import (
 )
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots, revised
 from chainshaper.planning.shaping import plan_shaping, server_per_chain
+from chainshaper.robot.decision import IntoOpenSlot
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

@@ -17,9 +17,9 @@ from quick_chain import quick_chain
 
 from chainshaper import open_recording, simulate, sweep
 from chainshaper.flow.sweep import rows_beside
-from chainshaper.linux import computing
+from chainshaper.monitor.budgets import check_budgets, propose_budget
+from chainshaper.values import many_tasks
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.verify.budgets import check_budgets, propose_budget
 from chainshaper.verify.slowdowns import slowdowns_in
 
 distributed = pytest.importorskip("distributed", reason="Dask's `distributed` is not installed")
@@ -101,7 +101,7 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
     start: Start, scheduler: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Dask's worker ends when it cannot load what it is sent: here it has no chainshaper."""
-    monkeypatch.setattr(computing, "WITHOUT_WORKERS_S", 1)
+    monkeypatch.setattr(many_tasks, "WITHOUT_WORKERS_S", 1)
     (tmp_path / "other" / "chainshaper").mkdir(parents=True)
     (tmp_path / "other" / "chainshaper" / "__init__.py").touch()
     # An editable installation goes before PYTHONPATH.
@@ -121,7 +121,7 @@ def test_without_any_worker_that_can_compute_it_does_not_wait_for_ever(
 def test_where_no_scheduler_answers_the_address_is_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(computing, "CONNECT_S", 1)
+    monkeypatch.setattr(many_tasks, "CONNECT_S", 1)
     with socket.socket() as reserved:
         reserved.bind(("127.0.0.1", 0))  # nothing listens there
         address = f"tcp://127.0.0.1:{reserved.getsockname()[1]}"
@@ -167,8 +167,8 @@ def test_a_scheduler_that_dies_or_hangs_costs_no_finished_row(
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(computing, "WITHOUT_WORKERS_S", 2)
-    monkeypatch.setattr(computing, "ANSWER_S", 1)
+    monkeypatch.setattr(many_tasks, "WITHOUT_WORKERS_S", 2)
+    monkeypatch.setattr(many_tasks, "ANSWER_S", 1)
     file = tmp_path / "scheduler.json"
     port = ("--host", "127.0.0.1", "--port", "0", "--scheduler-file", str(file))
     process: Any = start("scheduler", *port)

@@ -30,6 +30,7 @@ from traced_program import (
 )
 
 import chainshaper as cs
+from chainshaper.monitor.watch import Watch
 from chainshaper.reporting.overviews import watch_tables
 from chainshaper.sources.preload import (
     PreloadTracer,
@@ -40,7 +41,6 @@ from chainshaper.sources.preload import (
     preloading,
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError
-from chainshaper.verify.watch import Watch
 
 pytestmark = pytest.mark.waiting
 

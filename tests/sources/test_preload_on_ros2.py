@@ -17,8 +17,8 @@ from small_chain import small_chain
 
 import chainshaper as cs
 from chainshaper.flow.record import record_command
+from chainshaper.monitor.watch import SECOND, Watch
 from chainshaper.sources.preload import PreloadTracer, event_names, installed_library
-from chainshaper.verify.watch import SECOND, Watch
 
 SECONDS = 6
 LENGTHS = {"gid": 16}  # LTTng has what follows the gid as well

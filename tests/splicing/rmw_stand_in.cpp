@@ -1,5 +1,5 @@
 // Stands in for rmw, rcutils, tracetools and std_msgs where no ROS 2 is: what the gates in the
-// processes that publish and subscribe (splicing/nodes/) call, and are called by. Compiled with
+// processes that publish and subscribe (robot/) call, and are called by. Compiled with
 // PROGRAM, it is such a process instead: each line of its standard input is
 //
 //   subscription TOPIC NODE | take NS SUBSCRIPTION STAMP | publisher TOPIC NODE DEPTH | at NS PUBLISHER STAMP | serialized NS PUBLISHER STAMP

@@ -11,7 +11,7 @@ import pytest
 from cpp_program import compiled
 from gate_table import PUBLISHING_NS, Case, Outcome, cases, walk
 
-from chainshaper.gate.decision import (
+from chainshaper.robot.decision import (
     ANCHORS,
     DROPPED,
     INTO_OPEN_SLOT,

@@ -20,10 +20,10 @@ from gate_table import Case, cases, walk
 from native_build import built_for_arm64
 from processes import wait_for
 
-from chainshaper.gate.decision import Gate, gate_parameters
-from chainshaper.gate.handover import FIELDS, page_folders
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import gate_thread_name
+from chainshaper.robot.decision import Gate, gate_parameters
+from chainshaper.robot.handover import FIELDS, page_folders
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaped_outputs import (
     FollowedOutput,

@@ -26,10 +26,10 @@ from node_run import (
 from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
-from chainshaper.gate import decision as gate
-from chainshaper.gate.decision import READER_DEPTH, NodeParameters, gate_parameters
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import ShapingNode, revised
+from chainshaper.robot import decision as gate
+from chainshaper.robot.decision import READER_DEPTH, NodeParameters, gate_parameters
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.splicing.shaping_process import (
     ShapingProcess,

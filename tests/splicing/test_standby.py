@@ -16,9 +16,9 @@ from node_run import NodeRun, banded, outputs, parameters_of, running_node, stam
 from processes import wait_for
 from strangers import NOBODY, needs_root, strange
 
-from chainshaper.gate.handover import MOVING, VERSION, Page, open_page
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
+from chainshaper.robot.handover import MOVING, VERSION, Page, open_page
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
 from chainshaper.splicing.shaped_outputs import FollowedOutput, ask_phase, find_outputs, output_text
 from chainshaper.splicing.shaping_process import ShapingProcess, write_shaping_process

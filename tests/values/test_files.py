@@ -9,8 +9,8 @@ import pytest
 from strangers import NOBODY, needs_root, open_folder
 
 import chainshaper
+from chainshaper.enforcement.journal import Journal, discard_journal, open_journal
 from chainshaper.flow.sweep import finished_rows
-from chainshaper.linux.runs import Journal, discard_journal, open_journal
 from chainshaper.values.errors import ChainshaperError, InputError
 from chainshaper.values.files import (
     folder_beside,
@@ -174,7 +174,7 @@ _ELSEWHERE = {
     "enforcement/freezer.py": "writes to files of the kernel",
     "gate/schema_header.py": "is run where the package is built, for a file of the build",
     "gate/handover.py": "has memory in a folder of mode 0700, whose owner it checks",
-    "splicing/nodes/python/node.py": "runs in ROS nodes, which have nothing of ours",
+    "robot/python/node.py": "runs in ROS nodes, which have nothing of ours",
 }
 
 

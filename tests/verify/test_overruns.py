@@ -24,11 +24,11 @@ from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan,
 
 from chainshaper import LatencyAnalysis, measure_latency, save_plan, shape_application, simulate
 from chainshaper.flow.apply import apply_plan
-from chainshaper.gate.decision import Overrun, sleep_until
 from chainshaper.planning import Plan, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.reporting.latency import doubts_text, latency_json
+from chainshaper.robot.decision import Overrun, sleep_until
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
     Outcome,
@@ -40,6 +40,8 @@ from chainshaper.verify.overruns import (
 from chainshaper.workload import live
 from chainshaper.workload.description import Application, ExecutionTime
 from chainshaper.workload.live import Enforcement, StartedNodes
+
+pytestmark = pytest.mark.timed
 
 MS = 1_000_000
 

@@ -30,6 +30,8 @@ from chainshaper.verify.measure import Measurement
 from chainshaper.verify.promises import OutputsDue, outputs_due
 from chainshaper.workload.description import Application, ExecutionTime
 
+pytestmark = pytest.mark.timed
+
 MS = 1_000_000
 
 

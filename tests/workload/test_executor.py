@@ -36,6 +36,8 @@ from chainshaper.workload.executor import (
 )
 from chainshaper.workload.live import run_application
 
+pytestmark = pytest.mark.timed
+
 MS = 1_000_000
 
 

@@ -24,6 +24,8 @@ from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML
 from chainshaper.workload.description import Application, load_application
 
+pytestmark = pytest.mark.timed
+
 
 def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path, unshaped: Recording) -> None:
     """The slot of /t1 comes behind the end of fast callbacks, in the same cycle."""

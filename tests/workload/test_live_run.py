@@ -23,6 +23,8 @@ from chainshaper.workload import live
 from chainshaper.workload.description import load_application
 from chainshaper.workload.execution import ExecutionTimes
 
+pytestmark = pytest.mark.timed
+
 CYCLES = 12
 
 needs_fifo = pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")

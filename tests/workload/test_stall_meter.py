@@ -3,6 +3,7 @@
 import time
 
 import numpy as np
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from known import known
@@ -16,6 +17,8 @@ from chainshaper.workload.stall_meter import (
     stalls_watched,
     watch,
 )
+
+pytestmark = pytest.mark.timed
 
 
 def test_the_pace_of_all_wake_ups_is_noted_stretch_by_stretch() -> None:

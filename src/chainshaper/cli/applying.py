@@ -199,9 +199,9 @@ def release(
     process shapes any more.
     """
     from chainshaper.enforcement.freezer import groups_of, run_of
+    from chainshaper.enforcement.journal import find_journals
     from chainshaper.enforcement.scheduling_memory import look_alikes
     from chainshaper.enforcement.undoing import release_strays
-    from chainshaper.linux.runs import find_journals
     from chainshaper.splicing.shaped_outputs import remove_abandoned_pages
     from chainshaper.values.files import clear_killed_runs
 

@@ -24,9 +24,9 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
 
     from chainshaper.analysis import ChainEnumeration
+    from chainshaper.monitor.budgets import Budget, Judged
+    from chainshaper.monitor.watch import Seen, Watch
     from chainshaper.values.application import ApplicationGraph
-    from chainshaper.verify.budgets import Budget, Judged
-    from chainshaper.verify.watch import Seen, Watch
 
 STDERR = 2
 PATIENCE_NS = 10_000_000_000  # after nodes are there `watch` names what has not run of a budget
@@ -310,11 +310,11 @@ def watch(
     """
     from chainshaper.linux import own_processes
     from chainshaper.linux.processes import run_users
+    from chainshaper.monitor.budgets import Budget, load_budget
+    from chainshaper.monitor.watch import Watch, exporting
     from chainshaper.reporting.overviews import watch_tables
     from chainshaper.sources.preload import in_front, installed_library
     from chainshaper.values.recording import refuse_existing
-    from chainshaper.verify.budgets import Budget, load_budget
-    from chainshaper.verify.watch import Watch, exporting
 
     if environment:
         for name, value in in_front(installed_library()).items():
@@ -372,7 +372,7 @@ def _judging(
     limits: "Budget", watched: "Watch", recorder: Path
 ) -> "Callable[[Seen], list[Judged]]":
     """What finds the limits that are broken; new ones are written to stderr and recorded."""
-    from chainshaper.verify.budgets import broken_limits, not_running
+    from chainshaper.monitor.budgets import broken_limits, not_running
 
     breaks, named_at, left = set[tuple[str, str]](), 0, MOST_RECORDED
 

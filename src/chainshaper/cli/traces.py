@@ -13,8 +13,8 @@ from chainshaper.values.errors import InputError, OperationError
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from chainshaper.monitor.budgets import Judged
     from chainshaper.reporting.tables import ResultTable
-    from chainshaper.verify.budgets import Judged
     from chainshaper.verify.slowdowns import Compared
 
 
@@ -192,8 +192,8 @@ def budget(
 
     It is a YAML file that you edit; `chainshaper check` says which recordings keep to it.
     """
+    from chainshaper.monitor.budgets import propose_budget, save_budget
     from chainshaper.values.files import new_file
-    from chainshaper.verify.budgets import propose_budget, save_budget
     from chainshaper.verify.measure import taken_chain
 
     new_file(output)
@@ -236,9 +236,9 @@ def check(
     Limits apply to all cycles, disturbed ones included. Where only these break one, that is said.
     With --baseline all recordings together are compared with those of before, callback by callback.
     """
+    from chainshaper.monitor import budgets
     from chainshaper.reporting.latency import JSON_FORMAT
     from chainshaper.values.files import new_file, write_whole
-    from chainshaper.verify import budgets
 
     if budget is None and not baseline:
         raise InputError("say what to check against: --budget FILE, or --baseline REC")

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 
 from chainshaper.enforcement import litmus
 from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.scx import back_end as scx
 from chainshaper.enforcement.servers import BackEnd, ServerTable, server_named
 from chainshaper.linux import cgroups
-from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import may_use_fifo
 from chainshaper.values.errors import InputError, PlatformError
 

@@ -25,6 +25,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from chainshaper.enforcement.journal import DISPATCHER, Journal, note_process
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import (
     BackEnd,
@@ -35,7 +36,6 @@ from chainshaper.enforcement.servers import (
 )
 from chainshaper.linux import cgroups
 from chainshaper.linux.own_processes import end_in_words, start_module
-from chainshaper.linux.runs import DISPATCHER, Journal, note_process
 from chainshaper.linux.threads import has_ended, living_processes, start_of
 from chainshaper.values.errors import OperationError, PlatformError
 

@@ -23,11 +23,12 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
+from chainshaper.enforcement import journal as runs
 from chainshaper.enforcement.freezer import CounterPage, groups_of, run_of, thaw
+from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.undoing import claim_run, strange_lines, undo_run
-from chainshaper.linux import cgroups, runs
+from chainshaper.linux import cgroups
 from chainshaper.linux.own_processes import start_module, what_happened
-from chainshaper.linux.runs import Journal
 from chainshaper.linux.scheduling import become_fifo, set_thread_name
 from chainshaper.linux.threads import open_process
 from chainshaper.values.errors import OperationError

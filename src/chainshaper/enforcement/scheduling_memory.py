@@ -18,9 +18,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from chainshaper.enforcement.journal import Journal, process_of
 from chainshaper.linux.cgroups import threads_in
 from chainshaper.linux.processes import descendants
-from chainshaper.linux.runs import Journal, process_of
 from chainshaper.linux.scheduling import (
     ASPECTS,
     Scheduling,

@@ -26,8 +26,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from chainshaper.enforcement.freezer import Anchoring, CounterPage, FreezerRun, run_of
-from chainshaper.gate.decision import sleep_until, watch_until
-from chainshaper.linux.runs import remembered_journal
+from chainshaper.enforcement.journal import remembered_journal
 from chainshaper.linux.scheduling import (
     become_fifo,
     lock_memory,
@@ -35,6 +34,7 @@ from chainshaper.linux.scheduling import (
     stop_garbage_collection,
 )
 from chainshaper.linux.threads import read_proc
+from chainshaper.robot.decision import sleep_until, watch_until
 from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError, shown
 
 PRIORITY = 97

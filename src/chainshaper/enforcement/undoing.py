@@ -18,15 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from chainshaper.enforcement import freezer, litmus
-from chainshaper.enforcement.scheduling_memory import (
-    DESCENDANTS,
-    KIND,
-    read_change,
-    release_threads,
-)
-from chainshaper.enforcement.servers import ReservationServer, ServerCounters
-from chainshaper.linux import cgroups, own_processes, runs
-from chainshaper.linux.runs import (
+from chainshaper.enforcement import journal as runs
+from chainshaper.enforcement.journal import (
     Journal,
     LockHolder,
     all_runs_locked,
@@ -34,6 +27,14 @@ from chainshaper.linux.runs import (
     locked,
     process_of,
 )
+from chainshaper.enforcement.scheduling_memory import (
+    DESCENDANTS,
+    KIND,
+    read_change,
+    release_threads,
+)
+from chainshaper.enforcement.servers import ReservationServer, ServerCounters
+from chainshaper.linux import cgroups, own_processes
 from chainshaper.linux.scheduling import state_of
 from chainshaper.linux.threads import find_thread, open_process
 from chainshaper.values.durations import duration_text

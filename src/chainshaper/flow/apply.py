@@ -2,9 +2,10 @@
 
     find the threads ─► priorities and cores ─► servers ─► anchor ─► arm ─► watch ─► all as before
 
-Every change stands in a journal first (:mod:`chainshaper.linux.runs`): whatever ends the run puts
-it back. Servers are armed only when all nodes run, and released before a command of ours is to end,
-since a stopped thread cannot. A thread that appears later gets what the plan says at the next look.
+Every change stands in a journal first (:mod:`chainshaper.enforcement.journal`): whatever ends the
+run puts it back. Servers are armed only when all nodes run, and released before a command of ours
+is to end, since a stopped thread cannot. A thread that appears later gets what the plan says at the
+next look.
 """
 
 import json
@@ -26,6 +27,7 @@ from chainshaper.enforcement import undoing
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.freezer import Freezer, groups_of, run_of
 from chainshaper.enforcement.guardian import Guardians, put_back
+from chainshaper.enforcement.journal import PLAN_FILE, Journal
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters
 from chainshaper.enforcement.threads import Allocation, NodeThread
@@ -35,7 +37,6 @@ from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
 from chainshaper.linux.own_processes import end_command, end_in_words, start_command
 from chainshaper.linux.processes import run_users
-from chainshaper.linux.runs import PLAN_FILE, Journal
 from chainshaper.linux.scheduling import available_cores, check_cores
 from chainshaper.planning import application_plan as planned
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done

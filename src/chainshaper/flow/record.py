@@ -21,13 +21,13 @@ from pathlib import Path
 from typing import TypeAlias, TypeVar
 
 from chainshaper.analysis.objects import resolve_objects
+from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
 from chainshaper.enforcement.threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux import processes as running
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
 from chainshaper.linux.processes import Process, find_applications
-from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
 from chainshaper.planning import ApplicationPlan, Plan

@@ -38,7 +38,6 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from chainshaper.analysis import latency_statistics
 from chainshaper.analysis.latency import PERCENTILES
 from chainshaper.flow.plan import profile_chains
-from chainshaper.linux.computing import engine
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.overruns import slots_of_latency
@@ -47,6 +46,7 @@ from chainshaper.simulation.system import build_system
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import new_file, open_output, scratch_folder, write_whole
+from chainshaper.values.many_tasks import engine
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.verify.promises import OutputsDue
 from chainshaper.workload.description import Application, application_as_written, origin_timer

@@ -10,9 +10,9 @@ import polars as pl
 
 from chainshaper.analysis import ChainEnumeration
 from chainshaper.analysis.contradictions import Contradiction
+from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.threads import Allocation, NodeThread, WantedScheduling
 from chainshaper.enforcement.undoing import RunState, ServerState
-from chainshaper.linux.runs import Journal
 from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
 from chainshaper.planning.plan import slot_text
@@ -48,8 +48,8 @@ from chainshaper.values.recording import (
 from chainshaper.verify.measure import PARTS, Measurement
 
 if TYPE_CHECKING:  # only their verbs import them
-    from chainshaper.verify.budgets import Judged
-    from chainshaper.verify.watch import Seen
+    from chainshaper.monitor.budgets import Judged
+    from chainshaper.monitor.watch import Seen
 
 UNKNOWN = "unknown"
 COLOURS = {"good": "green", "limited": "yellow", "absent": "red"}

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.gate.decision import LOG_COLUMNS, STALL_NS
+from chainshaper.robot.decision import LOG_COLUMNS, STALL_NS
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 

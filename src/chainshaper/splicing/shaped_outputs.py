@@ -1,5 +1,5 @@
 """Which outputs are shaped on this machine at the moment, and which go around their shaping node:
-what their pages of memory say (:mod:`chainshaper.gate.handover`).
+what their pages of memory say (:mod:`chainshaper.robot.handover`).
 """
 
 import os
@@ -13,8 +13,10 @@ from typing import Literal, TypeAlias
 
 from pydantic import TypeAdapter
 
-from chainshaper.gate.decision import DROPPED
-from chainshaper.gate.handover import (
+from chainshaper.linux.processes import run_users, user_name
+from chainshaper.linux.threads import innermost_id, parents, read_proc, status_field
+from chainshaper.robot.decision import DROPPED
+from chainshaper.robot.handover import (
     MOVING,
     PASSING,
     PUBLISHING,
@@ -23,8 +25,6 @@ from chainshaper.gate.handover import (
     Page,
     page_folders,
 )
-from chainshaper.linux.processes import run_users, user_name
-from chainshaper.linux.threads import innermost_id, parents, read_proc, status_field
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError
 from chainshaper.values.yaml_file import FullName

@@ -20,13 +20,13 @@ from typing import Any, Literal
 import yaml
 
 from chainshaper.analysis.chains import close_names
-from chainshaper.gate import decision
-from chainshaper.gate.decision import DEPTH, Gate, Modes, gate_parameters
-from chainshaper.gate.schema_header import schema_header
 from chainshaper.linux.threads import gate_thread_name
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
+from chainshaper.robot import decision
+from chainshaper.robot.decision import DEPTH, Gate, Modes, gate_parameters
+from chainshaper.robot.schema_header import schema_header
 from chainshaper.sources.preload import native_library
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.files import write_whole
@@ -34,7 +34,7 @@ from chainshaper.values.plan_choices import STANDBY, NodeKind
 
 OF_ONE_TYPE = ("typed", "component")
 _SOURCES = Path(__file__).parents[2]
-_NODES = Path(__file__).parent / "nodes"
+_NODES = Path(__file__).parents[1] / "robot"
 _RESPAWNING = _NODES / "python/respawning.py"
 _CORE = native_library("core")  # the headers that the library was built from
 

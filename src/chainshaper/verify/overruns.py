@@ -24,10 +24,10 @@ from chainshaper.analysis import LatencyAnalysis
 from chainshaper.analysis.messages import with_overrun
 from chainshaper.analysis.objects import named_nodes
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT
-from chainshaper.gate.decision import DROPPED
 from chainshaper.planning import Plan
 from chainshaper.planning.overruns import cycles_until_output, slots_of_latency
 from chainshaper.planning.plan import publisher_servers, shaping_nodes
+from chainshaper.robot.decision import DROPPED
 from chainshaper.values import events
 from chainshaper.values.plan_choices import STANDBY
 from chainshaper.values.recording import Recording

@@ -35,9 +35,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.disturbance import stalled_after
 from chainshaper.analysis.latency import named_callbacks
-from chainshaper.linux.computing import computed
 from chainshaper.sources import open_source
 from chainshaper.values.errors import InputError
+from chainshaper.values.many_tasks import computed
 from chainshaper.values.recording import Recording
 from chainshaper.verify.measure import measure_latency
 from chainshaper.verify.student import t_quantile, t_tail
@@ -134,8 +134,8 @@ def slowdowns_in(
     """:func:`find_slowdowns` in recordings and traces, which are read in parallel.
 
     ``chains`` are those to speak of; without, those that recordings name. Raises: as
-    :func:`find_slowdowns` and :func:`~chainshaper.linux.computing.engine`. InputError: a recording
-    cannot be read.
+    :func:`find_slowdowns` and :func:`~chainshaper.values.many_tasks.engine`. InputError: a
+    recording cannot be read.
     """
     every, purpose = [*paths, *before], "a comparison"
     samples = computed(

@@ -47,9 +47,9 @@ from pathlib import Path
 from time import monotonic_ns
 from typing import Any, Generic, TypeAlias, TypeVar
 
-from chainshaper.gate.decision import origin_of
 from chainshaper.linux.own_processes import named_folders
 from chainshaper.linux.scheduling import set_thread_name
+from chainshaper.robot.decision import origin_of
 from chainshaper.values.files import why_distrusted
 from chainshaper.workload import dds
 from chainshaper.workload.dds import Message, Subscription

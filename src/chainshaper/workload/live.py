@@ -18,9 +18,8 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.gate.decision import clock_offset
+from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
 from chainshaper.linux.own_processes import LIBRARIES
-from chainshaper.linux.runs import Governed, governing, in_force_throughout
 from chainshaper.linux.scheduling import (
     Scheduling,
     apply_scheduling,
@@ -29,6 +28,7 @@ from chainshaper.linux.scheduling import (
     may_use_fifo,
 )
 from chainshaper.linux.threads import Thread, foreign_realtime_processes, list_threads
+from chainshaper.robot.decision import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError

@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
-from chainshaper.gate import decision
-from chainshaper.gate.clear_core import ClearCore
-from chainshaper.gate.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
-from chainshaper.gate.handover import Turn
 from chainshaper.linux import scheduling
+from chainshaper.robot import decision
+from chainshaper.robot.clear_core import ClearCore
+from chainshaper.robot.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
+from chainshaper.robot.handover import Turn
 from chainshaper.workload import dds, executor, launcher
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import FIRST_AFTER, ExecutionTimes, spend

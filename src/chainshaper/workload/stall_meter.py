@@ -20,9 +20,9 @@ from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import TYPE_CHECKING
 
-from chainshaper.gate.decision import STALL_NS, sleep_until
 from chainshaper.linux import scheduling
 from chainshaper.linux.threads import list_threads
+from chainshaper.robot.decision import STALL_NS, sleep_until
 from chainshaper.workload import launcher
 from chainshaper.workload.launcher import ENOUGH, Child
 

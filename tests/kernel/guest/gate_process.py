@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, "/src")
-from chainshaper.gate.decision import Gate, Shaper, sleep_until
+from chainshaper.robot.decision import Gate, Shaper, sleep_until
 
 cycle, arrival, start, spin = map(int, sys.argv[3:])
 shaper, seen = Shaper(Gate(((start, start + 1_000_000),), cycle, "cycle"), spin), []

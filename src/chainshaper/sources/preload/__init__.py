@@ -30,7 +30,6 @@ import polars as pl
 from numpy.typing import NDArray
 
 from chainshaper import _core
-from chainshaper.gate.decision import clock_offset
 from chainshaper.linux.processes import descendants, run_users
 from chainshaper.linux.threads import (
     innermost_id,
@@ -40,6 +39,7 @@ from chainshaper.linux.threads import (
     read_proc,
     time_namespace,
 )
+from chainshaper.robot.decision import clock_offset
 from chainshaper.sources.ebpf.trace_points import (
     Argument,
     TracePoint,

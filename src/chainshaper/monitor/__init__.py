@@ -1,0 +1,1 @@
+"""Chains of what runs now: the watch, budgets, metrics for other programs."""

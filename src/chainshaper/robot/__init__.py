@@ -1,0 +1,1 @@
+"""All that runs inside ROS nodes: the gate's decision, nodes, libraries before rmw."""

@@ -1,0 +1,290 @@
+// A gate at work: clocks, sleeping, and serialized messages around the decisions of gate/. The same
+// as chainshaper/robot/decision.py, which explains it. No ROS 2 here. All times are nanoseconds.
+
+#pragma once
+
+#include <errno.h>
+#include <fcntl.h>
+#include <sched.h>
+#include <sys/syscall.h>
+#include <time.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstdlib>
+#include <functional>
+#include <limits>
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "gate/decision.hpp"
+#include "gate/queue.hpp"
+#include "guest.hpp"
+#include "schema.hpp"
+
+namespace chainshaper {
+
+// The gate that a node's parameters describe, with room for so many messages. Throws
+// std::invalid_argument for a word that there is not.
+inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
+  const auto one_of = [](const auto & words, const std::string & word) {
+    if (const auto place = place_of(words, word)) return *place;
+    throw std::invalid_argument("'" + word + "' is no word for a gate");
+  };
+  Gate gate;
+  const auto & bounds = parameters.slots_ns;
+  for (std::size_t i = 0; i + 1 < bounds.size(); i += 2)
+    gate.slots.push_back({bounds[i], bounds[i + 1]});
+  gate.cycle_ns = parameters.cycle_ns;
+  gate.anchor = static_cast<Anchor>(one_of(anchor_names, parameters.anchor));
+  gate.phase_ns = parameters.phase_ns;
+  gate.overrun = static_cast<Policy>(one_of(policy_names, parameters.overrun));
+  gate.due_cycles = parameters.due_cycles;
+  gate.messages = static_cast<Messages>(one_of(messages_names, parameters.messages));
+  gate.depth = depth;
+  gate.into_open_slot = static_cast<Entry>(one_of(entry_names, parameters.into_open_slot));
+  if (!parameters.mode_topic.empty()) {
+    gate.modes = parameters.mode_names;
+    gate.bands.assign(parameters.mode_slots.begin(), parameters.mode_slots.end());
+    gate.first_mode = one_of(gate.modes, parameters.mode_default);
+    gate.late = static_cast<Policy>(one_of(policy_names, parameters.mode_late));
+  }
+  return gate;
+}
+
+// How many messages may wait: by default as many as in the publisher's history.
+inline std::size_t depth_of(const Parameters & parameters, std::size_t history) {
+  if (parameters.depth > 0) return static_cast<std::size_t>(parameters.depth);
+  return std::max<std::size_t>(schema::depth, history);
+}
+
+// Four bytes of a serialized message, in the byte order that its encapsulation header names.
+inline std::uint32_t word_at(const std::uint8_t * payload, std::size_t at) {
+  const bool little = payload[1] & 1;
+  std::uint32_t value = 0;
+  for (std::size_t i = 0; i < 4; ++i)
+    value |= std::uint32_t{payload[at + i]} << (8 * (little ? i : 3 - i));
+  return value;
+}
+
+inline Maybe origin_of(const std::uint8_t * payload, std::size_t size) {
+  if (size < 12) return std::nullopt;
+  const std::int64_t seconds = static_cast<std::int32_t>(word_at(payload, 4));
+  const std::int64_t nanoseconds = word_at(payload, 8);
+  if ((seconds == 0 && nanoseconds == 0) || nanoseconds >= 1'000'000'000) return std::nullopt;
+  return seconds * 1'000'000'000 + nanoseconds;
+}
+
+inline std::optional<std::string> text_of(const std::uint8_t * payload, std::size_t size) {
+  if (size < 8) return std::nullopt;
+  const std::size_t length = word_at(payload, 4);  // with the final NUL
+  if (length < 1 || length > size - 8) return std::nullopt;
+  return std::string(reinterpret_cast<const char *>(payload + 8), length - 1);
+}
+
+inline std::int64_t clock_ns(clockid_t clock) {
+  timespec now{};
+  clock_gettime(clock, &now);
+  return now.tv_sec * std::int64_t{1'000'000'000} + now.tv_nsec;
+}
+
+inline std::int64_t monotonic_ns() { return clock_ns(CLOCK_MONOTONIC); }
+
+inline void sleep_until(std::int64_t deadline_ns) {
+  const auto [seconds, rest] = std::lldiv(std::max<std::int64_t>(0, deadline_ns), 1'000'000'000);
+  const timespec request{static_cast<time_t>(seconds), static_cast<long>(rest)};  // NOLINT
+  while (clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &request, nullptr) == EINTR) continue;
+}
+
+inline std::int64_t watch_until(std::int64_t deadline_ns) {
+  std::int64_t now = monotonic_ns();
+  while (now < deadline_ns) now = monotonic_ns();
+  return now;
+}
+
+// Give the calling thread SCHED_FIFO with a priority, or a core; false (and errno): it is refused.
+inline bool set_fifo(std::int64_t priority) {
+  sched_param wanted{};
+  wanted.sched_priority = static_cast<int>(priority);
+  return sched_setscheduler(0, SCHED_FIFO | SCHED_RESET_ON_FORK, &wanted) == 0;
+}
+
+inline bool set_core(std::int64_t core) {
+  cpu_set_t cores;
+  CPU_ZERO(&cores);
+  CPU_SET(static_cast<std::size_t>(core), &cores);
+  return sched_setaffinity(0, sizeof(cores), &cores) == 0;
+}
+
+// Both, as the parameters say; `warn` gets what is refused, and the remedy.
+template <typename Warn>
+void schedule(const Parameters & parameters, Warn warn) {
+  if (parameters.fifo_priority > 0 && !set_fifo(parameters.fifo_priority))
+    warn("SCHED_FIFO is refused",
+         "give the user an rtprio limit of 98, or the container cpu.rt_runtime_us");
+  if (parameters.core >= 0 && !set_core(parameters.core))
+    warn("core " + std::to_string(parameters.core) + " is refused", "name another in the plan");
+}
+
+inline std::int64_t clock_offset() {
+  // How long it took, and what was found; a longer bracket means that something came between.
+  std::pair<std::int64_t, std::int64_t> best{std::numeric_limits<std::int64_t>::max(), 0};
+  for (int attempt = 0; attempt < 5 && best.first >= 2'000; ++attempt) {
+    const std::int64_t before = monotonic_ns();
+    const std::int64_t realtime = clock_ns(CLOCK_REALTIME);
+    const std::int64_t after = monotonic_ns();
+    best = std::min(best, {after - before, realtime - (before + after) / 2});
+  }
+  return best.second;
+}
+
+// A gate at work; `Message` is what the queue holds. Its owner sets the functions that it calls.
+template <typename Message>
+class Shaper {
+public:
+  Shaper(Gate gate, std::int64_t spin_ns)
+      : queue(std::move(gate)), spin_ns_(spin_ns), offset_(clock_offset()) {}
+
+  Shaper(const Shaper &) = delete;
+  Shaper & operator=(const Shaper &) = delete;
+
+  void set_phase(std::int64_t phase_ns, std::int64_t now_ns) {
+    next_phase_ = {now_ns + modulo(phase_ns - now_ns, queue.gate.cycle_ns), phase_ns};
+  }
+
+  void move_slots(std::int64_t by_ns, std::int64_t from_ns) {
+    const auto & moves = queue.moves;
+    if (by_ns != (moves.empty() ? 0 : moves.back().second) && queue.gate.may_move(by_ns))
+      remember(queue.moves, Move{from_ns, by_ns});
+  }
+
+  void follow_moves() {
+    if (const auto move = moved()) move_slots(move->second, move->first);
+  }
+
+  bool announce(const std::string & name, std::int64_t now_ns) {
+    const auto mode = place_of(queue.gate.modes, name);
+    if (!mode) return false;
+    queue.switch_mode(*mode, now_ns);
+    return true;
+  }
+
+  // A message with this stamp (CLOCK_REALTIME) was taken now. One that `waited` in the reader
+  // counts as having come at its source timestamp, if that is after the last look.
+  void arrive(Message message, Maybe stamp_ns, Maybe source_timestamp = {}, bool waited = false,
+              Maybe lost = {}) {
+    const std::int64_t offset = clock_offset();
+    const bool stepped = std::abs(offset - std::exchange(offset_, offset)) > schema::step_ns;
+    if (stamp_ns) *stamp_ns -= offset;
+    std::int64_t arrival_ns = monotonic_ns();
+    if (stepped) queue.doubt_stamps(arrival_ns);
+    if (waited && source_timestamp && !stepped)
+      arrival_ns = std::min(arrival_ns, std::max(looked_ns_, *source_timestamp - offset));
+    if (next_phase_ && arrival_ns >= next_phase_->first) {
+      queue.phase_ns = next_phase_->second;
+      next_phase_.reset();
+    }
+    follow_moves();
+    auto full = queue.arrive(std::move(message), arrival_ns, stamp_ns, source_timestamp, lost);
+    if (full) overflowed.push_back(std::move(*full));
+  }
+
+  // Wait until the oldest message leaves, or is dropped; none: it was overflowed meanwhile.
+  std::optional<Outcome<Message>> hold() {
+    const std::uint64_t number = queue.waiting.front().number;
+    std::int64_t now = monotonic_ns();
+    turn_ns_ = now;  // before, this thread was busy with the message before it
+    Release release = queue.decide();
+    on_decision(release, queue.phase_ns);
+    bool slept = false;
+    if (release.at_ns) {
+      waited_ns_ = others_ran_ns();
+      slept = *release.at_ns > now;
+      while (*release.at_ns - spin_ns_ > now) {
+        sleep_until(std::min(*release.at_ns - spin_ns_, now + schema::look_ns));
+        look_again();
+        now = monotonic_ns();
+      }
+      if (!slept && queue.gate.messages == Messages::newest) look_again();
+      if (queue.waiting.front().number != number) return std::nullopt;
+      if (queue.replaced(release, now)) release.drop(Dropped::replaced);
+    }
+    if (release.at_ns) {
+      if (slept) on_waking(*release.at_ns);
+      // Awake in time: what other threads took before is of no consequence.
+      if (slept && monotonic_ns() < *release.at_ns) waited_ns_ = others_ran_ns();
+      now = watch_until(*release.at_ns);
+      if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, now)) {
+        release.drop(Dropped::discarded);
+        release.overrun = Policy::discard;
+      }
+    }
+    return Outcome<Message>{queue.leave(release, now), release, now};
+  }
+
+  bool nothing_due() { return nothing_due(monotonic_ns() + schema::others_ns); }
+
+  void rest(std::int64_t published_ns, std::int64_t pause_ns) {
+    queue.free_ns = published_ns;
+    look_again();
+    if (!nothing_due(published_ns + pause_ns)) return;
+    sleep_until(published_ns + pause_ns);
+    queue.free_ns = monotonic_ns();
+  }
+
+  std::int64_t time_lost(const Outcome<Message> & outcome) {
+    const std::int64_t others = others_ran_ns() - waited_ns_;
+    const std::int64_t since_ns = std::max(*outcome.release.at_ns, turn_ns_);
+    return std::max<std::int64_t>(0, outcome.awake_ns - since_ns - others);
+  }
+
+  Queue<Message> queue;
+  std::vector<Outcome<Message>> overflowed;  // since the owner has emptied it
+  std::function<void()> look = [] {};
+  std::function<std::optional<Move>()> moved = [] { return std::nullopt; };
+  std::function<void(std::int64_t)> on_waking = [](std::int64_t) {};
+  std::function<void(const Release &, std::int64_t)> on_decision = [](const auto &...) {};
+
+private:
+  bool nothing_due(std::int64_t until_ns) {
+    if (queue.waiting.empty()) return true;
+    const auto at_ns = queue.decide().at_ns;
+    return at_ns && *at_ns > until_ns + spin_ns_;
+  }
+
+  void look_again() {
+    const std::int64_t now = monotonic_ns();
+    look();
+    looked_ns_ = now;
+  }
+
+  std::int64_t others_ran_ns() {
+    const auto thread = static_cast<pid_t>(syscall(SYS_gettid));
+    if (thread != thread_) {  // the file is bound to who opened it
+      schedstat_ = File(open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC));
+      thread_ = thread;
+    }
+    char text[128];
+    const auto size =
+        schedstat_.is_open() ? pread(schedstat_.number(), text, sizeof(text) - 1, 0) : -1;
+    if (size <= 0) return monotonic_ns();
+    text[size] = '\0';
+    char * second = nullptr;
+    std::strtoll(text, &second, 10);
+    return std::strtoll(second, nullptr, 10);
+  }
+
+  std::int64_t spin_ns_;
+  std::int64_t offset_;
+  std::int64_t looked_ns_{0};
+  std::int64_t waited_ns_{0};
+  std::int64_t turn_ns_{0};
+  File schedstat_;
+  pid_t thread_{-1};
+  std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which
+};
+
+}  // namespace chainshaper

@@ -1,0 +1,564 @@
+"""Which process publishes a shaped output: the shaping node, or the standby beside it.
+
+The standby receives the same messages as the shaping node, and passes them on while that is not
+in force. For each one of the two is responsible, whenever either is killed, stopped or started:
+
+* The **lock** of a file says whether a shaping node is in force; the kernel frees it at the node's
+  death. The node takes it with the first message that it receives, when its output is ready; the
+  standby takes it for as long as it publishes.
+* The file itself is a **page** in memory that both map: which messages each of them has dealt with
+  (by their source timestamps), and until when the node may take for the one that it holds.
+
+What the node has received and not released when it dies, or hangs longer than a given patience, the
+standby publishes; what the standby has published, the node leaves out. What is left are the
+microseconds from a publication until it is noted, in which a death has it published again.
+
+Who has slots follow the latencies reads these in a third ring, and says there by how much slots are
+moved, for as long as it has a lock of its own: however it ends, they go back.
+
+Standard library only, as the gate; `handover.hpp`, the node's side in C++, has this layout.
+"""
+
+import fcntl
+import os
+import select
+import stat
+import struct
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+
+from chainshaper.robot.decision import DROPPED, Outcome, Release, Shaper, Waiting
+
+FIELDS = (
+    "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
+    "taken",  # how many messages shaping nodes have begun with
+    "first",  # the first message of the shaping node in force
+    "acknowledged",  # the same, once the standby has passed on all that came before it
+    "until_ns",  # what the node has in hand is released then; CLOCK_MONOTONIC, as all times here
+    "released",  # how many messages shaping nodes have dealt with: so many are in their ring
+    "phase_ns",  # where cycles begin; a node that its launch starts again goes on from there
+    "phase_known",
+    "mode",  # the mode in force, from 1 in their order; 0: there are no modes
+    "started_ns",  # when a shaping node started last
+    "failed_starts",  # how many did, shortly one after the other, and dealt with no message
+    "starts",  # of shaping nodes of this launch
+    "standby",  # the standby, a process id
+    "listening",  # 1: it has received a message, and so receives all that come behind it
+    "silent",  # 1: the standby passes nothing on, it counts what is lost
+    "bypassing_since_ns",  # 0: a shaping node is in force
+    "bypassed",  # how many messages the standby has dealt with: so many are in its ring
+    "bypassed_before",  # how many of these before the present time without a shaping node
+    "published",  # how many messages shaping nodes of this launch have published
+    *DROPPED,  # how many they have dropped, for each of the gate's reasons
+    "lost_by_dds",  # how many are missing in what they have received
+    "late",  # how many came behind the last slot that they were due in
+    "measured",  # how many latencies, from origin to arrival, are in their ring
+    "moved_ns",  # by how much slots are moved from where the gate has them,
+    "moved_from_ns",  # for cycles that begin then or later; 0: it is being written, or never was
+    "in_process",  # 1: the gate is in the publisher's process, which needs no standby,
+    "asked_phase_ns",  # and no ROS parameter: where its cycles are asked to begin,
+    "phases_asked",  # so often so far
+    "parent",  # of the shaping node that started last: the process that launched it
+)
+"""Numbers of 8 bytes at the beginning of a page, in this order."""
+
+VERSION = 3  # of the page's layout: part of its name
+RING = 1024
+RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings,
+TOPIC = 32 + 3 * RING  # and of the name
+TOPIC_BYTES = 256
+PUBLISHING, STANDING_BY, PASSING, MOVING = 0, 1, 2, 3
+"""The bytes of the file that are locked, for the rights to publish, to be the standby, to publish
+as the standby although the shaping node has the first, and to move slots."""
+_RINGS = {"released": RELEASED, "bypassed": BYPASSED, "measured": MEASURED}
+"""Each has the name under which the numbers in it are counted."""
+_COUNTS = ("starts", "published", *DROPPED, "lost_by_dds", "late")
+"""These begin at 0 with each launch: what a node did for another one is not this one's."""
+_AT = {name: place for place, name in enumerate(FIELDS)}
+_SIZE = 8 * TOPIC + TOPIC_BYTES
+_FLOCK = "hhqqi4x"  # struct flock: type, whence, start, length, process
+
+GIVE_UP_NS = 50_000_000  # a node waits so long for a standby, which needs the lock a moment only
+AT_ONCE_NS = 30_000_000_000  # a node that deals with no message for so long has not failed at once
+BACK_OFF_AFTER = 3  # so many starts may fail at once; each further one waits twice as long
+
+
+def page_folders() -> Iterator[str]:
+    """Where pages are, in memory, the best first: of root, of a login session, of any user."""
+    user, session = os.geteuid(), os.environ.get("XDG_RUNTIME_DIR")
+    if user == 0:
+        yield "/run/chainshaper/outputs"
+    elif session:
+        yield f"{session}/chainshaper/outputs"
+    yield f"/dev/shm/chainshaper-{user}"  # noqa: S108 - owner and mode are checked
+
+
+def open_page(name: str, topic: str) -> "Page":
+    """The page of an output: the one that is there, or else a new one; ``name`` is that for all who
+    publish the ``topic`` in this domain. OSError: no folder is ours alone, or the file is not.
+    """
+    domain = os.environ.get("ROS_DOMAIN_ID") or "0"
+    problem = OSError("no folder")
+    for flags in (0, os.O_CREAT):
+        for folder in page_folders():
+            try:
+                file = f"{name}.{int(domain)}.v{VERSION}"
+                return Page(_private(folder, flags), file, topic, os.O_RDWR | flags)
+            except (OSError, ValueError) as error:
+                problem = OSError(f"{folder}: {error}")
+    raise problem
+
+
+def _private(folder: str, flags: int) -> str:
+    """A folder that is ours alone, made where a page is to be. Raises OSError: it is not."""
+    if flags & os.O_CREAT:
+        _make_private(folder)
+    found = os.lstat(folder)
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.geteuid() or found.st_mode & 0o077:
+        raise PermissionError("it is not a folder of this user alone (mode 0700)")
+    return folder
+
+
+def _make_private(folder: str) -> None:
+    # Not writable by others, whatever the umask: pages of every output are found through it.
+    os.makedirs(os.path.dirname(folder), 0o755, exist_ok=True)  # noqa: PTH103, PTH120 - of a node's file
+    with suppress(FileExistsError):
+        os.mkdir(folder, 0o700)  # noqa: PTH102
+
+
+class Page:
+    """A page and its lock; numbers are read and written under the names of :data:`FIELDS`.
+
+    The file is read and written, never mapped: a process that maps a file which another one cuts,
+    or for which the disk has no room, is ended by SIGBUS. What is not there reads as 0, what cannot
+    be written is missing, and shaping goes on.
+    """
+
+    def __init__(
+        self, folder: str, name: str, topic: str | None = None, flags: int = os.O_RDONLY
+    ) -> None:
+        """With the ``flags`` of `open`; without a ``topic`` the page is only looked at, as it was
+        at the last :meth:`look`. In `/proc`, the folder of a process's open files, all are links.
+
+        Raises OSError: it cannot be opened, or it is not a file of the folder's owner. ValueError:
+        it is too short for a page.
+        """
+        self.path = f"{folder}/{name}"
+        flags |= os.O_CLOEXEC | os.O_NONBLOCK
+        if not folder.startswith("/proc/"):
+            flags |= os.O_NOFOLLOW
+        self._file = os.open(self.path, flags, 0o600)
+        self._seen: bytes | None = None
+        try:
+            found = os.fstat(self._file)
+            if not stat.S_ISREG(found.st_mode) or found.st_uid != os.lstat(folder).st_uid:
+                raise PermissionError(f"{name} is not a file of the folder's owner")
+            if topic is None:
+                self.look()
+            else:  # one for which there is no room is of no use to others
+                os.posix_fallocate(self._file, 0, _SIZE)
+                text = topic.encode()[:TOPIC_BYTES].ljust(TOPIC_BYTES, b"\0")
+                os.pwrite(self._file, text, 8 * TOPIC)
+        except BaseException:
+            os.close(self._file)
+            raise
+        self._identity, self.owner = (found.st_dev, found.st_ino), found.st_uid
+
+    def _read(self, at: int, size: int) -> bytes:
+        """So many bytes of the page from there on."""
+        content = b""
+        if self._seen is not None:
+            content = self._seen[at : at + size]
+        else:
+            with suppress(OSError):
+                content = os.pread(self._file, size, at)
+        return content.ljust(size, b"\0")
+
+    def _numbers(self, place: int, count: int) -> tuple[int, ...]:
+        return struct.unpack(f"={count}q", self._read(8 * place, 8 * count))
+
+    def _write(self, place: int, value: int) -> None:
+        with suppress(OSError):
+            os.pwrite(self._file, value.to_bytes(8, sys.byteorder, signed=True), 8 * place)
+
+    def __getitem__(self, field: str) -> int:
+        return self._numbers(_AT[field], 1)[0]
+
+    def __setitem__(self, field: str, value: int) -> None:
+        self._write(_AT[field], value)
+
+    def look(self) -> None:
+        """Read the page anew, for who only looks. ValueError: it has become shorter, or is gone."""
+        if not os.fstat(self._file).st_nlink:
+            raise ValueError(f"{self.path} was removed")
+        content = os.pread(self._file, _SIZE, 0)
+        if len(content) < _SIZE:
+            raise ValueError(f"{self.path} is no page of an output")
+        self._seen = content
+
+    def add(self, ring: str, value: int) -> None:
+        """Put a number into a ring, and count it."""
+        number = self[ring]
+        self._write(_RINGS[ring] + number % RING, value)
+        self[ring] = number + 1
+
+    def noted(self, ring: str) -> list[int]:
+        """The latest numbers of a ring, in no order."""
+        return [*self._numbers(_RINGS[ring], RING)]
+
+    def latest(self, ring: str, since: int) -> list[int]:
+        """The numbers of a ring behind the first ``since``, as far as they are there."""
+        last, numbers = self[ring], self.noted(ring)
+        return [numbers[number % RING] for number in range(max(since, last - RING), last)]
+
+    @property
+    def topic(self) -> str:
+        """The output."""
+        return self._read(8 * TOPIC, TOPIC_BYTES).rstrip(b"\0").decode(errors="replace")
+
+    @property
+    def is_current(self) -> bool:
+        """Whether others find the page whole: folders of a session go when its user logs out."""
+        try:
+            there = os.stat(self.path)  # noqa: PTH116
+        except OSError:
+            return False
+        return (there.st_dev, there.st_ino) == self._identity and there.st_size >= _SIZE
+
+    # Locks of open files (F_OFD_…): several in one file, each visible without taking it.
+
+    def lock(self, byte: int = PUBLISHING) -> bool:
+        """Take a right, if no process has it; it ends with the process."""
+        try:
+            self._ask(fcntl.F_OFD_SETLK, fcntl.F_WRLCK, byte)
+        except BlockingIOError:
+            return False
+        return True
+
+    def unlock(self, byte: int = PUBLISHING) -> None:
+        """Give the right back."""
+        self._ask(fcntl.F_OFD_SETLK, fcntl.F_UNLCK, byte)
+
+    def is_locked(self, byte: int = PUBLISHING) -> bool:
+        """Whether another process has the right."""
+        return self._ask(fcntl.F_OFD_GETLK, fcntl.F_WRLCK, byte) != fcntl.F_UNLCK
+
+    def _ask(self, command: int, kind: int, byte: int) -> int:
+        answer = fcntl.fcntl(self._file, command, struct.pack(_FLOCK, kind, 0, byte, 1, 0))
+        return int(struct.unpack(_FLOCK, answer)[0])
+
+    def close(self) -> None:
+        """Give up the page, and with it whatever it has locked."""
+        os.close(self._file)
+
+
+class Turn:
+    """The shaping node's side: whose turn it is to publish a message, which its source timestamp
+    names; where that is not known (None), none is left out.
+    """
+
+    def __init__(self, name: str, topic: str) -> None:
+        self._name, self._topic = name, topic
+        self._gave_up = self._move_back = False
+        self._open()
+        page, now = self.page, time.monotonic_ns()
+        if now - page["started_ns"] > AT_ONCE_NS:
+            page["failed_starts"] = 0
+        page["started_ns"] = now
+        page["starts"] += 1
+        page["failed_starts"] += 1
+
+    def _open(self) -> None:
+        page, parent = open_page(self._name, self._topic), os.getppid()
+        # Phase and mode are one launch's. All launches have one parent in some containers, and of
+        # systemd: there it is the same one if little time has passed.
+        idle_ns = abs(time.monotonic_ns() - page["until_ns"])
+        if parent != page["parent"] or idle_ns > AT_ONCE_NS:
+            page["mode"] = page["phase_known"] = 0
+            if not page.is_locked():  # by a node of another launch, whose counts they are
+                for count in _COUNTS:
+                    page[count] = 0
+        page["parent"] = parent
+        self.page, self._in_force = page, False
+        # Of the standby's messages: how many there were at the last look, and which.
+        self._seen, self._bypassed, self._oldest = -1, frozenset[int](), 0
+
+    @property
+    def wait_s(self) -> float:
+        """For how long to wait before starting: nodes before this one have failed at once."""
+        failed = self.page["failed_starts"] - 1 - BACK_OFF_AFTER
+        return (
+            0.0 if failed < 0 else min(10.0, 0.5 * 2 ** min(failed, 10))
+        )  # a page may say anything
+
+    def go_on(self, shaper: Shaper) -> None:
+        """Have cycles of a gate begin where they did for the one before it in the same launch, in
+        its mode; the page shows each decision, and says how slots are to be moved.
+        """
+        modes = [] if shaper.gate.modes is None else [*shaper.gate.modes.bands]
+
+        def decided(release: Release, phase_ns: int) -> None:
+            mode = 0 if release.mode is None else modes.index(release.mode) + 1
+            self.hold(release.at_ns, phase_ns, mode)
+
+        shaper.moved, shaper.on_decision = self.moved, decided
+        if self.page["phase_known"]:  # from now on, not the next cycle
+            shaper.set_phase(self.page["phase_ns"], time.monotonic_ns() - shaper.gate.cycle_ns)
+        if 0 < (mode := self.page["mode"]) <= len(modes):
+            shaper.switch(modes[mode - 1], 0)
+
+    def take(self, key: int | None) -> bool:
+        """Whether a message that was received is this node's to deal with."""
+        if not self._in_force and not self._come_into_force(key):
+            return False
+        self.page["until_ns"] = time.monotonic_ns()
+        self.page["taken"] += 1
+        return not self.was_bypassed(key)
+
+    def hold(self, until_ns: int | None, phase_ns: int, mode: int = 0) -> None:
+        """The message is released then (None: never); ``mode`` from 1, 0: there are no modes."""
+        self.page["mode"] = mode
+        if until_ns is not None:
+            self.page["until_ns"] = until_ns
+        self.page["phase_ns"], self.page["phase_known"] = phase_ns, 1
+
+    def was_bypassed(self, key: int | None) -> bool:
+        """Whether the standby has dealt with a message."""
+        count = self.page["bypassed"]
+        if count != self._seen:
+            # What the standby is about to publish comes first.
+            give_up = time.monotonic_ns() + GIVE_UP_NS
+            while self.page.is_locked(PASSING) and time.monotonic_ns() < give_up:
+                time.sleep(0.0001)
+            self._bypassed = frozenset(self.page.noted("bypassed"))
+            if self._seen >= 0 and count - self._seen > RING:
+                self._oldest = min(self._bypassed)  # older ones were, too
+            self._seen = count
+        if key is None or (key not in self._bypassed and key >= self._oldest):
+            self._oldest = 0  # what comes now is newer, even if the clock is set back
+            return False
+        self.page["taken"] += 1  # so this node does not hang any more
+        return True
+
+    def done(self, key: int | None) -> None:
+        """A message has been published or discarded."""
+        self.page.add("released", key or 0)
+        self.page["until_ns"] = time.monotonic_ns()
+        self.page["failed_starts"] = 0
+        if not self.page.is_current:
+            left = self.page
+            with suppress(OSError):  # without a folder this page has to do
+                self._open()
+                self._move_back = left["moved_from_ns"] != 0
+                for one in left.noted("released"):  # a standby that lags has to know them
+                    self.page.add("released", one)
+                left.close()
+
+    def moved(self) -> tuple[int, int] | None:
+        """How slots are to be moved, for :meth:`.Shaper.move_slots` (None: as they are): back, if
+        the process that moved them is not there any more, or on a page that was left.
+        """
+        if self._move_back:
+            self._move_back = False
+            return 0, time.monotonic_ns()
+        since, by = self.page["moved_from_ns"], self.page["moved_ns"]
+        if since == 0 or since != self.page["moved_from_ns"]:
+            return None
+        return (by, since) if self.page.is_locked(MOVING) else (0, time.monotonic_ns())
+
+    def count(self, outcome: Outcome) -> None:
+        """A message has been published or dropped: it counts, and its latency to its arrival."""
+        message, release = outcome.message, outcome.release
+        self.page.add("measured", message.arrival_ns - release.origin_ns)
+        self.page[release.dropped or "published"] += 1
+        self.page["lost_by_dds"] += message.lost or 0
+        self.page["late"] += release.overrun is not None
+
+    def _come_into_force(self, key: int | None) -> bool:
+        page, give_up = self.page, time.monotonic_ns() + GIVE_UP_NS
+        while not page.lock():
+            holder = page["holder"]
+            if holder not in (0, os.getpid()) and os.path.exists(f"/proc/{holder}"):  # noqa: PTH110
+                return False  # another shaping node is in force
+            if self._gave_up or time.monotonic_ns() > give_up:
+                self._gave_up = True  # the standby was stopped while it published
+                break
+            time.sleep(0.001)
+        else:
+            self._in_force, self._gave_up = True, False
+        page["until_ns"] = time.monotonic_ns()
+        page["first"], page["holder"] = key or 0, os.getpid()
+        # A standby still deals with what came before this node's first message.
+        if page["listening"] and key is not None and not self._gave_up:
+            while page.is_locked(STANDING_BY) and time.monotonic_ns() < give_up:
+                if key == page["acknowledged"] or key in page.noted("bypassed"):
+                    break
+                time.sleep(0.0002)
+        return True
+
+
+class Standby:
+    """The standby's side: passes messages on while no shaping node is in force.
+
+    ``publish`` gets the payload, the source timestamp and the arrival of each message that is
+    passed on; ``changed`` a text when a shaping node goes or is back. One that is late by more than
+    ``patience_ns`` is taken to hang. ``silent``: others are told that ``publish`` does not.
+    """
+
+    def __init__(  # noqa: PLR0917 - each is used once
+        self,
+        name: str,
+        topic: str,
+        publish: Callable[[bytes, int | None, int], None],
+        changed: Callable[[str], None],
+        patience_ns: int,
+        depth: int = 1000,
+        *,
+        silent: bool = False,
+    ) -> None:
+        self._name, self._topic, self._publish = name, topic, publish
+        self._changed, self._patience_ns = changed, patience_ns
+        self._pending: deque[Waiting] = deque(maxlen=depth)  # about: the source timestamp, or 0
+        self._mutex = threading.Lock()
+        self._why = ""
+        self._silent = silent
+        self._woken, self._wake = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self._open()
+
+    def _open(self) -> None:
+        self.page = open_page(self._name, self._topic)
+        give_up = time.monotonic() + 1.0
+        while not self.page.lock(STANDING_BY):
+            if time.monotonic() > give_up:
+                raise OSError(f"{self.page.path}: another process is the standby of this output")
+            time.sleep(0.01)
+        self.page["standby"], self.page["listening"] = os.getpid(), 0
+        self.page["bypassing_since_ns"], self.page["silent"] = 0, int(self._silent)
+        self._stuck_at = -1  # what the node had taken when it was found to hang
+
+    def arrived(self, payload: bytes, key: int | None) -> None:
+        """A message has come, for the shaping node and for the standby alike."""
+        now = time.monotonic_ns()
+        with self._mutex:
+            self._follow()
+            self.page["listening"] = 1
+            self._pending.append(Waiting(payload, now, None, 0, about=key or 0))
+            if key is not None:
+                self._look(now)
+            elif self._none_in_force():
+                self._pass_on(len(self._pending))
+                self.page.unlock()
+            else:
+                self._pending.clear()  # what the shaping node holds is lost with it
+        with suppress(BlockingIOError):
+            os.write(self._wake, b".")
+
+    def look(self) -> None:
+        """See whether the shaping node still does what it has to."""
+        with self._mutex:
+            self._follow()
+            self._look(time.monotonic_ns())
+
+    def _follow(self) -> None:
+        """Go to the new page, where this one was removed and the shaping node has left it."""
+        left = self.page
+        if not left.is_current and not left.is_locked():
+            with suppress(OSError):
+                self._forget()  # a new page knows of nothing
+                self._open()
+                left.close()
+
+    def watch(self) -> None:
+        """Look when the shaping node dies, and when it should have released a message; for ever."""
+        gone = 0  # a process stays readable as one that has ended until its parent takes note
+        while True:
+            with self._mutex:  # the page may be left meanwhile
+                self._forget()
+                holder = self.page["holder"]
+                left_ms = -1 if holder else 1000
+                if self._pending:
+                    left_ms = max(1, (self._due_ns() - time.monotonic_ns()) // 1_000_000 + 1)
+            poll, died = select.poll(), -1
+            poll.register(self._woken, select.POLLIN)
+            with suppress(OSError):  # there is no such process
+                if holder not in (0, gone):
+                    died = os.pidfd_open(holder)
+                    poll.register(died, select.POLLIN)
+            ended = (died, select.POLLIN) in poll.poll(left_ms)
+            with suppress(BlockingIOError):
+                os.read(self._woken, 4096)
+            if died >= 0:
+                os.close(died)
+            self.look()
+            if ended:
+                gone = holder
+                time.sleep(0.001)  # another node with its lock is about to say so
+
+    def _due_ns(self) -> int:
+        """When the shaping node is too late with what it has to do."""
+        return max(self.page["until_ns"], self._pending[0].arrival_ns) + self._patience_ns
+
+    def _look(self, now: int) -> None:
+        alone = self._none_in_force()
+        self._forget()
+        taken = self.page["taken"]
+        if alone:
+            self._gone("is not there")
+            self._pass_on(len(self._pending))
+            self.page.unlock()
+        elif self._pending and (now > self._due_ns() or taken == self._stuck_at):
+            self._stuck_at = taken
+            self._gone("is late for its own release: it hangs, or was stopped")
+            self.page.lock(PASSING)
+            for waiting in self._pending:  # the node is there, and could go on at any time
+                self.page.add("bypassed", waiting.about)
+            self._pass_on(len(self._pending), noted=True)
+            self.page.unlock(PASSING)
+        elif taken != self._stuck_at:
+            self._back()
+            # What came before the first message of the node in force came to this process alone.
+            first, keys = self.page["first"], [waiting.about for waiting in self._pending]
+            if first != self.page["acknowledged"] and first in keys:
+                self._pass_on(keys.index(first))
+                self.page["acknowledged"] = first
+
+    def _none_in_force(self) -> bool:
+        """Take the lock, if no shaping node has it."""
+        if not self.page.lock():
+            return False
+        self.page["holder"] = 0
+        return True
+
+    def _forget(self) -> None:
+        """Leave out what was dealt with, and what came before: order is not to be broken."""
+        known = {*self.page.noted("released"), *self.page.noted("bypassed")}
+        dealt_with = [place for place, one in enumerate(self._pending, 1) if one.about in known]
+        for _ in range(max(dealt_with, default=0)):
+            self._pending.popleft()
+
+    def _pass_on(self, count: int, *, noted: bool = False) -> None:
+        for _ in range(count):
+            waiting = self._pending.popleft()
+            self._publish(waiting.payload, waiting.about or None, waiting.arrival_ns)
+            if not noted:
+                self.page.add("bypassed", waiting.about)
+
+    def _gone(self, why: str) -> None:
+        if not self.page["bypassing_since_ns"]:
+            self.page["bypassed_before"] = self.page["bypassed"]
+            self.page["bypassing_since_ns"] = time.monotonic_ns()
+            self._why = ""
+        if why != self._why:
+            self._changed(why)
+            self._why = why
+
+    def _back(self) -> None:
+        if since := self.page["bypassing_since_ns"]:
+            self.page["bypassing_since_ns"] = 0
+            passed = self.page["bypassed"] - self.page["bypassed_before"]
+            after_s = (time.monotonic_ns() - since) / 1e9
+            self._changed(f"is back after {after_s:.2f} s, in which {passed} messages came")

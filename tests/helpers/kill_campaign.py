@@ -1,0 +1,556 @@
+"""Kill whatever runs, at any instant, among odd names and on full disks, and see what is left.
+
+    python tests/helpers/kill_campaign.py [--kills 20] [--seed 1] [--seconds 600] [--verbs NAME…]
+                                  [--lanes 1] [--core N] [--pause-while FILE]
+
+Each case starts a verb, beside a node that a plan may govern, and kills or stops one or two of its
+processes at a random instant while it runs. Afterwards no thread may be frozen or real-time, no
+process, group or journal of the run may be left, nothing in /run, /dev/shm and /tmp, and no output
+that cannot be read; what is hidden beside an output, `release` must remove or name. It prints a
+line of JSON for each case, and one with the sums; a case is repeated by its own seed (`--seed SEED
+--kills 1`). A case whose verb had ended before the kill is counted as `too late`, and not as a
+kill.
+
+Python's own traceback is a finding, but for Ctrl-C before the first line of ours could run: until
+then the interpreter has its own handler, which no program can replace (`before our first line`).
+
+All of it is in namespaces of its own for processes, mounts, networks and groups, one set a lane:
+needs root, and harms no others. It has threads of the machine under SCHED_FIFO, so nothing that
+measures should run beside it; it pauses between two cases while the FILE exists.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import uuid
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+HERE = Path(__file__).parent
+CLI = [sys.executable, "-m", "chainshaper"]
+WORK, SMALL = Path("/mnt"), "3m"
+TIDY_S = 40.0
+"""Until all is as before: a guardian has a tenth of a second, a busy machine much more."""
+INSIDE = "CHAINSHAPER_KILL_CAMPAIGN"
+EMPTY = (Path("/dev/shm"), Path("/tmp"))
+LONGEST_S = 12.0
+"""A kill comes this long after the start at most, or when the verb has ended, as seen before."""
+_EMITS = """
+import ctypes, signal, time
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # its traceback would pass for one of ours
+libc = ctypes.CDLL(None)
+libc.prctl(15, b"n\\xc3\\xa4\\xc3", 0, 0, 0)
+libc.ros_trace_rcl_node_init(ctypes.c_uint64(1), None, b"n\\xfc", b"/")
+for n in range(3000):
+    libc.ros_trace_rcl_take(ctypes.c_uint64(n))
+    time.sleep(0.001)
+"""
+
+
+LIVE = """
+name: short
+chain: /a../b
+scheduling:
+  executors: {core: CORE, priority: 40}
+  dds: {core: CORE, priority: 50}
+nodes:
+  first:
+    callbacks:
+      - {timer: 20ms, execution: {constant: 200us}, publishes: [/a]}
+  second:
+    callbacks:
+      - {subscription: /a, execution: {constant: 200us}, publishes: [/b]}
+  last:
+    callbacks:
+      - {subscription: /b, execution: {constant: 100us}}
+topics:
+  /b: {publication: synchronous, reliability: reliable, depth: 10, payload: 64}
+"""
+_PAIR = """
+import subprocess, sys
+folder, program = sys.argv[1:]
+words = [sys.executable, program, folder]
+pair = [
+    subprocess.Popen([*words, what, "t5", port, "2000000"], stdout=subprocess.DEVNULL)
+    for what, port in (("shaping", "7001"), ("standby", "7002"))
+]
+for process in pair:
+    process.wait()
+"""
+_LAUNCH = """
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+def generate_launch_description():
+    return LaunchDescription([Node(package="p", executable="node5", name="node5")])
+"""
+
+
+@dataclass
+class Case:
+    """One kill: what is started, whether on a full disk, and what is left behind it."""
+
+    seed: int
+    verb: str
+    full: str = ""
+    kill: str = ""
+    faults: list[str] = field(default_factory=list)
+    left: list[str] = field(default_factory=list)
+
+
+def command(verb: str, words: list[str]) -> list[str]:
+    """How a verb is started: the command line's, and two nodes of an output."""
+    if verb == "handover":
+        return [sys.executable, "-c", _PAIR, *words]
+    return [*CLI, *words]
+
+
+def verbs(folder: Path) -> dict[str, tuple[list[str], Path | None]]:
+    """The words of each verb, and what it writes."""
+    application, recording, plan = (folder / name for name in ("app.yaml", "rec", "plan.yaml"))
+    servers, output = str(folder / "servers.yaml"), WORK / "small" / os.fsdecode(b"out\xfc)\n")
+
+    def writing(ending: str, *words: object) -> tuple[list[str], Path]:
+        place = output.with_name(output.name + ending)
+        return [*map(str, words), "-o", str(place)], place
+
+    emitting = ("--", sys.executable, "-c", _EMITS)
+    words, place = writing("", "record", "--source", "preload")
+    live, live_plan, budget = (folder / name for name in ("live.yaml", "lplan.yaml", "budget.yaml"))
+    package, figures = WORK / "small" / "pkg", WORK / "small" / "figures"
+    watch = ("watch", "--every", "100ms", "--json", "--recorder", str(WORK / "small"))
+    shape = ("shape", live, live_plan, "--cycles", 60)
+    adapt = ("--backend", "fifo", "--adapt")
+    return {
+        "version": (["--version"], None),
+        "info": (["info", str(recording)], None),
+        "callbacks": (["callbacks", str(recording), "--json"], None),
+        "chains": (["chains", str(recording)], None),
+        "latency": (["latency", str(recording), "--json", "--instances"], None),
+        "init": writing(".yaml", "init"),
+        "run": writing("", "run", live, "--cycles", 60),
+        "shape": writing("", *shape),
+        "shape-adapt": writing("", *shape, "--adapt"),
+        "apply-adapt": (["apply", servers, *adapt, "--phase", "0ms"], None),
+        "watch": ([*watch, *emitting], None),
+        "watch-plan": ([*watch, "--plan", str(plan), *emitting], None),
+        "watch-metrics": ([*watch, "--metrics", "9464", *emitting], None),
+        "watch-budget": ([*watch, "--budget", str(budget), *emitting], None),
+        "generate": (["generate", str(application), "-o", str(package)], package),
+        "describe": writing(".yaml", "describe", recording),
+        "compare": (["compare", *[str(recording)] * 2, "--figures", str(figures)], figures),
+        "budget": writing(".yaml", "budget", recording),
+        "check": (
+            ["check", str(recording), "--budget", str(budget), "--junit", f"{output}.xml"],
+            output.with_name(output.name + ".xml"),
+        ),
+        "splice": (
+            ["splice", str(plan), str(folder / "app.launch.py"), "-o", str(package)],
+            package,
+        ),
+        "plan-bands": writing(".yaml", "plan", recording, "--bands", 2, "--solver", "pso"),
+        "demo": (
+            ["demo", "--application", str(live), "--cycles", "60", "-o", str(WORK / "small" / "d")],
+            None,
+        ),
+        "profile": writing(
+            "", "profile", "--node", "first", "--source", "preload", "--core", core(), *emitting
+        ),
+        "handover": ([str(WORK / "pages"), str(HERE.parent / "robot" / "output_process.py")], None),
+        "apply": (["apply", servers, "--backend", "freezer", "--phase", "0ms"], None),
+        "apply-fifo": (["apply", servers, "--backend", "fifo", "--phase", "0ms"], None),
+        "record": ([*words, *emitting], place),
+        "simulate": writing("", "simulate", application, "--cycles", 300),
+        "sweep": writing(
+            ".parquet", "sweep", application, "--cycles", 2000, "--vary", "bands=1,2,3"
+        ),
+        "plan": writing(".yaml", "plan", recording),
+        "report": writing(".html", "report", recording),
+        "graph": writing(".svg", "graph", recording),
+        "convert": writing("", "convert", recording),
+        "export": writing(".pftrace", "export", recording, "--perfetto"),
+        "offsets": writing(".yaml", "offsets", plan),
+        "status": (["status"], None),
+        "release": (["release"], None),
+        "threads": (["threads"], None),
+        "doctor": (["doctor", "--watch", "200ms"], None),
+    }
+
+
+def core() -> int:
+    """Where the live workload's executors run."""
+    return max(os.sched_getaffinity(0))
+
+
+def write_inputs(folder: Path) -> None:
+    """A description, a recording and plans."""
+    from applied_plans import plan_for, server
+
+    from chainshaper.planning import save_plan
+
+    save_plan(plan_for(server("first", "victim", (0, 30))), folder / "servers.yaml")
+    (folder / "live.yaml").write_text(LIVE.replace("CORE", str(core())))
+    (folder / "app.launch.py").write_text(_LAUNCH)
+    for words in (
+        ("simulate", "live.yaml", "--cycles", "200", "-o", "lrec"),
+        ("plan", "lrec", "-o", "lplan.yaml"),
+        ("init", "-o", "app.yaml"),
+        ("simulate", "app.yaml", "--cycles", "200", "-o", "rec"),
+        ("plan", "rec", "-o", "plan.yaml"),
+        ("budget", "rec", "-o", "budget.yaml"),
+    ):
+        subprocess.run([*CLI, *words], cwd=folder, check=True, capture_output=True)
+
+
+def mount_disks() -> None:
+    """A small disk for outputs, and mount points of odd names."""
+    from odd_names import ODD_NAMES
+
+    (WORK / "small").mkdir()
+    subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", f"size={SMALL}", "none", WORK / "small"], check=True
+    )
+    for number, name in enumerate(ODD_NAMES):
+        place = WORK / f"{number}{os.fsdecode(name.replace(b'/', b''))}"
+        place.mkdir()
+        mount(place, SMALL)
+
+
+def mount(folder: Path, size: str) -> None:
+    words = ["mount", "-t", "tmpfs", "-o", f"size={size}", "none", str(folder)]
+    subprocess.run(words, check=True)
+
+
+def writes() -> bool:
+    """Whether the verb has begun to write: an output, a temporary file."""
+    places = (one for folder in (WORK / "small", *EMPTY) for one in folder.iterdir())
+    return any(one.name != "filling" for one in places)
+
+
+def output_of() -> bytes:
+    """What the verb has printed so far."""
+    return (WORK / "said").read_bytes()
+
+
+@contextlib.contextmanager
+def filled(folder: Path) -> Iterator[None]:
+    """A disk on which there is no room."""
+    filling = folder / "filling"
+    with contextlib.suppress(OSError), filling.open("wb", buffering=0) as file:
+        while file.write(bytes(1 << 16)):
+            pass
+    try:
+        yield
+    finally:
+        filling.unlink()
+
+
+class Victim:
+    """A node in a group of its own that is no text, which everything is to leave as it was."""
+
+    def __init__(self) -> None:
+        from applied_plans import node_command, scheduling
+
+        from chainshaper.linux.cgroups import mount_point
+
+        self.group = mount_point() / os.fsdecode(b"victim\xfc-%d" % random.getrandbits(32))
+        self.group.mkdir()
+        output = WORK / "victim"
+        self.process = subprocess.Popen(node_command("victim", output, 10_000_000, 1_000_000))
+        (self.group / "cgroup.procs").write_text(str(self.process.pid))
+        wait(lambda: output.exists() and output.stat().st_size > 0, 30)
+        self.before = scheduling(self.process.pid)
+
+    def changed(self) -> list[str]:
+        """What is not as it was."""
+        from applied_plans import scheduling
+        from gated import cpu_ns
+
+        pid, said = self.process.pid, []
+        if (now := scheduling(pid)) != self.before:
+            said.append(f"the node's scheduling is {now}, and was {self.before}")
+        said += [f"the group {one.name} is left" for one in self.group.iterdir() if one.is_dir()]
+        ran = cpu_ns(pid)
+        if not wait(lambda: cpu_ns(pid) > ran, 2):
+            said.append("the node does not run")
+        return said
+
+    def end(self) -> None:
+        self.process.kill()
+        self.process.wait()
+        wait(lambda: not _removed(self.group), 5)
+
+
+def _removed(group: Path) -> bool:
+    with contextlib.suppress(OSError):
+        group.rmdir()
+    return group.exists()
+
+
+def wait(condition: Callable[[], bool], seconds: float) -> bool:
+    """Whether it comes true before the time is over."""
+    deadline = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.02)
+    return True
+
+
+def run_case(case: Case, folder: Path, victim: Victim, longest: dict[str, float]) -> None:
+    """Start the verb, kill, and look."""
+    from processes import marked_processes
+
+    chance, marker = random.Random(case.seed), f"CASE={uuid.uuid4().hex}"
+    words, output = verbs(folder)[case.verb]
+    environment = {**os.environ, **dict([marker.split("=")])}
+    with contextlib.ExitStack() as disks:
+        case.full = chance.choice(("", "", "", "its disk", "/run"))
+        if case.full:
+            disks.enter_context(filled(WORK / "small" if case.full == "its disk" else Path("/run")))
+        began = time.monotonic()
+        with (WORK / "said").open("wb") as said:
+            process = subprocess.Popen(
+                command(case.verb, words),
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+            )
+        in_force = case.verb.startswith("apply") and chance.random() < 0.7
+        if in_force:
+            wait(lambda: b"in force" in output_of() or process.poll() is not None, 30)
+            time.sleep(chance.uniform(0, 0.5))
+        elif output is not None and chance.random() < 0.5:
+            wait(lambda: writes() or process.poll() is not None, 60)
+            time.sleep(chance.uniform(0, 0.3))
+        else:
+            most = longest.get(case.verb, LONGEST_S)
+            wait(lambda: process.poll() is not None, chance.uniform(0, most))
+        if process.poll() is not None:
+            longest[case.verb] = time.monotonic() - began
+        pids = marked_processes(marker)
+        case.kill = "a kill" if pids else "too late"
+        chosen = {process.pid} & {*pids} if chance.random() < 0.7 else set[int]()
+        if pids and (not chosen or chance.random() < 0.6):
+            chosen.add(chance.choice(sorted(pids)))
+        if case.verb == "handover" and chance.random() < 0.7:  # both nodes at once
+            chosen = {*pids} - {process.pid}
+        number = chance.choice((signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGINT))
+        stops = chance.random() < 0.3
+        for pid in chosen:
+            name = "the verb" if pid == process.pid else pids[pid]
+            case.faults.append(f"{'SIGSTOP, then ' if stops else ''}{number.name} to {name}")
+            for one in (signal.SIGSTOP, number) if stops else (number,):
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(pid, one)
+        if not wait(lambda: process.poll() is not None, 2):
+            with contextlib.suppress(ProcessLookupError):  # stopped, or it had another killed
+                os.kill(process.pid, signal.SIGKILL)
+                case.faults.append("SIGKILL to the verb")
+        process.wait()
+    look_behind(case, victim, marker, output)
+    for pid in marked_processes(marker):
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def look_behind(case: Case, victim: Victim, marker: str, output: Path | None) -> None:
+    """Note what is left when there was time enough, and `release` has had its turn."""
+    from processes import marked_processes
+
+    def orphans() -> list[str]:
+        pids = marked_processes(marker)
+        if case.verb == "handover":  # the nodes of a robot outlive who has started them
+            for pid in pids:
+                os.kill(pid, signal.SIGKILL)
+            pids = {}
+        return [f"{name} ({pid}) runs" for pid, name in pids.items()]
+
+    wait(lambda: not orphans() and not victim.changed(), TIDY_S)
+    small = WORK / "small"
+    for place in (small, *EMPTY):
+        for one in place.iterdir():  # as if time had passed, for what has just been made is left
+            os.utime(one, (time.time() - 60,) * 2, follow_symlinks=False)
+    released = subprocess.run([*CLI, "release"], capture_output=True, check=False, cwd=small)
+    if b"Traceback" in released.stderr:
+        case.left.append(f"release: {released.stderr.decode(errors='replace')[-900:]}")
+    case.left += orphans() + victim.changed()
+    if (said := output_of()) and b"Traceback" in said:
+        case.left += tracebacks(case, said)
+    for place in EMPTY:  # the folder of pages of a user stays where /run had no room
+        left = [one for one in place.iterdir() if one.name != f"chainshaper-{os.geteuid()}"]
+        case.left += [f"{one} is left" for one in left]
+    runs = Path("/run/chainshaper")
+    pages = [*(runs / "outputs").iterdir()] if (runs / "outputs").is_dir() else []
+    if runs.is_dir():
+        case.left += [f"{one} is left" for one in runs.iterdir() if one.name != "outputs"]
+    for one in pages:
+        case.left.append(f"the page {one} is left")
+        one.unlink()
+    for one in small.iterdir():
+        mark = one.name.rpartition(".tracing-")
+        named = mark[1] and mark[2].encode() in released.stderr
+        if one.name.startswith(".") and not named:
+            case.left.append(f"beside the output: {one.name!r}")
+    if output is not None:
+        case.left += half_written(output)
+    for place in (small, *EMPTY):
+        for one in place.iterdir():
+            subprocess.run(["rm", "-rf", str(one)], check=True)
+
+
+_FRAME = re.compile(r'File "([^"]+)"')
+
+
+def tracebacks(case: Case, said: bytes) -> Iterator[str]:
+    """Tracebacks of ours; those of Ctrl-C before our first line are noted as what they are."""
+    text = said.decode(errors="replace")
+    for trace in text.split("Traceback (most recent call last)")[1:]:
+        frames = [name for name in _FRAME.findall(trace) if "/chainshaper/" in name]
+        early = all(name.endswith(("chainshaper/__init__.py", "__main__.py")) for name in frames)
+        asked = any("SIGINT" in one for one in case.faults) or 'File "<string>"' in trace
+        if "KeyboardInterrupt" in trace and early and asked:  # that string is the application
+            case.faults.append("a traceback before our first line")
+        else:
+            yield f"a traceback: {trace[-1500:]}"
+
+
+_WHOLE = {".html": b"</html>", ".svg": b"</svg>", ".xml": b">", ".yaml": b"\n"}
+
+
+def half_written(output: Path) -> Iterator[str]:
+    """What stands where an output was to be, and is none."""
+    import polars as pl
+
+    if output.is_dir() and output.name == "figures":
+        for one in output.iterdir():
+            if not one.read_bytes().endswith(b"IEND\xaeB`\x82"):
+                yield f"half a figure: {one}"
+    elif output.is_dir() and output.name == "pkg":
+        if empty := [one for one in output.rglob("*") if one.is_file() and not one.stat().st_size]:
+            yield f"an empty file in a package: {empty}"
+        if not [*output.iterdir()]:
+            yield "an empty package"
+    elif output.is_dir():
+        read = subprocess.run([*CLI, "info", str(output)], capture_output=True, check=False)
+        if read.returncode:
+            yield f"half an output: {read.stderr.decode(errors='replace')[-200:]}"
+    elif output.suffix == ".parquet" and output.exists():
+        pl.read_parquet(output.read_bytes())  # its name may be no text
+    elif output.exists():
+        content = output.read_bytes()
+        if not content or not content.rstrip(b" ").endswith(_whole_end(output, content)):
+            yield f"{output.name!r} is not whole: it ends in {content[-40:]!r}"
+
+
+def _whole_end(output: Path, content: bytes) -> bytes:
+    end = _WHOLE.get(output.suffix, b"")
+    return end + b"\n" if content.endswith(b"\n") and not end.endswith(b"\n") else end
+
+
+def own_namespaces(lane: int, inputs: str) -> subprocess.Popen[bytes]:
+    """Start a lane: this script again, in namespaces and in a group of its own."""
+    from chainshaper.linux.cgroups import mount_point
+
+    group = mount_point() / f"kills-{os.getpid()}-{lane}"
+    group.mkdir()
+    apart = ("--mount", "--propagation", "private", "--pid", "--fork", "--kill-child")
+    words = ["unshare", *apart, "--mount-proc", "--net", "--cgroup", sys.executable, __file__]
+    enter = 'echo 0 > "$0/cgroup.procs"; exec "$@"'
+    return subprocess.Popen(
+        ["sh", "-c", enter, str(group), *words, *sys.argv[1:]],
+        env={**os.environ, INSIDE: f"{lane} {inputs}"},
+        start_new_session=True,  # cores are shared out by sessions
+    )
+
+
+def main() -> None:
+    arguments = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    arguments.add_argument("--kills", type=int, default=20, help="how many, of each lane")
+    arguments.add_argument("--seed", type=int, default=1)
+    arguments.add_argument("--seconds", type=float, default=600.0, help="no case begins later")
+    arguments.add_argument("--verbs", nargs="+", help="of these alone; apply alone is real-time")
+    arguments.add_argument("--lanes", type=int, default=1, help="so many cases side by side")
+    arguments.add_argument("--core", type=int, help="run on this core alone")
+    arguments.add_argument("--pause-while", type=Path, metavar="FILE")
+    given = arguments.parse_args()
+    if given.core is not None:
+        os.sched_setaffinity(0, {given.core})
+    if INSIDE not in os.environ:
+        with tempfile.TemporaryDirectory(dir="/var/tmp") as inputs:  # seen in all lanes
+            write_inputs(Path(inputs))
+            lanes = [own_namespaces(lane, inputs) for lane in range(given.lanes)]
+            codes = [lane.wait() for lane in lanes]
+        from chainshaper.linux.cgroups import mount_point
+
+        for lane in range(given.lanes):
+            group = mount_point() / f"kills-{os.getpid()}-{lane}"
+            wait(lambda group=group: not _removed(group), 5)  # type: ignore[misc]
+        sys.exit(any(codes))
+    number, _, inputs = os.environ.pop(INSIDE).partition(" ")
+    sys.exit(run_lane(given, int(number), Path(inputs)))
+
+
+def _remove_groups(folder: Path) -> None:
+    for one in folder.iterdir():
+        if one.is_dir():
+            _remove_groups(one)
+            _removed(one)
+
+
+def run_lane(given: argparse.Namespace, lane: int, folder: Path) -> bool:
+    """Cases one after the other, in namespaces of their own: whether something was left."""
+    from chainshaper.linux.cgroups import mount_point
+
+    pause = given.pause_while and os.open(given.pause_while.parent, os.O_RDONLY | os.O_DIRECTORY)
+    groups = mount_point()
+    for words in (
+        ["umount", str(groups)],
+        ["mount", "-t", "cgroup2", "none", str(groups)],
+        ["ip", "link", "set", "lo", "up"],
+    ):
+        subprocess.run(words, check=True)
+    for place, size in ((Path("/run"), "256k"), (WORK, "64m"), *((one, "64m") for one in EMPTY)):
+        mount(place, size)
+    sums, until = Counter[str](), time.monotonic() + given.seconds
+    mount_disks()
+    names = given.verbs or sorted(verbs(folder))
+    longest, victim = dict[str, float](), Victim()
+    for seed in range(given.seed + lane * given.kills, given.seed + (lane + 1) * given.kills):
+        while pause is not None and given.pause_while.name in os.listdir(pause):  # noqa: PTH208
+            time.sleep(1)
+        if time.monotonic() > until:
+            break
+        case = Case(seed, names[seed % len(names)])
+        run_case(case, folder, victim, longest)
+        sums[case.kill] += 1
+        sums[f"{case.kill} of {case.verb}"] += 1
+        sums["cases with something left"] += bool(case.left)
+        sums["before our first line"] += "a traceback before our first line" in case.faults
+        sys.stdout.write(json.dumps(vars(case)) + "\n")
+        sys.stdout.flush()
+        if case.left:
+            victim.end()
+            victim = Victim()
+    victim.end()
+    _remove_groups(groups)
+    sys.stdout.write(json.dumps(sums) + "\n")
+    return bool(sums["cases with something left"])
+
+
+if __name__ == "__main__":
+    sys.path.insert(0, str(HERE))
+    main()
