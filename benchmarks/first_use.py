@@ -4,8 +4,8 @@
 
 Each round makes a fresh home and runs every verb in it (those of `tests/helpers/every_verb.py`,
 but the live ones, which last as long as they are told), and then all again in the same home.
-Medians are printed (ms of wall time, and of the CPU time of all its processes, which a busy machine changes
-less). The first use is no slower than the second where nothing is compiled or cached at it.
+Medians are printed (ms of wall time, and of the CPU time of all its processes, which a busy machine
+changes less). The first use is no slower than the second where nothing is compiled or cached at it.
 """
 
 import importlib.util
