@@ -81,16 +81,15 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
-def warn(plan: "cs.Plan | cs.ApplicationPlan", node: "NodeKind | None" = None) -> None:
+def warn(plan: "cs.Plan", node: "NodeKind | None" = None) -> None:
     """What is doubtful about a plan, before it is used; and what such a ``node`` would cost."""
     from chainshaper.planning import plan_warnings
-    from chainshaper.planning.application_plan import whole
 
-    notes(plan_warnings(*whole(plan).chains))
+    notes(plan_warnings(*plan.chains))
     if node is not None:
         from chainshaper.splicing.shaping_process import zero_copy_lost
 
-        notes(zero_copy_lost(whole(plan), node))
+        notes(zero_copy_lost(plan, node))
 
 
 @contextmanager

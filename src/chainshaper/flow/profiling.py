@@ -20,7 +20,7 @@ from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import Process
 from chainshaper.linux.scheduling import Scheduling, available_cores, check_cores, may_use_fifo
-from chainshaper.planning.plan import PER_CALLBACK
+from chainshaper.planning.chain_plan import PER_CALLBACK
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together

@@ -26,10 +26,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.overruns import in_cycle, slots_without
-from chainshaper.planning.plan import (
+from chainshaper.planning.chain_plan import (
     PER_CALLBACK,
-    Plan,
+    ChainPlan,
     Server,
     Slot,
     below_executors,
@@ -41,6 +40,7 @@ from chainshaper.planning.plan import (
     server_of,
     shaping_nodes,
 )
+from chainshaper.planning.overruns import in_cycle, slots_without
 from chainshaper.planning.shaping import BOUNDARY_NS, OUTPUT_PRIORITY, with_gates_level
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
@@ -76,7 +76,9 @@ class Timetable(NamedTuple):
     busy: _Slots = MappingProxyType({})
 
 
-def _timetable(own: Sequence[Plan], plans: Sequence[Plan], alone: float | None) -> Timetable:
+def _timetable(
+    own: Sequence[ChainPlan], plans: Sequence[ChainPlan], alone: float | None
+) -> Timetable:
     """The slots of a chain, or of several that share servers, of which each counts once; and the
     share of the slot that it begins with in which no better server of the plans may run.
     """
@@ -100,7 +102,7 @@ def _timetable(own: Sequence[Plan], plans: Sequence[Plan], alone: float | None) 
     return Timetable(name, own[0].cycle_ns, slots, begins, busy)
 
 
-def _watching(plan: Plan) -> Iterator[tuple[Server, int]]:
+def _watching(plan: ChainPlan) -> Iterator[tuple[Server, int]]:
     """The servers of shaping nodes, and for how long these watch the clock before a slot."""
     for node in shaping_nodes(plan):
         if (server := server_of(plan, node.thread)) is not None:
@@ -108,12 +110,12 @@ def _watching(plan: Plan) -> Iterator[tuple[Server, int]]:
 
 
 def place_chains(
-    plans: Sequence[Plan],
+    plans: Sequence[ChainPlan],
     *,
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
-    at_once: Callable[[bool], Sequence[Plan]] | None = None,
-) -> tuple[tuple[Plan, ...], list[str]]:
+    at_once: Callable[[bool], Sequence[ChainPlan]] | None = None,
+) -> tuple[tuple[ChainPlan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
     The chains take turns where they can (:func:`with_offsets`). Where they cannot, ``at_once``
@@ -149,7 +151,7 @@ def place_chains(
     return with_gates_level(turns), remarks
 
 
-def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...] | None:
+def _longest_alone(apart: Callable[..., tuple[ChainPlan, ...]]) -> tuple[ChainPlan, ...] | None:
     """The offsets with which no better chain has the core for the largest of the shares, if any."""
     for share in SHARES:
         with suppress(OperationError):
@@ -157,7 +159,7 @@ def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...] |
     return None
 
 
-def stamp_shift_ns(plan: Plan, plans: Sequence[Plan]) -> int:
+def stamp_shift_ns(plan: ChainPlan, plans: Sequence[ChainPlan]) -> int:
     """How much later than its cycle begins a chain may take the stamp from which its slots count:
     0 where no better server, of any of the plans, has the core then.
     """
@@ -177,7 +179,7 @@ def stamp_shift_ns(plan: Plan, plans: Sequence[Plan]) -> int:
     return 0
 
 
-def _refuse_outputs_behind_others(plans: Sequence[Plan]) -> None:
+def _refuse_outputs_behind_others(plans: Sequence[ChainPlan]) -> None:
     """Refuse outputs that have to wait for those of others beyond their slot when stamps shift.
 
     The gate that wakes up first publishes first, so an output waits for publications that are due
@@ -222,7 +224,7 @@ def _refuse_outputs_behind_others(plans: Sequence[Plan]) -> None:
             raise OperationError(f"{said} (--publish-slot)")
 
 
-def _shared_threads(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> set[str]:
+def _shared_threads(plans: Sequence[ChainPlan], together: Sequence[Sequence[int]]) -> set[str]:
     """The threads that several groups of chains have in their servers: each has one priority."""
     threads = [
         {thread.text for k in group for server in plans[k].servers for thread in server.threads}
@@ -231,7 +233,7 @@ def _shared_threads(plans: Sequence[Plan], together: Sequence[Sequence[int]]) ->
     return {thread for one, two in combinations(threads, 2) for thread in one & two}
 
 
-def _refuse_too_full(plans: Sequence[Plan]) -> None:
+def _refuse_too_full(plans: Sequence[ChainPlan]) -> None:
     """Refuse chains that take more than all of a core, whatever their priorities are."""
     shares: dict[int, dict[str, float]] = {}
     for plan in plans:
@@ -247,7 +249,7 @@ def _refuse_too_full(plans: Sequence[Plan]) -> None:
             raise OperationError(f"{reason} {core}: {remedy}")
 
 
-def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
+def _turns_only(plans: Sequence[ChainPlan], shared: set[str]) -> str:
     """Why chains that cannot take turns are not planned at the same time, and what helps."""
     helps = "periods with a larger common divisor, a smaller margin, or shorter chains"
     if shared:
@@ -264,7 +266,7 @@ def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
     return f"{said} all were measured at priorities of their own, write these into the plans"
 
 
-def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
+def _ranked(plans: Sequence[ChainPlan], together: Sequence[Sequence[int]]) -> list[ChainPlan]:
     """The plans with a priority for each group of chains, and one behind it where the threads of
     asynchronous publishers may have to run below their executors.
     """
@@ -284,13 +286,13 @@ def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Pl
 
 
 def with_offsets(
-    plans: Sequence[Plan],
+    plans: Sequence[ChainPlan],
     *,
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
     alone: float | None = None,
     windows: Mapping[int, tuple[int, int]] = MappingProxyType({}),
-) -> tuple[Plan, ...]:
+) -> tuple[ChainPlan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
     ``together`` are groups of chains (places in ``plans``) that begin at the same callback: they
@@ -318,8 +320,10 @@ def with_offsets(
 
 
 def with_windows(
-    plans: Sequence[Plan], windows_ns: Sequence[tuple[int, int] | None], time_limit_s: float = 5.0
-) -> tuple[Plan, ...]:
+    plans: Sequence[ChainPlan],
+    windows_ns: Sequence[tuple[int, int] | None],
+    time_limit_s: float = 5.0,
+) -> tuple[ChainPlan, ...]:
     """The plans with offsets at which each cycle begins inside its chain's window: from and to, on
     a common clock (None: anywhere). So chains are placed around timers that cannot be moved.
 
@@ -542,7 +546,7 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
     return f"{said} their longest take {duration_text(needed)}{excess}"
 
 
-def chain_name(plan: Plan) -> str:
+def chain_name(plan: ChainPlan) -> str:
     """What a plan's chain is called in messages."""
     return plan.chain.spec or plan.chain.output or "a chain without a name"
 

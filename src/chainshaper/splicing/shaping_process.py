@@ -21,9 +21,9 @@ import yaml
 
 from chainshaper.analysis.chains import close_names
 from chainshaper.linux.threads import gate_thread_name
-from chainshaper.planning.application_plan import ApplicationPlan
+from chainshaper.planning.chain_plan import ChainPlan, ShapingNode, server_of
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import Plan, ShapingNode, server_of
+from chainshaper.planning.plan import Plan
 from chainshaper.robot import decision
 from chainshaper.robot.decision import DEPTH, Gate, Modes, gate_parameters
 from chainshaper.robot.schema_header import schema_header
@@ -85,7 +85,7 @@ class ShapingProcess:
 
 
 def write_shaping_process(
-    plan: Plan,
+    plan: ChainPlan,
     node: ShapingNode,
     kind: NodeKind,
     folder: Path,
@@ -129,7 +129,7 @@ def write_shaping_process(
     return process
 
 
-def zero_copy_lost(plan: ApplicationPlan, kind: NodeKind) -> list[str]:
+def zero_copy_lost(plan: Plan, kind: NodeKind) -> list[str]:
     """A line for each output of which a node of this kind would need copies that are not made now,
     or would be a component where none was seen to be of use.
     """
@@ -196,7 +196,7 @@ def write_throttler(
     return process
 
 
-def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
+def gate_of(plan: ChainPlan, node: ShapingNode, depth: int = DEPTH) -> Gate:
     """The gate of a plan's shaping node, with room for so many messages."""
     server = server_of(plan, node.thread)  # a plan without one for a shaping node is refused
     modes = plan.modes if node == plan.shaping_node else None
@@ -216,7 +216,7 @@ def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
     )
 
 
-def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
+def shaping_parameters(plan: ChainPlan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
     """The ROS parameters of a shaping node, by the names of :class:`NodeParameters`."""
     mode_topic = "" if plan.modes is None else plan.modes.topic
     parameters = gate_parameters(gate_of(plan, node), mode_topic) | {
@@ -308,7 +308,7 @@ GATES = "CHAINSHAPER_GATES"
 """The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
 
 
-def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
+def gate_settings(plan: ChainPlan, node: ShapingNode, publisher: str, log: Path) -> str:
     """The block of an output in the file that :data:`GATES` names, a line for each value."""
     values = {
         "output": node.output,
