@@ -29,7 +29,7 @@ from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
 from chainshaper.flow.record import record_command
-from chainshaper.linux.processes import Process, run_users
+from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
 from chainshaper.planning import ApplicationPlan, Plan, PlanRequest, Profile
 from chainshaper.planning import request as requests
@@ -290,7 +290,7 @@ def plan_in_force(
     users: frozenset[int],
     notes: list[str],
     **how: Any,
-) -> Iterator[Callable[[Sequence[Process]], bool]]:
+) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
     """The plan in force on what runs, by a thread that does what `chainshaper apply` does (``how``)
     until the context ends, which adds its ``notes``; it gives whether all servers have opened.
     """
@@ -299,7 +299,7 @@ def plan_in_force(
     with ThreadPoolExecutor(1, "apply") as beside:
         applied = beside.submit(apply_plan, plan, **how, stop=stop, watch=states.append)
 
-        def opened(_: Sequence[Process]) -> bool:
+        def opened(_: Sequence[RunningProcess]) -> bool:
             if applied.done():
                 applied.result()  # raises what it failed with
                 raise OperationError("the plan was released meanwhile")

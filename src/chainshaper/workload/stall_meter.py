@@ -177,7 +177,7 @@ def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]
             watch.meters[core].tell(parent=os.getpid())
         for core, child in watch.meters.items():
             child.hear()
-            wanted = scheduling.Scheduling(PRIORITY if realtime else None, cores=(core,))
+            wanted = scheduling.SchedulingRequest(PRIORITY if realtime else None, cores=(core,))
             for thread in list_threads(child.pid):
                 scheduling.apply_scheduling(thread, wanted)
         yield watch
