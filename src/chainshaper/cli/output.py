@@ -8,17 +8,17 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import chainshaper as cs
 from chainshaper.values.errors import OperationError, shown
+from chainshaper.values.progress import Progress
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from chainshaper.values.plan_choices import NodeKind
 
-Progress: TypeAlias = Callable[[float, str], None]  # the share that is done, what is done now
 PATIENCE_S = 2.0  # what takes longer than this shows its progress
 
 

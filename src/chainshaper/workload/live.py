@@ -32,6 +32,7 @@ from chainshaper.robot.decision import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.progress import Progress
 from chainshaper.values.recording import (
     InForceInfo,
     Recording,
@@ -52,7 +53,6 @@ from chainshaper.workload.launcher import Child
 from chainshaper.workload.stall_meter import StallWatch, far_from, meter_tables, stalls_watched
 
 Numbers: TypeAlias = npt.NDArray[np.int64]
-Progress = Callable[[float, str], None]  # of the share done (0 to 1) and what is being done
 
 
 @dataclass(frozen=True)
