@@ -26,11 +26,11 @@ from pathlib import Path
 from chainshaper.enforcement.freezer import CounterPage, groups_of, run_of, thaw
 from chainshaper.enforcement.journal import (
     DISPATCHER,
-    JOURNAL_FILE,
     GUARDIAN,
+    JOURNAL_FILE,
     Journal,
     note_process,
-    own_processes,
+    processes_of_role,
     remembered_journal,
 )
 from chainshaper.enforcement.undoing import claim_run, strange_lines, undo_run
@@ -167,7 +167,7 @@ class _Watch:
                 self.page = CounterPage(run.page, run.table)
             except OSError:  # the owner is gone, which its pidfd will say
                 return False
-        for one in own_processes(self.journal, DISPATCHER):
+        for one in processes_of_role(self.journal, DISPATCHER):
             if one.core is None or one.core in self.beats:
                 continue
             self.beats[one.core] = (-1, 0)

@@ -188,7 +188,7 @@ def read_process(entry: Mapping[str, Any]) -> OwnProcess:
     return OwnProcess(str(entry["role"]), *process_of(entry), entry["core"])
 
 
-def own_processes(journal: Journal, role: str) -> tuple[OwnProcess, ...]:
+def processes_of_role(journal: Journal, role: str) -> tuple[OwnProcess, ...]:
     """All processes of a role that the run has ever had."""
     return tuple(one for one in journal.read(PROCESS, read_process) if one.role == role)
 

@@ -21,19 +21,19 @@ from chainshaper.enforcement import freezer, litmus
 from chainshaper.enforcement.journal import (
     DISPATCHER,
     GUARDIAN,
-    Journal,
-    LockHolder,
     OPENED,
     PROCESS,
     STATE_FILE,
+    Journal,
+    LockHolder,
     all_runs_locked,
     discard_journal,
     find_journals,
     journals_folder,
     locked,
     open_journal,
-    own_processes,
     process_of,
+    processes_of_role,
     read_process,
 )
 from chainshaper.enforcement.scheduling_memory import (
@@ -315,7 +315,7 @@ def _hasten(holder: LockHolder | None, waited_s: float) -> None:
 
 def _end_processes(journal: Journal, role: str) -> None:
     """Kill all processes of a role, this one excepted: one that was stopped hears nothing else."""
-    for one in own_processes(journal, role):
+    for one in processes_of_role(journal, role):
         if one.pid != os.getpid() and (pidfd := open_process(one.pid, one.started)) is not None:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
