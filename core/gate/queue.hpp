@@ -1,5 +1,5 @@
 // Which of the messages that wait at a gate leave, and when it is the turn of each. It knows no
-// clock. The same as `Queue` of chainshaper/robot/decision.py.
+// clock. The same as `Queue` of chainshaper/robot/waiting.py.
 
 #pragma once
 

@@ -1,5 +1,5 @@
 // What the gates in C++ and in Python share: printed by scripts/gate-words from
-// chainshaper/robot/decision.py, which explains it. Do not edit.
+// chainshaper/robot/gate.py and those beside it, which explain it. Do not edit.
 // clang-format off
 
 #pragma once
@@ -29,9 +29,9 @@ inline constexpr std::array<const char *, 4> dropped_names{
 namespace schema {
 
 inline constexpr std::int64_t depth = 10;
-inline constexpr std::int64_t reader_depth = 1000;
 inline constexpr std::int64_t max_future_ns = 1000000;
 inline constexpr std::int64_t max_age_cycles = 10;
+inline constexpr std::int64_t reader_depth = 1000;
 inline constexpr std::int64_t stall_ns = 100000;
 inline constexpr std::int64_t step_ns = 500000;
 inline constexpr std::int64_t look_ns = 50000000;

@@ -21,7 +21,7 @@ from ros2 import ros2_environment
 
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
-from chainshaper.robot.decision import RULES, Rule
+from chainshaper.robot.throttling import RULES, Rule
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.sources.ros import script as ros_script

@@ -28,7 +28,8 @@ from chainshaper.planning import Plan, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.reporting.latency import doubts_text, latency_json
-from chainshaper.robot.decision import Overrun, sleep_until
+from chainshaper.robot.clocks import sleep_until
+from chainshaper.robot.gate import Overrun
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
     Outcome,

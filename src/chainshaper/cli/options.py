@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 import typer
 
 import chainshaper as cs
-from chainshaper.robot.decision import Late
+from chainshaper.robot.gate import Late
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import BANDS, NodeKind, Wishes

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
 from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
-from chainshaper.robot.decision import Rule
+from chainshaper.robot.throttling import Rule
 from chainshaper.sources.preload import ANY_ORDER, SANITIZER
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.splicing import redirection
@@ -59,7 +59,7 @@ class Splicing:
 class ThrottledInput(Part):
     """A topic that is to reach its ``subscriber`` (None: all) once every ``period_ns`` at most.
 
-    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.robot.decision`).
+    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.robot.throttling`).
     """
 
     topic: FullName

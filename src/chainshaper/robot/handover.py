@@ -31,7 +31,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from chainshaper.robot.decision import DROPPED, Outcome, Release, Shaper, Waiting
+from chainshaper.robot.decision import DROPPED, Release
+from chainshaper.robot.shaper import Shaper
+from chainshaper.robot.waiting import Outcome, Waiting
 
 FIELDS = (
     "holder",  # the shaping node in force, a process id; 0 while the standby has the lock

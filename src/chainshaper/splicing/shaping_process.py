@@ -24,9 +24,10 @@ from chainshaper.linux.threads import gate_thread_name
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.planning.plan import Plan, ShapingNode, server_of
-from chainshaper.robot import decision
-from chainshaper.robot.decision import DEPTH, Gate, Modes, gate_parameters
+from chainshaper.robot.gate import DEPTH, Gate, Modes
+from chainshaper.robot.node_parameters import gate_parameters
 from chainshaper.robot.schema_header import schema_header
+from chainshaper.robot.throttling import Rule
 from chainshaper.sources.preload import native_library
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
 from chainshaper.values.files import write_whole
@@ -161,7 +162,7 @@ def write_throttler(
     kind: Literal["python", "cpp"],
     folder: Path,
     *,
-    rule: decision.Rule = "newest",
+    rule: Rule = "newest",
     name: str = "chainshaper_throttler",
     phase_ns: int = 0,
     core: int | None = None,

@@ -6,7 +6,7 @@ This module imports nothing slow: the planner takes a while, `chainshaper plan -
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
-from chainshaper.robot.decision import Anchor, IntoOpenSlot, Messages, Overrun
+from chainshaper.robot.gate import Anchor, IntoOpenSlot, Messages, Overrun
 
 Policy: TypeAlias = Literal[
     "shaped",
