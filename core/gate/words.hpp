@@ -19,12 +19,12 @@ inline constexpr std::array<const char *, 4> policy_names{
 enum class Entry { at_once, next_slot };
 inline constexpr std::array<const char *, 2> entry_names{
     "at-once", "next-slot"};
-enum class Messages { all_in_order, newest, first };
-inline constexpr std::array<const char *, 3> messages_names{
-    "all-in-order", "newest", "first"};
-enum class Dropped { replaced, surplus, overflowed, discarded };
-inline constexpr std::array<const char *, 4> dropped_names{
-    "replaced", "surplus", "overflowed", "discarded"};
+enum class Messages { all_in_order, newest };
+inline constexpr std::array<const char *, 2> messages_names{
+    "all-in-order", "newest"};
+enum class Dropped { replaced, overflowed, discarded };
+inline constexpr std::array<const char *, 3> dropped_names{
+    "replaced", "overflowed", "discarded"};
 
 namespace schema {
 

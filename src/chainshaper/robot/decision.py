@@ -10,7 +10,7 @@ from typing import Literal, TypeAlias, get_args
 
 from chainshaper.robot.gate import Gate
 
-Dropped: TypeAlias = Literal["replaced", "surplus", "overflowed", "discarded"]
+Dropped: TypeAlias = Literal["replaced", "overflowed", "discarded"]
 DROPPED = get_args(Dropped)
 
 

@@ -11,7 +11,7 @@ sections 3.2.2 and 3.3): the gate *is* that server. Slots repeat every cycle. A 
 * A message that arrives behind the last slot it was due in is an **overrun** (section 6). The gate
   lets it ``wait`` for a slot of a later cycle, ``discard``s it, or ``publish``es it at once.
 * Of several **messages** in one cycle leave ``all-in-order`` (the gate drops the oldest where more
-  than ``depth`` wait), or only the ``newest`` of those that wait. ``first``: the first.
+  than ``depth`` wait), or only the ``newest`` of those that wait.
 * With **modes** (section 3.3) each mode of the system has a slot of its own.
 
 :mod:`chainshaper.robot.decision` decides about one message, :mod:`chainshaper.robot.waiting` about
@@ -30,7 +30,7 @@ Anchor: TypeAlias = Literal["stamp", "cycle"]
 Overrun: TypeAlias = Literal["wait", "discard", "publish"]
 Late: TypeAlias = Literal["wait", "discard", "publish", "next-slot"]
 IntoOpenSlot: TypeAlias = Literal["at-once", "next-slot"]
-Messages: TypeAlias = Literal["all-in-order", "newest", "first"]
+Messages: TypeAlias = Literal["all-in-order", "newest"]
 ANCHORS, OVERRUNS, LATE = get_args(Anchor), get_args(Overrun), get_args(Late)
 INTO_OPEN_SLOT, MESSAGES = get_args(IntoOpenSlot), get_args(Messages)
 

@@ -68,7 +68,7 @@ FIELDS = (
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 
-VERSION = 3  # of the page's layout: part of its name
+VERSION = 4  # of the page's layout: part of its name
 RING = 1024
 RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings,
 TOPIC = 32 + 3 * RING  # and of the name

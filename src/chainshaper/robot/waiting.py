@@ -84,8 +84,6 @@ class Queue:
         if release.slot is None or self.gate.messages == "all-in-order":
             return release
         if self._left is not None and self._same_cycle(release, self._left):
-            if self.gate.messages == "first":
-                return release.dropping("surplus")
             last_end = self._left + moved_at(self.moves, self._left) + self.gate.slots[-1][1]
             release = self._release(oldest, max(ready, last_end))
             if release.slot is None:
