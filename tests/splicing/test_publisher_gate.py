@@ -26,13 +26,13 @@ from chainshaper.robot.gate import Gate
 from chainshaper.robot.handover import FIELDS, page_folders
 from chainshaper.robot.node_parameters import gate_parameters
 from chainshaper.sources.gate_log import read_gate_log
+from chainshaper.splicing.gate_settings import gate_library, settings_text
 from chainshaper.splicing.shaped_outputs import (
     FollowedOutput,
     ShapedOutput,
     ask_phase,
     find_outputs,
 )
-from chainshaper.splicing.shaping_process import gate_library, settings_text
 from chainshaper.values.errors import OperationError
 
 MS = 1_000_000
