@@ -28,7 +28,7 @@ from chainshaper.linux.scheduling import (
     may_use_fifo,
 )
 from chainshaper.linux.threads import RunningThread, foreign_realtime_processes, list_threads
-from chainshaper.robot.decision import clock_offset
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
