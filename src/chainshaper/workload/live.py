@@ -420,7 +420,9 @@ def logged_tables(
         if not columns or not columns["time"].size:
             continue
         frame = pl.DataFrame(columns)
-        taken = frame.filter(taken=1) if entry == "take" else frame
+        taken = frame
+        if entry == "take" and not (frame["taken"] == 1).all():
+            taken = frame.filter(taken=1)
         for name in EVENTS[entry]:
             named = taken if name in ALSO_TAKEN else frame
             if named.height:
