@@ -13,7 +13,7 @@ import numpy.typing as npt
 from chainshaper import _core
 from chainshaper.planning.chain_plan import ReceiverPlace, Server
 from chainshaper.planning.plan import Plan
-from chainshaper.robot.decision import SAME
+from chainshaper.robot.node_parameters import SAME
 from chainshaper.simulation.system import ROLES, Entity, Publisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription

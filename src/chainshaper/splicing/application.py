@@ -14,8 +14,8 @@ from chainshaper.planning.chain_plan import (
 )
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan
-from chainshaper.robot.decision import SAME
-from chainshaper.splicing.shaping_process import gate_of
+from chainshaper.robot.node_parameters import SAME
+from chainshaper.splicing.gate_settings import gate_of
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import wrong_values_refused
