@@ -58,20 +58,14 @@ def plan(
     from chainshaper.planning.profile import deciding_cycles, doubts_about
     from chainshaper.planning.request import on_cores
     from chainshaper.reporting import figures, overviews
-    from chainshaper.values.files import new_file
     from chainshaper.verify.measure import taken_chain
 
     if convert is not None:
-        if recording is not None or latencies is not None or output is None:
-            raise InputError("--convert OLD.yaml goes with --output NEW.yaml, and nothing else")
-        _convert(convert, output, json)
+        _convert(convert, output, json, alone=recording is None and latencies is None)
         return
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
-    if curve is not None and request.bands != "auto":
-        raise InputError("--curve draws what --bands auto looked at: add --bands auto")
-    if curve is not None:
-        new_file(curve, figures.ENDINGS)  # before a plan is written
+    _check_curve(curve, request)
     wanted: list[str | None] = [*chain] if chain else [None]
     how: dict[str, Any] = {"modes": request.modes, "since_ns": since, "until_ns": until}
     how["mode_recordings"] = opt.mode_profiles(mode_profile, request)
@@ -115,8 +109,22 @@ def plan(
             out.show_line(path)
 
 
-def _convert(earlier: Path, output: Path, json: bool) -> None:
+def _check_curve(curve: Path | None, request: "cs.PlanRequest") -> None:
+    """Refuse a curve that cannot be drawn, before a plan is written."""
+    from chainshaper.reporting.figures import ENDINGS
+    from chainshaper.values.files import new_file
+
+    if curve is None:
+        return
+    if request.bands != "auto":
+        raise InputError("--curve draws what --bands auto looked at: add --bands auto")
+    new_file(curve, ENDINGS)
+
+
+def _convert(earlier: Path, output: Path | None, json: bool, *, alone: bool) -> None:
     """Write the plan of an earlier version as plans are written now."""
+    if output is None or not alone:
+        raise InputError("--convert OLD.yaml goes with --output NEW.yaml, and nothing else")
     cs.save_plan(cs.convert_plan(earlier), output)
     if out.present(json, {"files": [str(output)]}):
         out.show_line(output)
