@@ -56,7 +56,7 @@ def test_every_call_is_followed_to_the_client_that_made_it(recording: Path, node
     assert (found[:, 0] <= truth[:, 0]).all()
     assert (truth[:, 1] <= found[:, 1]).all()
     known = truth[1:, 0] > truth[0, 0] + 1_000_000_000  # first answers may take 0.1 s
-    # On a busy machine an answer may come when the next cycle has begun; that is so in the truth too.
+    # On a busy machine an answer may come when the next cycle has begun, in the truth as well.
     apart = truth[1:, 0] >= truth[:-1, 1]
     assert apart.sum() > 50
     before_next = truth[1:, 0] >= found[:-1, 1]
