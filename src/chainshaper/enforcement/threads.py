@@ -14,7 +14,7 @@ the most urgent:
   the plan names their nodes: at one priority, callbacks that become ready at once would run in the
   order in which DDS happens to deliver. Where priorities are too few, the last of a server share
   one; where slots are made of what single callbacks took, all but the first do, as while that was
-  measured (:attr:`~chainshaper.planning.application_plan.ApplicationPlan.most_urgent_first`). Turns
+  measured (:attr:`~chainshaper.planning.plan.Plan.most_urgent_first`). Turns
   (SCHED_RR), only if the plan wants them, end within a callback, which then waits for another;
 * who receives what a shaping node publishes: where the plan has a place for them, there, behind
   the shaping nodes and above all others; else below all servers, on the shaping node's core, or, of
@@ -54,9 +54,15 @@ from chainshaper.linux.threads import (
     is_of_zenoh,
     since_boot_ns,
 )
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Plan, ReceiverPlace, Server, ShapingNode, shaping_nodes
-from chainshaper.planning.plan import Thread as PlannedThread
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
+    ReceiverPlace,
+    Server,
+    ShapingNode,
+    shaping_nodes,
+)
+from chainshaper.planning.chain_plan import Thread as PlannedThread
+from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import InputError, OperationError
 
 IN_ORDER = "its executors are known by the order in which it started its threads, as when recorded"
@@ -357,9 +363,7 @@ class WantedScheduling:
     reason: str
 
 
-def server_members(
-    plan: ApplicationPlan, allocation: Allocation
-) -> dict[str, tuple[NodeThread, ...]]:
+def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeThread, ...]]:
     """The threads of each server of a plan, by its name. Raises OperationError: a planned thread is
     not running, two processes are the same node, or one thread executes nodes of two servers.
     """
@@ -436,7 +440,7 @@ def server_priorities(sizes: Mapping[int, int]) -> dict[int, tuple[int, ...]]:
 
 
 def plan_scheduling(
-    plan: ApplicationPlan, allocation: Allocation, available_cores: Sequence[int]
+    plan: Plan, allocation: Allocation, available_cores: Sequence[int]
 ) -> tuple[WantedScheduling, ...]:
     """What every thread concerned by a plan shall get: servers' threads first, then the others.
     Raises: as :func:`server_members` and :func:`scheduling_around`.
@@ -457,7 +461,7 @@ def plan_scheduling(
     )
 
 
-def waiting_receivers(plan: ApplicationPlan, wanted: Iterable[WantedScheduling]) -> list[str]:
+def waiting_receivers(plan: Plan, wanted: Iterable[WantedScheduling]) -> list[str]:
     """A note on who receives an output on a core that the servers of other chains keep busy."""
     busy = {(server.core,) for server in plan.servers if len(plan.chains) > 1}
     ours = [one for one in wanted if one.reason == _RECEIVES and one.wanted.cores in busy]
@@ -486,20 +490,20 @@ def absent_receivers(nodes: Iterable[ShapingNode], running: Collection[str]) -> 
     )
 
 
-def first_planned(chain: Plan) -> PlannedThread | None:
+def first_planned(chain: ChainPlan) -> PlannedThread | None:
     """The thread that begins a chain: the first executor, of no shaping node, by servers' slots."""
     run_it = (planned for _, planned in in_order_of_slots(chain))
     return next((one for one in run_it if one.role == "executor"), None)
 
 
-def in_order_of_slots(chain: Plan) -> Iterator[tuple[Server, PlannedThread]]:
+def in_order_of_slots(chain: ChainPlan) -> Iterator[tuple[Server, PlannedThread]]:
     """The planned threads that run a chain, with their servers: those of shaping nodes left out."""
     gates = {node.thread for node in shaping_nodes(chain)}
     for server in sorted(chain.servers, key=lambda one: (one.slots[0][0], one.priority)):
         yield from ((server, planned) for planned in server.threads if planned not in gates)
 
 
-def closed_before(chain: Plan) -> int | None:
+def closed_before(chain: ChainPlan) -> int | None:
     """How long (ns) before a cycle the server of a chain's first thread closes, if it does."""
     slots = next(in_order_of_slots(chain))[0].slots
     is_always_open = slots[0][0] == 0 and slots[-1][1] >= chain.cycle_ns

@@ -38,11 +38,10 @@ from chainshaper.flow.phase import DriftWatch, Phase, Telling, tell_phase
 from chainshaper.linux.own_processes import end_command, end_in_words, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.scheduling import available_cores, check_cores
-from chainshaper.planning import application_plan as planned
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done
+from chainshaper.planning.chain_plan import shaping_nodes
 from chainshaper.planning.offsets import LEAD_NS, chain_name
 from chainshaper.planning.overruns import publication_warnings
-from chainshaper.planning.plan import Plan, shaping_nodes
+from chainshaper.planning.plan import Plan, open_until_done, with_slots_moved
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, OperationError
@@ -69,7 +68,7 @@ class Applied:
 
 
 def apply_plan(
-    plan: Plan | ApplicationPlan,
+    plan: Plan,
     command: Sequence[str] = (),
     *,
     command_stdout: int | None = None,
@@ -102,7 +101,7 @@ def apply_plan(
     node, a node does not appear, a chain has no regular beginning, the kernel refuses something,
     the servers failed, the application ended, or ``stop`` was set before the plan was in force.
     """
-    given, taken = planned.whole(plan), run_users(users)
+    given, taken = plan, run_users(users)
     threads.server_table(given)
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
@@ -156,8 +155,8 @@ def _go_on(stop: threading.Event) -> None:
 class _Run:
     """What belongs together, and is to be put back, while a plan is in force."""
 
-    given: ApplicationPlan
-    plan: ApplicationPlan  # as it is carried out: with room for overruns, once timers are known
+    given: Plan
+    plan: Plan  # as it is carried out: with room for overruns, once timers are known
     choice: Choice
     journal: Journal
     recorded: tuple[allocation.RecordedProcess, ...]
@@ -362,7 +361,7 @@ class _Run:
         """Move a chain's slots in the servers, where they change; from when on the gate has to."""
         with self.arming:
             moves = {**self.moved_ns, place: moved_ns}
-            plan = open_until_done(planned.with_slots_moved(self.given, moves), self.waits_ns)
+            plan = open_until_done(with_slots_moved(self.given, moves), self.waits_ns)
             before, table = threads.server_table(self.plan), threads.server_table(plan)
             cycle_ns = self.plan.chains[place].cycle_ns
             since = time.monotonic_ns() + 2 * cycle_ns
@@ -580,7 +579,7 @@ class _Run:
                 known=known,
             )
             with self.arming:
-                moved = planned.with_slots_moved(given, self.moved_ns)
+                moved = with_slots_moved(given, self.moved_ns)
                 plan = open_until_done(moved, waits_ns)
                 table = threads.server_table(plan)
                 if isinstance(servers, Freezer):
