@@ -17,8 +17,8 @@ from small_chain import small_chain_plan
 
 from chainshaper.enforcement.back_ends import Choice
 from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.servers import ServerCounters
-from chainshaper.enforcement.threads import Allocation, NodeThread
 from chainshaper.enforcement.undoing import RunState, SlotMove
 from chainshaper.flow import apply as applying
 from chainshaper.flow import threads

@@ -22,15 +22,34 @@ from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement import undoing
 from chainshaper.enforcement.back_ends import Choice, choose_back_end, gates, make_back_end
 from chainshaper.enforcement.freezer import Freezer, groups_of, run_of
 from chainshaper.enforcement.guardian import Guardians, put_back
 from chainshaper.enforcement.journal import PLAN_FILE, Journal
+from chainshaper.enforcement.node_threads import (
+    IN_ORDER,
+    LEFT_ALONE,
+    Allocation,
+    NodeThread,
+    RecordedProcess,
+    new_and_ended,
+)
+from chainshaper.enforcement.planned_threads import (
+    NOT_RECOGNISED,
+    absent_receivers,
+    closed_before,
+    place_of,
+    server_members,
+)
 from chainshaper.enforcement.scheduling_memory import change_all, look_alikes, note_descendants
 from chainshaper.enforcement.servers import BackEnd, ServerCounters
-from chainshaper.enforcement.threads import Allocation, NodeThread
+from chainshaper.enforcement.thread_scheduling import (
+    WantedScheduling,
+    left_by_back_end,
+    plan_scheduling,
+    waiting_receivers,
+)
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.flow import threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
@@ -127,9 +146,9 @@ def apply_plan(
         threads.refuse_simulated(given, run.found)
         threads.refuse_other_clocks(given, run.found)
         said = threads.check_publishers(given, run.found, recordings)
-        said += allocation.waiting_receivers(given, run.schedule())
+        said += waiting_receivers(given, run.schedule())
         run.begin_state(command, plan_path)
-        run.note(*said, *(one for one in run.found.notes if one.endswith(allocation.IN_ORDER)))
+        run.note(*said, *(one for one in run.found.notes if one.endswith(IN_ORDER)))
         run.find_anchor(phase_ns, progress)
         table = threads.server_table(run.plan)
         servers = run.servers = make_back_end(choice.name, table, journal, run.go_on)
@@ -160,7 +179,7 @@ class _Run:
     plan: ApplicationPlan  # as it is carried out: with room for overruns, once timers are known
     choice: Choice
     journal: Journal
-    recorded: tuple[allocation.RecordedProcess, ...]
+    recorded: tuple[RecordedProcess, ...]
     users: frozenset[int]
     stop: threading.Event
     unread: tuple[str, ...] = ()  # recordings that say nothing of this machine, or cannot be read
@@ -224,7 +243,7 @@ class _Run:
             self.found = self.find()
             waited = time.monotonic_ns() - begun
             try:
-                allocation.server_members(self.plan, self.found)
+                server_members(self.plan, self.found)
                 looks += 1
             except OperationError:
                 missing = wanted - {node for one in self.found.threads for node in one.nodes}
@@ -243,18 +262,18 @@ class _Run:
                     raise OperationError(said) from None
                 if waited >= wait_ns:
                     raise
-            quiet = before is not None and not any(allocation.new_and_ended(before, self.found))
+            quiet = before is not None and not any(new_and_ended(before, self.found))
             if looks and (quiet or looks > _SETTLING_LOOKS or waited >= wait_ns):
                 return
             before = self.found
             progress(min(1.0, waited / wait_ns), "finding the nodes")
             self.stop.wait(min(_LOOK_S, (wait_ns - waited) / 1e9))
 
-    def schedule(self) -> tuple[allocation.WantedScheduling, ...]:
+    def schedule(self) -> tuple[WantedScheduling, ...]:
         """Give threads their priorities and cores, as far as the back end leaves that to us."""
-        wanted = allocation.plan_scheduling(self.plan, self.found, available_cores())
-        left = allocation.left_by_back_end(self.choice.name, wanted, self.plan.free_threads)
-        change_all(self.journal, ((one.thread.thread, one.wanted) for one in left))
+        wanted = plan_scheduling(self.plan, self.found, available_cores())
+        left = left_by_back_end(self.choice.name, wanted, self.plan.free_threads)
+        change_all(self.journal, ((one.node_thread.thread, one.scheduling) for one in left))
         return left
 
     def begin_state(self, command: Sequence[str], plan_path: str) -> None:
@@ -330,7 +349,7 @@ class _Run:
 
     def early(self, place: int) -> int:
         """How long before its slot a chain begins: with its timer, unless a server stops it."""
-        closed = allocation.closed_before(self.plan.chains[place]) is not None
+        closed = closed_before(self.plan.chains[place]) is not None
         if self.gated and (closed or not self.waits_ns):
             return 0
         return self.waits_ns[place] if self.waits_ns else LEAD_NS
@@ -389,14 +408,14 @@ class _Run:
         """Put the threads that are not in their servers yet there."""
         themselves = {thread.node for thread in self.plan.free_threads}
         already = {one.name: one.threads for one in self.state.servers}
-        members = allocation.server_members(self.plan, self.found)
+        members = server_members(self.plan, self.found)
         urgency = self.plan.most_urgent_first
         order = {one.name: threads.order_in(one, urgency) for one in self.plan.servers}
         for name, one in ((name, one) for name, group in members.items() for one in group):
             self.go_on()
             if one.thread.tid not in already[name] and themselves.isdisjoint(one.nodes):
                 with self.arming:
-                    servers.assign(one.thread.tid, name, allocation.place_of(one, order[name]))
+                    servers.assign(one.thread.tid, name, place_of(one, order[name]))
         tids = {name: tuple(one.thread.tid for one in group) for name, group in members.items()}
         self.show_servers(threads=tids)
 
@@ -527,7 +546,7 @@ class _Run:
     ) -> tuple[tuple[NodeThread, ...], str]:
         """Threads that are new get what the plan says: these, and why they were not taken in."""
         before, now = self.found, self.find()
-        new, ended = allocation.new_and_ended(before, now)
+        new, ended = new_and_ended(before, now)
         over = {one.thread.identity for one in ended}
         fleeting = Counter(one.thread.pid for one in latest if one.thread.identity in over)
         for pid, times in fleeting.items():
@@ -612,14 +631,14 @@ class _Run:
     def name_strangers(self, found: Allocation) -> None:
         """One line about strangers who say they are nodes: the latest replaces the one before."""
         if found.strangers is not None:
-            said = [one for one in self.state.notes if one.startswith(allocation.LEFT_ALONE)]
+            said = [one for one in self.state.notes if one.startswith(LEFT_ALONE)]
             self.note(found.strangers, instead=said)
 
     def name_absent(self, found: Allocation) -> None:
         """One line about receivers that do not run, or are not recognised, for as long as so."""
         running = {node for one in found.threads for node in one.nodes}
-        absent = allocation.absent_receivers(self.plan.shaping_nodes, running)
-        said = [one for one in self.state.notes if one.startswith(allocation.NOT_RECOGNISED)]
+        absent = absent_receivers(self.plan.shaping_nodes, running)
+        said = [one for one in self.state.notes if one.startswith(NOT_RECOGNISED)]
         reasons = "".join(f"; {reason}" for reason in self.unread)
         self.note(*filter(None, [absent and absent + reasons]), instead=said)
 
