@@ -28,7 +28,7 @@ from chainshaper.linux.scheduling import (
     may_use_fifo,
 )
 from chainshaper.linux.threads import RunningThread, foreign_realtime_processes, list_threads
-from chainshaper.robot.decision import clock_offset
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -420,7 +420,9 @@ def logged_tables(
         if not columns or not columns["time"].size:
             continue
         frame = pl.DataFrame(columns)
-        taken = frame.filter(taken=1) if entry == "take" else frame
+        taken = frame
+        if entry == "take" and not (frame["taken"] == 1).all():
+            taken = frame.filter(taken=1)
         for name in EVENTS[entry]:
             named = taken if name in ALSO_TAKEN else frame
             if named.height:

@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING
 
 from chainshaper.linux import scheduling
 from chainshaper.linux.threads import list_threads
-from chainshaper.robot.decision import STALL_NS, sleep_until
+from chainshaper.robot.clocks import sleep_until
+from chainshaper.robot.shaper import STALL_NS
 from chainshaper.workload import launcher
 from chainshaper.workload.launcher import ENOUGH, Child
 
