@@ -28,7 +28,7 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
-from chainshaper.flow.record import record_command
+from chainshaper.flow.record import Scheduling, record_command
 from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
 from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile
@@ -115,7 +115,16 @@ def shape_launch(
     folder, stop, taken = refuse_existing(folder), stop or threading.Event(), run_users(users)
     folder.mkdir(exist_ok=True)
 
-    def record(name: str, words: Sequence[str], lasting_ns: int, **how: Any) -> Recording:
+    def record(
+        name: str,
+        words: Sequence[str],
+        lasting_ns: int,
+        *,
+        scheduling: Scheduling | None = None,
+        plan: Plan | None = None,
+        gate_logs: Sequence[Path] = (),
+        chain: str | None = None,
+    ) -> Recording:
         done = record_command(
             folder / name,
             words,
@@ -125,7 +134,10 @@ def shape_launch(
             watch_stalls=name != "first",
             stop=stop,
             progress=lambda share, what: progress(share, f"{name}: {what}"),
-            **how,
+            scheduling=scheduling,
+            plan=plan,
+            gate_logs=gate_logs,
+            chain=chain,
         )
         if stop.is_set() or done.exit_code is not None:
             ended = "was stopped" if done.exit_code is None else "ended by itself"
@@ -186,7 +198,13 @@ def shape_launch(
     after = record(
         *("after", shaped, duration_ns),
         scheduling=plan_in_force(
-            *(plan, back_end, first, taken, found), adapt=adapt, max_latency_ns=max_latency_ns
+            plan,
+            back_end,
+            first,
+            taken,
+            found,
+            adapt=adapt,
+            max_latency_ns=max_latency_ns,
         ),
         plan=plan,
         gate_logs=() if splicing is None else splicing.logs,
@@ -289,15 +307,29 @@ def plan_in_force(
     recording: Recording,
     users: frozenset[int],
     notes: list[str],
-    **how: Any,
+    *,
+    adapt: bool = False,
+    max_latency_ns: int | None = None,
 ) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
-    """The plan in force on what runs, by a thread that does what `chainshaper apply` does (``how``)
-    until the context ends, which adds its ``notes``; it gives whether all servers have opened.
+    """Have a thread do what `chainshaper apply` does until the context ends.
+
+    It yields a function that says whether all servers have opened. At the end the run's notes are
+    added to ``notes``. The rest is for :func:`.apply_plan`.
     """
     stop, states = threading.Event(), list[RunState]()
-    how |= {"back_end": back_end, "recording": recording, "users": users, "wait_ns": START_NS}
     with ThreadPoolExecutor(1, "apply") as beside:
-        applied = beside.submit(apply_plan, plan, **how, stop=stop, watch=states.append)
+        applied = beside.submit(
+            apply_plan,
+            plan,
+            back_end=back_end,
+            recording=recording,
+            users=users,
+            wait_ns=START_NS,
+            adapt=adapt,
+            max_latency_ns=max_latency_ns,
+            stop=stop,
+            watch=states.append,
+        )
 
         def opened(_: Sequence[RunningProcess]) -> bool:
             if applied.done():

@@ -22,7 +22,7 @@ from typing import TypeAlias, TypeVar
 
 from chainshaper.analysis.objects import resolve_objects
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
-from chainshaper.enforcement.threads import allocate, strangers_text
+from chainshaper.enforcement.node_threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux import processes as running
