@@ -34,13 +34,14 @@ from chainshaper.enforcement.threads import (
 from chainshaper.flow.threads import check_publishers, first_threads
 from chainshaper.linux.processes import Process, read_process
 from chainshaper.linux.scheduling import Scheduling
-from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, gate_thread_name, role_of
+from chainshaper.linux.threads import Thread, ThreadRole, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.plan import ReceiverPlace, Server, ShapingNode, revised
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.planning.shaping import let_per_chain, over_cores
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.middleware import thread_work
 from chainshaper.values.recording import EndpointInfo, Recording, RecordingInfo
 
 MS = 1_000_000
@@ -59,7 +60,7 @@ def _process(
     inner = pid if inner_pid is None else inner_pid
     threads = []
     for index, name in enumerate(("main", *names)):
-        role, kind = role_of(name, is_main=index == 0), None if index == 0 else dds_kind(name)
+        role, kind = role_of(name, is_main=index == 0), None if index == 0 else thread_work(name)
         thread = Thread(pid + index, pid, name, role, "SCHED_OTHER", 0, (0, 1), 10)
         threads.append(replace(thread, inner_tid=inner + index, kind=kind))
     return Process(pid, parent, tuple(command.split()), inner, participates, tuple(threads))

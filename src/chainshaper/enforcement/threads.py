@@ -35,8 +35,6 @@ from typing import NamedTuple
 
 from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.linux.processes import (
-    MIDDLEWARE_LIMITS,
-    ROUTERS,
     Process,
     descendants,
     guessed_name,
@@ -58,6 +56,7 @@ from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import Plan, ReceiverPlace, Server, ShapingNode, shaping_nodes
 from chainshaper.planning.plan import Thread as PlannedThread
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.middleware import MIDDLEWARE_LIMITS, ROUTERS, MiddlewareLimit
 
 IN_ORDER = "its executors are known by the order in which it started its threads, as when recorded"
 NOT_RECOGNISED = "not running, or not recognised: "
@@ -174,7 +173,7 @@ def _ambiguous(node: str, pids: Iterable[int]) -> str:
 
 def _limits(identified: Iterable[_Identified]) -> Iterator[str]:
     """A line for each middleware that is supported in part only, with whom it concerns."""
-    found: dict[str, set[str]] = {}
+    found: dict[MiddlewareLimit, set[str]] = {}
     for one in identified:
         if one.nodes and (limit := middleware_limit(one.process)) is not None:
             found.setdefault(limit, set()).update(one.nodes)
