@@ -39,7 +39,7 @@ from chainshaper.linux.threads import (
     read_proc,
     time_namespace,
 )
-from chainshaper.robot.decision import clock_offset
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.preload.events_header import FORMAT
 from chainshaper.sources.registers import table_of_registers
 from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
