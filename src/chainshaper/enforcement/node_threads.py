@@ -15,8 +15,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from chainshaper.linux.processes import (
-    MIDDLEWARE_LIMITS,
-    ROUTERS,
     RunningProcess,
     descendants,
     guessed_name,
