@@ -398,8 +398,8 @@ def test_steps_of_the_wall_clock_are_not_seen() -> None:
     step it.
     """
     package = Path(package_file).parent
-    rooms = [package / room for room in ("enforcement", "linux", "robot")]
-    sources = [path for room in rooms for path in room.glob("*.py")]
+    patterns = ("enforcement/**/*.py", "linux/*.py", "robot/*.py")
+    sources = [path for pattern in patterns for path in package.glob(pattern)]
     sources += [package / "flow" / name for name in ("apply.py", "phase.py", "threads.py")]
     wall_clock = re.compile(
         r"CLOCK_REALTIME|\btime\.time(_ns)?\(|\bdatetime\b|\blocaltime|\bgmtime"

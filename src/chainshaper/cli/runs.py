@@ -118,7 +118,7 @@ def run(
     Every node is a process of its own, scheduled as the description says (SCHED_FIFO where it is
     permitted). The recording is a folder of Parquet tables.
     """
-    from chainshaper.workload.live import WARM_UP_CYCLES
+    from chainshaper.workload.timing import WARM_UP_CYCLES
 
     described = cs.load_application(application)
     with out.progress(f"running {described.name}") as report:

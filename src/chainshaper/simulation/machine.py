@@ -18,7 +18,7 @@ from chainshaper.simulation.system import ROLES, Entity, Publisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
 from chainshaper.workload.execution import FIRST_AFTER, blocks
-from chainshaper.workload.live import Timing
+from chainshaper.workload.timing import Timing
 
 Int64s = npt.NDArray[np.int64]
 
@@ -52,7 +52,7 @@ class Streams:
     def add(self, times: ExecutionTime, node: str | None, index: int) -> int:
         """The place of a new stream of CPU times or delays (ns)."""
         self.constants.append(times.constant_ns)
-        self._drawn.append(blocks(times.model_dump(), self._seed, node or "", index))
+        self._drawn.append(blocks(times, self._seed, node or "", index))
         return len(self.constants) - 1
 
     def draw(self, stream: int) -> Int64s:
