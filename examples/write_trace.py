@@ -16,7 +16,7 @@ import polars as pl
 
 from chainshaper.values import events
 
-sys.path.append(str(Path(__file__).resolve().parents[1] / "tests"))
+sys.path.append(str(Path(__file__).resolve().parents[1] / "tests/helpers"))
 from ctf_writing import write_lttng_trace
 
 CYCLES = 40

@@ -3,6 +3,7 @@
 #include <nanobind/stl/string.h>
 #include <nanobind/stl/vector.h>
 
+#include <memory>
 #include <utility>
 
 #include "bindings/records.hpp"
@@ -223,20 +224,23 @@ Source source_from(nb::callable draw) {
   };
 }
 
-// Columns `pid`, `tid` and `cpu` of entries, by their threads; 0 for the idle thread.
-void add_threads(nb::dict & columns, const Description & description,
+// Adds columns `pid`, `tid` and `cpu` of entries, by their threads; 0 for the idle thread.
+void add_threads(nb::dict & columns, const std::vector<ThreadDescription> & threads,
                  const EntryColumns & entries) {
-  static const std::vector<std::pair<const char *, std::int32_t ThreadDescription::*>> fields{
-      {"pid", &ThreadDescription::pid},
-      {"tid", &ThreadDescription::tid},
-      {"cpu", &ThreadDescription::cpu}};
-  for (const auto & [name, field] : fields) {
-    std::vector<std::int32_t> column(entries.count);
-    for (std::size_t row = 0; row < entries.count; ++row)
-      if (entries.threads[row] != absent)
-        column[row] = description.threads[static_cast<Place>(entries.threads[row])].*field;
-    columns[name] = column_of(std::move(column));
+  auto pids = std::make_unique_for_overwrite<std::int32_t[]>(entries.count);
+  auto tids = std::make_unique_for_overwrite<std::int32_t[]>(entries.count);
+  auto cpus = std::make_unique_for_overwrite<std::int32_t[]>(entries.count);
+  const ThreadDescription idle;
+  for (std::size_t row = 0; row < entries.count; ++row) {
+    const auto place = entries.threads[row];
+    const auto & thread = place == absent ? idle : threads[static_cast<Place>(place)];
+    pids[row] = thread.pid;
+    tids[row] = thread.tid;
+    cpus[row] = thread.cpu;
   }
+  columns["pid"] = column_of(std::move(pids), entries.count);
+  columns["tid"] = column_of(std::move(tids), entries.count);
+  columns["cpu"] = column_of(std::move(cpus), entries.count);
 }
 
 nb::dict take_log(Engine & engine) {
@@ -247,7 +251,7 @@ nb::dict take_log(Engine & engine) {
     EntryColumns & taken = entries[number];
     nb::dict columns;
     columns["time"] = column_of(std::move(taken.times), taken.count);
-    add_threads(columns, engine.description(), taken);
+    add_threads(columns, engine.description().threads, taken);
     columns["thread"] = column_of(std::move(taken.threads), taken.count);
     for (std::size_t field = 0; field < fields.size(); ++field)
       columns[fields[field]] = column_of(std::move(taken.fields[field]), taken.count);

@@ -8,7 +8,9 @@ import json
 import os
 import platform
 import zlib
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -272,11 +274,8 @@ def write_recording(
     path = refuse_existing(path)
     try:
         with folder_beside(path) as made:
-            partial, checksums = Path(made), dict[str, str]()
-            for part in [tables] if isinstance(tables, Mapping) else tables:
-                for name, frame in part.items():
-                    file = _next_part(partial / f"{name}.parquet", checksums)
-                    checksums[str(file.relative_to(partial))] = _write_table(file, frame)
+            partial = Path(made)
+            checksums = _write_parts(partial, [tables] if isinstance(tables, Mapping) else tables)
             info = info.model_copy(update={"checksums": checksums})
             values = storable(info.model_dump(mode="json"))
             text = json.dumps(values, indent=2, ensure_ascii=False) + "\n"
@@ -288,14 +287,37 @@ def write_recording(
     return open_recording(path)
 
 
-def _next_part(file: Path, checksums: dict[str, str]) -> Path:
-    """Where the next part of a table goes: the first one is a file, several are a folder."""
-    if file.is_file():
+def _write_parts(folder: Path, parts: Iterable[EventTables]) -> dict[str, str]:
+    """Write the tables of all parts; the checksums of the files by their names in the folder.
+
+    Threads write the tables of a part while the next part is made, so that a recording takes the
+    time of making it or of writing it, whichever is longer. No more than two parts are in memory.
+    """
+    count = Counter[str]()
+    writing: dict[Path, Future[str]] = {}
+    checksums: dict[Path, str] = {}
+    with ThreadPoolExecutor(len(os.sched_getaffinity(0))) as threads:
+        for part in parts:
+            checksums |= {file: future.result() for file, future in writing.items()}
+            writing = {}
+            for name, frame in part.items():
+                file = _next_file(folder / f"{name}.parquet", count[name], checksums)
+                count[name] += 1
+                writing[file] = threads.submit(_write_table, file, frame)
+        checksums |= {file: future.result() for file, future in writing.items()}
+    return {str(file.relative_to(folder)): checksum for file, checksum in checksums.items()}
+
+
+def _next_file(file: Path, before: int, checksums: dict[Path, str]) -> Path:
+    """The file for the next part of a table, of which so many parts were written before.
+
+    A table of one part is a file, one of several parts is a folder of files.
+    """
+    if before == 1:
         first = file.rename(file.with_suffix(".first"))
         file.mkdir()
-        first.rename(file / "000000.parquet")
-        checksums[f"{file.name}/000000.parquet"] = checksums.pop(file.name)
-    return file / f"{len(list(file.iterdir())):06}.parquet" if file.is_dir() else file
+        checksums[first.rename(file / "000000.parquet")] = checksums.pop(file)
+    return file / f"{before:06}.parquet" if before else file
 
 
 def _write_table(file: Path, frame: pl.DataFrame) -> str:

@@ -5,8 +5,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from chainshaper.robot.clear_core import ClearCore
-from chainshaper.robot.decision import STALL_NS, Gate, Modes, Outcome, Shaper
+from chainshaper.robot.gate import Gate, Modes
 from chainshaper.robot.handover import Turn
+from chainshaper.robot.shaper import STALL_NS, Shaper
+from chainshaper.robot.waiting import Outcome
 from chainshaper.workload import dds
 from chainshaper.workload.description import GateDescription
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of

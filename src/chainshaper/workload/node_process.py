@@ -16,8 +16,9 @@ from functools import partial
 from typing import TypeAlias
 
 from chainshaper.linux import scheduling
-from chainshaper.robot.decision import READER_DEPTH, Shaper, text_of
 from chainshaper.robot.handover import Turn
+from chainshaper.robot.serialized import text_of
+from chainshaper.robot.shaper import READER_DEPTH, Shaper
 from chainshaper.workload import dds, executor, launcher
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, GateDescription
 from chainshaper.workload.event_log import EventLog, number_of
