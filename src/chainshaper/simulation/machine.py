@@ -14,7 +14,7 @@ from chainshaper import _core
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import ReceiverPlace, Server
 from chainshaper.robot.node_parameters import SAME
-from chainshaper.simulation.system import ROLES, Entity, Publisher, System
+from chainshaper.simulation.system import ROLES, Entity, SimulatedPublisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
 from chainshaper.workload.execution import FIRST_AFTER, blocks
@@ -377,7 +377,7 @@ class Machine:
             )
         return publishers
 
-    def _delivery(self, reader: Entity, publisher: Publisher) -> int | None:
+    def _delivery(self, reader: Entity, publisher: SimulatedPublisher) -> int | None:
         """The stream of a reader's own times of delivery from a publisher; None: it has none."""
         process = self._system.processes[reader.process]
         described: Mapping[str, ExecutionTime] = self._system.application.simulation.deliveries.get(

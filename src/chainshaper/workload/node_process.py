@@ -52,7 +52,7 @@ class NodeProcess:
         self.log = EventLog()
         self.participant = dds.Participant(setup.domain)
         sys.setswitchinterval(NEVER_S)  # the kernel alone decides which thread of an executor runs
-        self.executor = executor.Executor(self.participant, self.log, setup.node.threads)
+        self.executor = executor.NodeExecutor(self.participant, self.log, setup.node.threads)
         self.endpoints: list[Endpoint] = []
         self.to_send: queue.SimpleQueue[executor.AsynchronousWriter] | None = None
         self.shapers: list[tuple[Shaper, GateDescription]] = []
