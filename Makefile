@@ -9,27 +9,22 @@ demo: .venv/.ready
 	.venv/bin/chainshaper demo
 
 # Tests that need the machine's cores for themselves, and beside them those that mostly wait for
-# tracers and other programs, all others, which leave the cores to these (tests/conftest.py), and what
-# looks at the code.
+# tracers and other programs, all others, which leave the cores to these (tests/conftest.py), the C++
+# library's own, and what looks at the code. What had to be tried twice stands at the end.
 test: .venv/.ready-dev
 	scripts/test-tools
-	$(MAKE) --jobs=4 --output-sync=line lint test-untimed test-timed test-waiting
-
-# What fails beside the others is named, and tried once more when those are through; what fails again
-# has failed.
-tried = run='$(3) .venv/bin/python -m pytest -m "$(1)" -o cache_dir=.pytest_cache/$(2)'; \
-	eval "$$run"; code=$$?; [ $$code = 1 ] || exit $$code; \
-	while pgrep -f "[p]ytest -m [a-z]" >/dev/null; do sleep 1; done; \
-	echo "tried once more, alone:"; eval "$$run --last-failed --last-failed-no-failures none"
+	rm -rf build/tried
+	$(MAKE) --jobs=5 --output-sync=line lint core-tests test-untimed test-timed test-waiting; \
+		code=$$?; scripts/run-tests --tried-twice; exit $$code
 
 test-untimed: .venv/.ready-dev
-	@$(call tried,not timed and not waiting,untimed,nice)
+	scripts/run-tests untimed "not timed and not waiting" nice
 
 test-timed: .venv/.ready-dev
-	@$(call tried,timed,timed)
+	scripts/run-tests timed timed
 
 test-waiting: .venv/.ready-dev
-	@$(call tried,waiting and not timed,waiting)
+	scripts/run-tests waiting "waiting and not timed"
 
 # In QEMU, what needs another kernel than this machine's: the sched_ext back end, LTTng's kernel
 # tracer. Fetches about 130 MB once; a quarter of an hour or so.
@@ -39,12 +34,15 @@ test-kernel: .venv/.ready-dev
 # The C++ library's sources; how each is compiled is what the last build noted.
 core = $(shell find core -name '*.[ch]pp')
 
-# The native library by itself, without Python, under sanitizers; its fuzz targets run briefly.
+# The native library by itself, without Python, under sanitizers; each fuzz target runs for so many
+# seconds: `make core-tests FUZZ_SECONDS=36000` is a campaign.
+FUZZ_SECONDS = 10
 core-tests: .venv/.ready-dev
 	.venv/bin/cmake -S core -B build/core-tests -DCMAKE_BUILD_TYPE=RelWithDebInfo \
-		-DCHAINSHAPER_BINDINGS=OFF -DCHAINSHAPER_TESTS=ON -DCHAINSHAPER_SANITIZE=ON
-	.venv/bin/cmake --build build/core-tests --parallel 2
-	.venv/bin/ctest --test-dir build/core-tests --output-on-failure
+		-DCHAINSHAPER_BINDINGS=OFF -DCHAINSHAPER_TESTS=ON -DCHAINSHAPER_SANITIZE=ON \
+		-DFUZZ_SECONDS=$(FUZZ_SECONDS)
+	MAKEFLAGS= nice .venv/bin/cmake --build build/core-tests --parallel 2
+	nice .venv/bin/ctest --test-dir build/core-tests --output-on-failure
 
 lint: .venv/.ready-dev
 	.venv/bin/ruff check .

@@ -20,7 +20,8 @@ from rich.table import Table
 
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning.margins import EPSILON_NS, OVERRUN_PROBABILITY, covered_latency
-from chainshaper.robot.decision import OVERRUNS, Gate, release_of
+from chainshaper.robot.decision import release_of
+from chainshaper.robot.gate import OVERRUNS, Gate
 from chainshaper.values.durations import milliseconds
 
 Times = NDArray[np.int64]

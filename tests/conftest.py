@@ -58,6 +58,20 @@ ALLOWED_SKIPS = [
 ]
 
 
+# Where scripts/run-tests wants the list of failures; tests that run pytest have none of it.
+FAILURES = os.environ.pop("CHAINSHAPER_FAILURES", None)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    """Append each failure to the list of failures: the test, and the first line of why."""
+    if report.failed and FAILURES is not None:
+        crash = getattr(report.longrepr, "reprcrash", None)
+        reason = str(report.longrepr) if crash is None else crash.message
+        stage = "" if report.when == "call" else f" ({report.when})"
+        with open(FAILURES, "a") as failures:
+            failures.write(f"  {report.nodeid}{stage}: {reason.strip().splitlines()[0]}\n")
+
+
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport() -> Generator[None, pytest.TestReport, pytest.TestReport]:
     """In CI a skip is a failure, unless its reason is in allowed_skips.txt."""

@@ -2,11 +2,11 @@
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 import chainshaper
-from chainshaper.robot import decision as gate
 
 HEAVY = ("polars", "matplotlib", "pydantic", "cyclonedds", "numpy", "yaml", "rich")
 
@@ -49,13 +49,9 @@ def test_a_plan_without_a_recording_is_applied_without_what_reads_recordings() -
 
 
 def test_the_gate_needs_the_standard_library_only() -> None:
+    robot = Path(chainshaper.__file__).parent / "robot"
     # It also runs inside a ROS 2 node, where nothing of ours may be installed.
-    statement = (
-        "import importlib.util, sys\n"
-        f"spec = importlib.util.spec_from_file_location('gate', {gate.__file__!r})\n"
-        "module = importlib.util.module_from_spec(spec)\n"
-        "sys.modules['gate'] = module\n"
-        "spec.loader.exec_module(module)"
-    )
-    loaded = _modules_after(statement) - _modules_after("pass") - {"gate"}
-    assert loaded <= sys.stdlib_module_names
+    ours = ["chainshaper", "chainshaper.robot"]
+    ours += [f"chainshaper.robot.{path.stem}" for path in robot.glob("[a-z]*.py")]
+    loaded = _modules_after(f"import {', '.join(ours)}") - _modules_after("pass")
+    assert loaded - {"chainshaper"} <= sys.stdlib_module_names

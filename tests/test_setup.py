@@ -52,7 +52,7 @@ def test_a_missing_compiler_is_installed_by_root(tmp_path: Path) -> None:
 
 def test_changed_sources_of_the_library_are_built_again() -> None:
     places = ("core/bands/placement.cpp", "src/chainshaper/sources/preload/preload.c")
-    for source in (*places, "src/chainshaper/robot/decision.py"):
+    for source in (*places, "src/chainshaper/robot/gate.py"):
         words = ["make", "--dry-run", f"--what-if={source}", ".venv/.ready-dev"]
         done = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=True)
         assert "scripts/setup dev" in done.stdout.splitlines(), source

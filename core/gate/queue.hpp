@@ -1,5 +1,5 @@
 // Which of the messages that wait at a gate leave, and when it is the turn of each. It knows no
-// clock. The same as `Queue` of chainshaper/robot/decision.py.
+// clock. The same as `Queue` of chainshaper/robot/waiting.py.
 
 #pragma once
 
@@ -39,10 +39,6 @@ public:
     Release release = release_at(oldest, ready_ns);
     if (!release.slot || gate.messages == Messages::all_in_order) return release;
     if (same_cycle(release, left_)) {
-      if (gate.messages == Messages::first) {
-        release.drop(Dropped::surplus);
-        return release;
-      }
       const std::int64_t last_end = *left_ + moved_at(moves, *left_) + gate.slots.back().end;
       release = release_at(oldest, std::max(ready_ns, last_end));
       if (release.at_ns && !release.slot) release.at_ns = ready_ns;

@@ -1,5 +1,5 @@
 // What the gates in C++ and in Python share: printed by scripts/gate-words from
-// chainshaper/robot/decision.py, which explains it. Do not edit.
+// chainshaper/robot/gate.py and those beside it, which explain it. Do not edit.
 // clang-format off
 
 #pragma once
@@ -19,19 +19,19 @@ inline constexpr std::array<const char *, 4> policy_names{
 enum class Entry { at_once, next_slot };
 inline constexpr std::array<const char *, 2> entry_names{
     "at-once", "next-slot"};
-enum class Messages { all_in_order, newest, first };
-inline constexpr std::array<const char *, 3> messages_names{
-    "all-in-order", "newest", "first"};
-enum class Dropped { replaced, surplus, overflowed, discarded };
-inline constexpr std::array<const char *, 4> dropped_names{
-    "replaced", "surplus", "overflowed", "discarded"};
+enum class Messages { all_in_order, newest };
+inline constexpr std::array<const char *, 2> messages_names{
+    "all-in-order", "newest"};
+enum class Dropped { replaced, overflowed, discarded };
+inline constexpr std::array<const char *, 3> dropped_names{
+    "replaced", "overflowed", "discarded"};
 
 namespace schema {
 
 inline constexpr std::int64_t depth = 10;
-inline constexpr std::int64_t reader_depth = 1000;
 inline constexpr std::int64_t max_future_ns = 1000000;
 inline constexpr std::int64_t max_age_cycles = 10;
+inline constexpr std::int64_t reader_depth = 1000;
 inline constexpr std::int64_t stall_ns = 100000;
 inline constexpr std::int64_t step_ns = 500000;
 inline constexpr std::int64_t look_ns = 50000000;

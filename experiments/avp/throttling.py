@@ -6,7 +6,7 @@ its callbacks can be seen as the timers that begin chains. What passes gets a st
 
 import time
 
-from chainshaper.robot.decision import FirstOfPeriod
+from chainshaper.robot.throttling import FirstOfPeriod
 from chainshaper.workload.dds import data_message, data_of, number_in
 
 __all__ = ["throttle_front", "throttle_rear"]

@@ -448,7 +448,7 @@ class PublisherDescription:
     def __init__(self, **fields: Any) -> None: ...
 
 class GateDescription:
-    """A gate in a callback: a `chainshaper.robot.decision.Gate`; ``modes`` are their numbers."""
+    """A gate in a callback: a `chainshaper.robot.gate.Gate`; ``modes`` are their numbers."""
 
     slots: list[tuple[int, int]]
     cycle_ns: int

@@ -33,8 +33,9 @@ def test_it_shows_what_is_redirected_and_what_to_launch(files: Files) -> None:
     copy = f"{folder}/robot.launch.py"
     finished = called("splice", plan, robot, "n:=1 2", "-o", folder)
     assert finished.code == 0
-    (said,) = finished.err.splitlines()
-    assert said.startswith("note: the sample is small: 2 cycles"), "before the plan is used"
+    sample, kind = finished.err.splitlines()
+    assert sample.startswith("note: the sample is small: 2 cycles"), "before the plan is used"
+    assert kind.startswith("note: /t3: the shaping node is in Python; it needs no building")
     assert finished.out.splitlines() == [
         "/third publishes /t3_tmp in place of /t3, for /chainshaper_t3",
         f"ros2 launch {copy} 'n:=1 2'",
@@ -49,7 +50,10 @@ def test_it_shows_what_is_redirected_and_what_to_launch(files: Files) -> None:
         "originals": {copy: str(robot)},
     }
     wanted |= {"nodes": nodes, "standbys": standbys, "logs": logs}
-    wanted |= {"notes": [], "setup": None, "redirected": [], "environment": {}}
+    assert [note.split(";")[0] for note in said.pop("notes")] == [
+        "/t3: the shaping node is in Python"
+    ]
+    wanted |= {"setup": None, "redirected": [], "environment": {}}
     assert said.pop("diff").startswith("--- /dev/null\n")
     assert said == wanted
     again = called("splice", plan, copy, "-o", folder)
@@ -65,7 +69,7 @@ def test_a_dry_run_of_a_gate_in_the_publishers_process_names_nothing_that_is_not
     inside = known(plan.shaping_node).model_copy(update={"in_process": True})
     save_plan(revised(plan, shaping_node=inside, anchor="cycle"), file)
     flow = "chainshaper.flow.launch_splicing"
-    library = "chainshaper.splicing.shaping_process.gate_library"
+    library = "chainshaper.splicing.gate_settings.gate_library"
     monkeypatch.setattr(library, lambda: Path("/gate.so"))
     monkeypatch.setattr(f"{flow}._tried", lambda *_: [])
     finished = called("splice", file, robot, "-o", folder, "--dry-run")
@@ -109,6 +113,15 @@ def test_a_throttler_needs_no_plan_and_undo_the_folder_only(files: Files) -> Non
     assert json_of("splice", plan, robot, "--undo", "-o", folder) == {"removed": str(folder)}
     assert not folder.exists()
     assert "nothing to undo" in refused(2, "splice", "--undo", "-o", folder)
+
+
+@pytest.mark.parametrize("word", ["typed", "component"])
+def test_kinds_that_are_found_out_now_are_no_choice(files: Files, word: str) -> None:
+    plan, robot, folder = files
+    finished = called("splice", plan, robot, "-o", folder, "--node", word)
+    assert finished.code == 2
+    assert f"{word} is found out now: write --node cpp" in finished.err
+    assert not folder.exists()
 
 
 def test_nothing_is_written_where_it_could_not_be_built(
@@ -155,16 +168,15 @@ def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
     [
         ("PLAN -o DIR", "give a plan and the launch files"),
         ("-o DIR", "give a plan and the launch files"),
-        ("PLAN ROBOT -o DIR --build", "--node python needs no building"),
-        ("PLAN ROBOT -o DIR --node typed", "not known: name it"),
-        ("PLAN ROBOT -o DIR --node typed --type Header", "'Header' is not a message type"),
+        ("PLAN ROBOT -o DIR --build --node python", "--node python needs no building"),
+        ("PLAN ROBOT -o DIR --node cpp --type Header", "'Header' is not a message type"),
         ("ROBOT -o DIR --throttle /t1=100ms", "is not known: name a recording of the application"),
         ("ROBOT -o DIR --throttle /third:/t1", "write a topic and a period"),
         ("ROBOT -o DIR --throttle /third:/t1=1s,last", "'last' should be 'newest' or 'first'"),
         ("ROBOT -o DIR --throttle third:/t1=1s", "'third' is not a full ROS"),
         ("ROBOT -o DIR --throttle /third:/t1=0ms", "is zero"),
         ("-o DIR --throttle /third:/t1=1s", "give the launch files"),
-        ("ROBOT -o DIR --throttle /third:/t1=1s --node typed", "a throttler is for all types"),
+        ("ROBOT -o DIR --throttle /third:/t1=1s --type p/msg/T", "a throttler is for all types"),
         ("ROBOT ROBOT -o DIR", "robot.launch.xml"),
         ("PLAN PLAN -o DIR", "plan.yaml"),
     ],

@@ -20,7 +20,7 @@ from chainshaper.enforcement.journal import open_journal
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
 from chainshaper.enforcement.undoing import undo_run
-from chainshaper.linux.scheduling import Scheduling
+from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import find_thread
 from chainshaper.values.errors import PlatformError
 
@@ -39,7 +39,7 @@ def main() -> None:
         thread = find_thread(tid)
         assert thread is not None
         with suppress(PlatformError):
-            change_all(journal, [(thread, Scheduling(5, None))])
+            change_all(journal, [(thread, SchedulingRequest(5, None))])
         servers.assign(tid, "gated")
     servers.arm(time.monotonic_ns() + 320 * MS)
     own = [one.pid for one in guardians.processes]

@@ -32,9 +32,9 @@ from chainshaper.enforcement.threads import (
     with_gates,
 )
 from chainshaper.flow.threads import check_publishers, first_threads
-from chainshaper.linux.processes import Process, read_process
-from chainshaper.linux.scheduling import Scheduling
-from chainshaper.linux.threads import Thread, ThreadRole, dds_kind, gate_thread_name, role_of
+from chainshaper.linux.processes import RunningProcess, read_process
+from chainshaper.linux.scheduling import SchedulingRequest
+from chainshaper.linux.threads import RunningThread, ThreadRole, dds_kind, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.plan import ReceiverPlace, Server, ShapingNode, revised
@@ -54,15 +54,15 @@ def _process(
     parent: int = 1,
     participates: bool = True,
     inner_pid: int | None = None,
-) -> Process:
+) -> RunningProcess:
     """A process whose threads get the ids behind its own; in a container ids start from 1."""
     inner = pid if inner_pid is None else inner_pid
     threads = []
     for index, name in enumerate(("main", *names)):
         role, kind = role_of(name, is_main=index == 0), None if index == 0 else dds_kind(name)
-        thread = Thread(pid + index, pid, name, role, "SCHED_OTHER", 0, (0, 1), 10)
+        thread = RunningThread(pid + index, pid, name, role, "SCHED_OTHER", 0, (0, 1), 10)
         threads.append(replace(thread, inner_tid=inner + index, kind=kind))
-    return Process(pid, parent, tuple(command.split()), inner, participates, tuple(threads))
+    return RunningProcess(pid, parent, tuple(command.split()), inner, participates, tuple(threads))
 
 
 def _seen(pid: int, nodes: tuple[str, ...], *threads: RecordedThread) -> RecordedProcess:
@@ -114,7 +114,7 @@ EARLIER = [_seen(31, ("/d", "/e")), _seen(30, BOX, RecordedThread(30, "executor"
     ],
 )
 def test_what_each_thread_of_a_process_does(
-    process: Process, recorded: list[RecordedProcess], expected: str, known_by: str
+    process: RunningProcess, recorded: list[RecordedProcess], expected: str, known_by: str
 ) -> None:
     found = allocate([process], recorded)
     roles = [f"{t.thread.role}/{t.known_by.removesuffix(' thread')}" for t in found.threads]
@@ -126,7 +126,7 @@ def test_what_each_thread_of_a_process_does(
 
 
 def test_the_nodes_of_a_process_and_of_its_threads() -> None:
-    def nodes_of(process: Process, *recorded: RecordedProcess) -> list[tuple[str, ...]]:
+    def nodes_of(process: RunningProcess, *recorded: RecordedProcess) -> list[tuple[str, ...]]:
         return [one.nodes for one in allocate([process], recorded).threads]
 
     assert nodes_of(_process(1, f"{X} -r __ns:=/y", "recv")) == [("/y/x",)] * 2
@@ -205,7 +205,9 @@ INNERMOST = _process(70, X, participates=False, parent=60)
         ([_process(100, X), _process(200, X)], {100, 200}),
     ],
 )
-def test_which_of_several_processes_is_the_node(processes: list[Process], nodes: set[int]) -> None:
+def test_which_of_several_processes_is_the_node(
+    processes: list[RunningProcess], nodes: set[int]
+) -> None:
     found = allocate(processes)
     assert {t.thread.pid for t in found.threads if "/x" in t.nodes} == nodes
     ambiguous = ["node /x is ambiguous: processes 100, 200" in note for note in found.notes]
@@ -255,7 +257,7 @@ def _node(
     name: str, pid: int, *roles: ThreadRole, cores: tuple[int, ...] = (0, 1)
 ) -> list[NodeThread]:
     threads = [
-        Thread(pid + index, pid, role, role, "SCHED_OTHER", 0, cores, 1)
+        RunningThread(pid + index, pid, role, role, "SCHED_OTHER", 0, cores, 1)
         for index, role in enumerate(roles)
     ]
     return [NodeThread(thread, (name,), "name", "command line") for thread in threads]
@@ -265,7 +267,7 @@ def _allocation(*nodes: list[NodeThread]) -> Allocation:
     return Allocation(tuple(thread for node in nodes for thread in node), ())
 
 
-def _by_tid(wanted: tuple[WantedScheduling, ...]) -> dict[int, Scheduling]:
+def _by_tid(wanted: tuple[WantedScheduling, ...]) -> dict[int, SchedulingRequest]:
     return {one.thread.thread.tid: one.wanted for one in wanted}
 
 
@@ -311,7 +313,9 @@ def test_on_zenoh_its_router_delivers_too_and_notes_say_what_was_never_run(tmp_p
         comms = {one.thread.tid: one.thread.comm for one in found.threads}
         of_router = {one.tid for one in daemon.threads} & wanted.keys()
         assert {comms[tid] for tid in of_router} == (set(ZENOH) if names == ZENOH else set())
-        receiving = {comms[tid] for tid, one in wanted.items() if one == Scheduling(91, (0,))}
+        receiving = {
+            comms[tid] for tid, one in wanted.items() if one == SchedulingRequest(91, (0,))
+        }
         assert receiving == ({"rx-0", "rx-1"} if names == ZENOH else {"recv"})
         (note,) = found.notes
         assert note.startswith("/a, /rmw_zenohd: Zenoh: " if names == ZENOH else "/rmw_zenohd: ")
@@ -341,7 +345,7 @@ def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:
     assert _text(left_by_back_end("scx", wanted)) == "100:0@1 200:-@1 201:90@0"
     assert _text(left_by_back_end("litmus", wanted)) == "100:-@1 200:-@1 201:90@0"
     assert left_by_back_end("freezer", wanted) == wanted
-    assert Scheduling(0, None).policy == os.SCHED_OTHER
+    assert SchedulingRequest(0, None).policy == os.SCHED_OTHER
 
 
 NUMBERS = {"core": 1, "fifo_priority": 84, "spin_ns": 0, "pause_ns": 0}
@@ -360,24 +364,26 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     # 200 is in the chain, and so not below it; 301 is waited for, so above other DDS threads.
     assert _text(wanted) == "100:87@1 200:85@1 300:83@1 301:91@0"
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
-    assert more_cores[301] == Scheduling(91, (0,)), "the core that is kept clear for them"
+    assert more_cores[301] == SchedulingRequest(91, (0,)), "the core that is kept clear for them"
     assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
     (gate_thread,) = (one.wanted for one in wanted if one.thread.thread.tid == 100)
     free = _by_tid(left_by_back_end("scx", wanted, plan.free_threads))
     assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
-    assert more_cores[300] == Scheduling(83, (1,)), "it rests while one chain's output is received"
+    assert more_cores[300] == SchedulingRequest(83, (1,)), (
+        "it rests while one chain's output is received"
+    )
     for own_cores, stays in (((0,), True), ((0, 1), False)):
         by_hand = replace(sink[0], thread=replace(sink[0].thread, priority=30, cores=own_cores))
         placed = _allocation(gate, _node("/a", 200, "executor"), [by_hand, receiving])
         scheduled = _by_tid(plan_scheduling(plan, placed, (0, 1)))
-        assert scheduled.get(300) == (None if stays else Scheduling(83, (1,)))
-        assert scheduled[301] == Scheduling(91, (0,))
+        assert scheduled.get(300) == (None if stays else SchedulingRequest(83, (1,)))
+        assert scheduled[301] == SchedulingRequest(91, (0,))
     other = _server("other", PlannedThread(node="/b"), core=2, priority=2)
     several = ApplicationPlan(chains=(plan.chains[0], _plan(other).chains[0]))
     both = _allocation(gate, _node("/a", 200, "executor"), _node("/b", 400, "executor"), sink)
     for cores, core, notes in (((0, 1, 2), 0, 0), ((1, 2), 1, 1)):
         found = plan_scheduling(several, both, cores)
-        assert _by_tid(found)[300] == Scheduling(83, (core,))
+        assert _by_tid(found)[300] == SchedulingRequest(83, (core,))
         assert len(waiting_receivers(several, found)) == notes
         assert not waiting_receivers(several, left_by_back_end("scx", found))
     alone = whole(revised(bare, shaping_node=GATE))
@@ -399,7 +405,7 @@ def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> 
         assert 300 in _by_tid(left_by_back_end("scx", wanted)), "above the servers, as planned"
         assert not waiting_receivers(plan, wanted)
     missing = plan_scheduling(plan, allocation, (0, 1))
-    assert _by_tid(missing)[300] == Scheduling(86, (1,)), "there is no core 2"
+    assert _by_tid(missing)[300] == SchedulingRequest(86, (1,)), "there is no core 2"
 
 
 def test_a_gate_inside_the_chain_stands_behind_that_of_its_output() -> None:
@@ -449,9 +455,9 @@ def test_best_effort_runs_under_the_fair_class_and_equal_servers_take_turns() ->
     turns = whole(revised(apart.chains[0], equal_priorities="round-robin"))
     nodes = [_node(name, tid, "executor") for name, tid in (("/a", 1), ("/b", 2), ("/noise", 3))]
     for plan, turn in ((apart, False), (turns, True)):
-        real_time = Scheduling(87, (1,), turn)
+        real_time = SchedulingRequest(87, (1,), turn)
         wanted = _by_tid(plan_scheduling(plan, _allocation(*nodes), (0, 1)))
-        assert wanted == {1: real_time, 2: real_time, 3: Scheduling(0, (1,))}
+        assert wanted == {1: real_time, 2: real_time, 3: SchedulingRequest(0, (1,))}
 
 
 def test_an_asynchronous_publisher_stands_below_its_siblings_on_its_core() -> None:
@@ -495,13 +501,13 @@ def test_a_publisher_on_a_core_of_its_own_has_its_servers_priority() -> None:
     output = _server("output", PUBLISHER_B, priority=1, core=2)
     plan = _plan(_server("chain", EXECUTOR_B, priority=2, core=1), output)
     allocation = _allocation(_node("/b", 200, "executor", "publisher"))
-    assert _by_tid(plan_scheduling(plan, allocation, (0, 1, 2)))[201] == Scheduling(87, (2,))
+    assert _by_tid(plan_scheduling(plan, allocation, (0, 1, 2)))[201] == SchedulingRequest(87, (2,))
 
 
 def test_without_a_free_core_dds_threads_stay_where_they_are_but_above() -> None:
     plan = _plan(_server("x", EXECUTOR_A, core=0), _server("y", EXECUTOR_B, core=1))
     allocation = _allocation(_node("/a", 100, "executor", "dds"), _node("/b", 200, "executor"))
-    assert _by_tid(plan_scheduling(plan, allocation, (0, 1)))[101] == Scheduling(90, None)
+    assert _by_tid(plan_scheduling(plan, allocation, (0, 1)))[101] == SchedulingRequest(90, None)
 
 
 ALONE = _node("/b", 200, "executor", "publisher", "unknown", cores=(1,))
@@ -532,7 +538,7 @@ def test_what_an_executor_that_we_had_raised_starts_leaves_the_publishers_core()
     late = replace(late, thread=replace(late.thread, cores=(1,), priority=85))
     plan = _plan(_server("server", PUBLISHER_B))
     wanted = _by_tid(plan_scheduling(plan, _allocation([*others, late]), (0, 1)))
-    assert wanted[202] == Scheduling(0, (0,)), "it inherited both"
+    assert wanted[202] == SchedulingRequest(0, (0,)), "it inherited both"
 
 
 def test_nodes_that_share_an_executor_are_one_thread_of_one_server() -> None:
@@ -615,7 +621,7 @@ def test_whatever_the_plan_the_order_of_priorities_holds(
             same_process = sibling.thread.pid == one.thread.thread.pid
             if not same_process or sibling.thread.role == "publisher":
                 continue
-            new = after.get(sibling.thread.tid, Scheduling(None, None))
+            new = after.get(sibling.thread.tid, SchedulingRequest(None, None))
             if set(new.cores or sibling.thread.cores) & set(one.wanted.cores or ()):
                 assert known(one.wanted.priority) < known(new.priority)
 

@@ -24,7 +24,7 @@ from chainshaper.enforcement.scheduling_memory import (
     release_threads,
 )
 from chainshaper.linux.scheduling import (
-    Scheduling,
+    SchedulingRequest,
     SchedulingState,
     available_cores,
     may_use_fifo,
@@ -43,7 +43,7 @@ pytestmark = [
 ]
 
 FIRST, LAST = available_cores()[0], available_cores()[-1]
-WANTED = Scheduling(30, (LAST,))
+WANTED = SchedulingRequest(30, (LAST,))
 
 
 @pytest.fixture
@@ -61,7 +61,9 @@ def test_class_and_cores_are_changed_and_put_back(tmp_path: Path, journal: Journ
         os.setpriority(os.PRIO_PROCESS, actor.tids["b"], 5)
         before = _states(actor)
         change_all(journal, [(actor.thread("a"), WANTED)])
-        change_all(journal, [(actor.thread("b"), Scheduling(31, (FIRST,), takes_turns=True))])
+        change_all(
+            journal, [(actor.thread("b"), SchedulingRequest(31, (FIRST,), takes_turns=True))]
+        )
         a, b = state_of(actor.tids["a"]), state_of(actor.tids["b"])
         assert (a.scheduling_class.policy, a.scheduling_class.priority) == (os.SCHED_FIFO, 30)
         assert (b.scheduling_class.policy, b.scheduling_class.priority) == (os.SCHED_RR, 31)
@@ -79,7 +81,7 @@ def test_several_changes_go_back_to_what_was_there_at_first_but_what_is_others_s
         before, ended = _states(actor), actor.thread("ending")
 
         def wish(name: str, priority: int | None, *cores: int) -> None:
-            change_all(journal, [(actor.thread(name), Scheduling(priority, cores or None))])
+            change_all(journal, [(actor.thread(name), SchedulingRequest(priority, cores or None))])
 
         for wanted in ((30, LAST), (None, FIRST), (12,)):
             wish("a", *wanted)
@@ -129,7 +131,7 @@ def test_what_threads_inherited_goes_back_to_what_their_parents_had(
         child = actor.fork()
         for tid in (late, changed, own, child):
             assert state_of(tid).scheduling_class.priority == 30, "the kernel lets it inherit"
-        change_all(journal, [(actor.thread("changed"), Scheduling(29, (FIRST,)))])
+        change_all(journal, [(actor.thread("changed"), SchedulingRequest(29, (FIRST,)))])
         os.sched_setscheduler(own, os.SCHED_FIFO, os.sched_param(3))  # by itself, say
         release_threads(journal)
         for tid in (late, changed, child, actor.pid):
@@ -194,9 +196,9 @@ def test_what_the_kernel_refuses_names_the_thread_and_what_was_wanted(
     with acting(tmp_path, "a") as actor:
         tid = actor.tids["a"]
         with pytest.raises(OperationError, match=rf"thread {tid} \(a\).*SCHED_FIFO 500"):
-            change_all(journal, [(actor.thread("a"), Scheduling(500, None))])
+            change_all(journal, [(actor.thread("a"), SchedulingRequest(500, None))])
         with pytest.raises(OperationError, match=r"cores 1023: Invalid argument"):
-            change_all(journal, [(actor.thread("a"), Scheduling(None, (1023,)))])
+            change_all(journal, [(actor.thread("a"), SchedulingRequest(None, (1023,)))])
         before = _states(actor)
         release_threads(journal)
         assert _states(actor) == before
@@ -232,7 +234,7 @@ def test_sched_deadline_is_refused_and_stays(tmp_path: Path, journal: Journal) -
         release_threads(journal)
         # Somebody may also give it to a thread that we have changed.
         os.sched_setscheduler(actor.tids["a"], os.SCHED_OTHER, os.sched_param(0))
-        change_all(journal, [(actor.thread("a"), Scheduling(30, None))])
+        change_all(journal, [(actor.thread("a"), SchedulingRequest(30, None))])
         assert _set_deadline(actor.tids["a"])
         release_threads(journal)
         assert state_of(actor.tids["a"]).scheduling_class.policy == 6

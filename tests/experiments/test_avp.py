@@ -26,7 +26,7 @@ from avp.raycasting import cast
 from avp.scene import SCANS, drive
 from avp.throttling import throttle_front, throttle_rear
 
-from chainshaper.robot.decision import origin_of
+from chainshaper.robot.serialized import origin_of
 from chainshaper.workload.dds import number_in
 
 AHEAD = Lidar(x=1.0, yaw=0.0, width=np.pi / 2, azimuths=3, beams=3, height=2.0)

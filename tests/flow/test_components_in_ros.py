@@ -53,7 +53,8 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 def plan() -> Plan:
     latencies = np.linspace(5 * MS, 26 * MS, 300).astype(np.int64)
     profile = Profile(latencies, 100 * MS, nodes=("/source", "/filter"), topics=("/raw", "/points"))
-    return plan_chain(replace(profile, core_of={"/source": 1, "/filter": 1}))
+    profile = replace(profile, core_of={"/source": 1, "/filter": 1}, intra_process=True)
+    return plan_chain(profile)
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +64,7 @@ def with_node(
     """The environment with the shaping node's package too."""
     folder = tmp_path_factory.mktemp("node")
     launch = HERE / "clouds/launch/clouds.launch.py"
-    splice_launch_files(plan, [launch], folder / "out", node="component", message_type=TYPE)
+    splice_launch_files(plan, [launch], folder / "out", node="cpp", message_type=TYPE)
     return built(folder, folder / "out" / NODES, clouds)
 
 
@@ -85,9 +86,7 @@ def test_a_container_loads_the_shaping_node_and_nothing_is_copied(
     with_node: dict[str, str], plan: Plan, language: str, arguments: list[str], tmp_path: Path
 ) -> None:
     launch = HERE / f"clouds/launch/clouds.launch.{language}"
-    spliced = splice_launch_files(
-        plan, [launch], tmp_path / "out", node="component", message_type=TYPE
-    )
+    spliced = splice_launch_files(plan, [launch], tmp_path / "out", node="cpp", message_type=TYPE)
     (file,) = spliced.launch.values()
     counting = Path(with_node["AMENT_PREFIX_PATH"].split(":")[1]) / "lib/liblarge_allocations.so"
     assert counting.is_file()
@@ -121,7 +120,7 @@ def test_a_container_loads_the_shaping_node_and_nothing_is_copied(
 @pytest.mark.skipif(not may_use_fifo(), reason="SCHED_FIFO is not permitted here")
 @pytest.mark.skipif(len(available_cores()) < 2, reason="two cores are needed")
 def test_it_is_shaped_by_one_command(clouds: dict[str, str], tmp_path: Path) -> None:
-    words = ["shape", "--node", "component", "--chain", "/raw../points", "--duration", "12s"]
+    words = ["shape", "--node", "cpp", "--chain", "/raw../points", "--duration", "12s"]
     application = ["ros2", "launch", "clouds", "clouds.launch.xml"]
     run = subprocess.run(
         [sys.executable, "-m", "chainshaper", *words, "-o", "out", "--", *application],

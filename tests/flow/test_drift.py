@@ -25,7 +25,7 @@ from chainshaper.flow import threads
 from chainshaper.flow.apply import _Run
 from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase
-from chainshaper.linux.threads import Thread
+from chainshaper.linux.threads import RunningThread
 from chainshaper.planning.application_plan import combined, open_until_done, whole
 from chainshaper.planning.margins import Tail
 from chainshaper.planning.plan import Plan, revised
@@ -277,7 +277,7 @@ def test_servers_and_gate_move_with_the_same_cycle(
 
 def node(tid: int, name: str = "/origin") -> NodeThread:
     """The executor of a node's process, which has no other thread."""
-    thread = Thread(tid, tid, "node", "executor", "SCHED_OTHER", 0, (0,), started=tid)
+    thread = RunningThread(tid, tid, "node", "executor", "SCHED_OTHER", 0, (0,), started=tid)
     return NodeThread(thread, (name,), "main thread", "command line")
 
 

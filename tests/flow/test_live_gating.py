@@ -34,7 +34,7 @@ from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow import described
 from chainshaper.flow.described import gated_threads
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.linux.threads import Thread as RunningThread
+from chainshaper.linux.threads import RunningThread
 from chainshaper.planning import Plan, PlanRequest, save_plan
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.overruns import cycles_until_output

@@ -25,7 +25,7 @@ from chainshaper.flow.profiling import (
 )
 from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import SchedulingState, available_cores, may_use_fifo, state_of
-from chainshaper.linux.threads import Thread, list_threads
+from chainshaper.linux.threads import RunningThread, list_threads
 
 pytestmark = [
     pytest.mark.timed,
@@ -58,7 +58,7 @@ def nodes(node: Path) -> Iterator[dict[str, int]]:
             process.wait()
 
 
-def _dds(pid: int) -> list[Thread]:
+def _dds(pid: int) -> list[RunningThread]:
     return [thread for thread in list_threads(pid) if thread.role == "dds"]
 
 
@@ -96,7 +96,7 @@ def test_cores_ranks_and_best_effort_are_those_that_are_named(
     last, (front, rear) = available_cores()[-1], nodes
     before = _states(nodes)
 
-    def executors(names: Any, cores: Any, **how: Any) -> list[Thread]:
+    def executors(names: Any, cores: Any, **how: Any) -> list[RunningThread]:
         with profiling_condition(names, cores, tmp_path, **how) as see_to_it:
             see_to_it(list_processes(nodes.values()))
             found = [list_threads(pid)[0] for pid in nodes.values()]

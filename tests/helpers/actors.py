@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from chainshaper.linux.threads import Thread, list_threads
+from chainshaper.linux.threads import RunningThread, list_threads
 
 _PROGRAM = """
 import ctypes, json, os, signal, sys, threading
@@ -76,7 +76,7 @@ class Actor:
     def pid(self) -> int:
         return self.process.pid
 
-    def thread(self, name: str) -> Thread:
+    def thread(self, name: str) -> RunningThread:
         """One of its threads as the kernel shows it now; ``main`` is the main thread."""
         tid = self.pid if name == "main" else self.tids[name]
         return next(thread for thread in list_threads(self.pid) if thread.tid == tid)

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from processes import children_of, wait_for
 
-from chainshaper.linux.processes import Process, read_process
+from chainshaper.linux.processes import RunningProcess, read_process
 
 __all__ = ["contained", "in_container", "needs_namespaces"]
 
@@ -45,7 +45,7 @@ def contained(
     *,
     user: bool = False,
     overlaid: Path | None = None,
-) -> Iterator[tuple["subprocess.Popen[str]", Process]]:
+) -> Iterator[tuple["subprocess.Popen[str]", RunningProcess]]:
     """A container with a command, until it is left: `unshare`, and the process as seen here."""
     started = subprocess.Popen(
         in_container(command, user=user, overlaid=overlaid),
@@ -55,7 +55,7 @@ def contained(
         text=True,
     )
     try:
-        found: list[Process] = []
+        found: list[RunningProcess] = []
 
         def runs() -> bool:
             assert started.poll() is None, "no such namespaces can be made here"

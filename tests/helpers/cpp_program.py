@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.splicing.shaping_process import cpp_package
+from chainshaper.splicing.node_packages import cpp_package
 
 
 def compiled(source: Path, folder: Path, name: str = "g++") -> Path:

@@ -15,7 +15,7 @@ import pytest
 
 from chainshaper.enforcement.slot_dispatcher import PRIORITY
 from chainshaper.linux.threads import list_threads
-from chainshaper.robot.decision import sleep_until
+from chainshaper.robot.clocks import sleep_until
 from chainshaper.workload.live import Enforcement, StartedNodes
 
 

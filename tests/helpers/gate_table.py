@@ -7,7 +7,9 @@ from typing import Any
 
 import yaml
 
-from chainshaper.robot.decision import Gate, Modes, Queue, Release, missed
+from chainshaper.robot.decision import Release, missed
+from chainshaper.robot.gate import Gate, Modes
+from chainshaper.robot.waiting import Queue
 
 MS = 1_000_000
 PUBLISHING_NS = MS // 8

@@ -3,7 +3,9 @@
 import struct
 import time
 
-from chainshaper.robot.decision import Outcome, Release, Shaper
+from chainshaper.robot.decision import Release
+from chainshaper.robot.shaper import Shaper
+from chainshaper.robot.waiting import Outcome
 
 
 def decided(shaper: Shaper, payload: bytes, arrival_ns: int) -> Release:

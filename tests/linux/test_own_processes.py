@@ -68,7 +68,7 @@ def test_one_place_starts_python() -> None:
         for path in SOURCES.rglob("*.py")
         if re.search(r"sys\.executable|multiprocessing|ProcessPool", path.read_text())
     }
-    in_nodes, again = "gate/clear_core.py", "robot/python/respawning.py"
+    in_nodes, again = "robot/clear_core.py", "robot/python/respawning.py"
     assert starting.keys() == {"linux/own_processes.py", in_nodes, again}
     assert '[sys.executable, "-I", "-S", "-c"' in starting[in_nodes]
 

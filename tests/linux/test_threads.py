@@ -12,7 +12,7 @@ from known import known
 from processes import in_time_namespace, wait_for
 
 from chainshaper.linux.scheduling import (
-    Scheduling,
+    SchedulingRequest,
     apply_scheduling,
     available_cores,
     check_cores,
@@ -22,7 +22,7 @@ from chainshaper.linux.scheduling import (
 )
 from chainshaper.linux.threads import (
     DdsKind,
-    Thread,
+    RunningThread,
     dds_kind,
     find_thread,
     foreign_realtime_processes,
@@ -131,20 +131,22 @@ def test_in_a_container_a_thread_has_an_id_of_its_own() -> None:
     assert innermost_id(b"Name:\tx\n") is None  # a kernel without pid namespaces
 
 
-def _thread(tid: int) -> Thread:
-    return Thread(tid, os.getpid(), "recv", "dds", "SCHED_OTHER", 0, (0,))
+def _thread(tid: int) -> RunningThread:
+    return RunningThread(tid, os.getpid(), "recv", "dds", "SCHED_OTHER", 0, (0,))
 
 
 def test_scheduling_a_thread_that_has_ended_is_no_error_and_what_is_refused_is_named() -> None:
     ended = threading.Thread(target=lambda: None)
     ended.start()
     ended.join()
-    apply_scheduling(_thread(known(ended.native_id)), Scheduling(None, (available_cores()[0],)))
+    apply_scheduling(
+        _thread(known(ended.native_id)), SchedulingRequest(None, (available_cores()[0],))
+    )
     thread = _thread(threading.get_native_id())
     with pytest.raises(OperationError, match=rf"thread {thread.tid} \(recv\).*priority 500"):
-        apply_scheduling(thread, Scheduling(500, None))
+        apply_scheduling(thread, SchedulingRequest(500, None))
     with pytest.raises(OperationError, match=r"cores \(1023,\)"):
-        apply_scheduling(thread, Scheduling(None, (1023,)))
+        apply_scheduling(thread, SchedulingRequest(None, (1023,)))
 
 
 def test_asking_for_real_time_scheduling_changes_nothing() -> None:

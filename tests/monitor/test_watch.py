@@ -41,7 +41,7 @@ from chainshaper.monitor.metrics import SCRAPERS
 from chainshaper.monitor.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 from chainshaper.planning import publish_slots
 from chainshaper.planning.application_plan import ApplicationPlan, whole
-from chainshaper.robot import decision
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.preload import (
     VARIABLE,
     PreloadTracer,
@@ -301,7 +301,7 @@ def test_a_clock_that_is_set_spoils_no_figure(
     (tmp_path / "clock.c").write_text(REALTIME_STEPS)
     words = ["gcc", "-shared", "-fPIC", "-o", str(tmp_path / "clock.so"), str(tmp_path / "clock.c")]
     subprocess.run(words, check=True)
-    at, real = time.monotonic_ns() + 3 * SECOND // 2, decision.clock_offset
+    at, real = time.monotonic_ns() + 3 * SECOND // 2, clock_offset
     shifted = lambda: real() - (60_000_000 if time.monotonic_ns() > at else 0)  # noqa: E731
     monkeypatch.setattr(watch_module, "clock_offset", shifted)
     program = built("-DHUMBLE", version=version) if version == "4.1.1" else built()

@@ -33,8 +33,9 @@ from chainshaper.planning.margins import Tail
 from chainshaper.planning.plan import Adaptation, Modes, Plan, Thread, revised, with_slots
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.robot import handover
-from chainshaper.robot.decision import Outcome, Release, Waiting
+from chainshaper.robot.decision import Release
 from chainshaper.robot.handover import Turn
+from chainshaper.robot.waiting import Outcome, Waiting
 from chainshaper.splicing import shaped_outputs
 from chainshaper.splicing.shaped_outputs import find_outputs, output_text
 from chainshaper.values.errors import InputError, OperationError

@@ -27,7 +27,7 @@ from chainshaper.planning.bands import (
 )
 from chainshaper.planning.plan import Plan, band_predictions, publish_slots, revised
 from chainshaper.planning.shaping import plan_shaping, server_per_chain
-from chainshaper.robot.decision import IntoOpenSlot
+from chainshaper.robot.gate import IntoOpenSlot
 from chainshaper.values.errors import InputError, OperationError
 
 MS = 1_000_000

@@ -17,35 +17,36 @@ import time
 from contextlib import suppress
 from unittest.mock import MagicMock
 
-from chainshaper.robot import decision, handover
+from chainshaper.robot import handover
+from chainshaper.robot.decision import DROPPED, Release
+from chainshaper.robot.gate import Gate, Modes
+from chainshaper.robot.waiting import Outcome, Waiting
 
 
 def publish(word: bytes, number: int) -> None:
     os.write(1, word + number.to_bytes(8, "little"))
 
 
-def outcome(
-    dropped: str | None, lost: int | None, *, late: bool, latency_ns: int
-) -> decision.Outcome:
-    message = decision.Waiting(b"", latency_ns, None, 0, lost=lost)
+def outcome(dropped: str | None, lost: int | None, *, late: bool, latency_ns: int) -> Outcome:
+    message = Waiting(b"", latency_ns, None, 0, lost=lost)
     treated = "wait" if late else None
-    release = decision.Release(None, 0, None, 0, "cycle", treated, dropped=dropped)
-    return decision.Outcome(message, release, 0)
+    release = Release(None, 0, None, 0, "cycle", treated, dropped=dropped)
+    return Outcome(message, release, 0)
 
 
 def main() -> None:
     folder, what, name, port, hold = sys.argv[1:]
     handover.page_folders = lambda: iter([folder])
     if what == "starting":
-        modes, asked = decision.Modes({"city": 0, "highway": 0}, "city"), list[object]()
-        shaper = MagicMock(gate=decision.Gate(((0, 1),), 2, modes=modes))
+        modes, asked = Modes({"city": 0, "highway": 0}, "city"), list[object]()
+        shaper = MagicMock(gate=Gate(((0, 1),), 2, modes=modes))
         shaper.set_phase = shaper.switch = lambda what, _: asked.append(what)
         handover.Turn(name, "/t5").go_on(shaper)
         print(*asked)  # noqa: T201
         return
     if what == "counting":
         turn = handover.Turn(name, "/t5")
-        for number, reason in enumerate(decision.DROPPED):
+        for number, reason in enumerate(DROPPED):
             for _ in range(number + 1):
                 turn.count(outcome(reason, number, late=number % 2 == 1, latency_ns=number))
         moved, _ = turn.moved() or (77, 0)

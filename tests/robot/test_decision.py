@@ -14,19 +14,11 @@ from hypothesis import strategies as st
 from known import known
 from passing import decided, held, serialized
 
-from chainshaper.robot import decision
-from chainshaper.robot.decision import (
-    LATE,
-    OVERRUNS,
-    Gate,
-    Modes,
-    Release,
-    Shaper,
-    missed,
-    origin_of,
-    release_of,
-    text_of,
-)
+from chainshaper.robot import shaper as shaping
+from chainshaper.robot.decision import Release, missed, release_of
+from chainshaper.robot.gate import LATE, OVERRUNS, Gate, Modes
+from chainshaper.robot.serialized import origin_of, text_of
+from chainshaper.robot.shaper import Shaper
 
 MS, SECOND = 1_000_000, 1_000_000_000
 
@@ -200,7 +192,7 @@ def test_who_wakes_behind_the_slot_discards_what_came_in_time(
         while time.monotonic_ns() < deadline_ns + 3 * MS:
             pass
 
-    monkeypatch.setattr(decision, "sleep_until", oversleep)
+    monkeypatch.setattr(shaping, "sleep_until", oversleep)
     for policy, treated in (
         ("discard", ("discard", None, "discarded")),
         ("wait", (None, 0, None)),
@@ -321,7 +313,7 @@ def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.Monkey
     The wall clock cannot be stepped for a test, so the offset that the shaper reads stands in.
     """
     offset = 1_700_000_000 * SECOND
-    monkeypatch.setattr(decision, "clock_offset", lambda: offset)
+    monkeypatch.setattr(shaping, "clock_offset", lambda: offset)
     shaper = Shaper(Gate(((60 * MS, 61 * MS),), 100 * MS))
     started = 5 * SECOND + 42 * MS
     under_way = serialized(started + 100 * MS + offset)
@@ -345,7 +337,7 @@ def test_a_step_of_the_wall_clock_disturbs_no_message(monkeypatch: pytest.Monkey
 
 def test_a_shaper_follows_the_modes_that_are_announced(monkeypatch: pytest.MonkeyPatch) -> None:
     """The offset between the two clocks, zero here, cannot be set for a test."""
-    monkeypatch.setattr(decision, "clock_offset", lambda: 0)
+    monkeypatch.setattr(shaping, "clock_offset", lambda: 0)
     shaper = Shaper(MODAL_MS)
     assert decided(shaper, serialized(1000 * MS), 1010 * MS).at_ns == 1060 * MS
     assert shaper.switch("highway", 1050 * MS)

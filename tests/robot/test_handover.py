@@ -245,7 +245,7 @@ def test_a_page_that_is_removed_while_it_is_used_is_made_again(
     output.kill("shaping")
     output.send_many(5)
     output.check(begun)
-    assert [path.name for path in folder.iterdir()] == ["t5.0.v3"]
+    assert [path.name for path in folder.iterdir()] == ["t5.0.v4"]
 
 
 def test_pages_that_no_process_has_are_removed_and_the_folder_behind_is_not_made(
@@ -339,7 +339,7 @@ def test_only_a_node_of_the_same_launch_goes_on_in_its_cycle_and_mode(
         return done.stdout.decode().strip()
 
     assert started() == ""
-    page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
+    page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
     for age_ns, before, wanted in (
         (0, [], "12345 highway"),
         (40_000 * MS, [], ""),  # its parent may be that of all launches
@@ -357,15 +357,15 @@ def test_what_a_node_counts_is_in_the_page_for_those_who_look(
     command = [*program, "counting", "t5", "0", "0"]
     for times in (1, 2):  # a node that its launch starts again goes on counting
         if times == 2:
-            page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
+            page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
             page["until_ns"] = time.monotonic_ns()
         subprocess.run(command, check=True, timeout=60)
-        page = Page(str(folder), "t5.0.v3")
+        page = Page(str(folder), "t5.0.v4")
         assert [page[reason] for reason in DROPPED] == [times, 2 * times, 3 * times, 4 * times]
         assert page["published"] == times
         assert page["lost_by_dds"] == times * (0 + 2 * 1 + 3 * 2 + 4 * 3)
         assert page["late"] == times * (2 + 4)
-    page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
+    page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
     page["moved_ns"], page["moved_from_ns"] = -5, time.monotonic_ns() + 10**15
     assert page.lock(MOVING)
     subprocess.run(command, check=True, timeout=60)
@@ -383,11 +383,11 @@ def test_each_launch_counts_from_nought(folder: Path, program: list[str]) -> Non
     launch = ["sh", "-c", '"$@"; true', "launch"]  # a parent of its own
     for _ in range(3):
         subprocess.run([*launch, *command], check=True, timeout=60)
-        page = Page(str(folder), "t5.0.v3")
+        page = Page(str(folder), "t5.0.v4")
         counts = [page[name] for name in ("starts", "published", *DROPPED, "lost_by_dds", "late")]
         assert counts == [1, 1, 1, 2, 3, 4, 0 + 2 * 1 + 3 * 2 + 4 * 3, 2 + 4]
     assert page["measured"] == 3 * 11, "who reads latencies goes on where it was"
-    page = Page(str(folder), "t5.0.v3", "/t5", os.O_RDWR)
+    page = Page(str(folder), "t5.0.v4", "/t5", os.O_RDWR)
     assert page.lock()  # a node of another launch is in force: its counts stay
     subprocess.run([*launch, *program, "starting", "t5", "0", "0"], check=True, timeout=60)
     assert page["published"] == 1
@@ -409,14 +409,14 @@ def test_a_folder_that_is_not_ours_alone_is_not_used(
     if how == "mode":
         folder.chmod(0o777)
     if how == "foreign page":
-        (folder / "t5.0.v3").touch()
+        (folder / "t5.0.v4").touch()
     if how in ("owner", "foreign page"):
-        os.chown(folder if how == "owner" else folder / "t5.0.v3", 65534, -1)
+        os.chown(folder if how == "owner" else folder / "t5.0.v4", 65534, -1)
     with pytest.raises(OSError, match=r"outputs: .*(not a folder|exists|not a file of)"):
         open_page("t5", "/t5")
     spare = str(tmp_path / "spare")
     monkeypatch.setattr(FOLDERS, lambda: iter([str(folder), spare]))
-    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v3"
+    assert open_page("t5", "/t5").path == f"{spare}/t5.0.v4"
 
 
 def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
@@ -425,7 +425,7 @@ def test_a_page_for_which_there_is_no_room_is_made_elsewhere_and_found_there(
     folders = [f"{full_disk}/outputs", str(folder)]
     monkeypatch.setattr(FOLDERS, lambda: iter(folders))
     page = open_page("t5", "/t5")
-    assert page.path == f"{folder}/t5.0.v3"
+    assert page.path == f"{folder}/t5.0.v4"
     folders[0] = f"{folder.parent}/room"
     assert open_page("t5", "/t5").path == page.path
 

@@ -10,7 +10,7 @@ from cpp_program import compiled
 from hypothesis import given
 from hypothesis import strategies as st
 
-from chainshaper.robot.decision import FirstOfPeriod
+from chainshaper.robot.throttling import FirstOfPeriod
 
 P, EARLY = 100, 20
 NS_PERIOD = 100_000_000

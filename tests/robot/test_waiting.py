@@ -17,7 +17,9 @@ from processes import wait_for
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads
 from chainshaper.robot.clear_core import ClearCore
-from chainshaper.robot.decision import Gate, Shaper, clock_offset, sleep_until, watch_until
+from chainshaper.robot.clocks import clock_offset, sleep_until, watch_until
+from chainshaper.robot.gate import Gate
+from chainshaper.robot.shaper import Shaper
 
 pytestmark = pytest.mark.timed
 

@@ -12,7 +12,7 @@ from small_chain import small_chain, small_chain_plan
 from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
 from chainshaper.planning import PlanRequest
-from chainshaper.robot.decision import Overrun
+from chainshaper.robot.gate import Overrun
 from chainshaper.simulation import simulate_latencies
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application

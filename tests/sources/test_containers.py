@@ -13,7 +13,7 @@ from traced_program import built, skip_without_bpftrace
 
 import chainshaper as cs
 from chainshaper.flow.threads import recorded_processes
-from chainshaper.linux.processes import Process, user_of
+from chainshaper.linux.processes import RunningProcess, user_of
 from chainshaper.sources.preload import installed_library
 from chainshaper.sources.system import NEXT_HOST
 
@@ -27,7 +27,7 @@ def _running(
     *,
     user: bool = False,
     overlaid: Path | None = None,
-) -> Process:
+) -> RunningProcess:
     """The program in a container, once its objects are there."""
     container = contained(command, environment, user=user, overlaid=overlaid)
     started, process = stack.enter_context(container)
@@ -37,7 +37,7 @@ def _running(
     return process
 
 
-def _recorded(output: Path, source: str, processes: Sequence[Process]) -> set[int]:
+def _recorded(output: Path, source: str, processes: Sequence[RunningProcess]) -> set[int]:
     """Record processes for a second; their ids."""
     words = [word for one in processes for word in ("--pid", str(one.pid))]
     made = called("record", "--source", source, "-o", output, "--duration", "600ms", *words)

@@ -5,7 +5,7 @@ from pathlib import Path
 import polars as pl
 import pytest
 
-from chainshaper.robot.decision import LOG_COLUMNS
+from chainshaper.robot.gate_log import LOG_COLUMNS
 from chainshaper.sources.gate_log import read_gate_log, with_gate_logs
 from chainshaper.values import events
 from chainshaper.values.errors import InputError

@@ -7,7 +7,7 @@ import polars as pl
 
 from chainshaper.analysis.flow import data_flow
 from chainshaper.analysis.graph import application_graph
-from chainshaper.linux.processes import Process
+from chainshaper.linux.processes import RunningProcess
 from chainshaper.sources.ebpf.late_attachment import (
     with_found_nodes,
     with_found_objects,
@@ -162,8 +162,8 @@ def nodes_of(tables: events.EventTables) -> dict[int, str]:
     return dict(rows)
 
 
-def container(command: tuple[str, ...]) -> Process:
-    return Process(PID, 1, command, PID, True, ())
+def container(command: tuple[str, ...]) -> RunningProcess:
+    return RunningProcess(PID, 1, command, PID, True, ())
 
 
 def test_two_nodes_of_one_process_are_told_apart_by_their_topics() -> None:

@@ -11,17 +11,9 @@ import pytest
 from cpp_program import compiled
 from gate_table import PUBLISHING_NS, Case, Outcome, cases, walk
 
-from chainshaper.robot.decision import (
-    ANCHORS,
-    DROPPED,
-    INTO_OPEN_SLOT,
-    LATE,
-    MESSAGES,
-    OVERRUNS,
-    Gate,
-    Modes,
-    origin_of,
-)
+from chainshaper.robot.decision import DROPPED
+from chainshaper.robot.gate import ANCHORS, INTO_OPEN_SLOT, LATE, MESSAGES, OVERRUNS, Gate, Modes
+from chainshaper.robot.serialized import origin_of
 from chainshaper.sources.gate_log import read_gate_log
 
 CASES = 5000

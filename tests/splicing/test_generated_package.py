@@ -7,11 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from chainshaper.splicing.shaping_process import (
-    build_package,
-    cpp_package,
-    message_type_named,
-)
+from chainshaper.splicing.message_types import message_type_named
+from chainshaper.splicing.node_packages import build_package, cpp_package
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 TYPE = "sensor_msgs/msg/PointCloud2"
@@ -156,7 +153,8 @@ def programs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         program.write_text('#!/bin/sh\necho "$0 $*"\nexit ${STAND_IN_CODE:-0}\n')
         program.chmod(0o755)
     monkeypatch.setenv("PATH", str(folder))
-    monkeypatch.setenv("AMENT_PREFIX_PATH", "/opt/ros/some")
+    (tmp_path / "share/rclcpp").mkdir(parents=True)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     monkeypatch.delenv("CXX", raising=False)
     return folder
 

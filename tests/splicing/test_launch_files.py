@@ -15,12 +15,11 @@ from launch_cases import NDT, ROBOTS, plan_for, robot_file
 from node_run import parameters_of
 
 from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
-from chainshaper.planning.application_plan import whole
 from chainshaper.planning.plan import publish_slots, revised
-from chainshaper.splicing.shaping_process import zero_copy_lost
+from chainshaper.splicing.node_kinds import copies_made, kind_of, language_of
 from chainshaper.splicing.spliced_launch import parse_launch_command, undo_splice
 from chainshaper.values.errors import InputError, PlatformError
-from chainshaper.values.plan_choices import NodeKind
+from chainshaper.values.plan_choices import NodeChoice
 from chainshaper.values.recording import Recording
 
 MS = 1_000_000
@@ -131,7 +130,10 @@ def test_both_nodes_are_started_with_their_files_and_again_when_they_end(
 
 def test_a_component_goes_into_its_publishers_container_and_has_no_standby(robot: Path) -> None:
     out, type_ = robot.parent / "out", "sensor_msgs/msg/PointCloud2"
-    spliced = splice_launch_files(PLAN, [robot], out, node="component", message_type=type_)
+    evidence = PLAN.evidence.model_copy(update={"intra_process": True})
+    plan = revised(PLAN, evidence=evidence)
+    spliced = splice_launch_files(plan, [robot], out, node="cpp", message_type=type_)
+    assert "/pose: the shaping node is a component in C++" in spliced.notes[0]
     written, nodes = launched(spliced), out / "shaping_nodes"
     assert written["PROCESSES"] == []
     assert written["REDIRECTS"][0]["component"] == {
@@ -148,14 +150,51 @@ def test_a_component_goes_into_its_publishers_container_and_has_no_standby(robot
 
 
 def test_what_a_node_costs_where_messages_are_not_copied_is_said() -> None:
-    assert zero_copy_lost(whole(PLAN), "python") == []
-    (said,) = zero_copy_lost(whole(PLAN), "component")
-    assert said.startswith("/pose: subscribers in the process of /ndt do not get its messages now;")
+    assert not [*copies_made(PLAN, "python", within_container=False)]
     evidence = PLAN.evidence.model_copy(update={"intra_process": True})
-    plan = whole(revised(PLAN, evidence=evidence))
-    (said,) = zero_copy_lost(plan, "cpp")
+    plan = revised(PLAN, evidence=evidence)
+    (said,) = copies_made(plan, "python", within_container=True)
     assert said.startswith("/pose: subscribers in the process of /ndt get its messages without a")
-    assert zero_copy_lost(plan, "component") == []
+    assert said.endswith("choose --node cpp")
+    (said,) = copies_made(plan, "generic", within_container=True)
+    assert "name the type of the output with --type" in said
+    assert not [*copies_made(plan, "component", within_container=True)]
+
+
+def test_the_kind_of_shaping_node_is_found_out_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    type_ = "sensor_msgs/msg/PointCloud2"
+    header = tmp_path / "include/sensor_msgs/sensor_msgs/msg/point_cloud2.hpp"
+    header.parent.mkdir(parents=True)
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    assert kind_of("python", type_, within_container=True)[0] == "python"
+    assert kind_of("cpp", None, within_container=True)[0] == "generic"
+    kind, reason = kind_of("cpp", type_, within_container=True)
+    assert (kind, f"no headers of {type_}" in reason) == ("generic", True)
+    header.touch()
+    assert kind_of("cpp", type_, within_container=False)[0] == "typed"
+    assert kind_of("cpp", type_, within_container=True)[0] == "component"
+
+
+def test_auto_is_cpp_where_it_is_built_and_can_be(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("colcon", "cmake", "c++"):
+        (tmp_path / name).touch(0o755)
+    (tmp_path / "share/rclcpp").mkdir(parents=True)
+    monkeypatch.delenv("CXX", raising=False)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+    assert language_of("auto", builds=True)[0] == "cpp"
+    assert language_of("auto", builds=False)[0] == "python"
+    assert language_of("python", builds=True) == ("python", "")
+    (tmp_path / "share/rclcpp").rmdir()
+    language, reason = language_of("auto", builds=True)
+    assert (language, "has no rclcpp" in reason) == ("python", True)
+    monkeypatch.setenv("PATH", "/nowhere")
+    assert "colcon" in language_of("auto", builds=True)[1]
+    assert language_of("cpp", builds=True) == ("cpp", "")
 
 
 def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
@@ -218,27 +257,30 @@ def test_all_shaping_nodes_of_a_plan_are_spliced(robot: Path, known: str) -> Non
 
 
 @pytest.mark.parametrize("distribution", ["jazzy", "lyrical"])
-@pytest.mark.parametrize("node", ["python", "typed"])
+@pytest.mark.parametrize("node", ["python", "cpp"])
 @pytest.mark.parametrize("field", ["uint8[] data  # bytes", "uint8[4] data"])
 def test_a_node_that_would_get_no_message_is_refused(
-    robot: Path, monkeypatch: pytest.MonkeyPatch, node: NodeKind, distribution: str, field: str
+    robot: Path, monkeypatch: pytest.MonkeyPatch, node: NodeChoice, distribution: str, field: str
 ) -> None:
     """Lyrical's Fast DDS has another reader for messages with bytes, which `typed` takes from."""
     definition = robot.parent / "share" / "robot_msgs" / "msg" / "Cloud.msg"
     definition.parent.mkdir(parents=True)
     definition.write_text(f"float32 x\n{field}\n")
+    header = robot.parent / "include/robot_msgs/robot_msgs/msg/cloud.hpp"
+    header.parent.mkdir(parents=True)
+    header.touch()
     monkeypatch.setenv("AMENT_PREFIX_PATH", f"/elsewhere:{robot.parent}")
     # Its standby is no second publisher.
     ends = [(name, "/pose", "publisher") for name in ("/ndt", "/chainshaper_pose_standby")]
     known = {"rmw": "rmw_fastrtps_cpp", "distribution": distribution}
     seen = recorded(robot.parent, *ends, type_="robot_msgs/msg/Cloud", **known)
     refused = (node, distribution, field[:7]) == ("python", "lyrical", "uint8[]")
-    with pytest.raises(InputError, match="use --node typed") if refused else nullcontext():
+    with pytest.raises(InputError, match="use --node cpp") if refused else nullcontext():
         spliced = splice_launch_files(
             PLAN, [robot], robot.parent / "out", node=node, recording=seen
         )
         assert redirects(spliced) == {"/pose": ("/pose_tmp", ("/ndt",))}
-        package = "shaping_robot_msgs_cloud" if node == "typed" else None
+        package = "shaping_robot_msgs_cloud" if node == "cpp" else None
         assert spliced.processes[0].package == package
 
 
@@ -280,7 +322,7 @@ def test_a_plan_is_spliced_into_the_throttled_launch_file_and_again_from_its_own
     shaped = splice_launch_files(PLAN, [*throttled.launch.values()], robot.parent / "shaped")
     again = splice_launch_files(PLAN, [*shaped.launch.values()], robot.parent / "shaped")
     assert again.diff == shaped.diff
-    assert f"spliced from its original, {out / 'robot.launch.py'}" in again.notes[0]
+    assert f"spliced from its original, {out / 'robot.launch.py'}" in again.notes[-1]
     for spliced in (shaped, again):
         assert launched(spliced)["LAUNCH_FILES"] == [str(out / "robot.launch.py")]
         assert list(redirects(spliced)) == ["/pose"]

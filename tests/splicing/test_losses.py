@@ -62,7 +62,7 @@ def wait_for_rows(log: Path, count: int) -> pl.DataFrame:
 
 @pytest.mark.parametrize(
     ("messages", "lost"),
-    [("all-in-order", "overflowed"), ("newest", "replaced"), ("first", "surplus")],
+    [("all-in-order", "overflowed"), ("newest", "replaced")],
 )
 def test_bursts_leave_as_planned_and_the_rest_is_counted(
     tmp_path: Path, plan: Plan, messages: str, lost: str

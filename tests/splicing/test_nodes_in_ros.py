@@ -21,17 +21,18 @@ from ros2 import ros2_environment
 
 from chainshaper.planning import Plan
 from chainshaper.planning.plan import revised
-from chainshaper.robot.decision import RULES, Rule
+from chainshaper.robot.throttling import RULES, Rule
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.sources.ros import own_environment, run_with_rclpy
 from chainshaper.sources.ros import script as ros_script
+from chainshaper.splicing.node_kinds import NodeKind
+from chainshaper.splicing.node_packages import build_package
 from chainshaper.splicing.shaping_process import (
     ShapingProcess,
-    build_package,
     write_shaping_process,
     write_throttler,
 )
-from chainshaper.values.plan_choices import NodeKind
+from chainshaper.values.plan_choices import NodeLanguage
 
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(600)]
 
@@ -52,7 +53,7 @@ def workspace(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Path:
     if shutil.which("colcon") is None:
         pytest.skip("colcon is not on the PATH, so no package can be built")
     folder = tmp_path_factory.mktemp("workspace")
-    for kind in ("cpp", "typed"):
+    for kind in ("generic", "typed"):
         written(plan, kind, folder)
     build_package(folder)
     return folder
@@ -116,7 +117,7 @@ def rclpy_has_source_timestamps() -> bool:
 
 
 @pytest.mark.parametrize("quality", ["latched", "best_effort"])
-@pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
+@pytest.mark.parametrize("kind", ["python", "generic", "typed"])
 def test_messages_come_back_in_the_slot_of_their_mode(
     tmp_path: Path, plan: Plan, kind: NodeKind, quality: str, place: Path | None
 ) -> None:
@@ -153,7 +154,7 @@ def test_messages_come_back_in_the_slot_of_their_mode(
 
 
 @pytest.mark.parametrize("messages", ["all-in-order", "newest"])
-@pytest.mark.parametrize("kind", ["python", "cpp", "typed"])
+@pytest.mark.parametrize("kind", ["python", "generic", "typed"])
 def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
     tmp_path: Path, plan: Plan, kind: NodeKind, messages: str, place: Path | None
 ) -> None:
@@ -172,7 +173,7 @@ def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
     assert reasons <= ({"replaced", "overflowed"} if messages == "newest" else {"overflowed"})
 
 
-@pytest.mark.parametrize("kind", ["python", "cpp"])
+@pytest.mark.parametrize("kind", ["python", "generic"])
 def test_a_running_node_is_told_where_cycles_begin(
     tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
 ) -> None:
@@ -191,7 +192,7 @@ def test_a_running_node_is_told_where_cycles_begin(
     assert set(origins % plan.cycle_ns) <= {0, phase}
 
 
-@pytest.mark.parametrize("kind", ["python", "cpp"])
+@pytest.mark.parametrize("kind", ["python", "generic"])
 def test_it_stops_while_it_waits_for_its_input(
     tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
 ) -> None:
@@ -219,12 +220,13 @@ def test_a_typed_node_refuses_another_type(
 
 
 @pytest.mark.parametrize("rule", RULES)
-@pytest.mark.parametrize("kind", ["python", "cpp"])
+@pytest.mark.parametrize("kind", ["python", "generic"])
 def test_the_throttler_publishes_once_a_period(
-    tmp_path: Path, kind: Any, place: Path | None, rule: Rule
+    tmp_path: Path, kind: NodeKind, place: Path | None, rule: Rule
 ) -> None:
     # Messages come every 50 ms, so that two are there each time.
-    process = write_throttler({"/t3_tmp": "/t3"}, 100 * MS, kind, tmp_path, rule=rule)
+    language: NodeLanguage = "python" if kind == "python" else "cpp"
+    process = write_throttler({"/t3_tmp": "/t3"}, 100 * MS, language, tmp_path, rule=rule)
     with started(process, place) as child:
         _, *messages = exchanged("latched")
         time.sleep(0.3)

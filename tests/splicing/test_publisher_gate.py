@@ -22,16 +22,17 @@ from processes import wait_for
 
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import gate_thread_name
-from chainshaper.robot.decision import Gate, gate_parameters
+from chainshaper.robot.gate import Gate
 from chainshaper.robot.handover import FIELDS, page_folders
+from chainshaper.robot.node_parameters import gate_parameters
 from chainshaper.sources.gate_log import read_gate_log
+from chainshaper.splicing.gate_settings import gate_library, settings_text
 from chainshaper.splicing.shaped_outputs import (
     FollowedOutput,
     ShapedOutput,
     ask_phase,
     find_outputs,
 )
-from chainshaper.splicing.shaping_process import gate_library, settings_text
 from chainshaper.values.errors import OperationError
 
 MS = 1_000_000

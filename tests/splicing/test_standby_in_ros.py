@@ -25,10 +25,10 @@ from ros2 import ros2_environment
 
 from chainshaper import measure_latency, splice_launch_files
 from chainshaper.planning import Plan, plan_shaping
+from chainshaper.splicing.node_packages import build_package
 from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
-from chainshaper.splicing.shaping_process import build_package
 from chainshaper.splicing.spliced_launch import NODES
-from chainshaper.values.plan_choices import NodeKind
+from chainshaper.values.plan_choices import NodeLanguage
 
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(1200)]
 
@@ -69,19 +69,19 @@ def plan() -> Plan:
 
 
 @pytest.fixture(params=["python", "cpp"])
-def kind(request: pytest.FixtureRequest) -> NodeKind:
-    wanted: NodeKind = request.param
+def kind(request: pytest.FixtureRequest) -> NodeLanguage:
+    wanted: NodeLanguage = request.param
     return wanted
 
 
 @pytest.fixture
-def launched(kind: NodeKind, tmp_path: Path) -> Iterator[Launched]:
+def launched(kind: NodeLanguage, tmp_path: Path) -> Iterator[Launched]:
     with launching(kind, tmp_path) as app:
         yield app
 
 
 @contextmanager
-def launching(kind: NodeKind, tmp_path: Path, *recorder: str) -> Iterator[Launched]:
+def launching(kind: NodeLanguage, tmp_path: Path, *recorder: str) -> Iterator[Launched]:
     """The spliced application, which `ros2 launch` runs, behind a recorder's words if there are."""
     environment = {**ros2_environment(), "ROS_DOMAIN_ID": DOMAIN, "CHAINSHAPER_TEST": str(tmp_path)}
     if kind == "cpp" and shutil.which("colcon", path=environment["PATH"]) is None:
@@ -185,7 +185,7 @@ def test_whichever_is_killed_the_output_goes_on_and_both_are_back(
 
 
 def test_a_recording_in_which_the_shaping_node_was_killed_is_of_one_chain(
-    kind: NodeKind, tmp_path: Path
+    kind: NodeLanguage, tmp_path: Path
 ) -> None:
     folder, pids = tmp_path / "recording", list[int]()
     words = ("-m", "chainshaper", "record", "-o", str(folder), "--source", "preload", "--")

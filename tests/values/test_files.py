@@ -172,8 +172,8 @@ _ELSEWHERE = {
     "values/files.py": "opens outputs",
     "linux/cgroups.py": "writes to files of the kernel",
     "enforcement/freezer.py": "writes to files of the kernel",
-    "gate/schema_header.py": "is run where the package is built, for a file of the build",
-    "gate/handover.py": "has memory in a folder of mode 0700, whose owner it checks",
+    "robot/schema_header.py": "is run where the package is built, for a file of the build",
+    "robot/handover.py": "has memory in a folder of mode 0700, whose owner it checks",
     "robot/python/node.py": "runs in ROS nodes, which have nothing of ours",
 }
 

@@ -28,7 +28,8 @@ from chainshaper.planning import Plan, plan_shaping, publish_slots
 from chainshaper.planning.plan import revised
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.reporting.latency import doubts_text, latency_json
-from chainshaper.robot.decision import Overrun, sleep_until
+from chainshaper.robot.clocks import sleep_until
+from chainshaper.robot.gate import Overrun
 from chainshaper.values.recording import Recording
 from chainshaper.verify.overruns import (
     Outcome,
@@ -248,7 +249,7 @@ AROUND = "2 went around the shaping node, which was not there"
     ("text", "counts", "said"),
     [
         (dropped_text, {"overflowed": 1}, "1 message was lost at the gate (1 overflowed)"),
-        (dropped_text, {"surplus": 2, "lost by DDS": 1}, "3 messages were lost at the gate"),
+        (dropped_text, {"replaced": 2, "lost by DDS": 1}, "3 messages were lost at the gate"),
         (overruns_text, {"discard": 2, "publish": 3}, "5 outputs were too late for their slot"),
         (overruns_text, {"wait": 1, "bypass": 2}, f"(1 waited for the next slot); {AROUND}"),
         (overruns_text, {"silence": 3}, "3 were not published, since the shaping node"),

@@ -72,7 +72,6 @@ def application_of(messages: str, depth: int) -> Application:
         ("all-in-order", 20, set()),
         ("all-in-order", 2, {"overflowed"}),
         ("newest", 20, {"replaced"}),
-        ("first", 20, {"surplus"}),
     ],
 )
 def test_what_comes_in_comes_out_or_is_counted(

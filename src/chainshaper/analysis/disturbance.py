@@ -31,7 +31,7 @@ import polars as pl
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.analysis.messages import gated_hops
 from chainshaper.analysis.traversals import Traversals
-from chainshaper.robot.decision import STALL_NS
+from chainshaper.robot.shaper import STALL_NS
 from chainshaper.values import events
 from chainshaper.values.application import Chain
 

@@ -27,7 +27,7 @@ from chainshaper.values.application import Chain
 ENDING_NS = 3_000_000_000  # in so long an application ends,
 ENDING_PART = 10  # or in such a part of a short recording
 _CATCHES_UP = 8  # beginnings in which one that was delayed catches up
-_AS_PLANNED = ["replaced", "surplus"]
+_AS_PLANNED = ["replaced", "surplus"]  # "surplus": in recordings of before
 
 
 def with_outputs_due(

@@ -12,6 +12,7 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.progress import Progress
 
 if TYPE_CHECKING:
     from chainshaper.enforcement.undoing import RunState
@@ -120,7 +121,7 @@ def apply(
 
 
 @contextmanager
-def _watching() -> "Iterator[tuple[Callable[[RunState], None], out.Progress]]":
+def _watching() -> "Iterator[tuple[Callable[[RunState], None], Progress]]":
     """What shows the state of a run, and progress before: a live table, or a line now and then."""
     from chainshaper.reporting.overviews import run_line, servers_table
 

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias, get_args
 import typer
 
 import chainshaper as cs
-from chainshaper.robot.decision import Late
+from chainshaper.robot.gate import Late
 from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import InputError
-from chainshaper.values.plan_choices import BANDS, NodeKind, Wishes
+from chainshaper.values.plan_choices import BANDS, NodeChoice, Wishes
 
 if TYPE_CHECKING:
     from chainshaper.planning import Modes
@@ -47,6 +47,16 @@ def _bands(text: str) -> int | Literal["auto"]:
     return int(text)
 
 
+def _node(text: str) -> NodeChoice:
+    if text in ("typed", "component"):
+        said = f"{text} is found out now: write --node cpp, and --type where no recording says it"
+        raise typer.BadParameter(said)
+    if text not in get_args(NodeChoice):
+        raise typer.BadParameter(f"{text!r} is none of {', '.join(get_args(NodeChoice))}")
+    choice: NodeChoice = text  # type: ignore[assignment]
+    return choice
+
+
 def _cores(text: str) -> tuple[int, ...]:
     words = text.split(",")
     if not all(word.strip().isdecimal() for word in words):
@@ -70,6 +80,7 @@ PARSERS: dict[str, tuple[Callable[[str], Any], Callable[[Any], str]]] = {
     "DURATION>0": (_positive, format_duration),
     "N|auto": (_bands, str),
     "CORES": (_cores, lambda cores: ",".join(map(str, cores))),
+    "auto|python|cpp": (_node, str),
     "SHARE": (_share, "{:.0%}".format),
 }
 """What reads and writes the values behind a metavar."""
@@ -147,11 +158,12 @@ MAX_LATENCY: int | None = option(
 SOURCE: Source | None = option(
     "--source", "Tracer. Default: preload, or lttng where that cannot be had."
 )
-NODE: NodeKind = option(
-    "--node",
-    "A script; a package for all types; one generated for the type; or that as a component, in the "
-    "publisher's container.",
-    "python",
+NODE: NodeChoice = option(
+    "--node auto|python|cpp",
+    "The shaping node in Python, which needs no building, or in C++. auto: in C++ where it is built"
+    " and can be. What kind of node in C++, for all types or for the output's own, in a process or"
+    " in the publisher's container, is found out.",
+    "auto",
 )
 
 

@@ -8,17 +8,16 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import chainshaper as cs
 from chainshaper.values.errors import OperationError, shown
+from chainshaper.values.progress import Progress
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-    from chainshaper.values.plan_choices import NodeKind
 
-Progress: TypeAlias = Callable[[float, str], None]  # the share that is done, what is done now
 PATIENCE_S = 2.0  # what takes longer than this shows its progress
 
 
@@ -81,16 +80,12 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
-def warn(plan: "cs.Plan | cs.ApplicationPlan", node: "NodeKind | None" = None) -> None:
-    """What is doubtful about a plan, before it is used; and what such a ``node`` would cost."""
+def warn(plan: "cs.Plan | cs.ApplicationPlan") -> None:
+    """Say what is doubtful about a plan, before it is used."""
     from chainshaper.planning import plan_warnings
     from chainshaper.planning.application_plan import whole
 
     notes(plan_warnings(*whole(plan).chains))
-    if node is not None:
-        from chainshaper.splicing.shaping_process import zero_copy_lost
-
-        notes(zero_copy_lost(whole(plan), node))
 
 
 @contextmanager

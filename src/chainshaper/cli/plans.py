@@ -9,7 +9,7 @@ import chainshaper as cs
 from chainshaper.cli import options as opt
 from chainshaper.cli import output as out
 from chainshaper.values.errors import InputError
-from chainshaper.values.plan_choices import Fallback, NodeKind
+from chainshaper.values.plan_choices import Fallback, NodeChoice
 
 
 @opt.takes_wishes(*opt.PLAN_WISHES)
@@ -257,10 +257,10 @@ def splice(
         "NODE or whoever subscribes in the recording (may be repeated). RULE: newest, at fixed "
         "instants (default), or first, as it comes.",
     ),
-    node: NodeKind = opt.NODE,
+    node: NodeChoice = opt.NODE,
     message_type: str | None = opt.option(
         "--type PKG/msg/TYPE",
-        "Of the output, for --node typed and component. Default: what the recording says.",
+        "Type of the output, for a node in C++. Default: what the recording says.",
     ),
     recording: Path | None = opt.option(
         "--recording REC",
@@ -284,7 +284,8 @@ def splice(
     first, then record and plan, and splice the plan into its launch file. Launch the file that it
     names, with your launch arguments; your launch files stay as they are.
     """
-    from chainshaper.splicing.shaping_process import build_package, check_build_tools
+    from chainshaper.splicing.node_kinds import language_of
+    from chainshaper.splicing.node_packages import build_package, check_build_tools
     from chainshaper.splicing.spliced_launch import NODES
 
     if undo:
@@ -294,20 +295,20 @@ def splice(
         return
     if build and node == "python":
         raise InputError("--node python needs no building: leave out --build, or choose another")
-    if build:
+    if build and language_of(node, builds=True)[0] == "cpp":
         check_build_tools()  # before anything is written
     words = [*([str(plan)] if throttle and plan is not None else []), *(launch or [])]
     ran = words[:2] == ["ros2", "run"]
     arguments = {} if ran else dict(word.split(":=", 1) for word in words if ":=" in word)
     files = words if ran else [word for word in words if ":=" not in word]
     common: dict[str, Any] = {"launch_files": files, "output": output, "node": node}
+    common |= {"builds": build}
     common |= {"arguments": arguments, "dry_run": dry_run}
     if throttle:
         if fallback is not None:
             raise InputError("a throttler has no fallback: --fallback goes with a plan")
-        if message_type is not None or node in ("typed", "component"):
-            said = "a throttler is for all types: choose --node python or cpp, and no --type"
-            raise InputError(said)
+        if message_type is not None:
+            raise InputError("a throttler is for all types: leave out --type")
         if not files:
             said = "give the launch files: `splice --throttle TOPIC=PERIOD LAUNCH... -o DIR`"
             raise InputError(said)
@@ -317,11 +318,13 @@ def splice(
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
         planned = cs.load_application_plan(plan)
-        out.warn(planned, node)
+        out.warn(planned)
         common |= {"message_type": message_type, "fallback": fallback}
         known = opt.recording_of(recording, planned)
         splicing = cs.splice_launch_files(planned, recording=known, **common)
-    setup = build_package(splicing.folder / NODES) if build and not dry_run else None
+    packages = any(process.package is not None for process in splicing.processes)
+    built = build and not dry_run and packages
+    setup = build_package(splicing.folder / NODES) if built else None
     if out.present(json, _splicing_json(splicing, setup)):
         _show_splicing(splicing, arguments, setup, dry_run=dry_run)
 

@@ -18,7 +18,7 @@ from chainshaper.cli import output as out
 from chainshaper.cli.plans import throttled_inputs
 from chainshaper.cli.traces import comparison_tables, judge
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
-from chainshaper.values.plan_choices import NodeKind
+from chainshaper.values.plan_choices import NodeChoice
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -555,7 +555,7 @@ def shape(
     since: int = opt.SINCE,
     until: int | None = opt.UNTIL,
     source: opt.Source | None = opt.SOURCE,
-    node: NodeKind = opt.NODE,
+    node: NodeChoice = opt.NODE,
     backend: str = opt.option("--backend NAME", "As for `chainshaper apply`.", "auto"),
     adapt: bool = opt.ADAPT,
     max_latency: int | None = opt.MAX_LATENCY,
@@ -626,7 +626,7 @@ def _shape_described(
 
 
 def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, **how: Any) -> None:
-    """The whole flow; ``how`` goes to :func:`chainshaper.shape_launch`, with the ``node``."""
+    """Do the whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
     from chainshaper.reporting.latency import comparison_json
 
     with out.stop_on_signals() as stop:
@@ -635,7 +635,7 @@ def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, 
             folder,
             choose=_ask if sys.stdin.isatty() and not json else None,
             stop=stop,
-            planned=lambda plan: out.warn(plan, how["node"]),
+            planned=out.warn,
             progress=out.stage_lines("shape"),
             **how,
         )

@@ -23,9 +23,16 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator
 from pathlib import Path
 
-from chainshaper.enforcement import journal as runs
 from chainshaper.enforcement.freezer import CounterPage, groups_of, run_of, thaw
-from chainshaper.enforcement.journal import Journal
+from chainshaper.enforcement.journal import (
+    DISPATCHER,
+    GUARDIAN,
+    JOURNAL_FILE,
+    Journal,
+    note_process,
+    processes_of_role,
+    remembered_journal,
+)
 from chainshaper.enforcement.undoing import claim_run, strange_lines, undo_run
 from chainshaper.linux import cgroups
 from chainshaper.linux.own_processes import start_module, what_happened
@@ -160,7 +167,7 @@ class _Watch:
                 self.page = CounterPage(run.page, run.table)
             except OSError:  # the owner is gone, which its pidfd will say
                 return False
-        for one in runs.own_processes(self.journal, runs.DISPATCHER):
+        for one in processes_of_role(self.journal, DISPATCHER):
             if one.core is None or one.core in self.beats:
                 continue
             self.beats[one.core] = (-1, 0)
@@ -207,11 +214,11 @@ def main() -> None:
         signal.signal(ignored, signal.SIG_IGN)
     set_thread_name("guardian")
     try:
-        journal = runs.remembered_journal(Path(sys.argv[1], runs.FILE))
+        journal = remembered_journal(Path(sys.argv[1], JOURNAL_FILE))
     except OSError:
         return  # the run is over already
     with contextlib.suppress(OperationError):  # a full disk: it watches all the same
-        runs.note_process(journal, runs.GUARDIAN, os.getpid())
+        note_process(journal, GUARDIAN, os.getpid())
     cgroups.enter_own_group(GROUP)
     try:
         owner = journal.open_owner()

@@ -33,7 +33,7 @@ from chainshaper.values.files import open_output, read_regular
 
 _T = TypeVar("_T")
 
-FILE, STATE_FILE, PLAN_FILE = "journal.jsonl", "run.json", "plan.json"
+JOURNAL_FILE, STATE_FILE, PLAN_FILE = "journal.jsonl", "run.json", "plan.json"
 FORMAT = 1
 OPENED, PROCESS = "opened", "process"
 GUARDIAN, DISPATCHER = "guardian", "dispatcher"
@@ -106,7 +106,7 @@ class Journal:
             if not content:
                 return False
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-            written = self.path.with_name(f"{FILE}.{os.getpid()}")
+            written = self.path.with_name(f"{JOURNAL_FILE}.{os.getpid()}")
             try:
                 with os.fdopen(open_output(written, mode=0o600), "wb") as file:
                     file.write(content)
@@ -188,7 +188,7 @@ def read_process(entry: Mapping[str, Any]) -> OwnProcess:
     return OwnProcess(str(entry["role"]), *process_of(entry), entry["core"])
 
 
-def own_processes(journal: Journal, role: str) -> tuple[OwnProcess, ...]:
+def processes_of_role(journal: Journal, role: str) -> tuple[OwnProcess, ...]:
     """All processes of a role that the run has ever had."""
     return tuple(one for one in journal.read(PROCESS, read_process) if one.role == role)
 
@@ -215,7 +215,7 @@ def open_journal(folder: str | Path | None = None, run: str | None = None) -> Jo
     """
     base = journals_folder(folder)
     place = base / (run or f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}")
-    path = place / FILE
+    path = place / JOURNAL_FILE
     try:
         place.mkdir(mode=0o700, parents=True, exist_ok=True)
         os.close(open_output(path, mode=0o600))
@@ -256,7 +256,9 @@ def journals_folder(named: str | Path | None = None) -> Path:
 
 def find_journals(folder: str | Path | None = None) -> tuple[Journal, ...]:
     """All journals that have not been discarded, oldest name first."""
-    return tuple(Journal(path) for path in sorted(journals_folder(folder).glob(f"*/{FILE}")))
+    return tuple(
+        Journal(path) for path in sorted(journals_folder(folder).glob(f"*/{JOURNAL_FILE}"))
+    )
 
 
 def discard_journal(journal: Journal) -> None:

@@ -29,7 +29,7 @@ from chainshaper.enforcement.journal import Journal
 from chainshaper.enforcement.scheduling_memory import note_scheduling, release_threads
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable, server_named
 from chainshaper.linux.own_processes import is_installed, tool_environment
-from chainshaper.linux.scheduling import Scheduling, SchedulingClass, apply_scheduling
+from chainshaper.linux.scheduling import SchedulingClass, SchedulingRequest, apply_scheduling
 from chainshaper.linux.threads import find_thread, read_proc
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
@@ -96,7 +96,7 @@ class Litmus(BackEnd):
             _run(create_command(ids[server.name], server, self._table.cycle_ns, anchor_ns))
         self._ids = ids
         for thread in filter(None, map(find_thread, self._members if moving else ())):
-            apply_scheduling(thread, Scheduling(0, None))
+            apply_scheduling(thread, SchedulingRequest(0, None))
         self._attach(*self._members)
         self._since_ns = time.monotonic_ns()
 

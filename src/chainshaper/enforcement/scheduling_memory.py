@@ -23,7 +23,7 @@ from chainshaper.linux.cgroups import threads_in
 from chainshaper.linux.processes import descendants
 from chainshaper.linux.scheduling import (
     ASPECTS,
-    Scheduling,
+    SchedulingRequest,
     SchedulingState,
     after_wish,
     different_aspects,
@@ -35,7 +35,7 @@ from chainshaper.linux.scheduling import (
 from chainshaper.linux.threads import (
     SCHED_DEADLINE,
     TICK_NS,
-    Thread,
+    RunningThread,
     find_thread,
     list_threads,
     parents,
@@ -66,7 +66,9 @@ class Change:
         return (self.tid, self.started)
 
 
-def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -> None:
+def change_all(
+    journal: Journal, changes: Iterable[tuple[RunningThread, SchedulingRequest]]
+) -> None:
     """Give threads, if they run still, their class and cores. Raises OperationError: as
     :func:`note_scheduling` (then nothing is changed), or the kernel refuses. PlatformError: a
     privilege is missing.
@@ -91,13 +93,14 @@ def change_all(journal: Journal, changes: Iterable[tuple[Thread, Scheduling]]) -
             raise OperationError(_refused(thread, target, error)) from error
 
 
-def _refused(thread: Thread, target: SchedulingState, error: OSError) -> str:
+def _refused(thread: RunningThread, target: SchedulingState, error: OSError) -> str:
     return f"{thread.text}: the kernel refuses {target.text}: {error.strerror}"
 
 
 def note_scheduling(
-    journal: Journal, changes: Iterable[tuple[Thread, Callable[[SchedulingState], SchedulingState]]]
-) -> list[tuple[Thread, SchedulingState]]:
+    journal: Journal,
+    changes: Iterable[tuple[RunningThread, Callable[[SchedulingState], SchedulingState]]],
+) -> list[tuple[RunningThread, SchedulingState]]:
     """Write down what threads have before each changes; those that are to be, with their targets.
     Raises OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
     """
@@ -181,7 +184,7 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
         return
     remembered, refused = remembered_threads(journal), dict[int, str]()
 
-    def give_back(thread: Thread, family: list[Change]) -> bool:
+    def give_back(thread: RunningThread, family: list[Change]) -> bool:
         try:
             now = target = state_of(thread.tid)
             target = _given_back(now, family)
@@ -226,7 +229,7 @@ def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...
 
 def _born_of(
     journal: Journal, remembered: list[Change], groups: Iterable[Path]
-) -> list[tuple[Thread, list[Change]]]:
+) -> list[tuple[RunningThread, list[Change]]]:
     """Threads of the application not in its journal, each with those it may have inherited from."""
     done, families = {one.identity for one in remembered}, _families(journal, remembered)
     found = [(one, family) for pid, family in families.items() for one in list_threads(pid)]

@@ -34,7 +34,7 @@ from chainshaper.linux.scheduling import (
     stop_garbage_collection,
 )
 from chainshaper.linux.threads import read_proc
-from chainshaper.robot.decision import sleep_until, watch_until
+from chainshaper.robot.clocks import sleep_until, watch_until
 from chainshaper.values.errors import ChainshaperError, OperationError, PlatformError, shown
 
 PRIORITY = 97

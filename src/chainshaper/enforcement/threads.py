@@ -37,7 +37,7 @@ from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.linux.processes import (
     MIDDLEWARE_LIMITS,
     ROUTERS,
-    Process,
+    RunningProcess,
     descendants,
     guessed_name,
     middleware_limit,
@@ -45,10 +45,10 @@ from chainshaper.linux.processes import (
     takes_ros_arguments,
     user_name,
 )
-from chainshaper.linux.scheduling import Scheduling
+from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import (
     TICK_NS,
-    Thread,
+    RunningThread,
     ThreadRole,
     gate_thread_name,
     is_of_zenoh,
@@ -102,7 +102,7 @@ class NodeThread:
     ``recording``, ``command line``, or, a guess, ``program's name``.
     """
 
-    thread: Thread
+    thread: RunningThread
     nodes: tuple[str, ...]
     known_by: str
     nodes_known_by: str
@@ -125,7 +125,7 @@ class _Identified(NamedTuple):
     in a recording of itself, or (``in_order``) of an earlier run.
     """
 
-    process: Process
+    process: RunningProcess
     nodes: tuple[str, ...] = ()
     nodes_known_by: str = ""
     recorded: Mapping[int, RecordedThread] = MappingProxyType({})
@@ -134,9 +134,9 @@ class _Identified(NamedTuple):
 
 
 def allocate(
-    processes: Sequence[Process],
+    processes: Sequence[RunningProcess],
     recorded: Sequence[RecordedProcess] = (),
-    among: Sequence[Process] | None = None,
+    among: Sequence[RunningProcess] | None = None,
     users: Collection[int] | None = None,
 ) -> Allocation:
     """Find out what each thread of ``processes`` does, ``among`` all that were looked at: who
@@ -205,7 +205,9 @@ def new_and_ended(
 
 
 def strangers_text(
-    processes: Iterable[Process], users: Collection[int], nodes: Collection[str] | None = None
+    processes: Iterable[RunningProcess],
+    users: Collection[int],
+    nodes: Collection[str] | None = None,
 ) -> str | None:
     """One line about others' processes that carry a name of one of ``nodes`` (None: any node)."""
     found = [
@@ -221,7 +223,7 @@ def strangers_text(
     return f"{LEFT_ALONE}{named}; to take them for nodes, name their user (--user)"
 
 
-def _identify(process: Process, recorded: Sequence[RecordedProcess]) -> _Identified:
+def _identify(process: RunningProcess, recorded: Sequence[RecordedProcess]) -> _Identified:
     named = named_nodes(process.command)
     nodes, known_by = _own_words(process)
     itself = next((seen for seen in recorded if _is_same(process, named, seen)), None)
@@ -260,7 +262,7 @@ def _same_program(
     return runs[0] if len(runs) == 1 else None
 
 
-def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedThread]:
+def _in_order(process: RunningProcess, earlier: RecordedProcess) -> dict[int, RecordedThread]:
     """The threads of a process as an earlier run of its program had them; none if it is not sure. A
     program starts its threads in one order, so those of one name are the same by turns, once there
     are as many. It is asked for executors beside the main thread only.
@@ -281,7 +283,7 @@ def _in_order(process: Process, earlier: RecordedProcess) -> dict[int, RecordedT
     return found
 
 
-def _own_words(process: Process) -> tuple[tuple[str, ...], str]:
+def _own_words(process: RunningProcess) -> tuple[tuple[str, ...], str]:
     """The nodes that a process has by its command line, and which part of that says so."""
     if named := named_nodes(process.command):
         return named, "command line"
@@ -290,7 +292,7 @@ def _own_words(process: Process) -> tuple[tuple[str, ...], str]:
     return ((guess,), "program's name") if guess is not None and looks_like_a_node else ((), "")
 
 
-def _is_same(process: Process, named: tuple[str, ...], seen: RecordedProcess) -> bool:
+def _is_same(process: RunningProcess, named: tuple[str, ...], seen: RecordedProcess) -> bool:
     """Whether a process is the one that was recorded: its id, alive by then, no other name."""
     pid = process.pid if seen.numbered_here else process.inner_pid
     if seen.pid != pid or not process.threads:
@@ -350,7 +352,7 @@ class WantedScheduling:
     """What a thread shall get, for which server (None: it is in none), and why."""
 
     thread: NodeThread
-    wanted: Scheduling
+    wanted: SchedulingRequest
     server: str | None
     reason: str
 
@@ -545,12 +547,12 @@ def scheduling_around(
         sizes[rank] += 1  # behind all of it
     priorities = server_priorities(sizes)
 
-    def wanted_in(server: Server | ReservationServer, one: NodeThread) -> Scheduling:
+    def wanted_in(server: Server | ReservationServer, one: NodeThread) -> SchedulingRequest:
         if getattr(server, "best_effort", False):
-            return Scheduling(0, (server.core,))
+            return SchedulingRequest(0, (server.core,))
         own, place = priorities[server.priority], taken[server.name].index(place_of(one, order))
         place += server.name in behind
-        return Scheduling(own[min(place, len(own) - 1)], (server.core,), take_turns)
+        return SchedulingRequest(own[min(place, len(own) - 1)], (server.core,), take_turns)
 
     own = [
         WantedScheduling(one, wanted_in(its, one), its.name, f"server priority {its.priority}")
@@ -572,7 +574,9 @@ def scheduling_around(
             priority, reason = priorities[place.priority][-1], _RECEIVES_IN_PLACE
             core = place.core if place.core in available_cores else core
         if one.thread.priority in (0, priority) or not busy.isdisjoint(one.thread.cores):
-            receiving.append(WantedScheduling(one, Scheduling(priority, (core,)), None, reason))
+            receiving.append(
+                WantedScheduling(one, SchedulingRequest(priority, (core,)), None, reason)
+            )
     planned |= {one.thread.thread.identity for one in receiving}
     free_cores = tuple(sorted(set(available_cores) - busy))
     free_cores = free_cores or tuple(sorted(set(available_cores) - set(clear or available_cores)))
@@ -602,11 +606,11 @@ def _beside(
     thread = one.thread
     if thread.kind == "resend":
         reason = "spins on its siblings' locks, and has nothing to do as a rule"
-        return WantedScheduling(one, Scheduling(0, cores or None), None, reason)
+        return WantedScheduling(one, SchedulingRequest(0, cores or None), None, reason)
     if thread.role == "dds":
         receives = thread.kind == "receive"
         allowed = cores[:1] if receives and receives_output else cores
-        scheduling = Scheduling(DDS_PRIORITY + receives, allowed or None)
+        scheduling = SchedulingRequest(DDS_PRIORITY + receives, allowed or None)
         return WantedScheduling(one, scheduling, None, "DDS threads deliver for the servers")
     publishers = (
         publisher.wanted.cores or ()
@@ -626,7 +630,9 @@ def _beside(
             " another core too (`taskset`)"
         )
     reason = "not on the core of its process's asynchronous publisher"
-    return WantedScheduling(one, Scheduling(0 if inherits else None, elsewhere), None, reason)
+    return WantedScheduling(
+        one, SchedulingRequest(0 if inherits else None, elsewhere), None, reason
+    )
 
 
 def _below(publisher: WantedScheduling, wanted: Iterable[WantedScheduling]) -> WantedScheduling:
@@ -662,7 +668,7 @@ def left_by_back_end(
     for one in wanted:
         if one.server is not None and themselves.isdisjoint(one.thread.nodes):
             priority = 0 if back_end == "scx" and one.thread.thread.priority else None
-            left.append(replace(one, wanted=Scheduling(priority, one.wanted.cores)))
+            left.append(replace(one, wanted=SchedulingRequest(priority, one.wanted.cores)))
         elif one.reason != _RECEIVES:
             left.append(one)
     return tuple(left)

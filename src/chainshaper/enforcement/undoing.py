@@ -18,14 +18,23 @@ from pathlib import Path
 from typing import Any
 
 from chainshaper.enforcement import freezer, litmus
-from chainshaper.enforcement import journal as runs
 from chainshaper.enforcement.journal import (
+    DISPATCHER,
+    GUARDIAN,
+    OPENED,
+    PROCESS,
+    STATE_FILE,
     Journal,
     LockHolder,
     all_runs_locked,
+    discard_journal,
     find_journals,
+    journals_folder,
     locked,
+    open_journal,
     process_of,
+    processes_of_role,
+    read_process,
 )
 from chainshaper.enforcement.scheduling_memory import (
     DESCENDANTS,
@@ -102,12 +111,12 @@ class RunState:
 
 def save_run_state(folder: Path, state: RunState) -> None:
     """Write `run.json`, whole. Raises OSError; a plan in force needs it for nothing."""
-    partial_file = folder / f"{runs.STATE_FILE}.partial"
+    partial_file = folder / f"{STATE_FILE}.partial"
     try:
         partial_file.unlink(missing_ok=True)
         with os.fdopen(open_output(partial_file), "w") as file:
             file.write(json.dumps(storable(asdict(state))))
-        partial_file.replace(folder / runs.STATE_FILE)
+        partial_file.replace(folder / STATE_FILE)
     finally:
         partial_file.unlink(missing_ok=True)  # a part of it would fill the disk for good
 
@@ -119,7 +128,7 @@ def find_runs(folder: Path | None = None) -> Iterator[tuple[Journal, RunState | 
     for journal in find_journals(folder):
         state = None
         with contextlib.suppress(OSError, ValueError):
-            content = read_regular(journal.path.with_name(runs.STATE_FILE))
+            content = read_regular(journal.path.with_name(STATE_FILE))
             state = TypeAdapter(RunState).validate_json(content)
         if journal.path.exists():  # not over meanwhile
             yield journal, state
@@ -150,7 +159,7 @@ def claim_run(
     one of them, a crashed one cannot be undone, or one that begins does not get on with it.
     PlatformError: nothing may be written to the folder.
     """
-    base = runs.journals_folder(folder)
+    base = journals_folder(folder)
     wanted: dict[str, set[Any]] = {"core": set(cores), "node": set(nodes)}
 
     def waiting(holder: LockHolder | None, waited_s: float) -> None:
@@ -190,7 +199,7 @@ def claim_run(
             if is_in_the_way and (left := undo_run(other)):
                 why = "; ".join(left)
                 raise OperationError(f"the crashed run {other.name} cannot be undone: {why}")
-        journal = runs.open_journal(base)
+        journal = open_journal(base)
         journal.note(CLAIMS, cores=sorted(cores), nodes=sorted(nodes))
         return journal
 
@@ -200,11 +209,11 @@ def _read_claim(entry: Mapping[str, Any]) -> dict[str, set[Any]]:
 
 
 _READERS: Mapping[str, Callable[[Mapping[str, Any]], object]] = {
-    runs.OPENED: process_of,
+    OPENED: process_of,
     CLAIMS: _read_claim,
     KIND: read_change,
     DESCENDANTS: process_of,
-    runs.PROCESS: runs.read_process,
+    PROCESS: read_process,
     freezer.FREEZER: freezer.read_run,
     litmus.NOTE: litmus.read_note,
 }
@@ -271,7 +280,7 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
             return (str(error),)
         except OSError:
             pass  # its folder is gone, and there is no room for another: it is in memory
-        _end_processes(journal, runs.DISPATCHER)
+        _end_processes(journal, DISPATCHER)
         # Threads run first; those born in our groups are known by them, as long as these are.
         groups = freezer.groups_of(freezer.run_of(journal))
         freezer.thaw(groups)
@@ -287,7 +296,7 @@ def undo_run(journal: Journal, *, by_owner: bool = False) -> tuple[str, ...]:
                 left.append(str(error) or type(error).__name__)
         is_over = by_owner or journal.owner is None
         if is_over and not left and not strange_lines(journal):
-            _end_processes(journal, runs.GUARDIAN)
+            _end_processes(journal, GUARDIAN)
             remove_run(journal)
     return tuple(left)
 
@@ -306,7 +315,7 @@ def _hasten(holder: LockHolder | None, waited_s: float) -> None:
 
 def _end_processes(journal: Journal, role: str) -> None:
     """Kill all processes of a role, this one excepted: one that was stopped hears nothing else."""
-    for one in runs.own_processes(journal, role):
+    for one in processes_of_role(journal, role):
         if one.pid != os.getpid() and (pidfd := open_process(one.pid, one.started)) is not None:
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(pidfd, signal.SIGKILL)
@@ -327,7 +336,7 @@ def remove_run(journal: Journal) -> None:
         for path in journal.path.parent.iterdir():
             if path != journal.path and not path.is_dir():
                 path.unlink(missing_ok=True)
-    runs.discard_journal(journal)
+    discard_journal(journal)
 
 
 def release_strays(journals: Iterable[Journal]) -> tuple[tuple[Path, ...], tuple[str, ...]]:

@@ -21,12 +21,12 @@ from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import write_whole
+from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 from chainshaper.workload.description import Application, load_application
 from chainshaper.workload.live import (
     Enforcement,
-    Progress,
     StartedNodes,
     node_threads,
     run_application,

@@ -29,18 +29,19 @@ from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
 from chainshaper.flow.record import record_command
-from chainshaper.linux.processes import Process, run_users
+from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
 from chainshaper.planning import ApplicationPlan, Plan, PlanRequest, Profile
 from chainshaper.planning import request as requests
 from chainshaper.planning.application_plan import whole
 from chainshaper.planning.profile import doubts_about
 from chainshaper.reporting.figures import write_comparison
-from chainshaper.splicing.shaping_process import build_package, check_build_tools
+from chainshaper.splicing.node_kinds import language_of
+from chainshaper.splicing.node_packages import build_package, check_build_tools
 from chainshaper.splicing.spliced_launch import NODES, parse_launch_command
 from chainshaper.values.application import ApplicationGraph
 from chainshaper.values.errors import InputError, OperationError
-from chainshaper.values.plan_choices import NodeKind
+from chainshaper.values.plan_choices import NodeChoice
 from chainshaper.values.recording import Recording, refuse_existing
 from chainshaper.verify.measure import Comparison, compare_recordings
 
@@ -81,7 +82,7 @@ def shape_launch(
     until_ns: int | None = None,
     duration_ns: int = 60_000_000_000,
     source: Literal["lttng", "preload", "ebpf"] | None = None,
-    node: NodeKind = "python",
+    node: NodeChoice = "auto",
     back_end: str = "auto",
     adapt: bool = False,
     max_latency_ns: int | None = None,
@@ -110,7 +111,7 @@ def shape_launch(
         **{"modes": request.modes, "mode_recordings": mode_recordings or {}},
     }
     _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
-    if node != "python":
+    if language_of(node, builds=True)[0] == "cpp":
         check_build_tools()
     folder, stop, taken = refuse_existing(folder), stop or threading.Event(), run_users(users)
     folder.mkdir(exist_ok=True)
@@ -138,9 +139,8 @@ def shape_launch(
     shaped, setup = list(command), list[str]()
     if throttled:
         request = replace(request, anchor="cycle")  # messages have the stamps of their sensors
-        kind: Literal["python", "cpp"] = "python" if node == "python" else "cpp"
         inputs = launch_splicing.splice_throttlers(
-            throttled, [launch.file], folder / "throttled", node=kind
+            throttled, [launch.file], folder / "throttled", node=node, builds=True
         )
         launch, setup = replace(launch, file=next(iter(inputs.launch.values()))), _sourced(inputs)
         shaped = [*setup, *launch.with_file(launch.file)]
@@ -179,6 +179,7 @@ def shape_launch(
         splicing = launch_splicing.splice_launch_files(
             *(plan, [launch.file], folder / "launch"),
             node=node,
+            builds=True,
             recording=_with_types([first, *(before for before, _ in measured.values())], plan),
         )
         found += splicing.notes
@@ -290,7 +291,7 @@ def plan_in_force(
     users: frozenset[int],
     notes: list[str],
     **how: Any,
-) -> Iterator[Callable[[Sequence[Process]], bool]]:
+) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
     """The plan in force on what runs, by a thread that does what `chainshaper apply` does (``how``)
     until the context ends, which adds its ``notes``; it gives whether all servers have opened.
     """
@@ -299,7 +300,7 @@ def plan_in_force(
     with ThreadPoolExecutor(1, "apply") as beside:
         applied = beside.submit(apply_plan, plan, **how, stop=stop, watch=states.append)
 
-        def opened(_: Sequence[Process]) -> bool:
+        def opened(_: Sequence[RunningProcess]) -> bool:
             if applied.done():
                 applied.result()  # raises what it failed with
                 raise OperationError("the plan was released meanwhile")

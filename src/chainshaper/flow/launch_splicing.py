@@ -12,21 +12,26 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
 from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
-from chainshaper.robot.decision import Rule
+from chainshaper.robot.throttling import Rule
 from chainshaper.sources.preload import ANY_ORDER, SANITIZER
 from chainshaper.sources.ros import own_environment, run_with_rclpy
-from chainshaper.splicing import redirection
-from chainshaper.splicing import shaping_process as ours
+from chainshaper.splicing import gate_settings, node_kinds, redirection
 from chainshaper.splicing import spliced_launch as launching
 from chainshaper.splicing.application import nothing_to_splice
+from chainshaper.splicing.message_types import has_bytes, message_type_named
 from chainshaper.splicing.redirection import Redirect
+from chainshaper.splicing.shaping_process import (
+    ShapingProcess,
+    write_shaping_process,
+    write_throttler,
+)
 from chainshaper.values.errors import InputError, OperationError, PlatformError, storable
 from chainshaper.values.files import scratch_folder, write_whole
-from chainshaper.values.plan_choices import STANDBY, Fallback, NodeKind
+from chainshaper.values.plan_choices import STANDBY, Fallback, NodeChoice, NodeLanguage
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
 if TYPE_CHECKING:
@@ -36,8 +41,10 @@ THROTTLER = "chainshaper_throttler"
 THROTTLER_PRIORITY = 85  # of SCHED_FIFO, until `apply` puts it into its server
 DRY_RUN_S = 120.0  # how long a dry run may take
 
+_SERIALIZED = ("python", "generic")  # nodes that take their messages serialized
+
 _Names: TypeAlias = Mapping[str, Sequence[str]]
-_Written: TypeAlias = tuple[list[ours.ShapingProcess], dict[str, str]]  # and the environment
+_Written: TypeAlias = tuple[list[ShapingProcess], dict[str, str]]  # and the environment
 
 
 @dataclass(frozen=True)
@@ -47,7 +54,7 @@ class Splicing:
     folder: Path
     launch: Mapping[Path, Path]  # each launch file, or executable: the one to launch instead
     originals: Mapping[Path, Path]  # that one: the first that it includes
-    processes: tuple[ours.ShapingProcess, ...]  # that were added
+    processes: tuple[ShapingProcess, ...]  # that were added
     logs: tuple[Path, ...]  # of shaping nodes and their standbys
     diff: str  # the new launch file as a unified diff
     notes: tuple[str, ...]  # what to know before relying on it
@@ -59,7 +66,7 @@ class Splicing:
 class ThrottledInput(Part):
     """A topic that is to reach its ``subscriber`` (None: all) once every ``period_ns`` at most.
 
-    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.robot.decision`).
+    The ``rule`` says which messages reach it, and when (:mod:`chainshaper.robot.throttling`).
     """
 
     topic: FullName
@@ -73,7 +80,8 @@ def splice_launch_files(
     launch_files: Sequence[str | Path],
     output: str | Path,
     *,
-    node: NodeKind = "python",
+    node: NodeChoice = "auto",
+    builds: bool = False,
     arguments: Mapping[str, str] | None = None,
     message_type: str | None = None,
     recording: "Recording | None" = None,
@@ -82,8 +90,10 @@ def splice_launch_files(
 ) -> Splicing:
     """Write a launch file that starts the plan's shaping nodes and launch files, into a new folder.
 
-    ``launch_files`` may be the words of `ros2 run …` as well. ``recording`` tells who publishes a
-    topic and of which type it is, as far as the plan does not. ``fallback`` goes before the plan's.
+    ``launch_files`` may be the words of `ros2 run …` as well. With the ``node`` ``auto`` shaping
+    nodes are in C++ only where the caller ``builds`` what is written (:func:`.build_package`); the
+    notes say which kinds were found (:mod:`.node_kinds`). ``recording`` tells who publishes a topic
+    and of which type it is, as far as the plan does not. ``fallback`` goes before the plan's.
     A folder that was spliced before and not changed since is replaced. With ``dry_run`` nothing is
     written: our own ROS 2 carries out the launch files with ``arguments``, but starts no process.
 
@@ -116,44 +126,76 @@ def splice_launch_files(
             redirects.append(Redirect("publisher", one.output, one.input, (publisher,), added))
     seen = () if recording is None else recording.info.endpoints
     types = {one.topic: one.type for one in reversed(seen) if one.type}
-    if recording is not None and node not in ours.OF_ONE_TYPE:
-        ends = {one.topic: types.get(one.topic, "") for one in redirects}
-        _refuse_undelivered(recording, ends, node)
+    if message_type is not None:
+        message_type_named(message_type)
+        types |= {one.output: message_type for _, one, _ in every}
+    found = _kinds_of(every, node_kinds.language_of(node, builds=builds), types, recording)
+    kinds = {name: kind for name, (kind, _) in found.items()}
+    notes = [line for _, lines in found.values() for line in lines]
+    if recording is not None:
+        serialized = [one.output for _, one, _ in every if kinds.get(one.name) in _SERIALIZED]
+        _refuse_undelivered(recording, {output: types.get(output, "") for output in serialized})
     logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
 
     def written(into: Path) -> _Written:
-        made, blocks = list[ours.ShapingProcess](), list[str]()
+        made, blocks = list[ShapingProcess](), list[str]()
         for chain, one, publisher in every:
             if one.in_process:
-                blocks.append(ours.gate_settings(chain, one, publisher, logs[one.name]))
+                blocks.append(gate_settings.gate_settings(chain, one, publisher, logs[one.name]))
                 continue
-            process = ours.write_shaping_process(
-                *(chain, one, node, folder / launching.NODES),
-                message_type=message_type or types.get(one.output),
+            process = write_shaping_process(
+                *(chain, one, kinds[one.name], folder / launching.NODES),
+                message_type=types.get(one.output),
                 log=logs[one.name],
                 into=into,
             )
             redirects[len(made)].component = process.component
             made.append(process)
-        blocks += [ours.delivery_settings(one) for _, one, _ in every]
+        blocks += [gate_settings.delivery_settings(one) for _, one, _ in every]
         if not any(blocks):
             return made, {}
         into.mkdir(parents=True, exist_ok=True)
         write_whole(into / "gates", ["".join(blocks).encode()])
         return made, {
-            "LD_PRELOAD": str(ours.gate_library()),
+            "LD_PRELOAD": str(gate_settings.gate_library()),
             SANITIZER: ANY_ORDER,
-            ours.GATES: str(folder / launching.NODES / "gates"),
+            gate_settings.GATES: str(folder / launching.NODES / "gates"),
         }
 
     dry = dict(arguments or {}) if dry_run else None
     spliced = _spliced(launch_files, folder, redirects, written, throttled=False, dry=dry)
     pairs = [(logs[one.name], one.standby) for one in spliced.processes]
     standbys = (log.with_stem(standby.name) for log, standby in pairs if standby is not None)
-    return replace(spliced, logs=(*logs.values(), *standbys))
+    return replace(spliced, logs=(*logs.values(), *standbys), notes=(*notes, *spliced.notes))
 
 
-def _refuse_undelivered(recording: "Recording", types: Mapping[str, str], node: NodeKind) -> None:
+def _kinds_of(
+    every: Sequence[tuple[Plan, ShapingNode, str]],
+    chosen: tuple[NodeLanguage, str],
+    types: Mapping[str, str],
+    recording: "Recording | None",
+) -> dict[str, tuple[node_kinds.NodeKind, list[str]]]:
+    """Return the kind of each shaping node, by its name, with lines to be said about it."""
+    language, reason = chosen
+    kinds = {}
+    for chain, shaping, publisher in every:
+        if shaping.in_process:
+            continue
+        within = node_kinds.passes_within_container(chain, publisher, recording)
+        kind, found_out = node_kinds.kind_of(
+            language, types.get(shaping.output), within_container=within
+        )
+        lines = list[str]()
+        if reason or language == "cpp":
+            why = f"{found_out}; {reason}" if reason else found_out
+            lines.append(f"{shaping.output}: the shaping node is {why}")
+        if shaping == chain.shaping_node:
+            lines += node_kinds.copies_made(chain, kind, within_container=within)
+        kinds[shaping.name] = kind, lines
+    return kinds
+
+
+def _refuse_undelivered(recording: "Recording", types: Mapping[str, str]) -> None:
     """Refuse nodes that take outputs of these types serialized where none is delivered so.
 
     From Lyrical on rmw_fastrtps_cpp has a reader of its own for messages with a field ``uint8[]``,
@@ -164,11 +206,12 @@ def _refuse_undelivered(recording: "Recording", types: Mapping[str, str], node: 
     if info.rmw != "rmw_fastrtps_cpp" or info.distribution not in ("lyrical", "rolling"):
         return
     for output, message_type in types.items():
-        if ours.has_bytes(message_type):
+        if has_bytes(message_type):
             raise InputError(
                 f"{output} is of {message_type}: on {info.distribution}, {info.rmw} delivers no"
-                " message with a field uint8[] to nodes that take it serialized, as with --node"
-                f" {node}: use --node typed, whose standby gets none either, or another RMW"
+                " message with a field uint8[] to nodes that take it serialized: source the"
+                " workspace with the headers of the type and use --node cpp, for the type, whose"
+                " standby gets none either; or use another RMW"
             )
 
 
@@ -177,7 +220,8 @@ def splice_throttlers(
     launch_files: Sequence[str | Path],
     output: str | Path,
     *,
-    node: Literal["python", "cpp"] = "python",
+    node: NodeChoice = "auto",
+    builds: bool = False,
     arguments: Mapping[str, str] | None = None,
     recording: "Recording | None" = None,
     dry_run: bool = False,
@@ -190,6 +234,7 @@ def splice_throttlers(
     """
     if not inputs:
         raise InputError("no input to throttle: name one, such as /points_raw=100ms")
+    language, reason = node_kinds.language_of(node, builds=builds)
     folder = launching.usable(Path(output))
     subscribers = _endpoints(recording, "subscription")
     alike: dict[tuple[int, Rule], dict[str, tuple[str, ...]]] = {}
@@ -209,10 +254,10 @@ def splice_throttlers(
         for topic, nodes in topics.items()
     ]
 
-    def throttler(name: str, how: tuple[int, Rule], into: Path) -> ours.ShapingProcess:
-        return ours.write_throttler(
+    def throttler(name: str, how: tuple[int, Rule], into: Path) -> ShapingProcess:
+        return write_throttler(
             {topic: f"{topic}_throttled" for topic in alike[how]},
-            *(how[0], node, folder / launching.NODES),
+            *(how[0], language, folder / launching.NODES),
             rule=how[1],
             name=name,
             fifo_priority=THROTTLER_PRIORITY,
@@ -223,7 +268,11 @@ def splice_throttlers(
         return [throttler(*one, into) for one in zip(names, alike, strict=True)], {}
 
     dry = dict(arguments or {}) if dry_run else None
-    return _spliced(launch_files, folder, redirects, written, throttled=True, dry=dry)
+    spliced = _spliced(launch_files, folder, redirects, written, throttled=True, dry=dry)
+    if not reason:
+        return spliced
+    named = "Python" if language == "python" else "C++"
+    return replace(spliced, notes=(f"throttlers are in {named}: {reason}", *spliced.notes))
 
 
 def _spliced(

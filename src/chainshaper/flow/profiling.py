@@ -18,8 +18,13 @@ from chainshaper.enforcement.servers import ReservationServer
 from chainshaper.enforcement.threads import Allocation, NodeThread, allocate, scheduling_around
 from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
 from chainshaper.flow.threads import recorded_processes
-from chainshaper.linux.processes import Process
-from chainshaper.linux.scheduling import Scheduling, available_cores, check_cores, may_use_fifo
+from chainshaper.linux.processes import RunningProcess
+from chainshaper.linux.scheduling import (
+    SchedulingRequest,
+    available_cores,
+    check_cores,
+    may_use_fifo,
+)
 from chainshaper.planning.plan import PER_CALLBACK
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
@@ -43,7 +48,7 @@ def profiling_condition(
     before: Mapping[str, int] = MappingProxyType({}),
     best_effort: Mapping[str, int] = MappingProxyType({}),
     policy: Policy = "shaped",
-) -> Iterator[Callable[[Sequence[Process]], bool]]:
+) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
     """Have the threads of ``nodes`` (default: of all, at one priority) run as the paper profiles a
     chain: what :func:`.record_command` wants for its ``scheduling``.
 
@@ -66,7 +71,7 @@ def profiling_condition(
     begun_ns, done = time.monotonic_ns(), set[tuple[int, int]]()
     appeared = False
 
-    def see_to_it(processes: Sequence[Process]) -> bool:
+    def see_to_it(processes: Sequence[RunningProcess]) -> bool:
         """Give new threads what they shall have; whether all nodes have it, and nothing was new."""
         nonlocal appeared
         found = allocate(processes, recorded)
@@ -93,7 +98,7 @@ def profiling_condition(
         )
         wishes = [(one.thread.thread, one.wanted) for one in around]
         wishes += [
-            (one.thread, Scheduling(0, (best_effort[node],)))
+            (one.thread, SchedulingRequest(0, (best_effort[node],)))
             for one in found.threads
             if one.thread.role == "executor" and one not in members
             for node in one.nodes
@@ -168,7 +173,7 @@ def undelayed(seen: Sequence[Profile], core_of: Mapping[str, int]) -> list[list[
 
 
 def executors_of(
-    found: Allocation, nodes: frozenset[str], processes: Sequence[Process]
+    found: Allocation, nodes: frozenset[str], processes: Sequence[RunningProcess]
 ) -> list[NodeThread]:
     """The threads that execute these nodes or publish for them; by default all but launchers'."""
     running = [one for one in found.threads if one.thread.role in ("executor", "publisher")]

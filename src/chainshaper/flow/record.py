@@ -27,7 +27,7 @@ from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux import processes as running
 from chainshaper.linux.own_processes import check_command, end_command, end_in_words, start_command
-from chainshaper.linux.processes import Process, find_applications
+from chainshaper.linux.processes import RunningProcess, find_applications
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
 from chainshaper.planning import ApplicationPlan, Plan
@@ -48,7 +48,7 @@ from chainshaper.values.recording import EndpointInfo, Recording, ThreadInfo
 from chainshaper.workload.stall_meter import StallWatch, far_from, stalls_watched
 
 _T = TypeVar("_T")
-Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[Process]], bool]]
+Scheduling: TypeAlias = AbstractContextManager[Callable[[Sequence[RunningProcess]], bool]]
 """Changes how the application's threads run for as long as its context lasts. What it gives is
 called about once a second with the processes, and says whether all is as it shall be from now on.
 """
@@ -84,10 +84,10 @@ class _Run:
     gate_logs: Sequence[Path]
     notes: tuple[str, ...] = ()
     command: "subprocess.Popen[bytes] | None" = None
-    schedule: Callable[[Sequence[Process]], bool] | None = None
+    schedule: Callable[[Sequence[RunningProcess]], bool] | None = None
     begun_ns: int = 0
     ended_ns: int = 0
-    processes: tuple[Process, ...] = ()
+    processes: tuple[RunningProcess, ...] = ()
     strangers: str | None = None
     environment: Environment | None = None  # a node's
     endpoints: tuple[EndpointInfo, ...] = ()
@@ -347,7 +347,9 @@ def _beside_events(run: _Run, what: str, ask: Callable[[], _T], otherwise: _T) -
         return otherwise
 
 
-def _recorded_threads(processes: Sequence[Process], recording: Recording) -> tuple[ThreadInfo, ...]:
+def _recorded_threads(
+    processes: Sequence[RunningProcess], recording: Recording
+) -> tuple[ThreadInfo, ...]:
     """The threads of the nodes among ``processes`` (without nodes, of those in DDS), numbered as in
     the recording. One that works for several nodes (a container's) is given to none.
     """

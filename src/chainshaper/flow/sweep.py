@@ -47,13 +47,13 @@ from chainshaper.values.durations import format_duration, parse_duration
 from chainshaper.values.errors import ChainshaperError, InputError, OperationError
 from chainshaper.values.files import new_file, open_output, scratch_folder, write_whole
 from chainshaper.values.many_tasks import engine
+from chainshaper.values.progress import Progress
 from chainshaper.values.yaml_file import AS_YAML, PlainData, compose, wrong_values_refused
 from chainshaper.verify.promises import OutputsDue
 from chainshaper.workload.description import Application, application_as_written, origin_timer
 
 Values: TypeAlias = Mapping[str, Any]  # one for every axis: a point
 Row: TypeAlias = Mapping[str, Any]
-Progress: TypeAlias = Callable[[float, str], None]
 _Model = TypeVar("_Model", bound=BaseModel)
 
 INTERFERENCE = "interference"

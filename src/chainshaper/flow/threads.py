@@ -29,7 +29,7 @@ from chainshaper.flow.phase import Phase, measure_phase
 from chainshaper.linux import processes as running
 from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.linux.threads import Thread, ThreadRole, of_another_clock, read_proc
+from chainshaper.linux.threads import RunningThread, ThreadRole, of_another_clock, read_proc
 from chainshaper.planning import application_plan as joint
 from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
 from chainshaper.planning.offsets import LEAD_NS, chain_name, linked, with_windows
@@ -415,10 +415,10 @@ def places_in(server: Server, order: Sequence[str]) -> int:
     return max(1, len(ordered) + (len(ordered) < len(nodes)))
 
 
-def first_threads(plan: ApplicationPlan, found: Allocation) -> list[tuple[Thread, ...]]:
+def first_threads(plan: ApplicationPlan, found: Allocation) -> list[tuple[RunningThread, ...]]:
     """The running threads that begin each chain: any of an executor's may, where it has several."""
     allocation.server_members(plan, found)  # none is in two servers
-    begin: list[tuple[Thread, ...]] = []
+    begin: list[tuple[RunningThread, ...]] = []
     for chain in plan.chains:
         planned = allocation.first_planned(chain)
         if planned is None:

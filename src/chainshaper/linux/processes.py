@@ -24,7 +24,7 @@ from pathlib import Path, PurePath
 from typing import NamedTuple
 
 from chainshaper.linux.threads import (
-    Thread,
+    RunningThread,
     dds_kind,
     innermost_id,
     is_of_zenoh,
@@ -126,7 +126,7 @@ def user_in(folder: int) -> int | None:
 
 
 @dataclass(frozen=True)
-class Process:
+class RunningProcess:
     """A process at one instant; ``inner_pid`` is its id in its own pid namespace, ``user`` None if
     it is no single user's. Whether it ``participates`` in DDS.
     """
@@ -136,17 +136,17 @@ class Process:
     command: tuple[str, ...]
     inner_pid: int
     participates: bool
-    threads: tuple[Thread, ...]
+    threads: tuple[RunningThread, ...]
     user: int | None = None
 
 
-def list_processes(pids: Iterable[int] | None = None) -> tuple[Process, ...]:
+def list_processes(pids: Iterable[int] | None = None) -> tuple[RunningProcess, ...]:
     """Processes with a command line (kernel threads have none), by id; all if none are given."""
     found = (read_process(pid) for pid in sorted(parents() if pids is None else pids))
     return tuple(process for process in found if process is not None)
 
 
-def read_process(pid: int) -> Process | None:
+def read_process(pid: int) -> RunningProcess | None:
     """A process, None when it is gone, dead, or the kernel's own."""
     try:
         with process_folder(pid) as folder:
@@ -161,7 +161,7 @@ def read_process(pid: int) -> Process | None:
                 return None
     except OSError:
         return None
-    return Process(
+    return RunningProcess(
         pid=pid,
         parent=status_field(status, "PPid")[0],
         command=tuple(map(text_of, command.rstrip(b"\0").split(b"\0"))),
@@ -181,12 +181,14 @@ def descendants(parent_of: Mapping[int, int], *pids: int) -> frozenset[int]:
     return frozenset(family)
 
 
-def find_applications(processes: Iterable[Process]) -> tuple[Process, ...]:
+def find_applications(processes: Iterable[RunningProcess]) -> tuple[RunningProcess, ...]:
     """Those that look like applications of ROS 2 or DDS."""
     return tuple(one for one in processes if one.participates or takes_ros_arguments(one.command))
 
 
-def _participation(pid: int, threads: tuple[Thread, ...]) -> tuple[bool, tuple[Thread, ...]]:
+def _participation(
+    pid: int, threads: tuple[RunningThread, ...]
+) -> tuple[bool, tuple[RunningThread, ...]]:
     """Whether a process takes part in DDS, and its threads with what they do there."""
     if any(thread.kind in ("receive", "event") for thread in threads):
         return True, threads
@@ -237,7 +239,7 @@ _OF_LANGUAGE = re.compile(r"/(lib(c|pthread|stdc\+\+|gcc_s)|ld-linux[-\w]*)[-.]|
 _OUTERMOST = 16_384  # so near are a thread's first frames to where it waits, and to its stack's end
 
 
-def _receives_for_fast_dds(thread: Thread, regions: Sequence[Region]) -> bool:
+def _receives_for_fast_dds(thread: RunningThread, regions: Sequence[Region]) -> bool:
     """Whether a thread, of a process with Fast DDS before 2.13, receives: it waits for a datagram,
     or for a word in the memory of a port, and the library's function is the first on its stack. Not
     known of one that runs just now, nor without ptrace(2)'s PTRACE_MODE_ATTACH.
@@ -264,7 +266,7 @@ def _receives_for_fast_dds(thread: Thread, regions: Sequence[Region]) -> bool:
     return False
 
 
-def middleware_limit(process: Process) -> str | None:
+def middleware_limit(process: RunningProcess) -> str | None:
     """The key in :data:`MIDDLEWARE_LIMITS` of a process that takes part, by its threads."""
     others = [one for one in process.threads if one.tid != process.pid]
     if not process.participates or not others:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
-from chainshaper.linux.threads import POLICIES, RESET_ON_FORK, Thread
+from chainshaper.linux.threads import POLICIES, RESET_ON_FORK, RunningThread
 from chainshaper.values.errors import OperationError, PlatformError
 
 Aspect: TypeAlias = Literal["scheduling_class", "nice", "cores"]
@@ -27,7 +27,7 @@ _THROTTLE = "/proc/sys/kernel/sched_rt_{}_us"
 
 
 @dataclass(frozen=True)
-class Scheduling:
+class SchedulingRequest:
     """What a thread should get, or None: a priority of SCHED_FIFO or, if it ``takes_turns``, of
     SCHED_RR (0: SCHED_OTHER), and cores.
     """
@@ -93,7 +93,7 @@ def set_state(tid: int, target: SchedulingState) -> None:
             os.sched_setaffinity(tid, target.cores)
 
 
-def after_wish(now: SchedulingState, wanted: Scheduling) -> SchedulingState:
+def after_wish(now: SchedulingState, wanted: SchedulingRequest) -> SchedulingState:
     """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
     if wanted.priority is not None:
         own = replace(now.scheduling_class, policy=wanted.policy, priority=wanted.priority)
@@ -117,7 +117,7 @@ def state_from_json(values: dict[str, Any]) -> SchedulingState:
     return SchedulingState(own, values["nice"], tuple(values["cores"]))
 
 
-def apply_scheduling(thread: Thread, wanted: Scheduling) -> None:
+def apply_scheduling(thread: RunningThread, wanted: SchedulingRequest) -> None:
     """Give a thread, if it runs still, class and cores. Raises OperationError: it is refused."""
     try:
         set_state(thread.tid, after_wish(state_of(thread.tid), wanted))

@@ -99,7 +99,7 @@ def role_of(comm: str, is_main: bool) -> ThreadRole:
 
 
 @dataclass(frozen=True)
-class Thread:
+class RunningThread:
     """A thread as the kernel shows it at one instant: started so many ticks (:data:`TICK_NS`) after
     the machine, with the id that tracers record in a container (``inner_tid``).
     """
@@ -125,7 +125,7 @@ class Thread:
         return f"thread {self.tid} ({self.comm}) of process {self.pid}"
 
 
-def list_threads(pid: int) -> tuple[Thread, ...]:
+def list_threads(pid: int) -> tuple[RunningThread, ...]:
     """The threads of a process, main thread first; empty when the process is gone."""
     try:
         tids = [int(name) for name in os.listdir(f"/proc/{pid}/task")]  # noqa: PTH208 - quicker
@@ -142,19 +142,19 @@ def list_threads(pid: int) -> tuple[Thread, ...]:
     return tuple(found.values())
 
 
-def is_of_zenoh(thread: Thread) -> bool:
+def is_of_zenoh(thread: RunningThread) -> bool:
     """Whether a thread with its role is one of Zenoh's runtimes."""
     return thread.kind is not None and _ZENOH_NAME.fullmatch(thread.comm) is not None
 
 
-def find_thread(tid: int) -> Thread | None:
+def find_thread(tid: int) -> RunningThread | None:
     """The thread with this id, None when there is none."""
     with suppress(OSError):
         return _thread(status_field(read_proc(f"/proc/{tid}/status"), "Tgid")[0], tid, None)
     return None
 
 
-def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
+def _thread(pid: int, tid: int, inner_pid: int | None) -> RunningThread | None:
     """A thread, if it runs still, by reading one file: there are thousands, every second."""
     folder = f"/proc/{pid}/task/{tid}"
     try:
@@ -166,7 +166,7 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> Thread | None:
     except OSError:
         return None
     policy = int(fields[38])
-    return Thread(
+    return RunningThread(
         tid=tid,
         pid=pid,
         comm=comm,

@@ -48,7 +48,7 @@ from chainshaper.monitor.metrics import (
 )
 from chainshaper.planning import ApplicationPlan, Plan
 from chainshaper.planning.plan_file import plan_values
-from chainshaper.robot.decision import clock_offset
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import (
     NO_PROCESS,

@@ -35,7 +35,7 @@ from chainshaper import _core
 from chainshaper.planning import plan as plans
 from chainshaper.planning.margins import check_latencies
 from chainshaper.planning.plan import Plan, Prediction, Slot, publish_slots
-from chainshaper.robot.decision import IntoOpenSlot
+from chainshaper.robot.gate import IntoOpenSlot
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
 from chainshaper.values.plan_choices import Goal, Solver

@@ -1,7 +1,7 @@
 """What a plan asks of the application and the machine: overruns, publishers, warnings.
 
 An **overrun** is an output that comes behind the last slot it was due in (section 6). A shaping
-node sees them and treats them as the plan says (:mod:`chainshaper.robot.decision`). The thread of
+node sees them and treats them as the plan says (:mod:`chainshaper.robot.gate`). The thread of
 an asynchronous publisher cannot, but DDS can, by an output's age: with a **lifespan** on the topic,
 what waited for the slot of a later cycle has expired when the thread may run again.
 """

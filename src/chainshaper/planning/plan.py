@@ -18,7 +18,7 @@ from typing import Annotated, Literal, NamedTuple, TypeAlias
 
 from pydantic import AfterValidator, Field, model_validator
 
-from chainshaper.robot.decision import Anchor, IntoOpenSlot, Late, Messages, Overrun
+from chainshaper.robot.gate import Anchor, IntoOpenSlot, Late, Messages, Overrun
 from chainshaper.values.durations import duration_text, format_duration, parse_duration
 from chainshaper.values.plan_choices import (
     EqualPriorities,
@@ -335,7 +335,7 @@ class Plan(Part):
 
     ``cycle_ns`` is a whole multiple of the chain's period; cycles start ``offset_ns`` after the
     instant from which those of all chains count. For ``anchor`` to ``messages`` see
-    :mod:`chainshaper.robot.decision`, for the next four :mod:`chainshaper.values.plan_choices`.
+    :mod:`chainshaper.robot.gate`, for the next four :mod:`chainshaper.values.plan_choices`.
     ``shaping_node`` serves the chain's output, unless the publisher's own thread is gated;
     ``further_shaping_nodes`` serve other sinks, or topics inside a chain (LET per callback).
     """

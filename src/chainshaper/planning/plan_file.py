@@ -36,7 +36,7 @@ _SECTION_COMMENTS = {
     "anchor": "what starts a cycle: the message's origin stamp (stamp), or the servers (cycle)",
     "overrun": "an output that missed its last slot: wait for the next, discard, publish at once",
     "into_open_slot": "an output that comes when its slot is open: at once, or in the next slot",
-    "messages": "several outputs in one cycle: all leave in order, or the newest, or the first",
+    "messages": "several outputs in one cycle: all leave in order, or the newest",
     "fallback": "while the shaping node is not there: bypass, outputs go around it; or silence",
     "shaping_thread": "shaping nodes' threads run in their servers' slots only; free: their gates"
     " alone time them",

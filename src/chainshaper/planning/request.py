@@ -418,7 +418,7 @@ def _shaped(
     if request.publication == "in-process" and profile.intra_process:
         reason = f"subscribers of {profile.topics[-1]} get its messages inside the process of"
         reason += f" {last}, where no gate before DDS sees them: switch that off, or plan with"
-        raise InputError(f"{reason} --publication synchronous and --node component")
+        raise InputError(f"{reason} --publication synchronous, and splice with --node cpp")
     unused = "publication" if request.publication == "asynchronous" else "send"
     del values[f"longest_{unused}_ns"]  # no evidence for it
     length = _slot_ns(profile, request)

@@ -31,7 +31,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 
-from chainshaper.robot.decision import DROPPED, Outcome, Release, Shaper, Waiting
+from chainshaper.robot.decision import DROPPED, Release
+from chainshaper.robot.shaper import Shaper
+from chainshaper.robot.waiting import Outcome, Waiting
 
 FIELDS = (
     "holder",  # the shaping node in force, a process id; 0 while the standby has the lock
@@ -66,7 +68,7 @@ FIELDS = (
 )
 """Numbers of 8 bytes at the beginning of a page, in this order."""
 
-VERSION = 3  # of the page's layout: part of its name
+VERSION = 4  # of the page's layout: part of its name
 RING = 1024
 RELEASED, BYPASSED, MEASURED = 32, 32 + RING, 32 + 2 * RING  # places of three rings,
 TOPIC = 32 + 3 * RING  # and of the name

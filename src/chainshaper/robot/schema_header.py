@@ -11,8 +11,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from chainshaper.robot import decision, handover
-from chainshaper.robot.decision import NodeParameters
+from chainshaper.robot import handover
+from chainshaper.robot.gate_log import LOG_COLUMNS
+from chainshaper.robot.node_parameters import NodeParameters
 
 _CPP_TYPES = {
     int: "std::int64_t",
@@ -46,12 +47,12 @@ def numbers_of(module: ModuleType) -> dict[str, int]:
 
 def _values() -> dict[str, str]:
     """What stands in each place of the template."""
-    numbers = numbers_of(handover) | {"log_columns": len(decision.LOG_COLUMNS)}
+    numbers = numbers_of(handover) | {"log_columns": len(LOG_COLUMNS)}
     usual = vars(NodeParameters())
     types = {name: _CPP_TYPES[kind] for name, kind in NodeParameters.__annotations__.items()}
     return {
         "CONSTANTS": constants(numbers),
-        "LOG_HEADER": '"\n    "'.join(f"{n}," for n in decision.LOG_COLUMNS).removesuffix(","),
+        "LOG_HEADER": '"\n    "'.join(f"{n}," for n in LOG_COLUMNS).removesuffix(","),
         "FIELDS": ", ".join(handover.FIELDS),
         "PARAMETERS": "\n  ".join(f"{types[n]} {n}{{{_in_cpp(usual[n])}}};" for n in types),
         "READS": "\n    ".join(f'read("{name}", {name});' for name in types),

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from chainshaper import _core
 from chainshaper.planning.application_plan import ApplicationPlan
 from chainshaper.planning.plan import ReceiverPlace, Server
-from chainshaper.robot.decision import SAME
+from chainshaper.robot.node_parameters import SAME
 from chainshaper.simulation.system import ROLES, Entity, Publisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription

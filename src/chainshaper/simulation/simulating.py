@@ -27,6 +27,7 @@ from chainshaper.sources import open_source
 from chainshaper.splicing.application import at_offsets, splice_application
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.progress import Progress
 from chainshaper.values.recording import (
     InForceInfo,
     Recording,
@@ -59,7 +60,7 @@ def simulate(
     seed: int | None = None,
     switches: bool = False,
     command: Sequence[str] = (),
-    progress: live.Progress | None = None,
+    progress: Progress | None = None,
 ) -> Recording:
     """Simulate ``cycles`` periods of an application's chain and record its events.
 
@@ -100,7 +101,7 @@ def simulate_latencies(
     *,
     cycles: int = 320,
     seed: int | None = None,
-    progress: live.Progress | None = None,
+    progress: Progress | None = None,
 ) -> Int64s:
     """The end-to-end latencies of an application's chain, by simulation (ns).
 
@@ -165,7 +166,7 @@ def _built(
     return system, objects, machine
 
 
-def _runs(machine: Machine, progress: live.Progress | None = None) -> Iterator[_core.Pause]:
+def _runs(machine: Machine, progress: Progress | None = None) -> Iterator[_core.Pause]:
     """Run to the end; why the engine stopped, each time that it did."""
     simulation, described = machine.simulation, machine.description
     while (reason := simulation.run(INSTANTS)) != _core.Pause.over:
@@ -191,7 +192,7 @@ def _event_tables(
     system: System,
     objects: Sequence[live.ProcessLog],
     machine: Machine,
-    progress: live.Progress | None,
+    progress: Progress | None,
 ) -> Iterator[dict[str, pl.DataFrame]]:
     """The event tables part by part as the log fills up, the objects' first."""
     yield live.event_tables(objects, from_ns=0)

@@ -8,7 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import polars as pl
 
-from chainshaper.robot.decision import LOG_COLUMNS, STALL_NS
+from chainshaper.robot.gate_log import LOG_COLUMNS
+from chainshaper.robot.shaper import STALL_NS
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
 

@@ -9,8 +9,8 @@ output gets the lifespan by which DDS discards what overran.
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers, publishing_servers
-from chainshaper.robot.decision import SAME
-from chainshaper.splicing.shaping_process import gate_of
+from chainshaper.robot.node_parameters import SAME
+from chainshaper.splicing.gate_settings import gate_of
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
 from chainshaper.values.yaml_file import wrong_values_refused

@@ -6,7 +6,7 @@ This module imports nothing slow: the planner takes a while, `chainshaper plan -
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple, TypeAlias
 
-from chainshaper.robot.decision import Anchor, IntoOpenSlot, Messages, Overrun
+from chainshaper.robot.gate import Anchor, IntoOpenSlot, Messages, Overrun
 
 Policy: TypeAlias = Literal[
     "shaped",
@@ -31,8 +31,9 @@ EqualPriorities: TypeAlias = Literal["apart", "round-robin"]
 SlotEnds: TypeAlias = Literal["open-until-done", "closed"]
 """What servers do at their slots' ends while their callbacks still run: they stay open until these
 are done, for as long as the cycle has room; or they close, as the paper's do."""
-NodeKind: TypeAlias = Literal["python", "cpp", "typed", "component"]
-"""How a shaping node is made (:mod:`chainshaper.splicing.shaping_process`)."""
+NodeLanguage: TypeAlias = Literal["python", "cpp"]
+NodeChoice: TypeAlias = Literal["auto", "python", "cpp"]
+"""The shaping node that a user chooses; the rest is found out (:mod:`.splicing.node_kinds`)."""
 Solver: TypeAlias = Literal["exact", "pso", "random"]
 """What places latency bands; the paper uses particle swarm optimisation (section 3.3)."""
 Goal: TypeAlias = Literal["mean", "jitter", "gap"]

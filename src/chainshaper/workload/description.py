@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, model_validator
 
-from chainshaper.robot.decision import Anchor, Gate, IntoOpenSlot, Late, Messages, Modes, Overrun
+from chainshaper.robot.gate import Anchor, Gate, IntoOpenSlot, Late, Messages, Modes, Overrun
 from chainshaper.values.errors import InputError
 from chainshaper.values.plan_choices import Publication
 from chainshaper.values.yaml_file import (
@@ -119,7 +119,7 @@ class SimulationDescription(Part):
 
 
 class ModesDescription(Part):
-    """A gate's :class:`~chainshaper.robot.decision.Modes` and the ``topic`` that names the mode."""
+    """A gate's :class:`~chainshaper.robot.gate.Modes` and the ``topic`` that names the mode."""
 
     topic: FullName
     bands: Annotated[dict[str, int], Field(min_length=1)]
@@ -128,7 +128,7 @@ class ModesDescription(Part):
 
 
 class GateDescription(Part):
-    """A :class:`~chainshaper.robot.decision.Gate` in a callback: republishing in ``slots`` only.
+    """A :class:`~chainshaper.robot.gate.Gate` in a callback: republishing in ``slots`` only.
 
     ``phase_ns`` is where cycles begin without a stamp, behind the common start (None: with the
     timer that starts the application's chain). ``moves``: from when on after that start, and where
@@ -174,7 +174,7 @@ class GateDescription(Part):
         return self
 
     def moved(self, start_ns: int) -> list[tuple[int, int]]:
-        """The moves as a :class:`~chainshaper.robot.decision.Queue` has them."""
+        """The moves as a :class:`~chainshaper.robot.waiting.Queue` has them."""
         return [(start_ns + since, begin - self.slots[0][0]) for since, begin in self.moves]
 
 

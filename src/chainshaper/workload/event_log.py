@@ -15,7 +15,8 @@ from threading import get_native_id
 from time import monotonic_ns
 from typing import Any
 
-from chainshaper.robot.decision import ANCHORS, DROPPED, LATE, MESSAGES
+from chainshaper.robot.decision import DROPPED
+from chainshaper.robot.gate import ANCHORS, LATE, MESSAGES
 
 _RELEASE = "callback source_timestamp arrival origin release slot cycles_waited anchor overrun mode"
 LAYOUT: dict[str, tuple[str, ...]] = {

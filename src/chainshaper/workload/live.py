@@ -21,17 +21,18 @@ import polars as pl
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
 from chainshaper.linux.own_processes import LIBRARIES
 from chainshaper.linux.scheduling import (
-    Scheduling,
+    SchedulingRequest,
     apply_scheduling,
     available_cores,
     check_cores,
     may_use_fifo,
 )
-from chainshaper.linux.threads import Thread, foreign_realtime_processes, list_threads
-from chainshaper.robot.decision import clock_offset
+from chainshaper.linux.threads import RunningThread, foreign_realtime_processes, list_threads
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.values import events
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, PlatformError
+from chainshaper.values.progress import Progress
 from chainshaper.values.recording import (
     InForceInfo,
     Recording,
@@ -52,7 +53,6 @@ from chainshaper.workload.launcher import Child
 from chainshaper.workload.stall_meter import StallWatch, far_from, meter_tables, stalls_watched
 
 Numbers: TypeAlias = npt.NDArray[np.int64]
-Progress = Callable[[float, str], None]  # of the share done (0 to 1) and what is being done
 
 
 @dataclass(frozen=True)
@@ -308,7 +308,7 @@ def _allocate_threads(application: Application, nodes: dict[str, Child], realtim
             cores_of_thread: tuple[int, ...] = (core,)
             if thread.role in ("executor", "publisher") and not application.nodes[name].bound:
                 cores_of_thread = tuple(available_cores())
-            wanted = Scheduling(priority if realtime else None, cores=cores_of_thread)
+            wanted = SchedulingRequest(priority if realtime else None, cores=cores_of_thread)
             apply_scheduling(thread, wanted)
 
 
@@ -360,7 +360,7 @@ def _snapshot(nodes: dict[str, Child], meters: dict[int, Child]) -> tuple[Thread
     )
 
 
-def node_threads(pid: int) -> list[Thread]:
+def node_threads(pid: int) -> list[RunningThread]:
     """The threads of a node's process. What a callback's module starts executes nothing, and has
     its thread's name.
     """

@@ -16,10 +16,13 @@ from functools import partial
 from typing import Any, TypeAlias
 
 from chainshaper.linux import scheduling
-from chainshaper.robot import decision
 from chainshaper.robot.clear_core import ClearCore
-from chainshaper.robot.decision import READER_DEPTH, STALL_NS, Gate, Modes, Outcome, Shaper, text_of
+from chainshaper.robot.gate import Gate, Modes
 from chainshaper.robot.handover import Turn
+from chainshaper.robot.node_parameters import SAME
+from chainshaper.robot.serialized import text_of
+from chainshaper.robot.shaper import READER_DEPTH, STALL_NS, Shaper
+from chainshaper.robot.waiting import Outcome
 from chainshaper.workload import dds, executor, launcher
 from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
 from chainshaper.workload.execution import FIRST_AFTER, ExecutionTimes, spend
@@ -275,7 +278,7 @@ class NodeProcess:
         own = Gate(
             slots=tuple((begin, finish) for begin, finish in gate["slots"]),
             modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
-            **{name: gate[name] for name in (*decision.SAME, "depth")},
+            **{name: gate[name] for name in (*SAME, "depth")},
         )
         shaper, first = Shaper(own, gate["spin_ns"]), own.slots[0][0]
         if core is not None:

@@ -22,7 +22,8 @@ from typing import TYPE_CHECKING
 
 from chainshaper.linux import scheduling
 from chainshaper.linux.threads import list_threads
-from chainshaper.robot.decision import STALL_NS, sleep_until
+from chainshaper.robot.clocks import sleep_until
+from chainshaper.robot.shaper import STALL_NS
 from chainshaper.workload import launcher
 from chainshaper.workload.launcher import ENOUGH, Child
 
@@ -177,7 +178,7 @@ def stalls_watched(cores: Iterable[int], realtime: bool) -> Iterator[StallWatch]
             watch.meters[core].tell(parent=os.getpid())
         for core, child in watch.meters.items():
             child.hear()
-            wanted = scheduling.Scheduling(PRIORITY if realtime else None, cores=(core,))
+            wanted = scheduling.SchedulingRequest(PRIORITY if realtime else None, cores=(core,))
             for thread in list_threads(child.pid):
                 scheduling.apply_scheduling(thread, wanted)
         yield watch

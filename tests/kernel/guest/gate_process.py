@@ -13,7 +13,9 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, "/src")
-from chainshaper.robot.decision import Gate, Shaper, sleep_until
+from chainshaper.robot.clocks import sleep_until
+from chainshaper.robot.gate import Gate
+from chainshaper.robot.shaper import Shaper
 
 cycle, arrival, start, spin = map(int, sys.argv[3:])
 shaper, seen = Shaper(Gate(((start, start + 1_000_000),), cycle, "cycle"), spin), []

@@ -30,7 +30,11 @@ from rclpy.subscription import Subscription
 from rclpy.utilities import get_rmw_implementation_identifier
 
 from chainshaper.robot.clear_core import started_beside
-from chainshaper.robot.decision import DEPTH, LOG_COLUMNS, READER_DEPTH, NodeParameters, Outcome
+from chainshaper.robot.gate import DEPTH
+from chainshaper.robot.gate_log import LOG_COLUMNS
+from chainshaper.robot.node_parameters import NodeParameters
+from chainshaper.robot.shaper import READER_DEPTH
+from chainshaper.robot.waiting import Outcome
 
 HUMBLE = not hasattr(Subscription, "CallbackType")
 """There a callback gets the message only, and serialized messages pass no trace points."""

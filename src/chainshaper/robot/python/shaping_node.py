@@ -21,7 +21,7 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from std_msgs.msg import Empty, String
 
 from chainshaper.robot.clear_core import ClearCore
-from chainshaper.robot.decision import Outcome, Shaper, clock_offset
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.robot.handover import STANDING_BY, Turn
 from chainshaper.robot.python.node import (
     HUMBLE,
@@ -37,6 +37,8 @@ from chainshaper.robot.python.node import (
     wait,
     wait_for_publisher,
 )
+from chainshaper.robot.shaper import Shaper
+from chainshaper.robot.waiting import Outcome
 
 DISCOVERY_S, SETTLING_S = 2.0, 0.1
 REHEARSAL_TOPIC = "/_chainshaper_rehearsal"  # of all shaping nodes; the underscore hides it

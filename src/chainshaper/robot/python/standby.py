@@ -18,7 +18,7 @@ from typing import Any
 import rclpy
 from rclpy.node import Node
 
-from chainshaper.robot.decision import Outcome, Release, Waiting
+from chainshaper.robot.decision import Release
 from chainshaper.robot.handover import Standby
 from chainshaper.robot.python.node import (
     HUMBLE,
@@ -30,6 +30,7 @@ from chainshaper.robot.python.node import (
     wait,
     wait_for_publisher,
 )
+from chainshaper.robot.waiting import Outcome, Waiting
 
 
 def watch(node: Node, standby: Standby) -> None:

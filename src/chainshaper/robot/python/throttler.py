@@ -1,7 +1,7 @@
 """The throttler, for chains whose input is not quite periodic (paper, section 5.1).
 
 Each topic of ``inputs`` is republished on the topic of ``outputs`` in the same place, by a ``rule``
-of :mod:`chainshaper.robot.decision`. What is dropped, and how often nothing had come, is said at
+of :mod:`chainshaper.robot.throttling`. What is dropped, and how often nothing had come, is said at
 the end. ``first`` is periodic only behind the paper's server, a slot of 2 ms in every cycle; the
 timer of ``newest`` is so on every kernel.
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 from rclpy.node import Node
 
-from chainshaper.robot.decision import RULES, FirstOfPeriod, sleep_until
+from chainshaper.robot.clocks import sleep_until
 from chainshaper.robot.python.node import (
     asked_of,
     create_subscription,
@@ -26,6 +26,7 @@ from chainshaper.robot.python.node import (
     run,
     wait_for_publisher,
 )
+from chainshaper.robot.throttling import RULES, FirstOfPeriod
 
 
 @dataclass

@@ -7,7 +7,7 @@ once.
 """
 
 import os
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from chainshaper.sources.ctf import tsdl
 from chainshaper.sources.ctf.copies import CtfStream
 from chainshaper.sources.ctf.layout import Table, lay_out, select
 from chainshaper.sources.ctf.trace import CtfTrace, MappedFile
+from chainshaper.values.progress import ShareDone
 
 _CHUNK_BYTES = 32 << 20
 _SMALL_BYTES = 4 << 20
@@ -41,7 +42,6 @@ _FAILURES = {
     _core.CtfFailure.OVER_BUDGET: "its fields, most of them of no bits, would take far more memory"
     f" than its size warrants ({_core.CTF_BUDGET_PER_BYTE} times)",
 }
-_Progress = Callable[[float], None]
 
 
 class Events(dict[str, pl.DataFrame]):
@@ -73,7 +73,7 @@ def read_events(
     nameless: Collection[str] = (),
     counted: bool = False,
     threads: int | None = None,
-    progress: _Progress = lambda _: None,
+    progress: ShareDone = lambda _: None,
 ) -> Events:
     """Read events into one frame per name, ordered by name of event.
 
@@ -206,7 +206,7 @@ def _filled(
     files: list[_File],
     first_rows: NDArray[np.int64],
     columns: list["_Columns"],
-    progress: _Progress,
+    progress: ShareDone,
 ) -> list[bytes]:
     """Pass 2 over all chunks; returns the texts and bytes that text columns then have codes of.
 

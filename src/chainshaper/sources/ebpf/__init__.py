@@ -25,7 +25,7 @@ from chainshaper.linux.own_processes import is_installed, tool_environment
 from chainshaper.linux.processes import descendants, run_users, user_name, user_of
 from chainshaper.linux.scheduling import signalled_with_parent
 from chainshaper.linux.threads import parents, read_proc, read_stat, status_field
-from chainshaper.robot.decision import clock_offset
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.ebpf import trace_points as tp
 from chainshaper.sources.ebpf.functions import callback_functions
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions

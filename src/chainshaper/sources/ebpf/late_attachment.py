@@ -9,7 +9,7 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import polars as pl
 
-from chainshaper.linux.processes import Process, named_nodes
+from chainshaper.linux.processes import RunningProcess, named_nodes
 from chainshaper.sources.system import processes_of
 from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS
@@ -176,7 +176,7 @@ def with_found_nodes(
     tables: events.EventTables,
     info: RecordingInfo,
     endpoints: Sequence[EndpointInfo],
-    processes: Iterable[Process],
+    processes: Iterable[RunningProcess],
 ) -> tuple[events.EventTables, RecordingInfo]:
     """Give publishers, subscriptions and timers without a node theirs, where it is certain.
 

@@ -13,11 +13,10 @@ they really happened.
 """
 
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
-from typing import TypeAlias
 
 import polars as pl
 
@@ -40,9 +39,9 @@ from chainshaper.sources.system import (
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import CREATION
+from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording, RecordingInfo
 
-Progress: TypeAlias = Callable[[float, str], None]
 """Gets the share of the work that is done, from 0 to 1, and what is being done."""
 
 _EXECUTOR = frozenset(name for name in events.FIELDS if name.startswith("rclcpp_executor_"))

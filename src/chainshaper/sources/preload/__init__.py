@@ -39,7 +39,7 @@ from chainshaper.linux.threads import (
     read_proc,
     time_namespace,
 )
-from chainshaper.robot.decision import clock_offset
+from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.ebpf.trace_points import (
     Argument,
     TracePoint,

@@ -1,5 +1,5 @@
 // A gate at work: clocks, sleeping, and serialized messages around the decisions of gate/. The same
-// as chainshaper/robot/decision.py, which explains it. No ROS 2 here. All times are nanoseconds.
+// as chainshaper/robot/shaper.py, which explains it. No ROS 2 here. All times are nanoseconds.
 
 #pragma once
 

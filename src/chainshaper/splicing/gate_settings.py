@@ -1,0 +1,94 @@
+"""The gate of a plan's shaping node, as ROS parameters and as the settings of the gate libraries.
+
+A shaping node reads ROS parameters (:class:`.NodeParameters`). The gates inside the processes that
+publish and subscribe (`LD_PRELOAD`) read the same names and values from one text file.
+"""
+
+import hashlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from chainshaper.linux.threads import gate_thread_name
+from chainshaper.planning.overruns import cycles_until_output
+from chainshaper.planning.plan import Plan, ShapingNode, server_of
+from chainshaper.robot.gate import DEPTH, Gate, Modes
+from chainshaper.robot.node_parameters import gate_parameters
+from chainshaper.sources.preload import native_library
+
+GATES = "CHAINSHAPER_GATES"
+"""The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
+
+
+def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
+    """The gate of a plan's shaping node, with room for so many messages."""
+    server = server_of(plan, node.thread)  # a plan without one for a shaping node is refused
+    modes = plan.modes if node == plan.shaping_node else None
+    # Plans number bands from 1, as people do; a gate numbers its slots from 0.
+    bands = {} if modes is None else {mode: band - 1 for mode, band in modes.bands.items()}
+    return Gate(
+        slots=() if server is None else server.slots,
+        cycle_ns=plan.cycle_ns,
+        anchor=plan.anchor,
+        phase_ns=plan.offset_ns,
+        overrun=plan.overrun,
+        due_cycles=cycles_until_output(plan, node),
+        modes=None if modes is None else Modes(bands, modes.default, modes.late),
+        messages=plan.messages,
+        into_open_slot=plan.into_open_slot,
+        depth=depth,
+    )
+
+
+def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
+    """The ROS parameters of a shaping node, by the names of :class:`NodeParameters`."""
+    mode_topic = "" if plan.modes is None else plan.modes.topic
+    parameters = gate_parameters(gate_of(plan, node), mode_topic) | {
+        "depth": node.depth or 0,
+        "spin_ns": node.spin_ns,
+        "pause_ns": node.pause_ns,
+        "core": node.core,
+        "fifo_priority": node.fifo_priority,
+        "output_depth": plan.chain.output_depth or DEPTH,
+        "log": "" if log is None else str(log.absolute()),
+    }
+    if node.receivers:
+        parameters["server_cores"] = sorted({server.core for server in plan.servers})
+    return parameters
+
+
+def page_name(node: ShapingNode, place: Path) -> str:
+    """Of the page of an output: the files may be moved before they are used, the log may not."""
+    return f"{node.name}.{hashlib.sha256(str(place.absolute()).encode()).hexdigest()[:8]}"
+
+
+def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
+    """The block of an output in the file that :data:`GATES` names, a line for each value."""
+    values = {
+        "output": node.output,
+        "input": node.input,
+        "node": node.name,
+        "publisher": publisher,
+        "thread": gate_thread_name(node.name),
+        "handover": page_name(node, log),
+    }
+    return settings_text(values | shaping_parameters(plan, node, log))
+
+
+def delivery_settings(node: ShapingNode) -> str:
+    """The block of an output that is handed to its receivers at a constant time; none: empty."""
+    if node.delivery_ns is None:
+        return ""
+    values = {"output": node.output, "delivery_ns": node.delivery_ns}
+    return settings_text({**values, "receiver": list(node.receivers)})
+
+
+def settings_text(values: Mapping[str, Any]) -> str:
+    """A block of that file: ``NAME VALUE``, once for each value of a list; ``output`` is first."""
+    several = {name: one if isinstance(one, list) else [one] for name, one in values.items()}
+    return "".join(f"{name} {value}\n" for name, own in several.items() for value in own)
+
+
+def gate_library() -> Path:
+    """The library with both gates, which was built with the package."""
+    return native_library("libchainshaper_gate.so")
