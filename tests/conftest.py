@@ -68,7 +68,7 @@ def pytest_runtest_logreport(report: pytest.TestReport) -> None:
         crash = getattr(report.longrepr, "reprcrash", None)
         reason = str(report.longrepr) if crash is None else crash.message
         stage = "" if report.when == "call" else f" ({report.when})"
-        with open(FAILURES, "a") as failures:
+        with Path(FAILURES).open("a", encoding="utf-8") as failures:
             failures.write(f"  {report.nodeid}{stage}: {reason.strip().splitlines()[0]}\n")
 
 
