@@ -34,11 +34,11 @@ from chainshaper.sources.system import (
     distribution_of,
     processes_of,
     rmw_of_gids,
-    rmw_of_threads,
 )
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import CREATION
+from chainshaper.values.middleware import rmw_of_threads
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording, RecordingInfo
 
