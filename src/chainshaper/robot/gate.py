@@ -23,8 +23,8 @@ single files that :mod:`chainshaper.splicing` puts together from them.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal, TypeAlias, get_args
+from dataclasses import dataclass, fields
+from typing import Annotated, Literal, NamedTuple, TypeAlias, get_args, get_origin
 
 Anchor: TypeAlias = Literal["stamp", "cycle"]
 Overrun: TypeAlias = Literal["wait", "discard", "publish"]
@@ -63,36 +63,55 @@ class Modes:
         _one_of("late", self.late, LATE)
 
 
+class AtLeast(NamedTuple):
+    """The smallest value of a number."""
+
+    number: int
+
+
 @dataclass(frozen=True)
 class Gate:
-    """The publish slots of one output. All times are nanoseconds.
+    """The publish slots of one output, and what happens to its messages.
 
-    ``slots`` are half-open ``(start, end)`` intervals counted from the anchor, ascending, apart
-    from each other and inside ``[0, cycle_ns)``. With the ``stamp`` anchor, ``phase_ns`` serves
-    messages whose stamp is of no use: it is older than :data:`MAX_AGE_CYCLES`, or from the future.
+    This is the one declaration of a gate's fields. Names in ``_ns`` are times in nanoseconds. From
+    its numbers and words derive the ROS parameters (:mod:`chainshaper.robot.node_parameters`), the
+    values in C++ (`scripts/gate-words`), the description in YAML
+    (:class:`chainshaper.workload.description.GateDescription`) and what the simulator gets.
 
-    A message is due in the cycle that it belongs to, or, under logical execution time,
-    ``due_cycles`` later, and leaves in none before. With the ``cycle`` anchor it belongs to the
-    cycle it arrives in, and is due in the next one at the latest: the data of each callback came a
-    cycle before. Raises ValueError: such a gate makes no sense.
+    * ``slots``: half-open ``(start, end)`` intervals in ns, counted from the start of the cycle;
+      ascending, apart from each other, inside ``[0, cycle_ns)``.
+    * ``cycle_ns``: the time from the start of one cycle to the next.
+    * ``anchor``: where a cycle starts: at the stamp of the message, or where the servers start it.
+    * ``phase_ns``: an instant at which a cycle starts, for the anchor ``cycle``, and for a stamp
+      that is of no use: older than :data:`MAX_AGE_CYCLES`, or from the future.
+    * ``overrun``: what happens to a message behind the last slot that it was due in.
+    * ``due_cycles``: cycles from the one that a message belongs to until the one that it is due in
+      (logical execution time); it leaves in none before. With the anchor ``cycle`` a message
+      belongs to the cycle it arrives in, and is due in the next one at the latest: the data of each
+      callback came a cycle before.
+    * ``modes``: which slots the messages of each mode leave in; None: there are no modes.
+    * ``messages``: which of several messages in one cycle leave.
+    * ``depth``: how many messages may wait.
+    * ``into_open_slot``: when a message leaves that arrives in an open slot.
+
+    Raises ValueError: such a gate makes no sense.
     """
 
     slots: tuple[tuple[int, int], ...]
-    cycle_ns: int
-    anchor: str = "stamp"
+    cycle_ns: Annotated[int, AtLeast(1)]
+    anchor: Anchor = "stamp"
     phase_ns: int = 0
-    overrun: str = "wait"
-    due_cycles: int = 0
+    overrun: Overrun = "wait"
+    due_cycles: Annotated[int, AtLeast(0)] = 0
     modes: Modes | None = None
-    messages: str = "all-in-order"
-    depth: int = DEPTH
-    into_open_slot: str = "at-once"
+    messages: Messages = "all-in-order"
+    depth: Annotated[int, AtLeast(1)] = DEPTH
+    into_open_slot: IntoOpenSlot = "at-once"
 
     def __post_init__(self) -> None:
-        _one_of("anchor", self.anchor, ANCHORS)
-        _one_of("overrun", self.overrun, OVERRUNS)
-        _one_of("messages", self.messages, MESSAGES)
-        _one_of("into_open_slot", self.into_open_slot, INTO_OPEN_SLOT)
+        for declared in fields(self):
+            if get_origin(declared.type) is Literal:
+                _one_of(declared.name, getattr(self, declared.name), get_args(declared.type))
         if self.depth < 1:
             raise ValueError(f"room for {self.depth} messages: a gate needs it for one at least")
         if self.due_cycles < 0:
@@ -134,3 +153,14 @@ class Gate:
             return False
         max_age = (MAX_AGE_CYCLES + self.due_cycles) * self.cycle_ns
         return -MAX_FUTURE_NS <= arrival_ns - stamp_ns <= max_age
+
+
+VALUES = tuple(
+    declared for declared in fields(Gate) if declared.name not in ("slots", "modes", "depth")
+)
+"""The declarations of a gate's values that are one number or one word."""
+
+
+def values_of(gate: Gate) -> dict[str, int | str]:
+    """Return a gate's values that are one number or one word, by their names."""
+    return {declared.name: getattr(gate, declared.name) for declared in VALUES}

@@ -6,10 +6,12 @@ republishes on the original one is added. Where the plan gates the publisher's o
 output gets the lifespan by which DDS discards what overran.
 """
 
+from typing import Any
+
 from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
 from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers, publishing_servers
-from chainshaper.robot.node_parameters import SAME
+from chainshaper.robot.gate import values_of
 from chainshaper.splicing.gate_settings import gate_of
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError
@@ -183,7 +185,7 @@ def writers_of(application: Application) -> list[Writer]:
 
 def _described(plan: Plan, shaping: ShapingNode, depth: int, phase_ns: int) -> NodeDescription:
     gate = gate_of(plan, shaping, depth)
-    described = {name: getattr(gate, name) for name in (*SAME, "slots", "depth")}
+    described: dict[str, Any] = {**values_of(gate), "slots": gate.slots, "depth": gate.depth}
     described |= {"phase_ns": phase_ns, "spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}
     if gate.modes is not None and plan.modes is not None:
         described["modes"] = {"topic": plan.modes.topic, **vars(gate.modes)}

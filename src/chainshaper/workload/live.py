@@ -212,7 +212,7 @@ def timing_of(application: Application, cycles: int, start: int) -> Timing:
     first = anchor + WARM_UP_CYCLES * period
     end, apart = first + cycles * period, min(1_000_000, period // 10)
     gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
-    delayed = max((gate.due_cycles for gate in gates), default=0)
+    delayed = max((gate.gate().due_cycles for gate in gates), default=0)
     return Timing(
         start_ns=start,
         anchor_ns=anchor,

@@ -17,9 +17,8 @@ from typing import Any, TypeAlias
 
 from chainshaper.linux import scheduling
 from chainshaper.robot.clear_core import ClearCore
-from chainshaper.robot.gate import Gate, Modes
+from chainshaper.robot.gate import VALUES, Gate, Modes
 from chainshaper.robot.handover import Turn
-from chainshaper.robot.node_parameters import SAME
 from chainshaper.robot.serialized import text_of
 from chainshaper.robot.shaper import READER_DEPTH, STALL_NS, Shaper
 from chainshaper.robot.waiting import Outcome
@@ -278,7 +277,8 @@ class NodeProcess:
         own = Gate(
             slots=tuple((begin, finish) for begin, finish in gate["slots"]),
             modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
-            **{name: gate[name] for name in (*SAME, "depth")},
+            depth=gate["depth"],
+            **{declared.name: gate[declared.name] for declared in VALUES},
         )
         shaper, first = Shaper(own, gate["spin_ns"]), own.slots[0][0]
         if core is not None:
