@@ -46,10 +46,12 @@ def _one_of(key: str, word: str, known: Sequence[str]) -> None:
 
 @dataclass(frozen=True)
 class Modes:
-    """Which of the gate's ``slots`` (by its place, from 0) the messages of each mode leave in.
+    """The slot that the messages of each mode of the system leave in.
 
-    ``default`` is in force until a mode is announced. ``late``: of messages that come behind their
-    mode's slot; with ``next-slot`` one behind the last slot is still an overrun.
+    * ``bands``: the place of each mode's slot in the gate's ``slots``, from 0.
+    * ``default``: the mode in force until one is announced.
+    * ``late``: what happens to a message behind its mode's slot; with ``next-slot`` one that comes
+      behind the last slot is still an overrun.
     """
 
     bands: Mapping[str, int]
@@ -132,23 +134,26 @@ class Gate:
                 raise ValueError(f"mode {mode!r}: band {band}, but {known}")
 
     def may_move(self, by_ns: int) -> bool:
-        """Whether slots that are moved by so much lie within the cycle still."""
+        """Return whether slots that are moved by this time still lie within the cycle."""
         return self.slots[0][0] + by_ns >= 0 and self.slots[-1][1] + by_ns <= self.cycle_ns
 
     @property
     def policy(self) -> str:
-        """What becomes of a message that comes behind the last slot that is open to it."""
+        """What happens to a message that comes behind the last slot that is open to it."""
         if self.modes is None or self.modes.late == "next-slot":
             return self.overrun
         return self.modes.late
 
     def lets_out(self, slot: tuple[int, int], from_ns: int, arrival_ns: int, ready_ns: int) -> bool:
-        """Whether a message may leave in a slot of the cycle that begins then, or before it."""
+        """Return whether a message may leave in a slot, or wait for it.
+
+        ``from_ns`` is the start of the slot's cycle; the message is ready at ``ready_ns``.
+        """
         in_time = self.into_open_slot == "at-once" or arrival_ns <= from_ns + slot[0]
         return in_time and ready_ns < from_ns + slot[1]
 
     def counts_from(self, stamp_ns: int | None, arrival_ns: int) -> bool:
-        """Whether a message's slots count from its stamp."""
+        """Return whether a message's slots count from its stamp."""
         if stamp_ns is None or self.anchor != "stamp":
             return False
         max_age = (MAX_AGE_CYCLES + self.due_cycles) * self.cycle_ns
