@@ -313,7 +313,8 @@ class Turn:
         failed = self.page["failed_starts"] - 1 - BACK_OFF_AFTER
         if failed < 0:
             return 0.0
-        return min(10.0, 0.5 * 2 ** min(failed, 10))  # `failed` is limited: a page may say anything
+        wait_s: float = 0.5 * 2 ** min(failed, 10)  # `failed` is limited: a page may say anything
+        return min(10.0, wait_s)
 
     def go_on(self, shaper: Shaper) -> None:
         """Give a gate the phase and the mode of the gate before it in the same launch.

@@ -31,8 +31,8 @@ def main() -> int:
     while True:
         child, handed_on = subprocess.Popen(command), 0
         while child.poll() is None:
-            for number in received[handed_on:]:
-                child.send_signal(number)
+            for signal_number in received[handed_on:]:
+                child.send_signal(signal_number)
                 handed_on += 1
             with suppress(subprocess.TimeoutExpired):
                 child.wait(0.05)
