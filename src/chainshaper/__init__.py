@@ -70,6 +70,7 @@ if TYPE_CHECKING:
     from chainshaper.reporting.page import write_report as write_report
     from chainshaper.reporting.perfetto import export_mcap as export_mcap
     from chainshaper.reporting.perfetto import export_perfetto as export_perfetto
+    from chainshaper.robot.serialized import origin_of as origin_of
     from chainshaper.simulation import simulate as simulate
     from chainshaper.simulation import simulate_latencies as simulate_latencies
     from chainshaper.sources import open_source as open_source

@@ -12,7 +12,7 @@ from command_line import called, json_of
 from gated import needs_cgroups
 from ros2 import ros2_environment
 
-from chainshaper.enforcement.threads import IN_ORDER
+from chainshaper.enforcement.node_threads import IN_ORDER
 from chainshaper.planning import load_plan
 from chainshaper.planning.chain_plan import Thread
 

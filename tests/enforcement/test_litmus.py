@@ -29,9 +29,9 @@ from chainshaper.enforcement.litmus import (
     restore_plugin,
     turned,
 )
+from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.enforcement.threads import Allocation
 from chainshaper.flow import threads
 from chainshaper.flow.phase import Phase
 from chainshaper.flow.threads import planned_changes

@@ -13,34 +13,36 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known import known
 
-from chainshaper.enforcement.threads import (
-    DDS_PRIORITY,
+from chainshaper.enforcement.node_threads import (
     IN_ORDER,
     Allocation,
     NodeThread,
     RecordedProcess,
     RecordedThread,
-    WantedScheduling,
     allocate,
-    first_planned,
-    left_by_back_end,
     new_and_ended,
+    with_gates,
+)
+from chainshaper.enforcement.planned_threads import first_planned, server_members
+from chainshaper.enforcement.thread_scheduling import (
+    DDS_PRIORITY,
+    WantedScheduling,
+    left_by_back_end,
     plan_scheduling,
-    server_members,
     server_priorities,
     waiting_receivers,
-    with_gates,
 )
 from chainshaper.flow.threads import check_publishers, first_threads
 from chainshaper.linux.processes import RunningProcess, read_process
 from chainshaper.linux.scheduling import SchedulingRequest
-from chainshaper.linux.threads import RunningThread, ThreadRole, dds_kind, gate_thread_name, role_of
+from chainshaper.linux.threads import RunningThread, ThreadRole, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
 from chainshaper.planning.chain_plan import ReceiverPlace, Server, ShapingNode, revised
 from chainshaper.planning.chain_plan import Thread as PlannedThread
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.shaping import let_per_chain, over_cores
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.middleware import thread_work
 from chainshaper.values.recording import EndpointInfo, Recording, RecordingInfo
 
 MS = 1_000_000
@@ -59,7 +61,7 @@ def _process(
     inner = pid if inner_pid is None else inner_pid
     threads = []
     for index, name in enumerate(("main", *names)):
-        role, kind = role_of(name, is_main=index == 0), None if index == 0 else dds_kind(name)
+        role, kind = role_of(name, is_main=index == 0), None if index == 0 else thread_work(name)
         thread = RunningThread(pid + index, pid, name, role, "SCHED_OTHER", 0, (0, 1), 10)
         threads.append(replace(thread, inner_tid=inner + index, kind=kind))
     return RunningProcess(pid, parent, tuple(command.split()), inner, participates, tuple(threads))
@@ -268,7 +270,7 @@ def _allocation(*nodes: list[NodeThread]) -> Allocation:
 
 
 def _by_tid(wanted: tuple[WantedScheduling, ...]) -> dict[int, SchedulingRequest]:
-    return {one.thread.thread.tid: one.wanted for one in wanted}
+    return {one.node_thread.thread.tid: one.scheduling for one in wanted}
 
 
 def _text(wanted: tuple[WantedScheduling, ...]) -> str:
@@ -368,7 +370,7 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
     assert more_cores[301] == SchedulingRequest(91, (0,)), "the core that is kept clear for them"
     assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
-    (gate_thread,) = (one.wanted for one in wanted if one.thread.thread.tid == 100)
+    (gate_thread,) = (one.scheduling for one in wanted if one.node_thread.thread.tid == 100)
     free = _by_tid(left_by_back_end("scx", wanted, plan.free_threads))
     assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
     assert more_cores[300] == SchedulingRequest(83, (1,)), (
@@ -598,34 +600,34 @@ def test_whatever_the_plan_the_order_of_priorities_holds(
     first = first_planned(plan.chains[0])
 
     def begins(one: WantedScheduling) -> int:
-        return first is not None and first.node in one.thread.nodes
+        return first is not None and first.node in one.node_thread.nodes
 
-    assert len({one.thread.thread.tid for one in wanted}) == len(wanted), "one wish per thread"
+    assert len({one.node_thread.thread.tid for one in wanted}) == len(wanted), "one wish per thread"
     for one in wanted:
-        priority, role = one.wanted.priority, one.thread.thread.role
+        priority, role = one.scheduling.priority, one.node_thread.thread.role
         assert (role == "dds") == (priority == DDS_PRIORITY)
         if role == "dds" or priority is None or one.server is None:
             continue
         assert 1 <= priority < 89
         for other in wanted:
-            if other.server is None or other.wanted.priority is None:
+            if other.server is None or other.scheduling.priority is None:
                 continue
             if ranks[one.server] < ranks[other.server] and role != "publisher":
-                assert priority > other.wanted.priority
-            if role == other.thread.thread.role == "executor" and one.server == other.server:
+                assert priority > other.scheduling.priority
+            if role == other.node_thread.thread.role == "executor" and one.server == other.server:
                 above = begins(one) - begins(other)
-                assert priority - other.wanted.priority == above
-    after = {one.thread.thread.tid: one.wanted for one in wanted}
+                assert priority - other.scheduling.priority == above
+    after = {one.node_thread.thread.tid: one.scheduling for one in wanted}
     for one in wanted:
-        if one.thread.thread.role != "publisher":
+        if one.node_thread.thread.role != "publisher":
             continue
         for sibling in allocation.threads:
-            same_process = sibling.thread.pid == one.thread.thread.pid
+            same_process = sibling.thread.pid == one.node_thread.thread.pid
             if not same_process or sibling.thread.role == "publisher":
                 continue
             new = after.get(sibling.thread.tid, SchedulingRequest(None, None))
-            if set(new.cores or sibling.thread.cores) & set(one.wanted.cores or ()):
-                assert known(one.wanted.priority) < known(new.priority)
+            if set(new.cores or sibling.thread.cores) & set(one.scheduling.cores or ()):
+                assert known(one.scheduling.priority) < known(new.priority)
 
 
 @pytest.mark.parametrize(

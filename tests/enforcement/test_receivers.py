@@ -98,10 +98,12 @@ def test_receivers_are_known_by_the_recording_that_the_plan_names(
 def test_who_asks_first_sees_the_same(receiver: int, tmp_path: Path) -> None:
     plan = plan_of(recorded(receiver, tmp_path / "recording"))
     (changed,) = (
-        one for one in planned_changes(Plan.of(plan), "fifo").threads if "/sink" in one.thread.nodes
+        one
+        for one in planned_changes(Plan.of(plan), "fifo").threads
+        if "/sink" in one.node_thread.nodes
     )
-    assert changed.thread.thread.pid == receiver
-    assert changed.wanted.cores == (GATE.core,)
+    assert changed.node_thread.thread.pid == receiver
+    assert changed.scheduling.cores == (GATE.core,)
     save_plan(Plan.of(plan), tmp_path / "plan.yaml")
     shown = called("apply", tmp_path / "plan.yaml", "--backend", "fifo", "--dry-run")
     assert "/sink" in shown.out

@@ -265,7 +265,7 @@ def test_pages_of_others_are_looked_at_without_trust(
 ) -> None:
     """Another robot, in another domain, has an output of the same name."""
     folder, topic = tmp_path / "outputs", f"/of_{os.getpid()}"
-    for module in ("gate.handover", "splicing.shaped_outputs"):
+    for module in ("robot.handover", "splicing.shaped_outputs"):
         name = f"chainshaper.{module}.page_folders"
         monkeypatch.setattr(name, lambda: iter([str(folder), str(tmp_path / "missing")]))
     good, bad = open_page("good", topic), open_page("bad", f"{topic}\x1b[31m")

@@ -6,7 +6,6 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
@@ -193,7 +192,6 @@ def run_demo(
     folder = refuse_existing(folder)
     path = synthetic_chain() if application is None else Path(application)
     description = load_application(path)
-    how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, "command": command}
 
     def part(start: float, title: str) -> Progress:
         return lambda done, what: progress(start + 0.48 * done, f"{title}, {what}")
@@ -203,7 +201,14 @@ def run_demo(
     try:
         folder.mkdir(exist_ok=True)
         write_whole(copy, [path.read_bytes()])
-        before = run_application(description, folder / "before", progress=report, **how)
+        before = run_application(
+            description,
+            folder / "before",
+            cycles=cycles,
+            realtime=realtime,
+            command=command,
+            progress=report,
+        )
     except OSError as error:
         raise OperationError(f"{folder}: cannot be written: {error}") from error
     finally:
@@ -216,7 +221,15 @@ def run_demo(
     save_plan(plan, folder / "plan.yaml")
     planned(plan)
     report = part(0.5, "shaped run")
-    after = shape_application(description, plan, folder / "after", progress=report, **how)
+    after = shape_application(
+        description,
+        plan,
+        folder / "after",
+        cycles=cycles,
+        realtime=realtime,
+        command=command,
+        progress=report,
+    )
     progress(0.98, "comparing")
     comparison = compare_recordings([before, after])
     write_comparison(comparison, folder)

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from chainshaper.enforcement.threads import Allocation
+from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
 from chainshaper.planning.chain_plan import ShapingNode

@@ -20,11 +20,30 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias, cast
 from xml.etree import ElementTree
 
-from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end, gates
 from chainshaper.enforcement.litmus import litmus_commands
+from chainshaper.enforcement.node_threads import (
+    Allocation,
+    RecordedProcess,
+    RecordedThread,
+    allocate,
+    strangers_text,
+    with_gates,
+)
+from chainshaper.enforcement.planned_threads import (
+    absent_receivers,
+    closed_before,
+    first_planned,
+    server_members,
+    threads_for,
+)
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads import Allocation, RecordedProcess, RecordedThread, allocate
+from chainshaper.enforcement.thread_scheduling import (
+    WantedScheduling,
+    left_by_back_end,
+    plan_scheduling,
+    waiting_receivers,
+)
 from chainshaper.flow.phase import Phase, measure_phase
 from chainshaper.linux import processes as running
 from chainshaper.linux.processes import list_processes
@@ -51,6 +70,7 @@ from chainshaper.values.errors import (
     text_of,
 )
 from chainshaper.values.files import read_regular
+from chainshaper.values.middleware import FAST_DDS_PUBLICATION, ROUTERS
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
@@ -93,23 +113,23 @@ def find_threads(
     else:
         found = allocate(running.find_applications(processes), recorded, processes, taken)
         nodes = defaultdict[int, set[str]](set)
-        for one in allocation.with_gates(found, shaping).threads:
+        for one in with_gates(found, shaping).threads:
             nodes[one.thread.pid].update(one.nodes)
         planned = {thread.node: server.name for server in servers for thread in server.threads}
         hosted, chosen = None, [p for p in processes if nodes[p.pid] or p.participates]
         if plan is not None:  # receivers need not run
-            hosted = running.ROUTERS.union(planned, *(node.receivers for node in shaping))
+            hosted = ROUTERS.union(planned, *(node.receivers for node in shaping))
             chosen = [process for process in processes if nodes[process.pid] & hosted]
         chosen = [process for process in chosen if process.user in taken]
-        strangers = allocation.strangers_text(processes, taken, hosted)
+        strangers = strangers_text(processes, taken, hosted)
         there = sorted(set().union(*nodes.values()))
         seen = f"is not running, or cannot be recognised; running: {', '.join(there) or 'no node'}"
         missing = [(node, server) for node, server in planned.items() if node not in there]
         notes += tuple(f"node {node} of server {server} {seen}" for node, server in missing)
-        notes += tuple(filter(None, [allocation.absent_receivers(shaping, there)]))
+        notes += tuple(filter(None, [absent_receivers(shaping, there)]))
         if plan is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
-    found = allocation.with_gates(allocate(chosen, recorded, processes, taken), shaping)
+    found = with_gates(allocate(chosen, recorded, processes, taken), shaping)
     if recorded and not any(one.nodes_known_by == "recording" for one in found.threads):
         notes += ("none of these processes is in the recording: they were started after it",)
     notes += found.notes + (() if strangers is None else (strangers,))
@@ -259,19 +279,23 @@ def check_publishers(
 
 
 def _asynchronous(pid: int) -> dict[str, bool]:
-    """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others."""
+    """Topic → whether the middleware of a process publishes it asynchronously, as its settings say.
+
+    "" is all other topics.
+    """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
 
     try:
         asked = environment_of(pid).variables
     except OperationError:
         return {}
-    mode = asked.get("RMW_FASTRTPS_PUBLICATION_MODE")
-    if mode != "AUTO" and asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") != "1":
+    settings = FAST_DDS_PUBLICATION
+    mode = asked.get(settings.mode)
+    if mode != "AUTO" and asked.get(settings.prefer_profiles) != "1":
         return {"": mode == "ASYNCHRONOUS"} if mode in ("ASYNCHRONOUS", "SYNCHRONOUS") else {}
-    files = [asked.get(f"{one}_DEFAULT_PROFILES_FILE") for one in ("FASTRTPS", "FASTDDS")]
+    files = [asked.get(variable) for variable in settings.profile_variables]
     modes: dict[str, bool] = {}
-    for name in (*files, "DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml"):
+    for name in (*files, *settings.profile_files):
         with suppress(OSError, ElementTree.ParseError):
             content = read_regular(Path(f"/proc/{pid}/cwd", name or ""), _LONGEST_SETTINGS)
             for one in ElementTree.fromstring(content).iter():  # noqa: S314 - expat bounds entities
@@ -290,7 +314,7 @@ class Changes:
 
     back_end: str
     reason: str
-    threads: tuple[allocation.WantedScheduling, ...]
+    threads: tuple[WantedScheduling, ...]
     commands: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...]
 
@@ -312,15 +336,15 @@ def planned_changes(
         refuse_unfit(plan, choice.name)
         refuse_simulated(plan, found)
         refuse_other_clocks(plan, found)
-        wanted = allocation.plan_scheduling(plan, found, available_cores())
-        threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
-        notes = (*found.notes, *allocation.waiting_receivers(plan, threads))
+        wanted = plan_scheduling(plan, found, available_cores())
+        threads = left_by_back_end(choice.name, wanted, plan.free_threads)
+        notes = (*found.notes, *waiting_receivers(plan, threads))
         return Changes(choice.name, choice.reason, threads, (), notes)
     notes, anchor_ns, members = found.notes, 0, dict[str, list[int | str]]()
     try:
         given, anchor_ns, waits_ns, _ = carried_out(given, found, phase_ns)
         table = server_table(open_until_done(given, waits_ns))
-        for name, group in allocation.server_members(plan, found).items():
+        for name, group in server_members(plan, found).items():
             members[name] = [member.thread.tid for member in group]
     except OperationError:
         members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
@@ -416,16 +440,16 @@ def places_in(server: Server, order: Sequence[str]) -> int:
 
 def first_threads(plan: Plan, found: Allocation) -> list[tuple[RunningThread, ...]]:
     """The running threads that begin each chain: any of an executor's may, where it has several."""
-    allocation.server_members(plan, found)  # none is in two servers
+    server_members(plan, found)  # none is in two servers
     begin: list[tuple[RunningThread, ...]] = []
     for chain in plan.chains:
-        planned = allocation.first_planned(chain)
+        planned = first_planned(chain)
         if planned is None:
             raise OperationError(
                 f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
                 " cycle the chain begins: give its phase (--phase)"
             )
-        begin.append(tuple(one.thread for one in allocation.threads_for(planned, found)))
+        begin.append(tuple(one.thread for one in threads_for(planned, found)))
     return begin
 
 
@@ -513,7 +537,7 @@ def _around(
     ready = [phase.at_ns + LEAD_NS for phase in phases]
     begin = [(at - one.offset_ns, one.cycle_ns) for at, one in zip(ready, chains, strict=True)]
     candidates = {(at + n * cycle) % hyper for at, cycle in begin for n in range(hyper // cycle)}
-    most = [allocation.closed_before(chain) if gated else None for chain in chains]
+    most = [closed_before(chain) if gated else None for chain in chains]
 
     def cost(at: int) -> tuple[int, int]:
         waits = [LEAD_NS + (at - one) % cycle for one, cycle in begin]

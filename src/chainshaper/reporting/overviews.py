@@ -11,7 +11,8 @@ import polars as pl
 from chainshaper.analysis import ChainEnumeration
 from chainshaper.analysis.contradictions import Contradiction
 from chainshaper.enforcement.journal import Journal
-from chainshaper.enforcement.threads import Allocation, NodeThread, WantedScheduling
+from chainshaper.enforcement.node_threads import Allocation, NodeThread
+from chainshaper.enforcement.thread_scheduling import WantedScheduling
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.linux.threads import POLICIES
 from chainshaper.planning import BandChoice, ChainPlan, band_predictions, publish_slots
@@ -569,12 +570,12 @@ def changes_table(changes: Iterable[WantedScheduling]) -> ResultTable:
     names = ("node", "pid", "tid", "name", "role", "server", "class", "core", "why")
     table = ResultTable("What threads would get", words(*names))
     for one in changes:
-        thread, wanted = one.thread.thread, one.wanted
+        thread, wanted = one.node_thread.thread, one.scheduling
         scheduling = "as it is"
         if wanted.priority is not None:
             scheduling = scheduling_text(POLICIES[wanted.policy], wanted.priority)
         cores = listed(wanted.cores) if wanted.cores else "as they are"
-        about = ", ".join(one.thread.nodes), thread.pid, thread.tid, thread.comm, thread.role
+        about = ", ".join(one.node_thread.nodes), thread.pid, thread.tid, thread.comm, thread.role
         table.add(*about, one.server or "", scheduling, cores, one.reason)
     return table
 
