@@ -148,7 +148,7 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(
     two = "/t3 has 2 publishers, /fourth, /third"
     assert two in refused(2, "splice", path, robot, "-o", folder, "--recording", recording)
     path.write_text(
-        path.read_text().replace("evidence:\n", f"evidence:\n  recording: {recording}\n")
+        path.read_text().replace("evidence:\n", f"evidence:\n    recording: {recording}\n")
     )
     assert two in refused(2, "splice", path, robot, "-o", folder)
 
