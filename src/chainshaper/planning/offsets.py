@@ -435,9 +435,9 @@ class _Puzzle:
         """
         tables = self.tables
         busy = [sum(b - a for slots in one.slots.values() for a, b in slots) for one in tables]
-        waiting = sorted(group, key=lambda k: (-tables[k].cycle_ns, busy[k]))
+        waiting = sorted(group[1:], key=lambda k: (-tables[k].cycle_ns, busy[k]))
         weight = dict.fromkeys(group, 1)
-        placed: dict[int, int] = {}
+        placed = {group[0]: 0}
         generator = random.Random(0)  # noqa: S311 - no secrets; the same plans, the same offsets
         for _ in range(MOST_FITTINGS * len(group)):
             if not waiting:
