@@ -588,7 +588,7 @@ def shape(
     if len(words) == 2 and words[0].endswith(opt.DESCRIPTIONS):
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
-        application, planned = cs.load_application(words[0]), cs.load_application_plan(words[1])
+        application, planned = cs.load_application(words[0]), cs.load_plan(words[1])
         out.warn(planned)
         with out.progress(f"shaping {application.name}") as report:
             recording = cs.shape_application(
