@@ -84,7 +84,10 @@ def demo(
     before, after = (one.recording for one in compared.measurements)
     flow = cs.data_flow(before.events, before.info.clock_offset_ns)
     tables = [callback_table(cs.callback_statistics(flow))]
-    tables += [plan_table(cs.load_plan(folder / "plan.yaml")), comparison_tables(compared)[0]]
+    tables += [
+        plan_table(cs.load_plan(folder / "plan.yaml").chains[0]),
+        comparison_tables(compared)[0],
+    ]
     if out.present(json, comparison_json(compared) | {"folder": str(folder)}, *tables):
         out.notes(dict.fromkeys((*before.info.notes, *after.info.notes)))
         out.show_line(folder.absolute())
@@ -607,7 +610,7 @@ def _shape_described(
 ) -> None:
     from chainshaper.verify.overruns import dropped_text, overruns_text
 
-    described, planned = cs.load_application(application), cs.load_application_plan(plan)
+    described, planned = cs.load_application(application), cs.load_plan(plan)
     out.warn(planned)
     with out.progress(f"shaping {described.name}") as report:
         how |= {"command": sys.argv, "progress": report}

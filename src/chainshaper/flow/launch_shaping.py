@@ -28,12 +28,11 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
-from chainshaper.flow.record import record_command
+from chainshaper.flow.record import Scheduling, record_command
 from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
-from chainshaper.planning import ApplicationPlan, Plan, PlanRequest, Profile
+from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile
 from chainshaper.planning import request as requests
-from chainshaper.planning.application_plan import whole
 from chainshaper.planning.profile import doubts_about
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.node_kinds import language_of
@@ -55,11 +54,11 @@ class ShapedLaunch:
 
     folder: Path
     chain: str  # the first
-    plan: Plan  # of the first chain
+    plan: ChainPlan  # of the first chain
     splicing: Splicing | None  # None: no output has a shaping node
     comparison: Comparison  # of the first chain
     notes: tuple[str, ...]
-    application: ApplicationPlan
+    application: Plan
     comparisons: tuple[Comparison, ...]  # of every chain and sink
     cores: Mapping[str, int]  # where each node's executor ran
 
@@ -88,7 +87,7 @@ def shape_launch(
     max_latency_ns: int | None = None,
     users: Collection[str | int] = (),
     stop: threading.Event | None = None,
-    planned: Callable[[Plan | ApplicationPlan], None] = lambda _: None,
+    planned: Callable[[Plan], None] = lambda _: None,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> ShapedLaunch:
     """Measure chains of a launched application, plan, splice, apply, and measure again.
@@ -116,7 +115,16 @@ def shape_launch(
     folder, stop, taken = refuse_existing(folder), stop or threading.Event(), run_users(users)
     folder.mkdir(exist_ok=True)
 
-    def record(name: str, words: Sequence[str], lasting_ns: int, **how: Any) -> Recording:
+    def record(
+        name: str,
+        words: Sequence[str],
+        lasting_ns: int,
+        *,
+        scheduling: Scheduling | None = None,
+        plan: Plan | None = None,
+        gate_logs: Sequence[Path] = (),
+        chain: str | None = None,
+    ) -> Recording:
         done = record_command(
             folder / name,
             words,
@@ -126,7 +134,10 @@ def shape_launch(
             watch_stalls=name != "first",
             stop=stop,
             progress=lambda share, what: progress(share, f"{name}: {what}"),
-            **how,
+            scheduling=scheduling,
+            plan=plan,
+            gate_logs=gate_logs,
+            chain=chain,
         )
         if stop.is_set() or done.exit_code is not None:
             ended = "was stopped" if done.exit_code is None else "ended by itself"
@@ -171,8 +182,8 @@ def shape_launch(
         measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
     progress(0.0, "planning")
     plan, remarks = _planned([measured[k][1] for k in range(len(wanted))], len(chains), request)
-    planning.save_application_plan(plan, folder / "plan.yaml")
-    planned(plan if len(plan.chains) > 1 else plan.chains[0])
+    planning.save_plan(plan, folder / "plan.yaml")
+    planned(plan)
     found += remarks
     splicing = None
     if plan.shaping_nodes:
@@ -187,7 +198,13 @@ def shape_launch(
     after = record(
         *("after", shaped, duration_ns),
         scheduling=plan_in_force(
-            *(plan, back_end, first, taken, found), adapt=adapt, max_latency_ns=max_latency_ns
+            plan,
+            back_end,
+            first,
+            taken,
+            found,
+            adapt=adapt,
+            max_latency_ns=max_latency_ns,
         ),
         plan=plan,
         gate_logs=() if splicing is None else splicing.logs,
@@ -241,7 +258,7 @@ def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanReq
 
 def _planned(
     profiles: Sequence[Profile], chains: int, request: PlanRequest
-) -> tuple[ApplicationPlan, list[str]]:
+) -> tuple[Plan, list[str]]:
     """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
     if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
@@ -249,10 +266,10 @@ def _planned(
     if chains > 1:
         plan, remarks = planning.plan_application(profiles, request)
         return plan, remarks + doubts
-    return whole(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
+    return Plan.of(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
 
 
-def _with_types(recordings: Sequence[Recording], plan: ApplicationPlan) -> Recording:
+def _with_types(recordings: Sequence[Recording], plan: Plan) -> Recording:
     """The first recording by whose end discovery had shown the types of all outputs, if any."""
     outputs = {node.output for node in plan.shaping_nodes}
 
@@ -285,20 +302,34 @@ def _sourced(splicing: Splicing) -> list[str]:
 
 @contextmanager
 def plan_in_force(
-    plan: ApplicationPlan,
+    plan: Plan,
     back_end: str,
     recording: Recording,
     users: frozenset[int],
     notes: list[str],
-    **how: Any,
+    *,
+    adapt: bool = False,
+    max_latency_ns: int | None = None,
 ) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
-    """The plan in force on what runs, by a thread that does what `chainshaper apply` does (``how``)
-    until the context ends, which adds its ``notes``; it gives whether all servers have opened.
+    """Have a thread do what `chainshaper apply` does until the context ends.
+
+    It yields a function that says whether all servers have opened. At the end the run's notes are
+    added to ``notes``. The rest is for :func:`.apply_plan`.
     """
     stop, states = threading.Event(), list[RunState]()
-    how |= {"back_end": back_end, "recording": recording, "users": users, "wait_ns": START_NS}
     with ThreadPoolExecutor(1, "apply") as beside:
-        applied = beside.submit(apply_plan, plan, **how, stop=stop, watch=states.append)
+        applied = beside.submit(
+            apply_plan,
+            plan,
+            back_end=back_end,
+            recording=recording,
+            users=users,
+            wait_ns=START_NS,
+            adapt=adapt,
+            max_latency_ns=max_latency_ns,
+            stop=stop,
+            watch=states.append,
+        )
 
         def opened(_: Sequence[RunningProcess]) -> bool:
             if applied.done():

@@ -706,4 +706,4 @@ def plan_recording(
         raise InputError("one chain goes here: profile several, and plan with `plan_application`")
     wanted = (chain, *sinks)
     profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
-    return plan_chain(profile, request, further)
+    return Plan.of(plan_chain(profile, request, further))

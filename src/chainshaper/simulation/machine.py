@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 
 from chainshaper import _core
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import ReceiverPlace, Server
+from chainshaper.planning.chain_plan import ReceiverPlace, Server
+from chainshaper.planning.plan import Plan
 from chainshaper.robot.gate import values_of
 from chainshaper.simulation.system import ROLES, Entity, Publisher, System
 from chainshaper.values.errors import InputError
@@ -78,7 +78,7 @@ class Machine:
         self,
         system: System,
         handles: Handles,
-        plan: ApplicationPlan | None,
+        plan: Plan | None,
         timing: Timing,
         *,
         switches: bool,
@@ -204,7 +204,7 @@ class Machine:
     def _rank(
         self,
         threads: Sequence[_core.ThreadDescription],
-        plan: ApplicationPlan,
+        plan: Plan,
         governed: dict[int, Server],
         ranked: list[Server],
         receiving: dict[int, ReceiverPlace],
@@ -395,9 +395,7 @@ class Machine:
         return self._deliveries[stream]
 
 
-def _governed_core(
-    plan: ApplicationPlan, ranked: Sequence[Server], timing: Timing
-) -> _core.CoreDescription:
+def _governed_core(plan: Plan, ranked: Sequence[Server], timing: Timing) -> _core.CoreDescription:
     """A core with servers. The run starts anywhere in a cycle."""
     table = _slot_table(plan, ranked)
     anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
@@ -413,7 +411,7 @@ def _governed_core(
     )
 
 
-def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
+def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
     # A free shaping node times its messages itself: its thread needs no slot to run in.
     slots = [

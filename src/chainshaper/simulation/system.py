@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.plan import Plan
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
@@ -81,7 +81,7 @@ class System:
 
 
 def build_system(
-    application: Application, plan: ApplicationPlan | None = None, *, follow_chain: bool
+    application: Application, plan: Plan | None = None, *, follow_chain: bool
 ) -> System:
     """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
 
@@ -175,7 +175,7 @@ def _threads(
             )
 
 
-def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
+def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
     """The server of each thread that is in one."""
     numbers: dict[Thread, list[int]] = {}
     for number, one in enumerate(threads):
@@ -195,7 +195,7 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
 
 
 def _receivers(
-    plan: ApplicationPlan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
+    plan: Plan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
 ) -> dict[int, ReceiverPlace]:
     """The place of each thread that receives an output, and is in no server."""
     place_of = plan.receivers_at

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from chainshaper.planning.plan import Plan, ShapingNode
+from chainshaper.planning.chain_plan import ChainPlan, ShapingNode
 from chainshaper.robot.gate import DEPTH
 from chainshaper.robot.throttling import Rule
 from chainshaper.splicing.gate_settings import page_name, shaping_parameters
@@ -86,7 +86,7 @@ class ShapingProcess:
 
 
 def write_shaping_process(
-    plan: Plan,
+    plan: ChainPlan,
     node: ShapingNode,
     kind: NodeKind,
     folder: Path,
@@ -131,7 +131,7 @@ def write_shaping_process(
     return process
 
 
-def _patience_ns(plan: Plan) -> int:
+def _patience_ns(plan: ChainPlan) -> int:
     """Return how late a shaping node is for a release if it hangs (ns)."""
     patience_ns = max(plan.cycle_ns // 2, 10_000_000)
     if plan.shaping_thread == "in-slots":  # its thread may have to wait for the next slot
