@@ -35,13 +35,14 @@ from chainshaper.enforcement.thread_scheduling import (
 from chainshaper.flow.threads import check_publishers, first_threads
 from chainshaper.linux.processes import RunningProcess, read_process
 from chainshaper.linux.scheduling import SchedulingRequest
-from chainshaper.linux.threads import RunningThread, ThreadRole, dds_kind, gate_thread_name, role_of
+from chainshaper.linux.threads import RunningThread, ThreadRole, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
 from chainshaper.planning.chain_plan import ReceiverPlace, Server, ShapingNode, revised
 from chainshaper.planning.chain_plan import Thread as PlannedThread
 from chainshaper.planning.plan import Plan
 from chainshaper.planning.shaping import let_per_chain, over_cores
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.middleware import thread_work
 from chainshaper.values.recording import EndpointInfo, Recording, RecordingInfo
 
 MS = 1_000_000
@@ -60,7 +61,7 @@ def _process(
     inner = pid if inner_pid is None else inner_pid
     threads = []
     for index, name in enumerate(("main", *names)):
-        role, kind = role_of(name, is_main=index == 0), None if index == 0 else dds_kind(name)
+        role, kind = role_of(name, is_main=index == 0), None if index == 0 else thread_work(name)
         thread = RunningThread(pid + index, pid, name, role, "SCHED_OTHER", 0, (0, 1), 10)
         threads.append(replace(thread, inner_tid=inner + index, kind=kind))
     return RunningProcess(pid, parent, tuple(command.split()), inner, participates, tuple(threads))

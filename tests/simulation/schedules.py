@@ -19,7 +19,7 @@ from chainshaper.values.durations import parse_duration
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import WARM_UP_CYCLES
+from chainshaper.workload.timing import WARM_UP_CYCLES
 
 FREE: dict[str, Any] = {
     **{name: {"constant": "0ms"} for name in ("wake_up", "take", "publish", "delivery")},

@@ -16,7 +16,7 @@ from chainshaper.robot.gate import Overrun
 from chainshaper.simulation import simulate_latencies
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import WARM_UP_CYCLES
+from chainshaper.workload.timing import WARM_UP_CYCLES
 
 
 def as_application(case: Case) -> Application:

@@ -30,12 +30,12 @@ from types import MappingProxyType
 from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.planned_threads import place_of, server_members
 from chainshaper.enforcement.servers import ReservationServer
-from chainshaper.linux.processes import ROUTERS
 from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import is_of_zenoh
 from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
 from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.middleware import ROUTERS
 
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87

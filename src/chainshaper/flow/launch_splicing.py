@@ -31,6 +31,7 @@ from chainshaper.splicing.shaping_process import (
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError, storable
 from chainshaper.values.files import scratch_folder, write_whole
+from chainshaper.values.middleware import middleware_of
 from chainshaper.values.plan_choices import STANDBY, Fallback, NodeChoice, NodeLanguage
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
@@ -197,12 +198,14 @@ def _kinds_of(
 def _refuse_undelivered(recording: "Recording", types: Mapping[str, str]) -> None:
     """Refuse nodes that take outputs of these types serialized where none is delivered so.
 
-    From Lyrical on rmw_fastrtps_cpp has a reader of its own for messages with a field ``uint8[]``,
-    at which `rmw_take_serialized_message` does not look (rmw_fastrtps 9.4.7, `take_buffer_aware`).
-    Raises InputError.
+    Which middleware does not deliver them is in :mod:`chainshaper.values.middleware`
+    (``undelivered_bytes``). Raises InputError.
     """
     info = recording.info
-    if info.rmw != "rmw_fastrtps_cpp" or info.distribution not in ("lyrical", "rolling"):
+    middleware = middleware_of(info.rmw)
+    if middleware is None or info.rmw != middleware.rmw:
+        return
+    if info.distribution not in middleware.undelivered_bytes:
         return
     for output, message_type in types.items():
         if has_bytes(message_type):

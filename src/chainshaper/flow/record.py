@@ -69,7 +69,7 @@ class Recorded:
 
 
 @dataclass
-class _Run:
+class _RecordedRun:
     """An application that is recorded, and what was seen of it."""
 
     tracer: Tracer
@@ -143,7 +143,7 @@ def record_command(
     try:
         tracer = _tracer(source, folder, command, pids, buffer, users=taken)
         how = (command, duration_ns, stop or threading.Event(), progress, taken, pids)
-        run = _Run(tracer, folder, *how, gate_logs)
+        run = _RecordedRun(tracer, folder, *how, gate_logs)
         try:
             _trace(run, scheduling, command_stdout, stalls=watch_stalls)
             progress(1.0, "reading the events")
@@ -194,7 +194,9 @@ def _tracer(
     return ebpf.EbpfTracer(folder, command, pids, users)
 
 
-def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool) -> None:
+def _trace(
+    run: _RecordedRun, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool
+) -> None:
     with ExitStack() as undo:
         if stalls:
             run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
@@ -223,7 +225,7 @@ def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stal
             run.endpoints, run.no_qos_because = ask_graph(run.environment)
 
 
-def _watch(run: _Run) -> None:
+def _watch(run: _RecordedRun) -> None:
     """Look at the application until it, its time (in force) or the tracer ends."""
     next_look = _FIRST_LOOK_NS
     while True:
@@ -258,7 +260,7 @@ def _watch(run: _Run) -> None:
         run.stop.wait(_STEP_S)
 
 
-def _look(run: _Run) -> None:
+def _look(run: _RecordedRun) -> None:
     """Which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
@@ -282,7 +284,7 @@ def _look(run: _Run) -> None:
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
 
 
-def _written(output: Path, run: _Run, chain: str | None, plan: Plan | None) -> Recording:
+def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | None) -> Recording:
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
         tables = {**tables, "machine_stall": run.stalls.table}
@@ -334,7 +336,7 @@ def _written(output: Path, run: _Run, chain: str | None, plan: Plan | None) -> R
     return recordings.write_recording(output, tables, info)
 
 
-def _beside_events(run: _Run, what: str, ask: Callable[[], _T], otherwise: _T) -> _T:
+def _beside_events(run: _RecordedRun, what: str, ask: Callable[[], _T], otherwise: _T) -> _T:
     """What is known of an application beside its events, which are written whatever fails here."""
     try:
         return ask()

@@ -70,6 +70,7 @@ from chainshaper.values.errors import (
     text_of,
 )
 from chainshaper.values.files import read_regular
+from chainshaper.values.middleware import FAST_DDS_PUBLICATION, ROUTERS
 
 if TYPE_CHECKING:
     from chainshaper.values.recording import Recording  # slow to import
@@ -117,7 +118,7 @@ def find_threads(
         planned = {thread.node: server.name for server in servers for thread in server.threads}
         hosted, chosen = None, [p for p in processes if nodes[p.pid] or p.participates]
         if plan is not None:  # receivers need not run
-            hosted = running.ROUTERS.union(planned, *(node.receivers for node in shaping))
+            hosted = ROUTERS.union(planned, *(node.receivers for node in shaping))
             chosen = [process for process in processes if nodes[process.pid] & hosted]
         chosen = [process for process in chosen if process.user in taken]
         strangers = strangers_text(processes, taken, hosted)
@@ -278,19 +279,23 @@ def check_publishers(
 
 
 def _asynchronous(pid: int) -> dict[str, bool]:
-    """Which topics rmw_fastrtps lets a process publish asynchronously; "" is all others."""
+    """Topic → whether the middleware of a process publishes it asynchronously, as its settings say.
+
+    "" is all other topics.
+    """
     from chainshaper.sources.ros import environment_of  # only who gates publishers pays for this
 
     try:
         asked = environment_of(pid).variables
     except OperationError:
         return {}
-    mode = asked.get("RMW_FASTRTPS_PUBLICATION_MODE")
-    if mode != "AUTO" and asked.get("RMW_FASTRTPS_USE_QOS_FROM_XML") != "1":
+    settings = FAST_DDS_PUBLICATION
+    mode = asked.get(settings.mode)
+    if mode != "AUTO" and asked.get(settings.prefer_profiles) != "1":
         return {"": mode == "ASYNCHRONOUS"} if mode in ("ASYNCHRONOUS", "SYNCHRONOUS") else {}
-    files = [asked.get(f"{one}_DEFAULT_PROFILES_FILE") for one in ("FASTRTPS", "FASTDDS")]
+    files = [asked.get(variable) for variable in settings.profile_variables]
     modes: dict[str, bool] = {}
-    for name in (*files, "DEFAULT_FASTRTPS_PROFILES.xml", "DEFAULT_FASTDDS_PROFILES.xml"):
+    for name in (*files, *settings.profile_files):
         with suppress(OSError, ElementTree.ParseError):
             content = read_regular(Path(f"/proc/{pid}/cwd", name or ""), _LONGEST_SETTINGS)
             for one in ElementTree.fromstring(content).iter():  # noqa: S314 - expat bounds entities

@@ -49,7 +49,6 @@ from chainshaper.monitor.metrics import (
 from chainshaper.planning import ChainPlan, Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.robot.clocks import clock_offset
-from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import (
     NO_PROCESS,
     TracedProcess,
@@ -59,6 +58,7 @@ from chainshaper.sources.preload import (
     memories,
 )
 from chainshaper.sources.system import info_of, own_pid_namespace, processes_of
+from chainshaper.sources.tracing_library import TracingLibrary
 from chainshaper.splicing.shaped_outputs import find_outputs
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain

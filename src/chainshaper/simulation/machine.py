@@ -14,11 +14,11 @@ from chainshaper import _core
 from chainshaper.planning.chain_plan import ReceiverPlace, Server
 from chainshaper.planning.plan import Plan
 from chainshaper.robot.gate import values_of
-from chainshaper.simulation.system import ROLES, Entity, Publisher, System
+from chainshaper.simulation.system import ROLES, Entity, SimulatedPublisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
 from chainshaper.workload.execution import FIRST_AFTER, blocks
-from chainshaper.workload.live import Timing
+from chainshaper.workload.timing import Timing
 
 Int64s = npt.NDArray[np.int64]
 
@@ -52,7 +52,7 @@ class Streams:
     def add(self, times: ExecutionTime, node: str | None, index: int) -> int:
         """The place of a new stream of CPU times or delays (ns)."""
         self.constants.append(times.constant_ns)
-        self._drawn.append(blocks(times.model_dump(), self._seed, node or "", index))
+        self._drawn.append(blocks(times, self._seed, node or "", index))
         return len(self.constants) - 1
 
     def draw(self, stream: int) -> Int64s:
@@ -377,7 +377,7 @@ class Machine:
             )
         return publishers
 
-    def _delivery(self, reader: Entity, publisher: Publisher) -> int | None:
+    def _delivery(self, reader: Entity, publisher: SimulatedPublisher) -> int | None:
         """The stream of a reader's own times of delivery from a publisher; None: it has none."""
         process = self._system.processes[reader.process]
         described: Mapping[str, ExecutionTime] = self._system.application.simulation.deliveries.get(

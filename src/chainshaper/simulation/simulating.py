@@ -45,6 +45,7 @@ from chainshaper.workload.description import (
     node_name,
 )
 from chainshaper.workload.event_log import EventLog
+from chainshaper.workload.timing import Timing, timing_of
 
 START_NS = 1_000_000_000
 LONGEST_NS = 1 << 62
@@ -119,7 +120,7 @@ def simulate_latencies(
 
 def _checked(
     application: Application, plan: Plan | None, cycles: int, seed: int | None
-) -> tuple[Application, live.Timing]:
+) -> tuple[Application, Timing]:
     """The application with the seed and the plan's shaping nodes, and the run's instants."""
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
@@ -138,7 +139,7 @@ def _checked(
             application = splice_application(application, plan)
         else:  # a baseline
             application = at_offsets(application, plan)
-    timing = live.timing_of(application, cycles, START_NS)
+    timing = timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
@@ -152,7 +153,7 @@ def _checked(
 def _built(
     application: Application,
     plan: Plan | None,
-    timing: live.Timing,
+    timing: Timing,
     *,
     switches: bool = False,
     latencies: int = 0,

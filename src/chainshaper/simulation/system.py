@@ -40,7 +40,7 @@ class Entity:
     listens: bool = False  # for modes on behalf of the gate
 
 
-class Publisher(NamedTuple):
+class SimulatedPublisher(NamedTuple):
     """One callback's publisher of a topic."""
 
     process: int
@@ -48,7 +48,7 @@ class Publisher(NamedTuple):
     asynchronous: bool
 
 
-class Process(NamedTuple):
+class SimulatedProcess(NamedTuple):
     """A node's process; ``key`` is the node's name in the description."""
 
     node: str
@@ -65,13 +65,13 @@ class System:
     """
 
     application: Application
-    processes: tuple[Process, ...]
+    processes: tuple[SimulatedProcess, ...]
     threads: tuple[ThreadInfo, ...]
     servers: Mapping[int, Server]
     receivers: Mapping[int, ReceiverPlace]
     cores: tuple[int, ...]
     entities: tuple[Entity, ...]
-    publishers: tuple[Publisher, ...]
+    publishers: tuple[SimulatedPublisher, ...]
     chain: Chain
     modes: tuple[str, ...]
 
@@ -89,11 +89,11 @@ def build_system(
     has a thread that the application does not have.
     """
     processes = tuple(
-        Process(node_name(key), key, FIRST_PID + 10 * number)
+        SimulatedProcess(node_name(key), key, FIRST_PID + 10 * number)
         for number, key in enumerate(application.nodes)
     )
     entities: list[Entity] = []
-    publishers: list[Publisher] = []
+    publishers: list[SimulatedPublisher] = []
     order = STATIC_ORDER if application.simulation.executor == "static" else KINDS
     for number, process in enumerate(processes):
         own = list(_entities(application, number, process.key, publishers))
@@ -129,14 +129,14 @@ def build_system(
 
 
 def _entities(
-    application: Application, process: int, key: str, publishers: list[Publisher]
+    application: Application, process: int, key: str, publishers: list[SimulatedPublisher]
 ) -> Iterator[Entity]:
     """A node's entities in the order of registration; their publishers are added to the list."""
     for index, described in enumerate(application.nodes[key].callbacks):
         own = tuple(range(len(publishers), len(publishers) + len(described.publishes)))
         for topic in described.publishes:
             asynchronous = application.topic(topic).publication == "asynchronous"
-            publishers.append(Publisher(process, topic, asynchronous))
+            publishers.append(SimulatedPublisher(process, topic, asynchronous))
         if described.timer_ns is not None:
             yield Entity(process, index, 0, "timer", None, described, own)
         of_modes = len(described.subscriptions) - len(described.inputs)
@@ -148,7 +148,9 @@ def _entities(
 
 
 def _threads(
-    application: Application, processes: Sequence[Process], publishers: Sequence[Publisher]
+    application: Application,
+    processes: Sequence[SimulatedProcess],
+    publishers: Sequence[SimulatedPublisher],
 ) -> Iterator[ThreadInfo]:
     for number, process in enumerate(processes):
         own = application.scheduling_of(process.key)
@@ -208,7 +210,9 @@ def _receivers(
 
 
 def _graph(
-    processes: Sequence[Process], entities: Sequence[Entity], publishers: Sequence[Publisher]
+    processes: Sequence[SimulatedProcess],
+    entities: Sequence[Entity],
+    publishers: Sequence[SimulatedPublisher],
 ) -> ApplicationGraph:
     """Where the chain is found: callbacks alone publish, so topics need not name their nodes."""
     callbacks = [
