@@ -1,7 +1,7 @@
-// The gate: when may a message of the chain's output leave? The same as
-// chainshaper/robot/decision.py, which explains it. Nodes of ROS 2, the gate in a publisher's
-// process and the simulator decide by this file. It knows no clock and asks the operating system
-// for nothing.
+// The gate's decision for one message: when it may leave, or why it never does. The shaping nodes
+// in C++, the gate in a publisher's process and the simulator run this file;
+// chainshaper/robot/gate.py and decision.py are the same in Python, and explain it. It reads no
+// clock and calls no operating system.
 //
 // All times are nanoseconds of one clock. C++17, since that is what ROS 2 builds nodes with.
 
@@ -31,7 +31,7 @@ struct Slot {
   std::int64_t end;
 };
 
-// The place of a word in a list; none where it is not there.
+// Returns the place of a word in a list; none: it is not there.
 template <typename Words, typename Word>
 std::optional<std::size_t> place_of(const Words & words, const Word & word) {
   const auto found = std::find(words.begin(), words.end(), word);
@@ -92,13 +92,13 @@ inline void check(const Gate & gate) {
   }
 }
 
-// From when on which mode is in force.
+// The time from which on a mode is in force, and the mode's number.
 using Change = std::pair<std::int64_t, std::size_t>;
 
-// From when on slots are moved, and by how much from where the gate has them.
+// The time from which on slots are moved, and by how much from where the gate has them.
 using Move = std::pair<std::int64_t, std::int64_t>;
 
-// Adds a change or a move behind those before it, of which only the last ones are of use.
+// Adds a change or a move behind those before it; only the last ones are remembered.
 template <typename Known>
 void remember(std::deque<Known> & known, Known newest) {
   known.push_back(newest);
@@ -111,8 +111,8 @@ inline std::int64_t moved_at(const std::deque<Move> & moves, std::int64_t cycle_
   return found == moves.rend() ? 0 : found->second;
 }
 
-// The decision for one message. No `at_ns`: never, it is `dropped`; no `slot`: in none; no
-// `overrun`: in time.
+// The decision for one message. No `at_ns`: it never leaves, it is `dropped`. No `slot`: it leaves
+// in no slot. No `overrun`: it came in time.
 struct Release {
   Maybe at_ns;
   std::int64_t origin_ns;
@@ -140,7 +140,7 @@ inline std::int64_t modulo(std::int64_t value, std::int64_t cycle_ns) {
   return rest < 0 ? rest + cycle_ns : rest;
 }
 
-// Decides when a message may leave, at `ready_ns` at the earliest. `phase_ns` is where cycles begin
+// Decides when a message may leave, at `ready_ns` at the earliest. `phase_ns` is where cycles start
 // for a message whose stamp is of no use.
 inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stamp_ns,
                           const std::deque<Change> & changes, std::int64_t ready_ns,
@@ -190,7 +190,7 @@ inline Release release_of(const Gate & gate, std::int64_t arrival_ns, Maybe stam
   }
 }
 
-// Whether the slot that a message was to leave in is over.
+// Returns whether the slot that a message was to leave in is over.
 inline bool missed(const Gate & gate, const Release & release, std::int64_t now_ns) {
   return release.slot && now_ns >= release.start_ns(gate.cycle_ns) + release.moved_ns +
                                        gate.slots[*release.slot].end;

@@ -1,5 +1,5 @@
-// Which of the messages that wait at a gate leave, and when it is the turn of each. It knows no
-// clock. The same as `Queue` of chainshaper/robot/waiting.py.
+// The messages that wait at a gate, and which of them leave. It reads no clock. `Queue` in
+// chainshaper/robot/waiting.py is the same in Python.
 
 #pragma once
 
@@ -14,26 +14,26 @@
 
 namespace chainshaper {
 
-// What a decision needs to know of a message.
+// The times of a message that a decision depends on.
 struct Arrival {
   std::int64_t arrival_ns;
   Maybe stamp_ns;         // its origin; none: it has none that is of use
   std::int64_t phase_ns;  // where cycles began when it came
 };
 
-// A gate's decisions, a message after the other, and what it has to know between two of them.
-// (`Queue` has the messages as well; in a simulation they stay in the history of their reader.)
+// A gate's decisions for one message after the other, and what it remembers between two of them.
+// `Queue` has the messages as well; in a simulation they stay in the history of their reader.
 class Turns {
 public:
   explicit Turns(Gate served) : gate(std::move(served)) { check(gate); }
 
-  // When a message would leave, whatever left before it.
+  // Decides when a message would leave, without regard to those before it.
   Release release_at(const Arrival & message, std::int64_t ready_ns) const {
     return release_of(gate, message.arrival_ns, message.stamp_ns, changes, ready_ns,
                       message.phase_ns, moves);
   }
 
-  // When the oldest message may leave, or why it never does.
+  // Decides when the oldest message may leave, or why it never does.
   Release decide(const Arrival & oldest) {
     const std::int64_t ready_ns = std::max(oldest.arrival_ns, free_ns);
     Release release = release_at(oldest, ready_ns);
@@ -48,19 +48,19 @@ public:
     return release;
   }
 
-  // Whether a newer message leaves for the oldest, which was to leave like this.
+  // Returns whether a newer message leaves in place of the oldest, which was to leave so.
   bool is_replaced(const Release & release, const Arrival & newer, std::int64_t now_ns) const {
     if (gate.messages != Messages::newest || !release.slot) return false;
     const Release instead = release_at(newer, now_ns);
     return instead.slot && same_cycle(instead, leaving_);
   }
 
-  // The oldest message leaves, or is dropped.
+  // Notes that the oldest message leaves or is dropped, as decided.
   void left(const Release & release) {
     if (release.slot) left_ = leaving_;
   }
 
-  // A mode is announced, in force from the next cycle on.
+  // Puts a mode in force from the next cycle on.
   void switch_mode(std::size_t mode, std::int64_t now_ns) {
     if (mode != (changes.empty() ? gate.first_mode : changes.back().second))
       remember(changes, Change{now_ns, mode});
@@ -69,21 +69,22 @@ public:
   const Gate gate;
   std::deque<Change> changes;
   std::deque<Move> moves;
-  std::int64_t free_ns{0};  // when it is the turn of the oldest message, if it is there then
+  std::int64_t free_ns{0};  // when the thread was done with the message before
 
 private:
-  // Stamps are not quite periodic: cycles are the same less than half a cycle apart.
+  // Returns whether a message leaves in the cycle that starts at this time. Stamps are not quite
+  // periodic: starts less than half a cycle apart are of one cycle.
   bool same_cycle(const Release & release, Maybe start_ns) const {
     return start_ns && 2 * std::abs(release.start_ns(gate.cycle_ns) - *start_ns) < gate.cycle_ns;
   }
 
-  // When cycles start: the one that the oldest message, or another for it, leaves in, and the one
-  // in which the last has left.
+  // The start of the cycle that the oldest message leaves in, or a newer one in its place.
   Maybe leaving_;
+  // The start of the cycle in which the last message left.
   Maybe left_;
 };
 
-// A message that has come and not left; `number` tells it from the others.
+// A message that waits at a gate; `number` tells it from the others.
 template <typename Message>
 struct Waiting : Arrival {
   Message message;
@@ -99,18 +100,18 @@ struct Outcome {
   std::int64_t awake_ns;
 };
 
-// The messages that wait at a gate, with its decisions.
+// The messages that wait at a gate, and its decisions about them.
 template <typename Message>
 class Queue : public Turns {
 public:
   explicit Queue(Gate served) : Turns(std::move(served)), phase_ns(gate.phase_ns) {}
 
-  // The wall clock was stepped: stamps of messages under way are of no use until the last has come.
+  // Uses no stamps until all messages under way have come: the wall clock was stepped.
   void doubt_stamps(std::int64_t now_ns) {
     unsure_until_ns_ = now_ns + (gate.due_cycles + 1) * gate.cycle_ns;
   }
 
-  // A message came; the one for which there is no room any more.
+  // Queues a message; returns the one that overflowed, if any.
   std::optional<Outcome<Message>> arrive(Message message, std::int64_t arrival_ns, Maybe stamp_ns,
                                          Maybe source_timestamp = {}, Maybe lost = {}) {
     if (arrival_ns < unsure_until_ns_) stamp_ns.reset();
@@ -130,7 +131,7 @@ public:
                        [&](const Arrival & newer) { return is_replaced(release, newer, now_ns); });
   }
 
-  // The oldest message leaves, or is dropped; no release: it is not this gate's to decide.
+  // Takes the oldest message out, as decided; no release: another process decided.
   Waiting<Message> leave(const std::optional<Release> & release, std::int64_t now_ns) {
     free_ns = now_ns;
     if (release) left(*release);

@@ -1,4 +1,4 @@
-// The throttler's rule `first`: the same as chainshaper/robot/throttling.py, which explains it.
+// The throttler's rule `first`; chainshaper/robot/throttling.py explains it.
 
 #pragma once
 

@@ -1,6 +1,6 @@
 // Which process publishes a shaped output: the shaping node, or the standby beside it. This is the
-// shaping node's side; what the two agree on, and why, is said in `handover.py` (`Turn`), which has
-// the same page: numbers of 8 bytes, three rings, and the output's name. No ROS 2 here.
+// shaping node's side. `handover.py` (`Turn`) explains what the two agree on, and why; its page is
+// the same: numbers of 8 bytes, three rings, and the output's name. No ROS 2 here.
 
 #pragma once
 
@@ -12,16 +12,16 @@
 #include <cstring>
 #include <memory>
 
-#include "shaper.hpp"
 #include "guest.hpp"
+#include "shaper.hpp"
 
 namespace chainshaper {
 
-// The file is read and written, never mapped: a process that maps a file which another one cuts, or for
-// which the disk has no room, is ended by SIGBUS. What is not there reads as 0.
+// The file is read and written, never mapped: SIGBUS ends a process that maps a file which another
+// process cuts short, or for which the disk has no room. Numbers that are not there read as 0.
 class Page {
 public:
-  // Throws where there is none and it is not to be made, or where it is not ours.
+  // Throws if there is no page and none is to be made, or if it is not this user's.
   Page(const std::string & folder, const std::string & name, const std::string & topic, bool make)
       : path_(folder + "/" + name) {
     const int flags = O_RDWR | O_CLOEXEC | O_NOFOLLOW | O_NONBLOCK | (make ? O_CREAT : 0);
@@ -29,7 +29,7 @@ public:
     if (!file_.is_open()) throw std::runtime_error(path_ + ": " + std::strerror(errno));
     if (!S_ISREG(file_.identity().st_mode) || file_.identity().st_uid != geteuid())
       throw std::runtime_error(path_ + ": not a file of this user");
-    // One for which there is no room is of no use to others.
+    // A page that has no room on its disk is of no use to others.
     if (const int refused = posix_fallocate(file_.number(), 0, size))
       throw std::runtime_error(path_ + ": " + std::strerror(refused));
     std::array<char, schema::topic_bytes> text{};
@@ -49,7 +49,8 @@ public:
 
   void add(std::size_t place, std::int64_t more = 1) { set(place, get(place) + more); }
 
-  // Take a byte of the file, if no process has it; see whether another one has it.
+  // `lock` takes a right (a byte of the file) if no process has it; `is_locked` says whether
+  // another process has it.
   bool lock(off_t byte) {
     struct flock wanted = region(byte);
     return file_.is_open() && fcntl(file_.number(), F_OFD_SETLK, &wanted) == 0;
@@ -61,11 +62,11 @@ public:
            asked.l_type != F_UNLCK;
   }
 
-  // Whether others find this page whole, and this process has it still.
+  // Returns whether other processes find this page, and whole.
   bool is_current() const { return file_.is_open() && file_.is_at(path_, size); }
 
   void note(std::size_t count, std::int64_t ring, std::int64_t value) {
-    // A page may say anything, if it was damaged: a place is always in its ring.
+    // A damaged page may say anything, so a place is always taken modulo the ring's length.
     const auto number = static_cast<std::uint64_t>(get(count));
     const auto place = static_cast<std::int64_t>(number % std::uint64_t{schema::ring});
     set(static_cast<std::size_t>(ring + place), value);
@@ -90,7 +91,7 @@ private:
       std::fill(numbers, numbers + count, 0);
   }
 
-  // What cannot be written is missing: shaping goes on.
+  // A number that cannot be written is missing; shaping goes on.
   void write_at(off_t at, const void * content, std::size_t bytes) {
     if (file_.is_open()) [[maybe_unused]]
       const auto written = pwrite(file_.number(), content, bytes, at);
@@ -100,7 +101,7 @@ private:
   File file_;
 };
 
-// Where pages are, the best place first: of root, of a login session, of any user.
+// Returns the folders that pages may be in: root's, a login session's, any user's.
 inline std::vector<std::string> page_folders() {
   const char * const session = geteuid() == 0 ? "/run" : std::getenv("XDG_RUNTIME_DIR");
   std::vector<std::string> folders{"/dev/shm/chainshaper-" + std::to_string(geteuid())};
@@ -140,7 +141,7 @@ inline std::unique_ptr<Page> open_page(const std::string & name, const std::stri
   throw std::runtime_error(problem);
 }
 
-// Whose turn it is to publish a message; messages are named by their source timestamps.
+// Decides whether it is this node's turn to publish a message, which its source timestamp names.
 class Turn {
 public:
   Turn(std::string name, std::string topic, std::vector<std::string> folders = page_folders(),
@@ -167,8 +168,8 @@ public:
     return failed < 0 ? 0.0 : std::min(10.0, std::ldexp(0.5, static_cast<int>(failed)));
   }
 
-  // Have cycles of a gate begin where they did for the one before it in the same launch, in its mode;
-  // the page shows each decision, and says how slots are to be moved.
+  // Gives a gate the phase and the mode of the gate before it in the same launch. From now on the
+  // page shows each of its decisions, and says how its slots are moved.
   template <typename Shaper>
   void go_on(Shaper & shaper) {
     shaper.moved = [this] { return moved(); };
@@ -199,19 +200,19 @@ public:
   bool was_bypassed(std::int64_t key) {
     const auto count = page_->get(Field::bypassed);
     if (count != seen_) {
-      // What the standby is about to publish comes first.
+      // Messages that the standby is about to publish come first.
       const auto give_up = monotonic_ns() + schema::give_up_ns;
       while (page_->is_locked(schema::passing) && monotonic_ns() < give_up)
         sleep_until(monotonic_ns() + 100'000);
       bypassed_ = page_->noted(schema::bypassed);
-      if (seen_ >= 0 && count - seen_ > schema::ring) oldest_ = bypassed_.front();  // so were older
+      if (seen_ >= 0 && count - seen_ > schema::ring) oldest_ = bypassed_.front();  // and older
       seen_ = count;
     }
     if (key >= oldest_ && !std::binary_search(bypassed_.begin(), bypassed_.end(), key)) {
-      oldest_ = 0;  // what comes now is newer, even if the clock is set back
+      oldest_ = 0;  // later messages are newer, even if the clock is set back
       return false;
     }
-    page_->add(Field::taken);  // so this node does not hang any more
+    page_->add(Field::taken);  // tells the standby that this node does not hang
     return true;
   }
 
@@ -224,19 +225,19 @@ public:
       auto next = opened();
       move_back_ = page_->get(Field::moved_from_ns) != 0;
       for (const auto one : page_->noted(schema::released))
-        next->note(Field::released, schema::released, one);  // a standby that lags has to know them
+        next->note(Field::released, schema::released, one);  // for a standby behind
       page_ = std::move(next);
       in_force_ = false;
       seen_ = -1;
       oldest_ = 0;
     } catch (const std::runtime_error &) {
-      // Without a folder this page has to do, which no other process finds.
+      // Where there is no folder, the node stays with this page, which no other process finds.
     }
   }
 
   void drop(std::int64_t key) { page_->note(Field::released, schema::released, key); }
 
-  // Where cycles are asked to begin, once each time; none: as they do.
+  // Returns where cycles are asked to start, once for each time that was asked; none: no change.
   Maybe asked_phase_ns() {
     const auto asked = page_->get(Field::phases_asked);
     if (asked == phases_asked_) return std::nullopt;
@@ -256,7 +257,7 @@ public:
   template <typename Message>
   void count(const Outcome<Message> & outcome) {
     const auto & [message, release, awake_ns] = outcome;
-    const auto & why = release.dropped;  // reasons stand in the page in their order
+    const auto & why = release.dropped;  // the page has the reasons in their order
     page_->note(Field::measured, schema::measured, message.arrival_ns - release.origin_ns);
     page_->add(why ? Field::replaced + static_cast<std::size_t>(*why) : Field::published);
     page_->add(Field::lost_by_dds, message.lost.value_or(0));
@@ -264,7 +265,7 @@ public:
   }
 
 private:
-  // The page as it is found by this node, of whose launch it is from now on.
+  // Opens the page for this node, and clears what belongs to another launch.
   std::unique_ptr<Page> opened() {
     auto page = open_page(name_, topic_, folders_);
     const auto parent = getppid();
@@ -272,7 +273,7 @@ private:
     if (parent != page->get(Field::parent) || idle_ns > schema::at_once_ns) {
       page->set(Field::mode, 0);  // another launch's
       page->set(Field::phase_known, 0);
-      if (!page->is_locked(schema::publishing)) {  // by a node of another launch, whose counts they are
+      if (!page->is_locked(schema::publishing)) {  // else another launch's
         page->set(Field::starts, 0);
         for (std::size_t count = Field::published; count <= Field::late; ++count)
           page->set(count, 0);
@@ -289,8 +290,9 @@ private:
     while (!(in_force_ = page_->lock(schema::publishing))) {
       const auto holder = page_->get(Field::holder);
       if (holder > 0 && holder != getpid() && kill(static_cast<pid_t>(holder), 0) == 0)
-        return false;  // another shaping node
-      gave_up_ = gave_up_ || monotonic_ns() > give_up;  // the standby was stopped while it published
+        return false;  // another shaping node is in force
+      gave_up_ =
+          gave_up_ || monotonic_ns() > give_up;  // the standby was stopped while it published
       if (gave_up_) break;
       sleep_until(monotonic_ns() + 1'000'000);
     }
@@ -298,7 +300,7 @@ private:
     page_->set(Field::until_ns, monotonic_ns());
     page_->set(Field::first, key);
     page_->set(Field::holder, getpid());
-    // A standby still deals with what came before this node's first message.
+    // The standby still deals with the messages before this node's first one.
     const bool listening = page_->get(Field::listening) > 0 && !gave_up_;
     while (listening && has_standby() && monotonic_ns() < give_up &&
            page_->get(Field::acknowledged) != key && !place_of(page_->noted(schema::bypassed), key))
@@ -315,7 +317,7 @@ private:
   bool gave_up_{false};
   bool move_back_{false};  // slots were moved by way of a page that was left
   std::int64_t phases_asked_{0};
-  // Of the standby's messages: how many there were at the last look, and which.
+  // How many messages the standby had dealt with at the last look, and which.
   std::int64_t seen_{-1};
   std::int64_t oldest_{0};
   std::vector<std::int64_t> bypassed_;

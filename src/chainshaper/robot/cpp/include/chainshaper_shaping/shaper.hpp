@@ -1,5 +1,6 @@
-// A gate at work: clocks, sleeping, and serialized messages around the decisions of gate/. The same
-// as chainshaper/robot/shaper.py, which explains it. No ROS 2 here. All times are nanoseconds.
+// A gate at work in a thread: clocks, sleeping and serialized messages around the decisions of
+// gate/. chainshaper/robot/shaper.py is the same in Python, and explains it. No ROS 2 here. All
+// times are nanoseconds.
 
 #pragma once
 
@@ -45,13 +46,14 @@ inline Gate gate_of(const Parameters & parameters, std::size_t depth) {
   return gate;
 }
 
-// How many messages may wait: by default as many as in the publisher's history.
+// Returns how many messages may wait: by default as many as in the publisher's history.
 inline std::size_t depth_of(const Parameters & parameters, std::size_t history) {
   if (parameters.depth > 0) return static_cast<std::size_t>(parameters.depth);
   return std::max<std::size_t>(schema::depth, history);
 }
 
-// Four bytes of a serialized message, in the byte order that its encapsulation header names.
+// Returns four bytes of a serialized message, in the byte order that its encapsulation header
+// names.
 inline std::uint32_t word_at(const std::uint8_t * payload, std::size_t at) {
   const bool little = payload[1] & 1;
   std::uint32_t value = 0;
@@ -95,7 +97,7 @@ inline std::int64_t watch_until(std::int64_t deadline_ns) {
   return now;
 }
 
-// Give the calling thread SCHED_FIFO with a priority, or a core; false (and errno): it is refused.
+// Give the calling thread SCHED_FIFO with a priority, or a core. False, and errno: it is refused.
 inline bool set_fifo(std::int64_t priority) {
   sched_param wanted{};
   wanted.sched_priority = static_cast<int>(priority);
@@ -109,7 +111,8 @@ inline bool set_core(std::int64_t core) {
   return sched_setaffinity(0, sizeof(cores), &cores) == 0;
 }
 
-// Both, as the parameters say; `warn` gets what is refused, and the remedy.
+// Gives the calling thread the priority and the core of the parameters; `warn` gets the text of
+// what is refused, and the remedy.
 template <typename Warn>
 void schedule(const Parameters & parameters, Warn warn) {
   if (parameters.fifo_priority > 0 && !set_fifo(parameters.fifo_priority))
@@ -120,7 +123,7 @@ void schedule(const Parameters & parameters, Warn warn) {
 }
 
 inline std::int64_t clock_offset() {
-  // How long it took, and what was found; a longer bracket means that something came between.
+  // How long a measurement took, and the offset; in a longer time something else ran in between.
   std::pair<std::int64_t, std::int64_t> best{std::numeric_limits<std::int64_t>::max(), 0};
   for (int attempt = 0; attempt < 5 && best.first >= 2'000; ++attempt) {
     const std::int64_t before = monotonic_ns();
@@ -131,7 +134,8 @@ inline std::int64_t clock_offset() {
   return best.second;
 }
 
-// A gate at work; `Message` is what the queue holds. Its owner sets the functions that it calls.
+// A gate at work, with `Message`s in its queue. The owner sets the functions that it calls: `look`,
+// `moved`, `on_waking` and `on_decision`.
 template <typename Message>
 class Shaper {
 public:
@@ -162,8 +166,8 @@ public:
     return true;
   }
 
-  // A message with this stamp (CLOCK_REALTIME) was taken now. One that `waited` in the reader
-  // counts as having come at its source timestamp, if that is after the last look.
+  // Queues a message that was taken now, with this stamp (CLOCK_REALTIME). One that `waited` in the
+  // reader counts as having come at its source timestamp, if that is after the last look.
   void arrive(Message message, Maybe stamp_ns, Maybe source_timestamp = {}, bool waited = false,
               Maybe lost = {}) {
     const std::int64_t offset = clock_offset();
@@ -182,7 +186,7 @@ public:
     if (full) overflowed.push_back(std::move(*full));
   }
 
-  // Wait until the oldest message leaves, or is dropped; none: it was overflowed meanwhile.
+  // Waits until the oldest message leaves or is dropped; none: it overflowed meanwhile.
   std::optional<Outcome<Message>> hold() {
     const std::uint64_t number = queue.waiting.front().number;
     std::int64_t now = monotonic_ns();
@@ -204,7 +208,7 @@ public:
     }
     if (release.at_ns) {
       if (slept) on_waking(*release.at_ns);
-      // Awake in time: what other threads took before is of no consequence.
+      // This thread is awake in time: other threads before that delayed nothing.
       if (slept && monotonic_ns() < *release.at_ns) waited_ns_ = others_ran_ns();
       now = watch_until(*release.at_ns);
       if (queue.gate.policy() == Policy::discard && missed(queue.gate, release, now)) {
@@ -232,7 +236,7 @@ public:
   }
 
   Queue<Message> queue;
-  std::vector<Outcome<Message>> overflowed;  // since the owner has emptied it
+  std::vector<Outcome<Message>> overflowed;  // since the owner emptied this list
   std::function<void()> look = [] {};
   std::function<std::optional<Move>()> moved = [] { return std::nullopt; };
   std::function<void(std::int64_t)> on_waking = [](std::int64_t) {};
@@ -253,7 +257,7 @@ private:
 
   std::int64_t others_ran_ns() {
     const auto thread = static_cast<pid_t>(syscall(SYS_gettid));
-    if (thread != thread_) {  // the file is bound to who opened it
+    if (thread != thread_) {  // the file belongs to the thread that opened it
       schedstat_ = File(open("/proc/thread-self/schedstat", O_RDONLY | O_CLOEXEC));
       thread_ = thread;
     }
@@ -274,7 +278,7 @@ private:
   std::int64_t turn_ns_{0};
   File schedstat_;
   pid_t thread_{-1};
-  std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and which
+  std::optional<std::pair<std::int64_t, std::int64_t>> next_phase_;  // from when on, and the phase
 };
 
 }  // namespace chainshaper
