@@ -32,9 +32,9 @@ from chainshaper.flow.plan_in_force.phases import PhaseMessages
 from chainshaper.flow.plan_in_force.supervision import Supervision
 from chainshaper.flow.plan_in_force.threads import RunThreads, assign_threads
 from chainshaper.linux.threads import RunningThread
-from chainshaper.planning.application_plan import combined, open_until_done, whole
+from chainshaper.planning.chain_plan import ChainPlan, revised
 from chainshaper.planning.margins import Tail
-from chainshaper.planning.plan import Plan, revised
+from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.reporting.overviews import servers_table
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -104,7 +104,7 @@ def test_without_looking_a_timer_that_falls_behind_is_followed() -> None:
 
 def run_of(
     folder: Path,
-    plan: Plan,
+    plan: ChainPlan,
     back_end: str = "freezer",
     waits_ns: Sequence[int] = (),
     slots: tuple[tuple[int, int], ...] | None = None,
@@ -115,7 +115,7 @@ def run_of(
         server = plan.servers[0].model_copy(update={"slots": slots})
         plan = plan.model_copy(update={"servers": (server,), "cycle_ns": 100 * MS})
     here: Any = SimpleNamespace(path=folder / "j", strangers=None, **{"threads": (), **seen})
-    joint, stop = whole(plan), Event()
+    joint, stop = Plan.of(plan), Event()
 
     def go_on() -> None:
         if stop.is_set():
@@ -257,7 +257,7 @@ def test_a_place_that_another_chain_has_is_why_slots_do_not_follow() -> None:
 
     follower = object.__new__(SlotFollower)
     follower._cores, follower._stop, follower.failure = (), Event(), None
-    follower._chain, follower._planned_ns = cast("Plan", SimpleNamespace(cycle_ns=MS)), 0
+    follower._chain, follower._planned_ns = cast("ChainPlan", SimpleNamespace(cycle_ns=MS)), 0
     tail = SimpleNamespace(start_ns=0)
     tail.saw = lambda seen_ns: setattr(tail, "start_ns", seen_ns)
     follower._tail, follower._put_in_force = cast("Tail", tail), refuse
@@ -456,7 +456,7 @@ def test_of_two_chains_only_the_timer_that_is_new_is_measured(
         revised(plan_for(server(name, name, (0, 20))), offset_ns=at * MS)
         for name, at in (("a", 0), ("b", 50))
     )
-    plan = combined([one, other])
+    plan = Plan.of(one, other)
     start = Allocation((node(7, "/a"), node(9, "/b")), ())
     phases = [Phase(5 * MS, 0), Phase(58 * MS, 0)]
 
@@ -487,6 +487,9 @@ def test_a_thread_that_fails_while_it_looks_or_follows_says_why(
     assert watch.failure == "looking for it has failed (ZeroDivisionError: nothing to divide by)"
     follower = SlotFollower.__new__(SlotFollower)
     follower._cores, follower._stop, follower.failure = (), Event(), None
-    follower._chain, follower._tail = cast("Plan", SimpleNamespace(cycle_ns=1)), cast("Tail", None)
+    follower._chain, follower._tail = (
+        cast("ChainPlan", SimpleNamespace(cycle_ns=1)),
+        cast("Tail", None),
+    )
     follower._follow()
     assert str(follower.failure).startswith("following has failed (AttributeError: ")

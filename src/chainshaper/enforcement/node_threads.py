@@ -15,8 +15,6 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 from chainshaper.linux.processes import (
-    MIDDLEWARE_LIMITS,
-    ROUTERS,
     RunningProcess,
     descendants,
     guessed_name,
@@ -32,7 +30,8 @@ from chainshaper.linux.threads import (
     gate_thread_name,
     since_boot_ns,
 )
-from chainshaper.planning.plan import ShapingNode
+from chainshaper.planning.chain_plan import ShapingNode
+from chainshaper.values.middleware import MIDDLEWARE_LIMITS, ROUTERS, MiddlewareLimit
 
 IN_ORDER = "its executors are known by the order in which it started its threads, as when recorded"
 LEFT_ALONE = "left alone, since users run them whom this run does not name: "
@@ -144,7 +143,7 @@ def ambiguous_node(node: str, pids: Iterable[int]) -> str:
 
 def _middleware_limits(identified: Iterable[_Identified]) -> Iterator[str]:
     """A line for each middleware that is supported in part only, with the nodes that use it."""
-    nodes_by_limit: dict[str, set[str]] = {}
+    nodes_by_limit: dict[MiddlewareLimit, set[str]] = {}
     for known in identified:
         if known.nodes and (limit := middleware_limit(known.process)) is not None:
             nodes_by_limit.setdefault(limit, set()).update(known.nodes)

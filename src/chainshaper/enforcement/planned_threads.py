@@ -3,16 +3,14 @@
 from collections.abc import Collection, Iterable, Iterator, Sequence
 
 from chainshaper.enforcement.node_threads import Allocation, NodeThread, ambiguous_node
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import Plan, Server, ShapingNode, Thread, shaping_nodes
+from chainshaper.planning.chain_plan import ChainPlan, Server, ShapingNode, Thread, shaping_nodes
+from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import OperationError
 
 NOT_RECOGNISED = "not running, or not recognised: "
 
 
-def server_members(
-    plan: ApplicationPlan, allocation: Allocation
-) -> dict[str, tuple[NodeThread, ...]]:
+def server_members(plan: Plan, allocation: Allocation) -> dict[str, tuple[NodeThread, ...]]:
     """The running threads of each server of a plan, by the server's name.
 
     Raises OperationError: a planned thread is not running, two processes are the same node, or one
@@ -99,7 +97,7 @@ def absent_receivers(nodes: Iterable[ShapingNode], running: Collection[str]) -> 
     )
 
 
-def first_planned(chain: Plan) -> Thread | None:
+def first_planned(chain: ChainPlan) -> Thread | None:
     """The thread that begins a chain: the first executor, of no shaping node, by servers' slots."""
     for _, planned in in_order_of_slots(chain):
         if planned.role == "executor":
@@ -107,14 +105,14 @@ def first_planned(chain: Plan) -> Thread | None:
     return None
 
 
-def in_order_of_slots(chain: Plan) -> Iterator[tuple[Server, Thread]]:
+def in_order_of_slots(chain: ChainPlan) -> Iterator[tuple[Server, Thread]]:
     """The planned threads that run a chain, with their servers: those of shaping nodes left out."""
     gates = {node.thread for node in shaping_nodes(chain)}
     for server in sorted(chain.servers, key=lambda server: (server.slots[0][0], server.priority)):
         yield from ((server, planned) for planned in server.threads if planned not in gates)
 
 
-def closed_before(chain: Plan) -> int | None:
+def closed_before(chain: ChainPlan) -> int | None:
     """How long (ns) before a cycle the server of a chain's first thread closes, if it does."""
     slots = next(in_order_of_slots(chain))[0].slots
     is_always_open = slots[0][0] == 0 and slots[-1][1] >= chain.cycle_ns

@@ -10,7 +10,7 @@ SCHED_FIFO priorities (DESIGN section 6). From the most urgent:
   the plan names their nodes: at one priority, callbacks that become ready at once would run in the
   order in which DDS happens to deliver. Where priorities are too few, the last of a server share
   one; where slots are made of what single callbacks took, all but the first do, as while that was
-  measured (:attr:`~chainshaper.planning.application_plan.ApplicationPlan.most_urgent_first`). Turns
+  measured (:attr:`~chainshaper.planning.plan.Plan.most_urgent_first`). Turns
   (SCHED_RR), only if the plan wants them, end within a callback, which then waits for another;
 * nodes that receive what a shaping node publishes: where the plan has a place for them, there,
   behind the shaping nodes and above all others; else below all servers, on the shaping node's core,
@@ -30,12 +30,12 @@ from types import MappingProxyType
 from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.planned_threads import place_of, server_members
 from chainshaper.enforcement.servers import ReservationServer
-from chainshaper.linux.processes import ROUTERS
 from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import is_of_zenoh
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.middleware import ROUTERS
 
 DDS_PRIORITY = 90
 _BEST_SERVER_PRIORITY = 87
@@ -76,7 +76,7 @@ def server_priorities(sizes: Mapping[int, int]) -> dict[int, tuple[int, ...]]:
 
 
 def plan_scheduling(
-    plan: ApplicationPlan, allocation: Allocation, available_cores: Sequence[int]
+    plan: Plan, allocation: Allocation, available_cores: Sequence[int]
 ) -> tuple[WantedScheduling, ...]:
     """What every thread concerned by a plan gets: servers' threads first, then the others.
 
@@ -101,7 +101,7 @@ def plan_scheduling(
     )
 
 
-def waiting_receivers(plan: ApplicationPlan, wanted: Iterable[WantedScheduling]) -> list[str]:
+def waiting_receivers(plan: Plan, wanted: Iterable[WantedScheduling]) -> list[str]:
     """Notes on nodes that receive an output on a core that other chains' servers keep busy."""
     if len(plan.chains) == 1:
         return []

@@ -44,7 +44,6 @@ from chainshaper.flow.plan_in_force.threads import (
 from chainshaper.linux.own_processes import end_command, start_command
 from chainshaper.linux.processes import run_users
 from chainshaper.linux.scheduling import check_cores
-from chainshaper.planning.application_plan import ApplicationPlan, whole
 from chainshaper.planning.offsets import LEAD_NS, chain_name
 from chainshaper.planning.overruns import publication_warnings
 from chainshaper.planning.plan import Plan
@@ -68,7 +67,7 @@ class Applied:
 
 
 def apply_plan(
-    plan: Plan | ApplicationPlan,
+    plan: Plan,
     command: Sequence[str] = (),
     *,
     command_stdout: int | None = None,
@@ -101,7 +100,7 @@ def apply_plan(
     node, a node does not appear, a chain has no regular beginning, the kernel refuses something,
     the servers failed, the application ended, or ``stop`` was set before the plan was in force.
     """
-    given, taken = whole(plan), run_users(users)
+    given, taken = plan, run_users(users)
     threads.server_table(given)
     check_cores({server.core: f"server {server.name}" for server in given.servers})
     choice = choose_back_end(back_end)
@@ -197,7 +196,7 @@ class _Run:
         put_back(self.journal, self.guardians, problems)
 
 
-def _claim(plan: ApplicationPlan, folder: Path | None, go_on: Callable[[], None]) -> Journal:
+def _claim(plan: Plan, folder: Path | None, go_on: Callable[[], None]) -> Journal:
     """Begin a run that governs the plan's cores and nodes. Raises: as :func:`.claim_run`."""
     cores = {server.core for server in plan.servers}
     nodes = {thread.node for server in plan.servers for thread in server.threads}
@@ -206,7 +205,7 @@ def _claim(plan: ApplicationPlan, folder: Path | None, go_on: Callable[[], None]
 
 
 def _schedule(
-    found: RunThreads, plan: ApplicationPlan, back_end: str, recordings: "Sequence[Recording]"
+    found: RunThreads, plan: Plan, back_end: str, recordings: "Sequence[Recording]"
 ) -> list[str]:
     """Give the threads their priorities and cores, unless the plan does not fit them.
 
@@ -219,7 +218,7 @@ def _schedule(
 
 
 def _begin_report(
-    journal: Journal, choice: Choice, plan: ApplicationPlan, command: Sequence[str], plan_path: str
+    journal: Journal, choice: Choice, plan: Plan, command: Sequence[str], plan_path: str
 ) -> RunReport:
     """Begin to show a run, before its slots count."""
     folder = journal.path.parent

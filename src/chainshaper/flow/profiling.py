@@ -26,7 +26,7 @@ from chainshaper.linux.scheduling import (
     check_cores,
     may_use_fifo,
 )
-from chainshaper.planning.plan import PER_CALLBACK
+from chainshaper.planning.chain_plan import PER_CALLBACK
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together

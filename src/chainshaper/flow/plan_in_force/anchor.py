@@ -15,8 +15,8 @@ from chainshaper.enforcement.servers import ServerCounters
 from chainshaper.enforcement.undoing import ServerState
 from chainshaper.flow import threads
 from chainshaper.flow.phase import Phase
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done
 from chainshaper.planning.offsets import LEAD_NS
+from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.values.errors import OperationError
 from chainshaper.values.files import write_whole
@@ -26,8 +26,8 @@ from chainshaper.values.files import write_whole
 class AnchoredPlan:
     """A plan, and where its cycles begin on CLOCK_MONOTONIC."""
 
-    given: ApplicationPlan  # as planned, with offsets that fit the timers once these are known
-    plan: ApplicationPlan  # as it is carried out: with room for overruns, and slots that have moved
+    given: Plan  # as planned, with offsets that fit the timers once these are known
+    plan: Plan  # as it is carried out: with room for overruns, and slots that have moved
     back_end: str
     anchor_ns: int = 0  # from when on slots count, where they have been moved to by now
     waits_ns: list[int] = field(default_factory=list)  # from each timer to its slot, if measured

@@ -15,7 +15,7 @@ from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.report import RunReport
 from chainshaper.flow.threads import server_table
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning.application_plan import open_until_done, with_slots_moved
+from chainshaper.planning.plan import open_until_done, with_slots_moved
 from chainshaper.values.errors import OperationError
 
 

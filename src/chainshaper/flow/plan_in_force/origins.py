@@ -14,7 +14,7 @@ from chainshaper.flow.phase import DriftWatch
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
 from chainshaper.flow.plan_in_force.report import RunReport
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning.application_plan import ApplicationPlan
+from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import OperationError
 
 
@@ -53,7 +53,7 @@ class OriginWatches:
                 )
             self.watches.append(watches[tids])
 
-    def restarted(self, plan: ApplicationPlan, allocation: Allocation) -> set[int]:
+    def restarted(self, plan: Plan, allocation: Allocation) -> set[int]:
         """The places of chains whose first node was started again."""
         origins = threads.first_threads(plan, allocation)
         now = [{thread.identity for thread in origin} for origin in origins]

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.flow.phase import Telling, tell_phase
 from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
-from chainshaper.planning.plan import shaping_nodes
+from chainshaper.planning.chain_plan import shaping_nodes
 
 
 @dataclass

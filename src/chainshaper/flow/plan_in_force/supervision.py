@@ -27,8 +27,8 @@ from chainshaper.flow.plan_in_force.threads import (
     note_strangers,
 )
 from chainshaper.flow.threads import carried_out, server_table
-from chainshaper.planning.application_plan import open_until_done, with_slots_moved
 from chainshaper.planning.offsets import chain_name
+from chainshaper.planning.plan import open_until_done, with_slots_moved
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import ChainshaperError, OperationError
 

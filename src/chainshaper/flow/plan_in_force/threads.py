@@ -32,7 +32,7 @@ from chainshaper.flow.plan_in_force.report import RunReport
 from chainshaper.flow.threads import find_threads, order_in
 from chainshaper.linux.own_processes import end_in_words
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning.application_plan import ApplicationPlan
+from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import OperationError
 from chainshaper.values.progress import Progress
 
@@ -51,11 +51,11 @@ class RunThreads:
     unread: tuple[str, ...] = ()  # recordings that say nothing of this machine, or cannot be read
     latest: Allocation = field(default_factory=lambda: Allocation((), ()))
 
-    def find(self, plan: ApplicationPlan) -> Allocation:
+    def find(self, plan: Plan) -> Allocation:
         """Look which threads the plan's application has now."""
         return find_threads(plan, recorded=self.recorded, users=self.users)
 
-    def schedule(self, plan: ApplicationPlan, back_end: str) -> tuple[WantedScheduling, ...]:
+    def schedule(self, plan: Plan, back_end: str) -> tuple[WantedScheduling, ...]:
         """Give threads their priorities and cores, as far as the back end leaves that to us."""
         wanted = plan_scheduling(plan, self.latest, available_cores())
         left = left_by_back_end(back_end, wanted, plan.free_threads)
@@ -65,7 +65,7 @@ class RunThreads:
 
 def await_nodes(
     threads: RunThreads,
-    plan: ApplicationPlan,
+    plan: Plan,
     wait_ns: int,
     *,
     command: subprocess.Popen[bytes] | None,
@@ -109,7 +109,7 @@ def await_nodes(
         stop.wait(min(LOOK_S, (wait_ns - waited) / 1e9))
 
 
-def _missing_nodes(plan: ApplicationPlan, allocation: Allocation) -> set[str]:
+def _missing_nodes(plan: Plan, allocation: Allocation) -> set[str]:
     """The nodes of servers that do not run."""
     wanted = {thread.node for server in plan.servers for thread in server.threads}
     return wanted - {node for listed in allocation.threads for node in listed.nodes}
@@ -157,7 +157,7 @@ def note_strangers(report: RunReport, allocation: Allocation) -> None:
 
 
 def note_absent(
-    report: RunReport, plan: ApplicationPlan, allocation: Allocation, unread: tuple[str, ...]
+    report: RunReport, plan: Plan, allocation: Allocation, unread: tuple[str, ...]
 ) -> None:
     """One line about receivers that do not run, or are not recognised, for as long as so.
 
