@@ -402,6 +402,7 @@ def test_steps_of_the_wall_clock_are_not_seen() -> None:
     sources = [path for room in rooms for path in room.rglob("*.py")]
     sources += (package / "robot").glob("*.py")
     sources += [package / "flow" / name for name in ("apply.py", "phase.py", "threads.py")]
+    sources += (package / "flow" / "plan_in_force").glob("*.py")
     wall_clock = re.compile(
         r"CLOCK_REALTIME|\btime\.time(_ns)?\(|\bdatetime\b|\blocaltime|\bgmtime"
     )
