@@ -251,7 +251,8 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
             process.wait()
     recording = open_recording(output)
     spell = known(recording.info.in_force)
-    assert known(recording.info.plan)["chains"][0]["chain"] == plan.model_dump(mode="json")["chain"]
+    recorded_chain = known(recording.info.plan)["chains"][0]["chain"]
+    assert recorded_chain == plan.model_dump(mode="json")["chain"]
     measured = measure_latency(recording)
     starts = measured.analysis.traversals["start"]
     assert 0 < len(starts) < 160

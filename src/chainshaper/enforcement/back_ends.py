@@ -1,4 +1,4 @@
-"""Which back ends this machine offers, the strongest of them, and making one; the back end `fifo`.
+"""Which back ends this machine offers; choosing and making one; the back end `fifo`.
 
 **scx** and **litmus** gate in the kernel, to the microsecond; **freezer** with a dispatcher on any
 kernel, to some tens of microseconds; **fifo** isolates, and leaves gating to the shaping node.
@@ -43,8 +43,10 @@ def offered_back_ends() -> tuple[Offer, ...]:
 
 
 def choose_back_end(name: str = "auto") -> Choice:
-    """The back end of this name; for ``auto`` the strongest that works here. Raises InputError:
-    there is no such back end. PlatformError: it, or any, cannot be used here.
+    """Choose the back end of this name; for ``auto`` the strongest that works here.
+
+    Raises InputError: there is no such back end. PlatformError: it cannot be used here or, for
+    ``auto``, none can.
     """
     if name not in ("auto", *_KNOWN):
         raise InputError(f"no back end {name!r}: choose one of auto, {', '.join(_KNOWN)}")
@@ -56,9 +58,11 @@ def choose_back_end(name: str = "auto") -> Choice:
     passed: list[Offer] = []
     for offer in offered_back_ends():
         if offer.missing is None:
-            others = " or ".join(one.name for one in passed)
-            without = f"; not {others} (`chainshaper doctor` says why)" * bool(passed)
-            return Choice(offer.name, f"the strongest here: {offer.strength}{without}")
+            reason = f"the strongest here: {offer.strength}"
+            if passed:
+                stronger = " or ".join(unusable.name for unusable in passed)
+                reason += f"; not {stronger} (`chainshaper doctor` says why)"
+            return Choice(offer.name, reason)
         passed.append(offer)
     reasons = "; ".join(f"{offer.name}: {offer.missing}" for offer in passed)
     raise PlatformError(f"no back end can be used here: {reasons}")
@@ -72,8 +76,9 @@ def gates(name: str) -> bool:
 def make_back_end(
     name: str, table: ServerTable, journal: Journal, go_on: Callable[[], None] = lambda: None
 ) -> BackEnd:
-    """Make a back end for a table. ``go_on`` is called while processes start, and may raise. Raises
-    InputError: the table is more than the back end can do. And as the back end.
+    """Make a back end for a table. ``go_on`` is called while processes start, and may raise.
+
+    Raises InputError: the table is more than the back end can do. And as the back end.
     """
     match name:
         case "scx":
@@ -109,10 +114,10 @@ class Fifo(BackEnd):
 
 def _missing_for_freezer() -> str | None:
     try:
-        folder, own = cgroups.mount_point(), cgroups.cgroup_of(os.getpid())
+        folder, our_group = cgroups.mount_point(), cgroups.cgroup_of(os.getpid())
     except PlatformError as error:
         return str(error)
-    if not any(os.access(one, os.W_OK, effective_ids=True) for one in (folder, own)):
+    if not any(os.access(path, os.W_OK, effective_ids=True) for path in (folder, our_group)):
         return f"{folder} is not writable: run as root, with CAP_DAC_OVERRIDE, or Delegate=yes"
     return _missing_for_fifo()
 

@@ -1,4 +1,4 @@
-"""Runs on this machine: the journal of what each has changed, and since when it governs whom.
+"""The journal of each run: what it has changed on this machine, and which processes it governs.
 
 A run has a folder (:func:`journals_folder`), gone when the machine boots again, as is all that was
 changed. In it are `journal.jsonl`, `run.json`, which the run writes anew every second, and
@@ -44,19 +44,19 @@ _NO_LINK = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 @dataclass(frozen=True)
 class Journal:
-    """A journal on disk, read anew each time, since others write to it too; and the open file, from
-    which it is written again where its folder is removed.
-    """
+    """A journal on disk. It is read anew each time, since other processes write to it too."""
 
     path: Path
-    memory: FileIO | None = None
+    memory: FileIO | None = None  # the open file; the journal is restored from it if it is removed
 
     def note(self, kind: str, *changes: Mapping[str, Any], **fields: Any) -> None:
-        """Write down, with one `fsync`, how to undo changes that are about to be made, or one, of
-        these ``fields``. Raises OperationError: they cannot be written; make no change then.
+        """Write down, with one `fsync`, how to undo changes that are about to be made.
+
+        Without ``changes`` it is one, of these ``fields``. Raises OperationError: they cannot be
+        written; make no change then.
         """
-        all_ = changes or (fields,)
-        lines = b"".join(json.dumps({"kind": kind, **one}).encode() + b"\n" for one in all_)
+        entries = [{"kind": kind, **change} for change in changes or (fields,)]
+        lines = b"".join(json.dumps(entry).encode() + b"\n" for entry in entries)
         try:
             self.keep()
             descriptor = os.open(self.path, os.O_RDWR | os.O_APPEND | _NO_LINK)
@@ -76,16 +76,18 @@ class Journal:
             ) from error
 
     def entries(self, kind: str | None = None) -> tuple[Mapping[str, Any], ...]:
-        """All that was noted (of a ``kind``), oldest first; what a crash cut off was not done, and
-        is left out. Raises OperationError: unreadable.
+        """All that was noted (of a ``kind``), oldest first.
+
+        A line that a crash cut off is left out: its change was not made. Raises OperationError: the
+        journal cannot be read.
         """
         entries = (_entry(line) for line in self._lines())
-        return tuple(one for one in entries if one and kind in (None, one["kind"]))
+        return tuple(entry for entry in entries if entry and kind in (None, entry["kind"]))
 
     def read(self, kind: str, reader: Callable[[Mapping[str, Any]], _T]) -> tuple[_T, ...]:
         """The entries of a kind as values; one that ``reader`` cannot make sense of is left out."""
-        found = (_value(entry, reader) for entry in self.entries(kind))
-        return tuple(value for value in found if value is not None)
+        values = (_value(entry, reader) for entry in self.entries(kind))
+        return tuple(value for value in values if value is not None)
 
     def strange_lines(
         self, readers: Mapping[str, Callable[[Mapping[str, Any]], object]]
@@ -98,7 +100,7 @@ class Journal:
                 yield number, line
 
     def keep(self) -> bool:
-        """See that the file is there, from ``memory`` if need be; whether it was not discarded."""
+        """Write the file again from ``memory`` if it is gone; False: it was discarded."""
         if self.memory is None or self.memory.closed:
             return self.path.exists()
         if not self.path.exists():
@@ -122,7 +124,7 @@ class Journal:
         return True
 
     def size(self) -> int:
-        """How long it is: it only grows."""
+        """The size of the journal in bytes: it only grows."""
         with contextlib.suppress(OSError):
             return self.path.stat().st_size
         return len(self._remembered())
@@ -170,12 +172,12 @@ def process_of(entry: Mapping[str, Any]) -> tuple[int, int]:
 
 
 class OwnProcess(NamedTuple):
-    """A process of a run, in its journal, known by id and start; ``core``: a dispatcher's."""
+    """A process of a run, as its journal has it."""
 
-    role: str
+    role: str  # GUARDIAN or DISPATCHER
     pid: int
-    started: int
-    core: int | None = None
+    started: int  # ticks after the machine booted
+    core: int | None = None  # the core of a dispatcher
 
 
 def note_process(journal: Journal, role: str, pid: int, core: int | None = None) -> None:
@@ -190,7 +192,8 @@ def read_process(entry: Mapping[str, Any]) -> OwnProcess:
 
 def processes_of_role(journal: Journal, role: str) -> tuple[OwnProcess, ...]:
     """All processes of a role that the run has ever had."""
-    return tuple(one for one in journal.read(PROCESS, read_process) if one.role == role)
+    processes = journal.read(PROCESS, read_process)
+    return tuple(process for process in processes if process.role == role)
 
 
 @functools.lru_cache(maxsize=8192)  # a run reads its journal often, and lines never change
@@ -210,8 +213,9 @@ def _value(entry: Mapping[str, Any], reader: Callable[[Mapping[str, Any]], _T]) 
 
 
 def open_journal(folder: str | Path | None = None, run: str | None = None) -> Journal:
-    """Begin a journal in ``folder``/``run``; both have defaults. Raises OperationError: there is
-    one, or it cannot be written. PlatformError: no folder for it.
+    """Begin a journal in ``folder``/``run``; both have defaults.
+
+    Raises OperationError: there is one, or it cannot be written. PlatformError: no folder for it.
     """
     base = journals_folder(folder)
     place = base / (run or f"{time.strftime('%Y%m%dT%H%M%S')}-{os.getpid()}")
@@ -280,23 +284,24 @@ def boot_id() -> str:
 
 
 class LockHolder(NamedTuple):
-    """A process that has a folder locked, by id and start; ``user`` None: no single user's."""
+    """A process that has a folder locked."""
 
     pid: int
-    started: int
-    user: int | None
+    started: int  # ticks after the machine booted
+    user: int | None  # None: no single user's
 
 
 Waiting: TypeAlias = Callable[[LockHolder | None, float], None]
-"""Called with who has a folder locked, if that is known, and for how long that one has been waited
-for by now (s); may raise."""
+"""Called while a folder is locked, with the process that has locked it (None: not known), and how
+long we have waited for that process (s); may raise."""
 
 
 @contextlib.contextmanager
 def locked(folder: Path, waiting: Waiting) -> Iterator[None]:
-    """Inside, no other process has this folder locked, which its user alone may open; until then
-    ``waiting`` is called. Raises OperationError: a process of another user has it locked, which is
-    not waited for. OSError: there is no such folder.
+    """Lock a folder, which its user alone may open, until the context ends.
+
+    ``waiting`` is called while another process has it locked. Raises OperationError: a process of
+    another user has it locked, which is not waited for. OSError: there is no such folder.
     """
     descriptor = _lock(folder, waiting)
     try:
@@ -307,8 +312,10 @@ def locked(folder: Path, waiting: Waiting) -> Iterator[None]:
 
 @contextlib.contextmanager
 def all_runs_locked(base: Path, waiting: Waiting) -> Iterator[None]:
-    """:func:`locked` for the folder of all runs. Others may read that, and so lock it; the lock is
-    a folder in it, of a mode that keeps them out, and gone when nobody has it.
+    """Lock the folder of all runs until the context ends; see :func:`locked`.
+
+    Other users may read that folder, and so could lock it. So the lock is a folder in it, of a mode
+    that keeps them out; it is removed when no process has it.
     """
     place = base / _LOCK
     with contextlib.ExitStack() as stack:
@@ -386,14 +393,12 @@ def _has_open(pid: int, state: os.stat_result) -> bool:
 
 @dataclass(frozen=True)
 class Governed:
-    """A run that governs processes from its first whole cycle on, seen last at ``seen_ns``
-    (CLOCK_MONOTONIC); ``until_ns``: when it ended (None: not seen to).
-    """
+    """A run that governs processes; instants are ns of CLOCK_MONOTONIC."""
 
-    run: str
-    since_ns: int
-    seen_ns: int
-    until_ns: int | None
+    run: str  # its name
+    since_ns: int  # when its first whole cycle began
+    seen_ns: int  # when it was seen last
+    until_ns: int | None  # when it ended (None: not seen to)
     plan: dict[str, Any] | None
 
 
@@ -404,39 +409,42 @@ def governing(
     folder: Path | None = None,
 ) -> tuple[Governed, ...]:
     """The runs that govern threads of these processes; one seen ``before`` and gone has ended."""
-    known = {one.run: one for one in before}
-    found = {
-        one.run: replace(one, until_ns=one.seen_ns if one.until_ns is None else one.until_ns)
-        for one in before
-    }
+    known = {governed.run: governed for governed in before}
+    runs: dict[str, Governed] = {}
+    for governed in before:
+        until_ns = governed.seen_ns if governed.until_ns is None else governed.until_ns
+        runs[governed.run] = replace(governed, until_ns=until_ns)
     with contextlib.suppress(OperationError, PlatformError, OSError):
         for journal in find_journals(folder):
             name, state = journal.name, _plain(journal.path.with_name(STATE_FILE))
             if state is None or journal.owner is None:
                 continue
             with contextlib.suppress(KeyError, TypeError, ValueError):  # not as a run writes it
-                threads = [find_thread(int(t)) for one in state["servers"] for t in one["threads"]]
+                tids = [int(tid) for server in state["servers"] for tid in server["threads"]]
+                threads = [find_thread(tid) for tid in tids]
                 if name in known:
                     plan = known[name].plan
-                elif any(one is not None and one.pid in pids for one in threads):
+                elif any(thread is not None and thread.pid in pids for thread in threads):
                     plan = _plain(journal.path.with_name(PLAN_FILE))
                 else:
                     continue
                 if (since_ns := state["in_force_ns"]) is not None:
-                    found[name] = Governed(name, since_ns, now_ns, state.get("ended_ns"), plan)
-    return tuple(found.values())
+                    runs[name] = Governed(name, since_ns, now_ns, state.get("ended_ns"), plan)
+    return tuple(runs.values())
 
 
 def in_force_throughout(runs: Collection[Governed]) -> Governed | None:
-    """All runs as one: while they were in force together (of runs that followed each other, the
-    last), with the plan if there was one alone. None: there was none.
+    """Join runs into one, of the time in which all were in force together.
+
+    Of runs that followed each other it is the last. It has a plan if it is of a single run. None:
+    there was no run.
     """
     if not runs:
         return None
-    latest = max(runs, key=lambda one: one.since_ns)
-    together = [one for one in runs if one.until_ns is None or one.until_ns > latest.since_ns]
-    together = [latest, *(one for one in together if one is not latest)]
-    ends = [one.until_ns for one in together if one.until_ns is not None]
+    latest = max(runs, key=lambda run: run.since_ns)
+    together = [run for run in runs if run.until_ns is None or run.until_ns > latest.since_ns]
+    together = [latest, *(run for run in together if run is not latest)]
+    ends = [run.until_ns for run in together if run.until_ns is not None]
     plan = latest.plan if len(together) == 1 else None
     return replace(latest, until_ns=min(ends, default=None), plan=plan)
 

@@ -51,15 +51,15 @@ _GENERATIONS = 5
 
 @dataclass(frozen=True)
 class Change:
-    """A thread of the journal: what it had before ``changed_at`` (ticks), and all it was given."""
+    """A thread of the journal, and how its scheduling was changed."""
 
     tid: int
-    started: int
+    started: int  # ticks after the machine booted
     pid: int
-    comm: str
-    changed_at: int
-    original: SchedulingState
-    given: tuple[SchedulingState, ...]
+    comm: str  # its name
+    changed_at: int  # when it was changed first (ticks after the machine booted)
+    original: SchedulingState  # what it had until then
+    given: tuple[SchedulingState, ...]  # all that it was given, in order
 
     @property
     def identity(self) -> tuple[int, int]:
@@ -69,9 +69,10 @@ class Change:
 def change_all(
     journal: Journal, changes: Iterable[tuple[RunningThread, SchedulingRequest]]
 ) -> None:
-    """Give threads, if they run still, their class and cores. Raises OperationError: as
-    :func:`note_scheduling` (then nothing is changed), or the kernel refuses. PlatformError: a
-    privilege is missing.
+    """Give threads, if they run still, their class and cores.
+
+    Raises OperationError: as :func:`note_scheduling` (then nothing is changed), or the kernel
+    refuses. PlatformError: a privilege is missing.
     """
     wishes = [(thread, partial(after_wish, wanted=wanted)) for thread, wanted in changes]
     for thread, target in note_scheduling(journal, wishes):
@@ -101,10 +102,12 @@ def note_scheduling(
     journal: Journal,
     changes: Iterable[tuple[RunningThread, Callable[[SchedulingState], SchedulingState]]],
 ) -> list[tuple[RunningThread, SchedulingState]]:
-    """Write down what threads have before each changes; those that are to be, with their targets.
-    Raises OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
+    """Write down how threads are scheduled before they are changed.
+
+    Returns the threads that have to be changed, each with what it is to have. Raises
+    OperationError: one runs under SCHED_DEADLINE, or the journal cannot be written.
     """
-    known = {one.identity: one for one in remembered_threads(journal)}
+    known = {change.identity: change for change in remembered_threads(journal)}
     families = _families(journal, list(known.values()))
     noted, entries = [], []
     for thread, changed in changes:
@@ -124,7 +127,8 @@ def note_scheduling(
         if earlier is None:
             # What it has from a thread of ours is not what it shall have afterwards.
             family = families.get(thread.pid, ())
-            before = _given_back(before, [f for f in family if thread.started >= f.changed_at])
+            inherited = [change for change in family if thread.started >= change.changed_at]
+            before = _given_back(before, inherited)
         elif before == target and target in earlier.given:
             continue
         noted.append((thread, target))
@@ -137,15 +141,17 @@ def note_scheduling(
 
 
 def read_change(entry: Mapping[str, Any]) -> Change:
-    """A journal's entry as a value."""
+    """Make a change of a journal's entry."""
     before, given = (state_from_json(entry[name]) for name in ("before", "given"))
     tid, started, pid, at = (int(entry[name]) for name in ("tid", "started", "pid", "at"))
     return Change(tid, started, pid, str(entry["comm"]), at, before, (given,))
 
 
 def remembered_threads(journal: Journal) -> list[Change]:
-    """The threads of a journal, each with its changes joined, in order of their first change. Where
-    another program changed an aspect between two changes of ours, theirs is the original.
+    """The threads of a journal, each with its changes joined, in order of their first change.
+
+    Where another program changed an aspect between two changes of ours, the aspect's original is
+    what that program set.
     """
     threads: dict[tuple[int, int], Change] = {}
     for change in journal.read(KIND, read_change):
@@ -154,7 +160,7 @@ def remembered_threads(journal: Journal) -> list[Change]:
             continue
         original, known = earlier.original, (earlier.original, *earlier.given)
         for aspect in ASPECTS:
-            if all(aspect in different_aspects(change.original, one) for one in known):
+            if all(aspect in different_aspects(change.original, state) for state in known):
                 original = with_aspect(original, aspect, change.original)
         given = (*earlier.given, *change.given)
         threads[change.identity] = replace(earlier, original=original, given=given)
@@ -162,13 +168,15 @@ def remembered_threads(journal: Journal) -> list[Change]:
 
 
 def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> set[tuple[int, int]]:
-    """Write down processes that the journal's have started meanwhile, if they were there at the
-    look ``before``, too: helpers come and go. Returns all that are new. Raises: as ``note``.
+    """Write down processes that the journal's have started meanwhile.
+
+    Only those are written that were there at the look ``before``, too: helpers come and go. Returns
+    all that are new, by id and start. Raises OperationError: the journal cannot be written.
     """
     remembered = remembered_threads(journal)
-    known = {one.pid for one in remembered}
-    found = ((pid, start_of(pid, pid)) for pid in _families(journal, remembered))
-    new = {(pid, when) for pid, when in found if pid not in known and when is not None}
+    known = {change.pid for change in remembered}
+    family = ((pid, start_of(pid, pid)) for pid in _families(journal, remembered))
+    new = {(pid, when) for pid, when in family if pid not in known and when is not None}
     new -= set(journal.read(DESCENDANTS, process_of))
     if entries := [{"pid": pid, "started": when} for pid, when in sorted(new.intersection(before))]:
         journal.note(DESCENDANTS, *entries)
@@ -176,9 +184,10 @@ def note_descendants(journal: Journal, before: Collection[tuple[int, int]]) -> s
 
 
 def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
-    """Put back the class and cores of every thread in the journal, and of what inherited them, from
-    any process and as often as one likes. ``groups`` are the run's cgroups. Raises OperationError:
-    the kernel refuses for some threads; the others are as before.
+    """Put back class and cores of every thread in the journal, and of those that inherited them.
+
+    Any process may do so, any number of times. ``groups`` are the run's cgroups. Raises
+    OperationError: the kernel refuses for some threads; the others are as before.
     """
     if journal.outdated:
         return
@@ -196,9 +205,10 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
             return False
         return now != target
 
-    for one in reversed(remembered):
-        if (thread := find_thread(one.tid)) is not None and thread.identity == one.identity:
-            give_back(thread, [one])
+    for change in reversed(remembered):
+        thread = find_thread(change.tid)
+        if thread is not None and thread.identity == change.identity:
+            give_back(thread, [change])
     # Until its parent is restored, a new thread inherits: what starts some may have just done so.
     for _ in range(_GENERATIONS if remembered else 0):
         changed = [give_back(*born) for born in _born_of(journal, remembered, groups)]
@@ -209,48 +219,54 @@ def release_threads(journal: Journal, groups: Iterable[Path] = ()) -> None:
 
 
 def look_alikes(journal: Journal, groups: Iterable[Path] = ()) -> tuple[str, ...]:
-    """Before the undoing: real-time threads as we made some, not known as ours, in words."""
+    """Name real-time threads that have what a run gives, but are not known as the application's.
+
+    To be called before the run is undone.
+    """
     remembered = [] if journal.outdated else remembered_threads(journal)
-    known = {one.identity for one in remembered}
+    known = {change.identity for change in remembered}
     known |= {thread.identity for thread, _ in _born_of(journal, remembered, groups)}
-    found = []
+    lines = []
     for thread in (thread for pid in parents() if remembered for thread in list_threads(pid)):
         if thread.priority == 0 or thread.identity in known:
             continue  # cores alone are no likeness
         with suppress(ProcessLookupError):
             now = state_of(thread.tid)
-            if any(now in one.given and thread.started >= one.changed_at for one in remembered):
-                found.append(
+            if any(
+                now in change.given and thread.started >= change.changed_at for change in remembered
+            ):
+                lines.append(
                     f"{thread.text} is left as it is: {now.text}; if it is the application's, which"
                     f" nothing shows, `chrt --other --pid 0 {thread.tid}`"
                 )
-    return tuple(found)
+    return tuple(lines)
 
 
 def _born_of(
     journal: Journal, remembered: list[Change], groups: Iterable[Path]
 ) -> list[tuple[RunningThread, list[Change]]]:
     """Threads of the application not in its journal, each with those it may have inherited from."""
-    done, families = {one.identity for one in remembered}, _families(journal, remembered)
-    found = [(one, family) for pid, family in families.items() for one in list_threads(pid)]
+    noted = {change.identity for change in remembered}
+    families = _families(journal, remembered)
+    threads = [(thread, family) for pid, family in families.items() for thread in list_threads(pid)]
     members = (find_thread(tid) for folder in groups for tid in threads_in(folder))
-    found += [(thread, remembered) for thread in members if thread is not None]
+    threads += [(thread, remembered) for thread in members if thread is not None]
     return [
-        (thread, [one for one in family if thread.started >= one.changed_at])
-        for thread, family in found
-        if thread.identity not in done
+        (thread, [change for change in family if thread.started >= change.changed_at])
+        for thread, family in threads
+        if thread.identity not in noted
     ]
 
 
 def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Change]]:
     """Processes that are the application's, each with the changes that it may have inherited."""
     families: dict[int, list[Change]] = {}
-    for one in remembered:
-        families.setdefault(one.pid, []).append(one)
+    for change in remembered:
+        families.setdefault(change.pid, []).append(change)
     for pid, family in list(families.items()):
         begun = start_of(pid, pid)
         # A process that had begun when its thread was changed is still the same.
-        if begun is None or begun > min(one.changed_at for one in family):
+        if begun is None or begun > min(change.changed_at for change in family):
             del families[pid]
     for pid, started in journal.read(DESCENDANTS, process_of):
         if start_of(pid, pid) == started:
@@ -263,11 +279,14 @@ def _families(journal: Journal, remembered: list[Change]) -> dict[int, list[Chan
 
 
 def _given_back(state: SchedulingState, family: Iterable[Change]) -> SchedulingState:
-    """A state with aspects of ours as the first of the family that was given these had them."""
+    """Put back each aspect of a state that is as we set it for a thread of the family.
+
+    It becomes what the first such thread had before.
+    """
     for aspect in ASPECTS:
-        for one in family:
-            ours = any(getattr(state, aspect) == getattr(given, aspect) for given in one.given)
-            if ours and aspect in different_aspects(state, one.original):
-                state = with_aspect(state, aspect, one.original)
+        for change in family:
+            ours = any(getattr(state, aspect) == getattr(given, aspect) for given in change.given)
+            if ours and aspect in different_aspects(state, change.original):
+                state = with_aspect(state, aspect, change.original)
                 break
     return state

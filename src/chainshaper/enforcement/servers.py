@@ -1,9 +1,10 @@
 """Reservation servers as the back ends see them, and what every back end can do.
 
-A **table** has servers with slots that repeat every cycle (paper, section 2.2.1). Between slots a
-server's threads do not run at all (``fifo`` excepted, which isolates only); where servers overlap
-on a core, the better priority runs, a smaller number; of one server's threads those of the first
-place are the most urgent (``litmus``: they take turns); others run when no server's wants to.
+A **table** has servers with slots that repeat every cycle (paper, section 2.2.1). Between its slots
+a server's threads do not run at all (the back end ``fifo`` isolates only). Where slots of several
+servers overlap on a core, the server with the better priority runs, which is the smaller number. In
+one server the threads of the first place are the most urgent (``litmus``: they take turns). Other
+threads run when no server's thread wants to.
 """
 
 from abc import ABC, abstractmethod
@@ -14,15 +15,13 @@ from chainshaper.values.errors import InputError
 
 @dataclass(frozen=True)
 class ReservationServer:
-    """A plan's server, for processes that have Python alone: half-open slots in ns after the start
-    of a cycle, ascending, on one core; how many ``places`` its threads have.
-    """
+    """A plan's server, for processes that have nothing but Python's standard library."""
 
     name: str
     core: int
-    priority: int
-    slots: tuple[tuple[int, int], ...]
-    places: int = field(default=1, kw_only=True)
+    priority: int  # the smaller, the more urgent
+    slots: tuple[tuple[int, int], ...]  # [start, end) in ns after the start of a cycle, ascending
+    places: int = field(default=1, kw_only=True)  # how many degrees of urgency its threads have
 
 
 @dataclass(frozen=True)
@@ -43,20 +42,19 @@ def server_named(table: ServerTable, name: str) -> ReservationServer:
 
 @dataclass(frozen=True)
 class ServerCounters:
-    """What a server has done since it was armed; None: the back end cannot know. Slots are entered
-    late more than 100 us after their start, overrun where a thread still wants to run at their end.
-    """
+    """Counts what a server has done since it was armed; None: the back end cannot know."""
 
     slots: int | None = None
-    late_entries: int | None = None
+    late_entries: int | None = None  # slots entered more than 100 us after their start
     longest_lateness_ns: int | None = None
-    overruns: int | None = None
+    overruns: int | None = None  # slots at whose end a thread still wanted to run
 
 
 class BackEnd(ABC):
-    """A table of servers in force on this machine. Making one changes nothing that an application
-    could notice. Then ``assign`` and ``arm`` in any order and number; ``release`` ends it. All
-    raise OperationError where the kernel refuses.
+    """Puts a table of servers in force on this machine.
+
+    Making a back end changes nothing that an application could notice. ``assign`` and ``arm`` come
+    in any order and number; ``release`` ends it. All raise OperationError where the kernel refuses.
     """
 
     def __init__(self, table: ServerTable) -> None:
@@ -65,14 +63,16 @@ class BackEnd(ABC):
 
     @abstractmethod
     def assign(self, tid: int, server: str, place: int = 0) -> None:
-        """Put a thread into a server; before ``arm`` it runs on freely. Its place there is for back
-        ends that choose between a server's threads. One that has ended is passed over. Raises
-        InputError: no such server.
+        """Put a thread into a server; before ``arm`` it runs on freely.
+
+        ``place`` says how urgent it is there (0: the most), for back ends that choose between a
+        server's threads. A thread that has ended is passed over. Raises InputError: no such server.
         """
 
     @abstractmethod
     def arm(self, anchor_ns: int) -> None:
         """Enforce the slots from now on; cycles start at ``anchor_ns`` (CLOCK_MONOTONIC) + k * CT.
+
         Another anchor moves the cycles without letting threads slip between. Where the kernel
         refuses, what was done before stays until the release.
         """
@@ -82,7 +82,7 @@ class BackEnd(ABC):
         return self._since_ns
 
     def counters(self) -> dict[str, ServerCounters]:
-        """Per server's name, since the first ``arm``."""
+        """Counters of each server since the first ``arm``, by the server's name."""
         return {server.name: ServerCounters() for server in self._table.servers}
 
     def failure(self) -> str | None:

@@ -47,9 +47,9 @@ _PATIENCE_S = 20  # ROS 2 has found the nodes by then, however busy the machine 
 
 @dataclass(frozen=True)
 class Phase:
-    """Where in a cycle a thread begins: ``at_ns`` after multiples of it, on CLOCK_MONOTONIC."""
+    """Where in a cycle a thread begins."""
 
-    at_ns: int
+    at_ns: int  # after multiples of the cycle, on CLOCK_MONOTONIC
     spread_ns: int  # how far apart most of the wake-ups at this place lie
 
 
@@ -70,19 +70,19 @@ def measure_phase(
 
 
 def _irregular(wake_ups: npt.NDArray[np.int64], cycle_ns: int, cycles: int) -> str:
-    """Why these wake-ups are no beginning of cycles, and what to do: how many there were says
-    nothing of where they lie.
-    """
+    """Say why these wake-ups are no beginning of cycles, and what to do."""
     length, width = duration_text(cycle_ns), duration_text(_width(cycle_ns))
     if not wake_ups.size:
-        said = f"does not wake up: not once in {cycles} cycles of {length}. Start the chain"
+        reason = f"does not wake up: not once in {cycles} cycles of {length}. Start the chain"
     else:
         seen = max(seen for _, seen, _ in _places(wake_ups, cycle_ns))
-        said = f"does not wake up at one place of the cycle {length}: {len(wake_ups)} wake-ups in"
-        said += f" {cycles} cycles, of which {seen} at most have one within the same {width}, and"
-        said += f" {math.ceil(SEEN_IN * cycles)} have to. Plan with the period that the chain has;"
-        said += " on a busy machine, whose cores serve others first, try again when it is calm"
-    return f"{said}; or give its --phase"
+        reason = (
+            f"does not wake up at one place of the cycle {length}: {len(wake_ups)} wake-ups in"
+            f" {cycles} cycles, of which {seen} at most have one within the same {width}, and"
+            f" {math.ceil(SEEN_IN * cycles)} have to. Plan with the period that the chain has;"
+            " on a busy machine, whose cores serve others first, try again when it is calm"
+        )
+    return f"{reason}; or give its --phase"
 
 
 def watch_wake_ups(
@@ -95,15 +95,15 @@ def watch_wake_ups(
     rest_ns: Callable[[int], int] = lambda _: 0,
     poll_ns: int = POLL_NS,
 ) -> npt.NDArray[np.int64]:
-    """When threads of a process became ready to run (ns of CLOCK_MONOTONIC, in order): half way
-    between two looks, minus the time that one waited for its core. Raises OperationError: one has
-    ended.
+    """Watch when threads of a process become ready to run (ns of CLOCK_MONOTONIC, in order).
 
-    Wake-ups after which a thread ran for less than ``least_ns`` are left out. ``rest_ns`` says at
-    any time for how long not to look, else it is done every ``poll_ns``.
+    That is half way between two looks, minus the time that the thread waited for its core. Wake-ups
+    after which a thread ran for less than ``least_ns`` are left out. ``rest_ns`` says at any time
+    for how long not to look, else it is done every ``poll_ns``. Raises OperationError: a thread has
+    ended.
     """
     # When each woke up (0: a rest begins, or the end), and how long it had run by then.
-    found: list[list[tuple[int, int]]] = [[] for _ in tids]
+    wake_ups: list[list[tuple[int, int]]] = [[] for _ in tids]
     started = now = time.monotonic_ns()
     born = [start_of(pid, tid) for tid in tids]
     try:
@@ -116,13 +116,13 @@ def watch_wake_ups(
                 time.sleep(max(rest, poll_ns) / 1e9)
                 before, seen = seen, [_counters(file) for file in files]
                 looked, now = now, time.monotonic_ns()
-                for own, (_, waited, times), (ran, waited_by_now, times_by_now) in zip(
-                    found, before, seen, strict=True
+                for of_thread, (_, waited, times), (ran, waited_by_now, times_by_now) in zip(
+                    wake_ups, before, seen, strict=True
                 ):
                     if rest > 0:
-                        own.append((0, ran))
+                        of_thread.append((0, ran))
                     elif times_by_now > times:
-                        own.append(((looked + now) // 2 - (waited_by_now - waited), ran))
+                        of_thread.append(((looked + now) // 2 - (waited_by_now - waited), ran))
                 progress(min(1.0, (now - started) / for_ns))
         for tid, began in zip(tids, born, strict=True):
             if began is None or has_ended(tid, began):
@@ -132,7 +132,10 @@ def watch_wake_ups(
             f"process {pid}, or its thread {', '.join(map(str, tids))}, ended while its phase was"
             " measured: start the application again"
         ) from error
-    when = [_after_rests(own, ran, least_ns) for own, (ran, _, _) in zip(found, seen, strict=True)]
+    when = [
+        _long_enough(of_thread, ran, least_ns)
+        for of_thread, (ran, _, _) in zip(wake_ups, seen, strict=True)
+    ]
     return np.sort(np.concatenate(when))
 
 
@@ -143,11 +146,11 @@ def _counters(file: FileIO) -> tuple[int, int, int]:
     return ran, waited, times
 
 
-def _after_rests(
-    found: Sequence[tuple[int, int]], ran_in_all: int, least_ns: int
+def _long_enough(
+    wake_ups: Sequence[tuple[int, int]], ran_in_all: int, least_ns: int
 ) -> npt.NDArray[np.int64]:
-    """The wake-ups of one thread after which it ran for so long."""
-    when, ran_by_then = np.array([*found, (0, ran_in_all)], dtype=np.int64).T
+    """The wake-ups of a thread after which it ran for at least so long."""
+    when, ran_by_then = np.array([*wake_ups, (0, ran_in_all)], dtype=np.int64).T
     worked = np.diff(ran_by_then) >= least_ns
     return np.asarray(when[:-1][worked & (when[:-1] > 0)], dtype=np.int64)
 
@@ -178,8 +181,10 @@ def _width(cycle_ns: int) -> int:
 def _places(
     wake_ups: npt.NDArray[np.int64], cycle_ns: int
 ) -> Iterator[tuple[int, int, npt.NDArray[np.int64]]]:
-    """Each place of the cycle that begins with a wake-up: how long nothing woke up before it, in
-    how many cycles something did there, and where in the cycle.
+    """Each place of the cycle that begins with a wake-up.
+
+    Yields how long nothing woke up before it (ns), in how many cycles something did there, and
+    where in the cycle.
     """
     width, places = _width(cycle_ns), np.sort(wake_ups % cycle_ns)
     # A circle has no first place: the first two turns of it have every neighbour.
@@ -200,8 +205,10 @@ def find_drift(
     expected_ns: int,
     slots: Sequence[tuple[int, int]] = (),
 ) -> int | None:
-    """How far behind ``expected_ns`` a thread begins its cycles (ns), if it does: in ``slots``,
-    which count from there, if there are any, since being stopped as one ends wakes a thread too.
+    """How far behind ``expected_ns`` a thread begins its cycles (ns), None: it does not.
+
+    Only wake-ups in ``slots`` count, which count from ``expected_ns``, if there are any: a thread
+    that is stopped as a slot ends wakes up too.
 
         >>> find_drift(np.array([1003, 1070, 1103, 1170, 1203, 1270]), 100, 3, 1000, [(0, 70)])
         3
@@ -216,12 +223,16 @@ def find_drift(
 class DriftWatch:
     """Looks every ten seconds, in a thread of its own, where an executor begins its cycles now.
 
-    ``latest_ns`` is how far that is from where it is expected (None: not seen yet), by look number
-    ``looks``; the next one comes earlier where it is to ``look_soon``. A busy machine may delay a
-    thread for a whole look, and hastens none: ``surely_ns`` is the earlier of the last two. Looking
-    takes a fifth of a core: it is done on ``cores`` or, where there are none, less often, and only
-    near where the cycle began last, unless it is not seen there. It ends with one of the threads,
-    or with a ``failure``: why, as half a sentence.
+    Looking takes a fifth of a core: it is done on ``cores`` or, where there are none, less often,
+    and only near where the cycle began last, unless it is not seen there. It ends with one of the
+    threads, or with a failure.
+
+    latest_ns   how far the beginning is from where it is expected (None: not seen yet)
+    surely_ns   the earlier of the last two: a busy machine may delay a thread for a whole look, and
+                hastens none
+    looks       how many looks have seen the thread
+    look_soon   set it, and the next look comes after a second
+    failure     why the watch has ended, as half a sentence
     """
 
     EVERY_S, SOON_S = 10.0, 1.0
@@ -307,7 +318,7 @@ class DriftWatch:
 
 @contextmanager
 def _undisturbed() -> Iterator[None]:
-    """The calling thread, which sleeps nearly always, at a high priority if that is permitted."""
+    """Give the calling thread, which sleeps nearly always, a high priority if that is permitted."""
     before = state_of(0)
     become_fifo(WATCHER_PRIORITY)
     try:
@@ -318,12 +329,12 @@ def _undisturbed() -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Telling:
-    """Nodes get the phase by a ``script``, if it was not ``refused``, since ``begun`` (s)."""
+    """Nodes that are being given the phase."""
 
     nodes: tuple[str, ...]
-    script: "Script | None"
-    begun: float
-    refused: str | None = None
+    script: "Script | None"  # the process that gives it to them
+    begun: float  # when (s of CLOCK_MONOTONIC)
+    refused: str | None = None  # why no process could be started
 
     def is_over(self) -> bool:
         """Look whether the nodes know, or never will."""

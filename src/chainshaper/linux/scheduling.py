@@ -28,13 +28,11 @@ _THROTTLE = "/proc/sys/kernel/sched_rt_{}_us"
 
 @dataclass(frozen=True)
 class SchedulingRequest:
-    """What a thread should get, or None: a priority of SCHED_FIFO or, if it ``takes_turns``, of
-    SCHED_RR (0: SCHED_OTHER), and cores.
-    """
+    """The class and the cores that a thread is to get; None: as it has."""
 
-    priority: int | None
+    priority: int | None  # 0: SCHED_OTHER
     cores: tuple[int, ...] | None
-    takes_turns: bool = False
+    takes_turns: bool = False  # SCHED_RR in place of SCHED_FIFO
 
     @property
     def policy(self) -> int:
@@ -45,16 +43,16 @@ class SchedulingRequest:
 
 @dataclass(frozen=True)
 class SchedulingClass:
-    """Policy (a number of `sched(7)`), real-time priority, and whether children start without."""
+    """A thread's scheduling class, with its real-time priority."""
 
-    policy: int
-    priority: int
-    reset_on_fork: bool
+    policy: int  # a number of `sched(7)`
+    priority: int  # 0 where the policy has none
+    reset_on_fork: bool  # whether children start as SCHED_OTHER
 
 
 @dataclass(frozen=True)
 class SchedulingState:
-    """All that the kernel has on how a thread is scheduled, SCHED_DEADLINE's numbers apart."""
+    """How a thread is scheduled, all but the numbers of SCHED_DEADLINE."""
 
     scheduling_class: SchedulingClass
     nice: int
@@ -63,24 +61,26 @@ class SchedulingState:
     @property
     def text(self) -> str:
         """For a person: ``SCHED_FIFO 87, nice 0, cores 1, 2``."""
-        own = self.scheduling_class
-        policy = POLICIES.get(own.policy, f"policy {own.policy}")
-        priority = f" {own.priority}" if own.priority else ""
+        scheduling_class = self.scheduling_class
+        policy = POLICIES.get(scheduling_class.policy, f"policy {scheduling_class.policy}")
+        priority = f" {scheduling_class.priority}" if scheduling_class.priority else ""
         return f"{policy}{priority}, nice {self.nice}, cores {', '.join(map(str, self.cores))}"
 
 
 def state_of(tid: int) -> SchedulingState:
     """How a thread is scheduled now. Raises ProcessLookupError: it has ended."""
     policy, priority = os.sched_getscheduler(tid), os.sched_getparam(tid).sched_priority
-    its = SchedulingClass(policy & ~RESET_ON_FORK, priority, bool(policy & RESET_ON_FORK))
+    resets = bool(policy & RESET_ON_FORK)
+    scheduling_class = SchedulingClass(policy & ~RESET_ON_FORK, priority, resets)
     nice = os.getpriority(os.PRIO_PROCESS, tid)
-    return SchedulingState(its, nice, tuple(sorted(os.sched_getaffinity(tid))))
+    return SchedulingState(scheduling_class, nice, tuple(sorted(os.sched_getaffinity(tid))))
 
 
 def set_state(tid: int, target: SchedulingState) -> None:
-    """Give a thread the aspects of a state in which it differs, the class first: as SCHED_OTHER it
-    would not run again where a FIFO thread spins. Raises OSError: it has ended
-    (ProcessLookupError), or the kernel refuses.
+    """Give a thread the aspects of a state in which it differs.
+
+    The class comes first: as SCHED_OTHER it would not run again where a FIFO thread spins. Raises
+    OSError: it has ended (ProcessLookupError), or the kernel refuses.
     """
     for aspect in different_aspects(state_of(tid), target):
         if aspect == "scheduling_class":
@@ -94,27 +94,30 @@ def set_state(tid: int, target: SchedulingState) -> None:
 
 
 def after_wish(now: SchedulingState, wanted: SchedulingRequest) -> SchedulingState:
-    """What a thread has after a wish is fulfilled: what the wish leaves open stays."""
+    """The state of a thread after a request is fulfilled: what the request leaves open stays."""
     if wanted.priority is not None:
-        own = replace(now.scheduling_class, policy=wanted.policy, priority=wanted.priority)
-        now = replace(now, scheduling_class=own)
+        scheduling_class = replace(
+            now.scheduling_class, policy=wanted.policy, priority=wanted.priority
+        )
+        now = replace(now, scheduling_class=scheduling_class)
     return now if wanted.cores is None else replace(now, cores=tuple(sorted(wanted.cores)))
 
 
-def different_aspects(one: SchedulingState, other: SchedulingState) -> list[Aspect]:
-    """In what two states differ, the class first."""
-    return [aspect for aspect in ASPECTS if getattr(one, aspect) != getattr(other, aspect)]
+def different_aspects(first: SchedulingState, second: SchedulingState) -> list[Aspect]:
+    """The aspects in which two states differ, the class first."""
+    return [aspect for aspect in ASPECTS if getattr(first, aspect) != getattr(second, aspect)]
 
 
 def with_aspect(state: SchedulingState, aspect: Aspect, source: SchedulingState) -> SchedulingState:
+    """Take an aspect from another state."""
     values: dict[str, Any] = {aspect: getattr(source, aspect)}
     return replace(state, **values)
 
 
 def state_from_json(values: dict[str, Any]) -> SchedulingState:
-    """What `dataclasses.asdict` made plain."""
-    own = SchedulingClass(**values["scheduling_class"])
-    return SchedulingState(own, values["nice"], tuple(values["cores"]))
+    """Make a state of what `dataclasses.asdict` made of it."""
+    scheduling_class = SchedulingClass(**values["scheduling_class"])
+    return SchedulingState(scheduling_class, values["nice"], tuple(values["cores"]))
 
 
 def apply_scheduling(thread: RunningThread, wanted: SchedulingRequest) -> None:
@@ -146,6 +149,7 @@ def may_use_fifo() -> bool:
 
 
 def available_cores() -> tuple[int, ...]:
+    """The cores that the calling thread may use, ascending."""
     return tuple(sorted(os.sched_getaffinity(0)))
 
 

@@ -37,7 +37,7 @@ ThreadRole: TypeAlias = Literal["executor", "publisher", "dds", "unknown"]
 
 
 def gate_thread_name(node: str) -> str:
-    """What a gate in its publisher's process calls its thread, which fits into 15 characters."""
+    """The name of a gate's thread in its publisher's process, which fits into 15 characters."""
     return f"gate-{zlib.crc32(node.strip('/').encode()):08x}"
 
 
@@ -53,24 +53,22 @@ def role_of(comm: str, is_main: bool) -> ThreadRole:
 
 @dataclass(frozen=True)
 class RunningThread:
-    """A thread as the kernel shows it at one instant: started so many ticks (:data:`TICK_NS`) after
-    the machine, with the id that tracers record in a container (``inner_tid``).
-    """
+    """A thread as the kernel shows it at one instant."""
 
     tid: int
     pid: int
-    comm: str
+    comm: str  # its name
     role: ThreadRole
-    policy: str
-    priority: int
-    cores: tuple[int, ...]
-    started: int = 0
-    inner_tid: int = 0
-    kind: ThreadWork | None = None
+    policy: str  # such as SCHED_FIFO
+    priority: int  # of real-time threads; 0: of no others
+    cores: tuple[int, ...]  # where it may run
+    started: int = 0  # ticks (TICK_NS) after the machine booted
+    inner_tid: int = 0  # its id in its own pid namespace, which tracers record in a container
+    kind: ThreadWork | None = None  # what it does, of a DDS thread
 
     @property
     def identity(self) -> tuple[int, int]:
-        """What no other thread has until the machine boots again: id and start."""
+        """Id and start, which no other thread has until the machine boots again."""
         return (self.tid, self.started)
 
     @property
@@ -86,12 +84,15 @@ def list_threads(pid: int) -> tuple[RunningThread, ...]:
     except OSError:
         return ()
     tids.sort(key=lambda tid: (tid != pid, tid))
-    found = {tid: one for tid in tids if (one := _thread(pid, tid, inner_pid)) is not None}
-    works = runtime_work(thread.comm for thread in found.values())
-    for tid, thread in found.items():
+    threads: dict[int, RunningThread] = {}
+    for tid in tids:
+        if (thread := _thread(pid, tid, inner_pid)) is not None:
+            threads[tid] = thread
+    works = runtime_work(thread.comm for thread in threads.values())
+    for tid, thread in threads.items():
         if tid != pid and thread.comm in works:
-            found[tid] = replace(thread, role="dds", kind=works[thread.comm])
-    return tuple(found.values())
+            threads[tid] = replace(thread, role="dds", kind=works[thread.comm])
+    return tuple(threads.values())
 
 
 def is_of_zenoh(thread: RunningThread) -> bool:
@@ -146,7 +147,7 @@ def living_processes() -> Iterator[tuple[int, int]]:
             if fields[0] not in _DEAD:
                 status = read_proc(f"/proc/{pid}/status")
                 started = int(fields[_STARTED])
-                yield from ((one, started) for one in {pid, innermost_id(status) or pid})
+                yield from ((known, started) for known in {pid, innermost_id(status) or pid})
 
 
 def parents() -> dict[int, int]:
@@ -155,8 +156,10 @@ def parents() -> dict[int, int]:
 
 
 def read_proc(path: str | Path, folder: int | None = None) -> bytes:
-    """A whole file of /proc or /sys, or of an open ``folder`` in it: bytes, since whoever names a
-    program, a file or a group chooses any. Raises OSError: gone, or forbidden.
+    """Read a whole file of /proc or /sys, or of an open ``folder`` in it.
+
+    It is bytes, since who names a program, a file or a group may choose any. Raises OSError: the
+    file is gone, or reading it is forbidden.
     """
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC, dir_fd=folder)
     with os.fdopen(descriptor, "rb", buffering=0) as file:
@@ -185,8 +188,10 @@ def read_stat(folder: str) -> tuple[str, list[bytes]]:
 
 @functools.cache
 def _started_later() -> int:
-    """By how many ticks the kernel shows us all starts later than to those who share no time
-    namespace with us (time_namespaces(7)): a start names a process to all of them alike.
+    """By how many ticks our time namespace has the kernel show starts too late to us.
+
+    See time_namespaces(7). Without this offset, processes outside the namespace would know a
+    process by another start than we do.
     """
     with suppress(OSError, ValueError):  # before Linux 5.6
         for line in lines_of(read_proc("/proc/self/timens_offsets")):
@@ -197,8 +202,10 @@ def _started_later() -> int:
 
 
 def of_another_clock(pid: int) -> bool:
-    """Whether a process may see another CLOCK_MONOTONIC than we do: it has a time namespace of its
-    own (time_namespaces(7)), as containers may have that were moved here while they ran.
+    """Whether a process may see another CLOCK_MONOTONIC than we do.
+
+    It has then a time namespace of its own (time_namespaces(7)), as containers may have that were
+    moved here while they ran.
     """
     return time_namespace(pid) not in (0, time_namespace())
 
@@ -211,7 +218,9 @@ def time_namespace(pid: int | Literal["self"] = "self") -> int:
 
 
 def since_boot_ns() -> int:
-    """For how long the machine has run, sleep included: the clock of :attr:`Thread.started`."""
+    """For how long the machine has run, sleep included: the clock of
+    :attr:`RunningThread.started`.
+    """
     return time.clock_gettime_ns(time.CLOCK_BOOTTIME) - _started_later() * TICK_NS
 
 
