@@ -76,7 +76,8 @@ docs: .venv/.ready-dev
 # What is compiled: the native library, and what stands in front of ROS 2 (core/CMakeLists.txt). Where
 # some of it has changed, scripts/setup builds again, and only that.
 compiled := $(shell find core -type f) $(wildcard src/chainshaper/robot/*.py) \
-	src/chainshaper/sources/preload/preload.c \
+	src/chainshaper/sources/preload/preload.c src/chainshaper/sources/preload/events_header.py \
+	src/chainshaper/values/event_declarations.py \
 	$(shell find src/chainshaper/robot -name '*.[ch]pp*')
 
 .venv/.ready: pyproject.toml scripts/setup $(compiled)

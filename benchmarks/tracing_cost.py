@@ -25,9 +25,9 @@ from rich.table import Table
 
 from chainshaper.sources import Tracer
 from chainshaper.sources.ebpf import EbpfTracer
-from chainshaper.sources.ebpf.trace_points import installed_libraries
 from chainshaper.sources.lttng import LttngSession
 from chainshaper.sources.preload import PreloadTracer
+from chainshaper.sources.tracing_library import installed_libraries
 from chainshaper.values.errors import ChainshaperError
 
 sys.path.append(str(Path(__file__).resolve().parents[1] / "tests/helpers"))

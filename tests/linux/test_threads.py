@@ -21,9 +21,7 @@ from chainshaper.linux.scheduling import (
     throttle_fraction,
 )
 from chainshaper.linux.threads import (
-    DdsKind,
     RunningThread,
-    dds_kind,
     find_thread,
     foreign_realtime_processes,
     innermost_id,
@@ -32,8 +30,9 @@ from chainshaper.linux.threads import (
     start_of,
 )
 from chainshaper.values.errors import OperationError, PlatformError
+from chainshaper.values.middleware import ThreadWork, thread_work
 
-KINDS: dict[DdsKind, tuple[str, ...]] = {
+KINDS: dict[ThreadWork, tuple[str, ...]] = {
     "receive": ("recv", "recvUC", "recvMC", "dds.udp.7410", "dds.shm.7413", "dds.tcp.5100"),
     "delivery": ("dq.user", "dq.camera"),
     "transmit": ("xmit.user", "sendq"),
@@ -52,8 +51,8 @@ KINDS: dict[DdsKind, tuple[str, ...]] = {
 
 
 @pytest.mark.parametrize(("kind", "names"), KINDS.items(), ids=list(KINDS))
-def test_threads_of_middleware_are_known_by_name(kind: DdsKind, names: tuple[str, ...]) -> None:
-    assert {dds_kind(name) for name in names} == {kind}
+def test_threads_of_middleware_are_known_by_name(kind: ThreadWork, names: tuple[str, ...]) -> None:
+    assert {thread_work(name) for name in names} == {kind}
     role = "publisher" if kind == "asynchronous publisher" else "dds"
     assert {role_of(name, is_main=False) for name in names} == {role}
 
@@ -63,7 +62,7 @@ OTHERS = ["talker", "recvX", "gcc", "ddsperf", "", "python3", "tevatron", "rx-0"
 
 @pytest.mark.parametrize("name", OTHERS)
 def test_names_of_others_say_nothing(name: str) -> None:
-    assert dds_kind(name) is None
+    assert thread_work(name) is None
     assert role_of(name, is_main=False) == "unknown"
     assert role_of(name, is_main=True) == role_of("gc", is_main=True) == "executor"
 

@@ -290,7 +290,7 @@ def test_what_the_machine_lacks_is_named_with_the_remedy(
 ) -> None:
     skip_without_bpftrace()
     any_command = EbpfTracer(tmp_path, ("any",), ())
-    monkeypatch.setattr("chainshaper.sources.ebpf.trace_points._INSTALLATIONS", tmp_path)
+    monkeypatch.setattr("chainshaper.sources.tracing_library._INSTALLATIONS", tmp_path)
     with pytest.raises(PlatformError, match=r"no libtracetools.so in AMENT_PREFIX_PATH"):
         any_command.start()
     disabled = build(tmp_path / "prefix", "-DDISABLED")
@@ -299,7 +299,7 @@ def test_what_the_machine_lacks_is_named_with_the_remedy(
         any_command.start()
     with pytest.raises(InputError, match=rf"process {os.getpid()} neither uses libtracetools.so"):
         EbpfTracer(tmp_path, (), (os.getpid(),)).start()
-    monkeypatch.setattr("chainshaper.sources.ebpf.trace_points.mapped_libraries", lambda _: {})
+    monkeypatch.setattr("chainshaper.sources.ebpf.mapped_libraries", lambda _: {})
     with pytest.raises(OperationError, match="no ROS 2 node to attach to"):
         EbpfTracer(tmp_path, (), ()).start()
     monkeypatch.setenv("PATH", str(tmp_path))

@@ -12,7 +12,6 @@ from traced_program import built, skip_without_bpftrace
 from chainshaper.sources.ebpf import lost_events
 from chainshaper.sources.ebpf.trace_points import (
     FIRST_POINT,
-    FUNCTION_PREFIX,
     HEADER,
     NAME_PLACE,
     RMW_PLACE,
@@ -21,11 +20,14 @@ from chainshaper.sources.ebpf.trace_points import (
     TEXT_LINES,
     Printed,
     TracePoint,
-    TracingLibrary,
     bpftrace_script,
-    installed_libraries,
     read_printed,
     trace_points,
+)
+from chainshaper.sources.tracing_library import (
+    FUNCTION_PREFIX,
+    TracingLibrary,
+    installed_libraries,
 )
 from chainshaper.values import events
 from chainshaper.values.errors import InputError

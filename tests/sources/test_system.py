@@ -2,7 +2,8 @@
 
 import polars as pl
 
-from chainshaper.sources.system import distribution_of, rmw_of_gids, rmw_of_threads
+from chainshaper.sources.system import distribution_of, rmw_of_gids
+from chainshaper.values.middleware import rmw_of_threads
 
 OLD = {"rmw_publish": {"message"}}
 NEW = {"rmw_publish": {"message", "timestamp"}}

@@ -8,14 +8,10 @@ from pathlib import Path
 import pytest
 from traced_program import built
 
-from chainshaper.sources.ebpf import trace_points
-from chainshaper.sources.ebpf.functions import (
-    callback_functions,
-    demangled,
-    exported_functions,
-    type_argument,
-)
-from chainshaper.sources.ebpf.trace_points import installed_libraries, mapped_libraries
+from chainshaper.sources import tracing_library
+from chainshaper.sources.ebpf.functions import callback_functions, demangled, type_argument
+from chainshaper.sources.elf import exported_functions
+from chainshaper.sources.tracing_library import installed_libraries, mapped_libraries
 
 SOURCE = Path(__file__).with_name("callbacks.cpp")
 BOUND = "std::_Bind<void (Relay::*(Relay*"
@@ -42,7 +38,7 @@ def test_every_prefix_of_the_environment_is_searched_and_a_file_counts_once(
     jazzy, humble = built(), built("-DHUMBLE", version="4.1.1")
     for name, one in (("jazzy", jazzy), ("humble", humble)):
         (tmp_path / name).symlink_to(one.prefix)
-    monkeypatch.setattr(trace_points, "_INSTALLATIONS", tmp_path)  # finds both once more
+    monkeypatch.setattr(tracing_library, "_INSTALLATIONS", tmp_path)  # finds both once more
     found = installed_libraries(
         {
             "AMENT_PREFIX_PATH": f"{tmp_path}/nothing:{jazzy.prefix}:",

@@ -16,7 +16,7 @@ import chainshaper as cs
 from chainshaper import measure_latency, run_application
 from chainshaper.analysis import data_flow
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, ThreadInfo
 from chainshaper.workload.description import ExecutionTime, load_application
@@ -153,7 +153,9 @@ def test_the_seed_determines_the_execution_times(privileged: Recording, shaped: 
             assert np.median(excess) < 500_000, "that is not the drawn sequence"
 
 
-def test_shaped_outputs_leave_in_their_slot_or_are_counted(shaped: Recording, plan: Plan) -> None:
+def test_shaped_outputs_leave_in_their_slot_or_are_counted(
+    shaped: Recording, plan: ChainPlan
+) -> None:
     """Every message left inside a slot, or overran it and left at once, as the plan has it."""
     releases = shaped.events["gate_release"]
     assert set(releases["anchor"]) == {"stamp"}

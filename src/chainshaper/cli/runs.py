@@ -84,7 +84,10 @@ def demo(
     before, after = (one.recording for one in compared.measurements)
     flow = cs.data_flow(before.events, before.info.clock_offset_ns)
     tables = [callback_table(cs.callback_statistics(flow))]
-    tables += [plan_table(cs.load_plan(folder / "plan.yaml")), comparison_tables(compared)[0]]
+    tables += [
+        plan_table(cs.load_plan(folder / "plan.yaml").chains[0]),
+        comparison_tables(compared)[0],
+    ]
     if out.present(json, comparison_json(compared) | {"folder": str(folder)}, *tables):
         out.notes(dict.fromkeys((*before.info.notes, *after.info.notes)))
         out.show_line(folder.absolute())

@@ -3,7 +3,6 @@
 import importlib.metadata
 import os
 import platform
-import re
 import resource
 import shutil
 import subprocess
@@ -12,10 +11,15 @@ from pathlib import Path
 
 from chainshaper.enforcement.back_ends import offered_back_ends
 from chainshaper.linux.own_processes import tool_environment
-from chainshaper.linux.processes import MIDDLEWARE_LIMITS
 from chainshaper.linux.scheduling import available_cores, may_use_fifo, throttle_fraction
 from chainshaper.linux.threads import foreign_realtime_processes
 from chainshaper.values.errors import text_of
+from chainshaper.values.middleware import (
+    DEFAULT_MIDDLEWARE,
+    MIDDLEWARE_LIMITS,
+    limit_by_settings,
+    middleware_of,
+)
 from chainshaper.values.recording import Check, MachineReport, State
 
 
@@ -114,18 +118,19 @@ def _dds() -> Check:
 def _middleware() -> Iterator[Check]:
     """What is limited on the middleware that the environment chooses; no check without ROS 2."""
     distribution = os.environ.get("ROS_DISTRO")
-    rmw = os.environ.get("RMW_IMPLEMENTATION") or ("rmw_fastrtps_cpp" if distribution else None)
-    if rmw is None:
-        return
-    limits = {"rmw_zenoh_cpp": "zenoh", "rmw_connextdds": "connext", "rmw_gurumdds_cpp": "unnamed"}
-    limit = limits.get(rmw)
-    if rmw.startswith("rmw_fastrtps") and distribution in ("humble", "iron"):
-        limit = "unnamed"
-    configured = os.environ.get("CYCLONEDDS_URI", "")
-    if rmw == "rmw_cyclonedds_cpp" and re.search(r"iox|<SharedMemory>", configured):
-        limit = "iceoryx"
-    found = MIDDLEWARE_LIMITS.get(limit or "", f"{rmw} is not known")
-    good = None if limit or not re.match("rmw_(cyclonedds|fastrtps)", rmw) else rmw
+    rmw = os.environ.get("RMW_IMPLEMENTATION")
+    if not rmw:
+        if not distribution:
+            return
+        rmw = DEFAULT_MIDDLEWARE.rmw
+    good, found = None, f"{rmw} is not known"
+    middleware = middleware_of(rmw)
+    if middleware is not None:
+        limit = limit_by_settings(middleware, distribution, os.environ)
+        if limit is None:
+            good = rmw
+        else:
+            found = MIDDLEWARE_LIMITS[limit]
     purpose = "delivery threads, in their place beside a chain"
     remedy = "RMW_IMPLEMENTATION=rmw_cyclonedds_cpp, or measure what `shape` makes of it"
     yield _check("middleware", purpose, good, "limited", found, remedy)

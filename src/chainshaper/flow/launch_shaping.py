@@ -32,9 +32,8 @@ from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_co
 from chainshaper.flow.record import Scheduling, record_command
 from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
-from chainshaper.planning import ApplicationPlan, Plan, PlanRequest, Profile
+from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile
 from chainshaper.planning import request as requests
-from chainshaper.planning.application_plan import whole
 from chainshaper.planning.profile import doubts_about
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.node_kinds import language_of
@@ -56,11 +55,11 @@ class ShapedLaunch:
 
     folder: Path
     chain: str  # the first
-    plan: Plan  # of the first chain
+    plan: ChainPlan  # of the first chain
     splicing: Splicing | None  # None: no output has a shaping node
     comparison: Comparison  # of the first chain
     notes: tuple[str, ...]
-    application: ApplicationPlan
+    application: Plan
     comparisons: tuple[Comparison, ...]  # of every chain and sink
     cores: Mapping[str, int]  # where each node's executor ran
 
@@ -89,7 +88,7 @@ def shape_launch(
     max_latency_ns: int | None = None,
     users: Collection[str | int] = (),
     stop: threading.Event | None = None,
-    planned: Callable[[Plan | ApplicationPlan], None] = lambda _: None,
+    planned: Callable[[Plan], None] = lambda _: None,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> ShapedLaunch:
     """Measure chains of a launched application, plan, splice, apply, and measure again.
@@ -148,8 +147,8 @@ def shape_launch(
     progress(0.0, "planning")
     profiles = [measured[place].profile for place in range(len(wanted))]
     plan, remarks = _planned(profiles, len(chains), request)
-    planning.save_application_plan(plan, folder / "plan.yaml")
-    planned(plan if len(plan.chains) > 1 else plan.chains[0])
+    planning.save_plan(plan, folder / "plan.yaml")
+    planned(plan)
     notes += remarks
     splicing = None
     if plan.shaping_nodes:
@@ -271,7 +270,7 @@ class _Recorder:
         duration_ns: int,
         *,
         scheduling: Scheduling | None = None,
-        plan: ApplicationPlan | None = None,
+        plan: Plan | None = None,
         gate_logs: Sequence[Path] = (),
         chain: str | None = None,
     ) -> Recording:
@@ -333,7 +332,7 @@ def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanReq
 
 def _planned(
     profiles: Sequence[Profile], chains: int, request: PlanRequest
-) -> tuple[ApplicationPlan, list[str]]:
+) -> tuple[Plan, list[str]]:
     """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
     if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
@@ -341,10 +340,10 @@ def _planned(
     if chains > 1:
         plan, remarks = planning.plan_application(profiles, request)
         return plan, remarks + doubts
-    return whole(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
+    return Plan.of(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
 
 
-def _with_types(recordings: Sequence[Recording], plan: ApplicationPlan) -> Recording:
+def _with_types(recordings: Sequence[Recording], plan: Plan) -> Recording:
     """The first recording by whose end discovery had shown the types of all outputs, if any."""
     outputs = {node.output for node in plan.shaping_nodes}
 
@@ -377,7 +376,7 @@ def _sourced(splicing: Splicing) -> list[str]:
 
 @contextmanager
 def plan_in_force(
-    plan: ApplicationPlan,
+    plan: Plan,
     back_end: str,
     recording: Recording,
     users: frozenset[int],

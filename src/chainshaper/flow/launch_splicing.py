@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
-from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
+from chainshaper.planning.chain_plan import ChainPlan, ShapingNode, revised, shaping_nodes
+from chainshaper.planning.plan import Plan
 from chainshaper.robot.throttling import Rule
 from chainshaper.sources.preload import ANY_ORDER, SANITIZER
 from chainshaper.sources.ros import own_environment, run_with_rclpy
@@ -31,6 +31,7 @@ from chainshaper.splicing.shaping_process import (
 )
 from chainshaper.values.errors import InputError, OperationError, PlatformError, storable
 from chainshaper.values.files import scratch_folder, write_whole
+from chainshaper.values.middleware import middleware_of
 from chainshaper.values.plan_choices import STANDBY, Fallback, NodeChoice, NodeLanguage
 from chainshaper.values.yaml_file import FullName, Part, PositiveDuration
 
@@ -76,7 +77,7 @@ class ThrottledInput(Part):
 
 
 def splice_launch_files(
-    plan: Plan | ApplicationPlan,
+    plan: Plan,
     launch_files: Sequence[str | Path],
     output: str | Path,
     *,
@@ -101,10 +102,9 @@ def splice_launch_files(
     folder is not ours. OperationError: the folder cannot be written, or a dry run finds too few or
     too many redirections. PlatformError: there is no ROS 2 environment for a dry run.
     """
-    joint = whole(plan)
     if fallback is not None:
-        joint = combined([revised(chain, fallback=fallback) for chain in joint.chains])
-    if without := [chain for chain in joint.chains if chain.shaping_node is None]:
+        plan = Plan.of(*[revised(chain, fallback=fallback) for chain in plan.chains])
+    if without := [chain for chain in plan.chains if chain.shaping_node is None]:
         raise nothing_to_splice(without[0])
     folder = launching.usable(Path(output))
     for path in (folder, *launch_files):
@@ -116,7 +116,7 @@ def splice_launch_files(
     known = _endpoints(recording, "publisher")
     every = [
         (chain, one, _publisher(chain, one, known))
-        for chain in joint.chains
+        for chain in plan.chains
         for one in shaping_nodes(chain)
     ]
     redirects = []
@@ -135,7 +135,7 @@ def splice_launch_files(
     if recording is not None:
         serialized = [one.output for _, one, _ in every if kinds.get(one.name) in _SERIALIZED]
         _refuse_undelivered(recording, {output: types.get(output, "") for output in serialized})
-    logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
+    logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in plan.shaping_nodes}
 
     def written(into: Path) -> _Written:
         made, blocks = list[ShapingProcess](), list[str]()
@@ -170,7 +170,7 @@ def splice_launch_files(
 
 
 def _kinds_of(
-    every: Sequence[tuple[Plan, ShapingNode, str]],
+    every: Sequence[tuple[ChainPlan, ShapingNode, str]],
     chosen: tuple[NodeLanguage, str],
     types: Mapping[str, str],
     recording: "Recording | None",
@@ -198,12 +198,14 @@ def _kinds_of(
 def _refuse_undelivered(recording: "Recording", types: Mapping[str, str]) -> None:
     """Refuse nodes that take outputs of these types serialized where none is delivered so.
 
-    From Lyrical on rmw_fastrtps_cpp has a reader of its own for messages with a field ``uint8[]``,
-    at which `rmw_take_serialized_message` does not look (rmw_fastrtps 9.4.7, `take_buffer_aware`).
-    Raises InputError.
+    Which middleware does not deliver them is in :mod:`chainshaper.values.middleware`
+    (``undelivered_bytes``). Raises InputError.
     """
     info = recording.info
-    if info.rmw != "rmw_fastrtps_cpp" or info.distribution not in ("lyrical", "rolling"):
+    middleware = middleware_of(info.rmw)
+    if middleware is None or info.rmw != middleware.rmw:
+        return
+    if info.distribution not in middleware.undelivered_bytes:
         return
     for output, message_type in types.items():
         if has_bytes(message_type):
@@ -373,7 +375,7 @@ def _subscribers(one: ThrottledInput, known: _Names | None) -> Sequence[str]:
     return sorted(known[one.topic])
 
 
-def _publisher(plan: Plan, node: ShapingNode, known: _Names | None) -> str:
+def _publisher(plan: ChainPlan, node: ShapingNode, known: _Names | None) -> str:
     standby = f"/{node.name}{STANDBY}"
     names = sorted(name for name in (known or {}).get(node.output, ()) if name != standby)
     if len(names) > 1:

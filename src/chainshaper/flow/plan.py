@@ -30,7 +30,6 @@ from chainshaper.analysis.contradictions import refuse_contradicted
 from chainshaper.analysis.disturbance import overlapping, stalled_within
 from chainshaper.analysis.graph import goes_on_elsewhere
 from chainshaper.analysis.latency import Executor
-from chainshaper.linux.threads import dds_kind
 from chainshaper.planning import CallbackTimes, Modes, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.margins import read_latencies
 from chainshaper.planning.profile import UNKNOWN, Interfering, Reception
@@ -39,6 +38,7 @@ from chainshaper.values import events
 from chainshaper.values.application import INTERNAL_TOPICS, ApplicationGraph, Callback, Chain
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
+from chainshaper.values.middleware import middleware_of, thread_work
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import PARTS, chain_of, longest_stall, opened
@@ -631,7 +631,7 @@ def _writer(recording: Recording, flow: DataFlow, node: str, topic: str) -> dict
 
     No event says when a publication was over: not after the end of its callback, the next that the
     callback made, and when all subscribers had the message. Whether a thread of the process
-    publishes shows where DDS threads have names; under Cyclone DDS the thread that publishes sends.
+    publishes shows where DDS threads have names; some middleware has no such threads.
     """
     own, time = (pl.col("topic") == topic) & (pl.col("node") == node), pl.col("time")
     readers = flow.takes.drop_nulls("publication").group_by("publication").agg(taken=time.max())
@@ -652,11 +652,12 @@ def _writer(recording: Recording, flow: DataFlow, node: str, topic: str) -> dict
     pids = {thread.pid for thread in threads if thread.node == node}
     own_threads = [thread for thread in threads if thread.pid in pids]
     roles = {thread.role for thread in own_threads}
-    have_names = any(dds_kind(thread.comm) is not None for thread in own_threads)
-    sends_itself = False if recording.info.rmw == "rmw_cyclonedds_cpp" else None
+    have_names = any(thread_work(thread.comm) is not None for thread in own_threads)
+    middleware = middleware_of(recording.info.rmw)
+    is_synchronous = middleware is not None and middleware.is_synchronous
     return {
         "longest_publication_ns": _longest_calm(flow, sent),
-        "asynchronous": "publisher" in roles if have_names else sends_itself,
+        "asynchronous": "publisher" in roles if have_names else (False if is_synchronous else None),
         "intra_process": True if handed.height else None,
         "output_depth": depths.filter(depths > 0).min(),
     }
@@ -706,4 +707,4 @@ def plan_recording(
         raise InputError("one chain goes here: profile several, and plan with `plan_application`")
     wanted = (chain, *sinks)
     profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
-    return plan_chain(profile, request, further)
+    return Plan.of(plan_chain(profile, request, further))

@@ -22,7 +22,7 @@ from typing import TypeAlias, TypeVar
 
 from chainshaper.analysis.objects import resolve_objects
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
-from chainshaper.enforcement.threads import allocate, strangers_text
+from chainshaper.enforcement.node_threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux import processes as running
@@ -30,8 +30,7 @@ from chainshaper.linux.own_processes import check_command, end_command, end_in_w
 from chainshaper.linux.processes import RunningProcess, find_applications
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
-from chainshaper.planning import ApplicationPlan, Plan
-from chainshaper.planning.application_plan import whole
+from chainshaper.planning import Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources import Tracer, ebpf, lttng, preload
 from chainshaper.sources.ebpf.late_attachment import with_found_nodes
@@ -109,7 +108,7 @@ def record_command(
     buffer: int | None = None,
     chain: str | None = None,
     scheduling: Scheduling | None = None,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     gate_logs: Sequence[Path] = (),
     watch_stalls: bool = False,
     command_stdout: int | None = None,
@@ -285,9 +284,7 @@ def _look(run: _RecordedRun) -> None:
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
 
 
-def _written(
-    output: Path, run: _RecordedRun, chain: str | None, plan: Plan | ApplicationPlan | None
-) -> Recording:
+def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | None) -> Recording:
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
         tables = {**tables, "machine_stall": run.stalls.table}
@@ -328,7 +325,7 @@ def _written(
         "realtime": run.schedule is not None or in_real_time,
         "stall_meter": run.stalls.info,
         "chain": chain,
-        "plan": None if plan is None else plan_values(whole(plan)),
+        "plan": None if plan is None else plan_values(plan),
         "in_force": None if plan is None else recordings.InForceInfo(since_ns=since_ns),
         "notes": tuple(notes),
     }

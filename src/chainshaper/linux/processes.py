@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 from chainshaper.linux.threads import (
     RunningThread,
-    dds_kind,
     innermost_id,
     is_of_zenoh,
     lines_of,
@@ -35,6 +34,14 @@ from chainshaper.linux.threads import (
     status_field,
 )
 from chainshaper.values.errors import InputError, text_of
+from chainshaper.values.middleware import (
+    MIDDLEWARES,
+    ZENOH,
+    Middleware,
+    MiddlewareLimit,
+    limit_by_thread,
+    thread_work,
+)
 
 _AT_UID = 11
 _AUXILIARY = struct.Struct("@NN")
@@ -43,23 +50,6 @@ _RULE = re.compile(
 )
 _WITH_VALUE = {"-p", "--param", "--params-file", "-e", "--enclave"}
 _WITH_VALUE |= {"--log-level", "--log-config-file", "--log-file-name"}
-_FAST_DDS = b"/libfastrtps.so"
-_WITHOUT_NAMED_THREADS = ("fastrtps", "fastdds", "nddscore", "gurumdds", "rmw_zenoh_cpp")
-ROUTERS = frozenset({"/rmw_zenohd", "/zenohd"})
-"""Zenoh's router, by the name of its program: messages may pass through it."""
-
-_OF_ICEORYX = "KeepAlive"  # `posh_runtime_impl.cpp`; its `Listener` names no thread
-_NEVER_RAN = "its threads are known by rules from its {}, and chainshaper never ran on it"
-MIDDLEWARE_LIMITS = {
-    "zenoh": f"Zenoh: {_NEVER_RAN.format('sources')}",
-    "connext": f"RTI Connext: {_NEVER_RAN.format('manual')}",
-    "iceoryx": f"Cyclone DDS with iceoryx: {_NEVER_RAN.format('sources')}; the thread that"
-    " delivers has no name, and stays as it is",
-    "unnamed": "the middleware's threads have no names (Fast DDS before 2.13, GurumDDS): Fast DDS's"
-    " that receive are known by what they wait for; others stay as they are, and may wait for a"
-    " chain on the same core",
-}
-"""What is limited on a middleware, in a line; what is not here was run."""
 
 
 def run_users(named: Collection[str | int] = ()) -> frozenset[int]:
@@ -195,15 +185,18 @@ def _participation(
     if len(threads) > 1:
         with suppress(OSError):  # another user's: its threads' names are all there is to see
             mapped = read_proc(f"/proc/{pid}/maps")
-            if _FAST_DDS in mapped:
-                regions = list(regions_in(mapped))
-                threads = tuple(
-                    replace(one, role="dds", kind="receive")
-                    if one.tid != pid and _receives_for_fast_dds(one, regions)
-                    else one
-                    for one in threads
-                )
-            return any(b"/lib%s.so" % n.encode() in mapped for n in _WITHOUT_NAMED_THREADS), threads
+            for middleware in MIDDLEWARES:
+                waited_in = middleware.receivers_wait_in
+                if waited_in and waited_in.encode() in mapped:
+                    regions = list(regions_in(mapped))
+                    threads = tuple(
+                        replace(thread, role="dds", kind="receive")
+                        if thread.tid != pid and _receives(thread, regions, middleware)
+                        else thread
+                        for thread in threads
+                    )
+            names = [name for middleware in MIDDLEWARES for name in middleware.nameless_libraries]
+            return any(f"/lib{name}.so".encode() in mapped for name in names), threads
     return False, threads
 
 
@@ -239,10 +232,12 @@ _OF_LANGUAGE = re.compile(r"/(lib(c|pthread|stdc\+\+|gcc_s)|ld-linux[-\w]*)[-.]|
 _OUTERMOST = 16_384  # so near are a thread's first frames to where it waits, and to its stack's end
 
 
-def _receives_for_fast_dds(thread: RunningThread, regions: Sequence[Region]) -> bool:
-    """Whether a thread, of a process with Fast DDS before 2.13, receives: it waits for a datagram,
-    or for a word in the memory of a port, and the library's function is the first on its stack. Not
-    known of one that runs just now, nor without ptrace(2)'s PTRACE_MODE_ATTACH.
+def _receives(thread: RunningThread, regions: Sequence[Region], middleware: Middleware) -> bool:
+    """Whether a thread without a name receives for a middleware.
+
+    It does if it waits for a datagram, or for a word in the memory of a port, and the middleware's
+    function is the first on its stack. False too for one that runs just now, and without
+    ptrace(2)'s PTRACE_MODE_ATTACH.
     """
     receive, futex = _SYSCALLS.get(platform.machine(), ((), -1))
     try:
@@ -250,7 +245,7 @@ def _receives_for_fast_dds(thread: RunningThread, regions: Sequence[Region]) -> 
         if len(values) < 8:  # it runs, or sleeps outside of a system call
             return False
         word, stack = (region_at(regions, int(values[k], 16)) for k in (0, 6))
-        at_port = int(number) == futex and word is not None and "/fastrtps_port" in word.path
+        at_port = int(number) == futex and word is not None and middleware.port_memory in word.path
         if stack is None or not (at_port or int(number) in receive):
             return False
         top = int(values[6], 16)
@@ -262,23 +257,21 @@ def _receives_for_fast_dds(thread: RunningThread, regions: Sequence[Region]) -> 
     for (address,) in reversed([*struct.iter_unpack("=Q", data)]):  # the outermost frame first
         found = region_at(regions, address) if address >= lowest else None
         if found is not None and found.executable and not _OF_LANGUAGE.search(found.path):
-            return _FAST_DDS.decode() in found.path
+            return middleware.receivers_wait_in in found.path
     return False
 
 
-def middleware_limit(process: RunningProcess) -> str | None:
-    """The key in :data:`MIDDLEWARE_LIMITS` of a process that takes part, by its threads."""
-    others = [one for one in process.threads if one.tid != process.pid]
+def middleware_limit(process: RunningProcess) -> MiddlewareLimit | None:
+    """What is limited in a process that takes part in DDS, as far as its threads tell."""
+    others = [thread for thread in process.threads if thread.tid != process.pid]
     if not process.participates or not others:
         return None
     if any(map(is_of_zenoh, others)):
-        return "zenoh"
-    if any(one.comm == _OF_ICEORYX for one in others):
-        return "iceoryx"
-    named = {one.comm[:3] for one in others if dds_kind(one.comm) is not None}
-    if named & {"rCo", "rTr"}:
-        return "connext"
-    return None if named else "unnamed"
+        return ZENOH.limit
+    for thread in others:
+        if (limit := limit_by_thread(thread.comm)) is not None:
+            return limit
+    return None if any(thread_work(thread.comm) is not None for thread in others) else "unnamed"
 
 
 def takes_ros_arguments(command: Sequence[str]) -> bool:

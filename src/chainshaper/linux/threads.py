@@ -1,16 +1,13 @@
 """Threads as the kernel shows them, and what their names say.
 
-A thread is identified by its id *and* its start: ids are used again. Cyclone DDS names its threads,
-and Fast DDS from 2.13 on (ROS 2 Jazzy); before, those that receive are known by what they wait for
-(:mod:`.processes`). Zenoh's names are short words (`rx-0`): a process has to have several of them.
+A thread is identified by its id *and* its start: ids are used again. The names of a
+middleware's threads are in :mod:`chainshaper.values.middleware`.
 
-Upstream: proc(5); Cyclone DDS, `ddsi_create_thread`; Fast DDS, "Concurrency and multithreading";
-Zenoh, `zenoh-runtime` and `zenoh-shm/src/watchdog`; RTI Connext, "Identifying Threads".
+Upstream: proc(5).
 """
 
 import functools
 import os
-import re
 import time
 import zlib
 from collections.abc import Iterator
@@ -20,6 +17,7 @@ from pathlib import Path
 from typing import Literal, TypeAlias
 
 from chainshaper.values.errors import text_of
+from chainshaper.values.middleware import ThreadWork, is_runtime_name, runtime_work, thread_work
 
 SCHED_DEADLINE = 6
 RESET_ON_FORK = getattr(os, "SCHED_RESET_ON_FORK", 0x40000000)
@@ -37,51 +35,6 @@ POLICIES[7] = "SCHED_LITMUS" if Path("/proc/litmus").is_dir() else "SCHED_EXT"
 ThreadRole: TypeAlias = Literal["executor", "publisher", "dds", "unknown"]
 """``publisher``: sends what executors hand over to it (asynchronous publication, section 2.2)."""
 
-DdsKind: TypeAlias = str
-"""What a DDS thread does, in the words of the tables below."""
-
-_DDS_NAMES: tuple[tuple[str, DdsKind], ...] = (  # the first that matches a whole name counts
-    # Cyclone DDS 0.10 and 11; per channel, `user` unless the configuration defines others.
-    (r"recv(UC|MC)?", "receive"),
-    (r"dq\.builtins", "discovery"),
-    (r"dq\..*", "delivery"),
-    (r"sendq|xmit\..*", "transmit"),
-    (r"tev(\..*)?", "event"),  # heartbeats, retransmissions, discovery announcements
-    (r"gc", "garbage collection"),
-    (r"lease", "lease"),
-    (r"fsm", "connection"),
-    (r"debmon|threadmon", "housekeeping"),
-    # Fast DDS; per participant, port or reader.
-    (r"dds\.asyn\.\d+\.0", "resend"),  # what synchronous writers could not send
-    (r"dds\.asyn\..*", "asynchronous publisher"),
-    (r"dds\.tcp_(accept|keep)", "connection"),
-    (r"dds\.shm\.wdog", "housekeeping"),
-    (r"dds\.(udp|tcp|shm|dsha)\..*", "receive"),
-    (r"dds\.ev\..*", "event"),
-    (r"dds\.(ds_ev|tls)\..*", "discovery"),
-    (r"dds\..*", "housekeeping"),
-    # RTI Connext: module, domain, participant, then a task that no manual lists completely.
-    (r"r(Co|Tr)\d{5}.*", "housekeeping"),
-    (r"Watchdog (Confir|Valida)\w*", "housekeeping"),  # Zenoh's shared memory
-)
-
-_ZENOH_RUNTIMES: dict[str, DdsKind] = {
-    "rx": "receive",  # takes messages from links, and runs what subscriptions registered
-    "tx": "transmit",  # sends what publishers hand over, and what keeps a link alive
-    "acc": "connection",
-    "net": "connection",
-    "app": "event",
-}
-_ZENOH_NAME = re.compile(rf"({'|'.join(_ZENOH_RUNTIMES)})-\d+")
-_SURELY_ZENOH = 3  # runtimes; the variable ZENOH_RUNTIME may join two of the five to others
-
-
-@functools.lru_cache(maxsize=1024)
-def dds_kind(comm: str) -> DdsKind | None:
-    """What a DDS thread of this name does; None when it is no DDS thread's name."""
-    found = (kind for name, kind in _DDS_NAMES if re.fullmatch(name, comm, re.DOTALL))
-    return next(found, None)
-
 
 def gate_thread_name(node: str) -> str:
     """What a gate in its publisher's process calls its thread, which fits into 15 characters."""
@@ -92,7 +45,7 @@ def role_of(comm: str, is_main: bool) -> ThreadRole:
     """The role of a thread of a node's process, as far as its name shows."""
     if is_main:
         return "executor"  # executors spin there, unless a program arranges it otherwise
-    kind = dds_kind(comm)
+    kind = thread_work(comm)
     if kind == "asynchronous publisher":
         return "publisher"
     return "unknown" if kind is None else "dds"
@@ -113,7 +66,7 @@ class RunningThread:
     cores: tuple[int, ...]
     started: int = 0
     inner_tid: int = 0
-    kind: DdsKind | None = None
+    kind: ThreadWork | None = None
 
     @property
     def identity(self) -> tuple[int, int]:
@@ -134,17 +87,16 @@ def list_threads(pid: int) -> tuple[RunningThread, ...]:
         return ()
     tids.sort(key=lambda tid: (tid != pid, tid))
     found = {tid: one for tid in tids if (one := _thread(pid, tid, inner_pid)) is not None}
-    names = ((tid, _ZENOH_NAME.fullmatch(one.comm)) for tid, one in found.items())
-    zenoh = {tid: name[1] for tid, name in names if name is not None}
-    if len(set(zenoh.values())) >= _SURELY_ZENOH:
-        for tid in zenoh.keys() - {pid}:
-            found[tid] = replace(found[tid], role="dds", kind=_ZENOH_RUNTIMES[zenoh[tid]])
+    works = runtime_work(thread.comm for thread in found.values())
+    for tid, thread in found.items():
+        if tid != pid and thread.comm in works:
+            found[tid] = replace(thread, role="dds", kind=works[thread.comm])
     return tuple(found.values())
 
 
 def is_of_zenoh(thread: RunningThread) -> bool:
     """Whether a thread with its role is one of Zenoh's runtimes."""
-    return thread.kind is not None and _ZENOH_NAME.fullmatch(thread.comm) is not None
+    return thread.kind is not None and is_runtime_name(thread.comm)
 
 
 def find_thread(tid: int) -> RunningThread | None:
@@ -176,7 +128,7 @@ def _thread(pid: int, tid: int, inner_pid: int | None) -> RunningThread | None:
         cores=cores,
         started=int(fields[_STARTED]),
         inner_tid=inner_tid,
-        kind=None if tid == pid else dds_kind(comm),
+        kind=None if tid == pid else thread_work(comm),
     )
 
 

@@ -46,10 +46,9 @@ from chainshaper.monitor.metrics import (
     delivery_news,
     serving,
 )
-from chainshaper.planning import ApplicationPlan, Plan
+from chainshaper.planning import ChainPlan, Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.robot.clocks import clock_offset
-from chainshaper.sources.ebpf.trace_points import TracingLibrary
 from chainshaper.sources.preload import (
     NO_PROCESS,
     TracedProcess,
@@ -59,6 +58,7 @@ from chainshaper.sources.preload import (
     memories,
 )
 from chainshaper.sources.system import info_of, own_pid_namespace, processes_of
+from chainshaper.sources.tracing_library import TracingLibrary
 from chainshaper.splicing.shaped_outputs import find_outputs
 from chainshaper.values import events
 from chainshaper.values.application import ApplicationGraph, Callback, Chain
@@ -279,7 +279,7 @@ class Watch:
         chains: Sequence[str],
         *,
         users: Collection[int],
-        plan: ApplicationPlan | None = None,
+        plan: Plan | None = None,
         longest_ns: int = 2 * SECOND,
         callbacks: bool = False,
     ) -> None:
@@ -310,7 +310,7 @@ class Watch:
     def _due(self, output: str) -> Due | None:
         return next((due for due in self.due if due.output in (None, output)), None)
 
-    def _plan_of(self, output: str) -> Plan | None:
+    def _plan_of(self, output: str) -> ChainPlan | None:
         """The plan whose promise is about a chain with this output."""
         plans = () if self.plan is None else self.plan.chains
         return next((plan for plan in plans if plan.chain.output in (None, output)), None)

@@ -26,7 +26,7 @@ import numpy as np
 import polars as pl
 
 from chainshaper.analysis import DataFlow, callback_statistics, recorded_flow
-from chainshaper.planning import Plan, dump_plan, publish_slots
+from chainshaper.planning import ChainPlan, Plan, dump_plan, publish_slots
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting import overviews
@@ -133,12 +133,12 @@ def report_page(
     )
 
 
-def _plans_of(parts: Sequence[_NamedMeasurement]) -> dict[str, Plan]:
+def _plans_of(parts: Sequence[_NamedMeasurement]) -> dict[str, ChainPlan]:
     """The plans that were in force, by the names of their recordings; equal ones stand once."""
-    plans: dict[str, tuple[list[str], Plan]] = {}
+    plans: dict[str, tuple[list[str], ChainPlan]] = {}
     for part in parts:
         if (plan := part.measurement.plan) is not None:
-            plans.setdefault(dump_plan(plan), ([], plan))[0].append(part.name)
+            plans.setdefault(dump_plan(Plan.of(plan)), ([], plan))[0].append(part.name)
     return {", ".join(users): plan for users, plan in plans.values()}
 
 
@@ -335,7 +335,7 @@ def _stalls(part: _NamedMeasurement) -> str:
     return _paragraph(about) + overviews.stall_table(meter, stalls).html()
 
 
-def _plan(number: str, users: str, plan: Plan) -> str:
+def _plan(number: str, users: str, plan: ChainPlan) -> str:
     title = "The servers' slots over one cycle"
     return (
         f'<section id="plan-{number}">\n<h2>{escape(f"The plan of {users}")}</h2>\n'
@@ -344,7 +344,7 @@ def _plan(number: str, users: str, plan: Plan) -> str:
         "<figcaption>Blue: the server in whose slots the output is published. Slots are half-open"
         " and drawn at least 1.5 pixels wide; drag to zoom.</figcaption></figure>\n"
         + overviews.plan_table(plan).html()
-        + _details("The plan as YAML", f"<pre>{escape(dump_plan(plan))}</pre>")
+        + _details("The plan as YAML", f"<pre>{escape(dump_plan(Plan.of(plan)))}</pre>")
         + "</section>"
     )
 
@@ -416,7 +416,7 @@ def _hop_bars(parts: Sequence[_NamedMeasurement]) -> dict[str, Any]:
     return {"label": label, "length": longest * 1.01, "rows": rows}
 
 
-def _slot_bars(plan: Plan) -> dict[str, Any]:
+def _slot_bars(plan: ChainPlan) -> dict[str, Any]:
     """The servers' slots over one cycle, a row per server."""
     rows = []
     for one in plan.servers:

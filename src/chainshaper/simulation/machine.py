@@ -11,9 +11,9 @@ import numpy as np
 import numpy.typing as npt
 
 from chainshaper import _core
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import ReceiverPlace, Server
-from chainshaper.robot.node_parameters import SAME
+from chainshaper.planning.chain_plan import ReceiverPlace, Server
+from chainshaper.planning.plan import Plan
+from chainshaper.robot.gate import values_of
 from chainshaper.simulation.system import ROLES, Entity, SimulatedPublisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
@@ -79,7 +79,7 @@ class Machine:
         self,
         system: System,
         handles: Handles,
-        plan: ApplicationPlan | None,
+        plan: Plan | None,
         timing: Timing,
         *,
         switches: bool,
@@ -209,7 +209,7 @@ class Machine:
     def _rank(
         self,
         threads: Sequence[_core.ThreadDescription],
-        plan: ApplicationPlan,
+        plan: Plan,
         governed: dict[int, Server],
         ranked: list[Server],
         receiving: dict[int, ReceiverPlace],
@@ -335,7 +335,7 @@ class Machine:
             described.due_ns = self._timing.start_ns + entity.described.phase_ns
         else:
             topic = system.application.topic(entity.topic)
-            described.depth = topic.depth if gate is None or entity.listens else gate.depth
+            described.depth = topic.depth if gate is None or entity.listens else gate.gate().depth
             described.lifespan_ns = topic.lifespan_ns
 
     def _gate(self, described: CallbackDescription) -> _core.GateDescription:
@@ -343,11 +343,11 @@ class Machine:
         assert gate is not None  # noqa: S101 - the caller has seen it
         description = _core.GateDescription(
             slots=list(gate.slots),
-            depth=gate.depth,
+            depth=gate.gate().depth,
             moves=gate.moved(timing.start_ns),
             spin_ns=gate.spin_ns,
             pause_ns=gate.pause_ns,
-            **{name: getattr(gate, name) for name in SAME if name != "phase_ns"},
+            **values_of(gate.gate()),
         )
         description.phase_ns = timing.anchor_ns
         if gate.phase_ns is not None:
@@ -410,9 +410,7 @@ class Machine:
         return self._deliveries[stream]
 
 
-def _governed_core(
-    plan: ApplicationPlan, ranked: Sequence[Server], timing: Timing
-) -> _core.CoreDescription:
+def _governed_core(plan: Plan, ranked: Sequence[Server], timing: Timing) -> _core.CoreDescription:
     """A core with servers, in the state that it has at the run's start, anywhere in a cycle."""
     table = _slot_table(plan, ranked)
     anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
@@ -428,7 +426,7 @@ def _governed_core(
     )
 
 
-def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
+def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """The slot table of a core: (offset in the cycle (ns), bit mask of the servers open then)."""
     # A free shaping node times its messages itself: its thread needs no slot to run in.
     slots = [

@@ -18,8 +18,8 @@ import polars as pl
 from chainshaper import _core
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.flow import DataFlow
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
-from chainshaper.planning.plan import Plan, publisher_servers
+from chainshaper.planning.chain_plan import publisher_servers
+from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.simulation.machine import INSTANTS, Handles, Int64s, Machine
 from chainshaper.simulation.system import System, build_system
@@ -55,7 +55,7 @@ MOST = 100_000  # samples of an execution time: enough for any distribution
 def simulate(
     application: Application,
     output: str | Path,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     *,
     cycles: int = 320,
     seed: int | None = None,
@@ -75,9 +75,8 @@ def simulate(
     end, or the recording cannot be written.
     """
     output = refuse_existing(output)
-    joint = None if plan is None else whole(plan)
-    application, timing = _checked(application, joint, cycles, seed)
-    system, objects, machine = _built(application, joint, timing, switches=switches)
+    application, timing = _checked(application, plan, cycles, seed)
+    system, objects, machine = _built(application, plan, timing, switches=switches)
     info = RecordingInfo(
         source="simulated",
         host="simulation",  # thread ids say nothing about any real machine
@@ -90,15 +89,15 @@ def simulate(
         notes=("simulated",),
         chain=application.chain,
         application=application_as_written(application),
-        plan=None if joint is None else plan_values(joint),
-        in_force=None if joint is None else InForceInfo(since_ns=timing.record_from_ns),
+        plan=None if plan is None else plan_values(plan),
+        in_force=None if plan is None else InForceInfo(since_ns=timing.record_from_ns),
     )
     return write_recording(output, _event_tables(system, objects, machine, progress), info)
 
 
 def simulate_latencies(
     application: Application,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     *,
     cycles: int = 320,
     seed: int | None = None,
@@ -112,16 +111,15 @@ def simulate_latencies(
 
     Raises: as :func:`simulate`.
     """
-    joint = None if plan is None else whole(plan)
-    application, timing = _checked(application, joint, cycles, seed)
-    _, _, machine = _built(application, joint, timing, latencies=cycles)
+    application, timing = _checked(application, plan, cycles, seed)
+    _, _, machine = _built(application, plan, timing, latencies=cycles)
     for _ in _runs(machine, progress):
         pass
     return machine.simulation.latencies()
 
 
 def _checked(
-    application: Application, plan: ApplicationPlan | None, cycles: int, seed: int | None
+    application: Application, plan: Plan | None, cycles: int, seed: int | None
 ) -> tuple[Application, Timing]:
     """Give the application seed and shaping nodes; return it, and the instants of its run.
 
@@ -159,7 +157,7 @@ def _checked(
 
 def _built(
     application: Application,
-    plan: ApplicationPlan | None,
+    plan: Plan | None,
     timing: Timing,
     *,
     switches: bool = False,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.plan import Plan
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
@@ -79,7 +79,7 @@ class System:
 
 
 def build_system(
-    application: Application, plan: ApplicationPlan | None = None, *, follow_chain: bool
+    application: Application, plan: Plan | None = None, *, follow_chain: bool
 ) -> System:
     """List everything that runs in an application; find its chain where ``follow_chain`` asks.
 
@@ -181,7 +181,7 @@ def _threads(
             )
 
 
-def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
+def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
     """The server of each thread that is in one, by the thread's place.
 
     Raises InputError: a server has a thread that the application does not have.
@@ -204,7 +204,7 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
 
 
 def _receivers(
-    plan: ApplicationPlan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
+    plan: Plan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
 ) -> dict[int, ReceiverPlace]:
     """Core and priority of the threads that receive an output outside servers, by place."""
     place_of = plan.receivers_at

@@ -1,6 +1,6 @@
 """What the events of a trace tell about the system it was taken on: distribution, RMW, processes.
 
-Upstream: changelogs of tracetools; https://www.dds-foundation.org/dds-rtps-vendor-and-product-ids/.
+Upstream: changelogs of tracetools.
 """
 
 import re
@@ -11,6 +11,7 @@ from typing import Any
 import polars as pl
 
 from chainshaper.values.events import NODE_NAME, EventTables, table
+from chainshaper.values.middleware import rmw_of_vendor
 from chainshaper.values.recording import RecordingInfo
 
 NEXT_HOST = 10_000_000
@@ -19,18 +20,6 @@ NEXT_HOST = 10_000_000
 _RELEASES = {  # Versions of tracetools below these belong to the distribution.
     **{"eloquent": (1, 0), "foxy": (2, 0), "galactic": (3, 0), "humble": (5, 0), "iron": (7, 0)},
     **{"jazzy": (8, 3), "kilted": (8, 7), "lyrical": (8, 11)},
-}
-_VENDORS = {
-    (0x01, 0x01): "rmw_connextdds",
-    (0x01, 0x0F): "rmw_fastrtps_cpp",
-    (0x01, 0x10): "rmw_cyclonedds_cpp",
-    (0x01, 0x16): "rmw_gurumdds_cpp",
-}
-_THREADS = {
-    "rmw_cyclonedds_cpp": re.compile(r"recvUC|recvMC|dq\.builtins|dq\.user|xmit\.user"),
-    "rmw_fastrtps_cpp": re.compile(r"dds\.(asyn|ev|udp|shm|tcp)"),
-    "rmw_connextdds": re.compile(r"rCo\d{5}"),
-    "rmw_zenoh_cpp": re.compile(r"net-\d+$"),
 }
 
 
@@ -89,25 +78,16 @@ def _first(tables: EventTables, event: str, field: str) -> str | None:
 
 
 def rmw_of_gids(tables: EventTables) -> str | None:
-    """The RMW from CARET's event, or from the endpoints' gids.
-
-    These begin with the DDS vendor's number (RTPS 2.5, 9.3.1.5: guidPrefix[0:2] = vendorId).
-    """
+    """The RMW implementation, from CARET's event, or from the endpoints' gids."""
     named = _first(tables, "rmw_implementation", "rmw_impl")
     if named is not None:
         return named
     for event in ("rmw_publisher_init", "rmw_subscription_init"):
         gids = table(tables, event, ["gid"])["gid"].drop_nulls().head(1000)
-        names = {_VENDORS.get(tuple(gid[:2])) for gid in gids}
+        names = {rmw_of_vendor(gid) for gid in gids}
         if len(names) == 1:
             return names.pop()
     return None
-
-
-def rmw_of_threads(names: Iterable[str]) -> str | None:
-    """The RMW from the names of threads; Fast DDS names its own from 2.13 on."""
-    known = list(names)
-    return next((rmw for rmw, one in _THREADS.items() if any(map(one.match, known))), None)
 
 
 def processes_of(tables: EventTables, commands: Mapping[int, str]) -> dict[int, str]:

@@ -30,6 +30,12 @@ from chainshaper.sources.ebpf import trace_points as tp
 from chainshaper.sources.ebpf.functions import callback_functions
 from chainshaper.sources.ebpf.late_attachment import ADDED, with_found_objects, with_functions
 from chainshaper.sources.system import info_of, own_pid_namespace
+from chainshaper.sources.tracing_library import (
+    LIBRARY,
+    TracingLibrary,
+    installed_libraries,
+    mapped_libraries,
+)
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.events import EventTables
@@ -190,11 +196,11 @@ class EbpfTracer:
     def written(self) -> None:
         """What was traced stays beside the tables."""
 
-    def _libraries(self) -> tuple[tp.TracingLibrary, ...]:
-        libraries = self._mapped() if self._attached else tp.installed_libraries(os.environ)
+    def _libraries(self) -> tuple[TracingLibrary, ...]:
+        libraries = self._mapped() if self._attached else installed_libraries(os.environ)
         if not libraries:
             raise PlatformError(
-                f"no {tp.LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: source the "
+                f"no {LIBRARY} in AMENT_PREFIX_PATH, LD_LIBRARY_PATH or /opt/ros: source the "
                 "setup.bash of ROS 2; attach to an application in a container (no COMMAND)"
             )
         if not tp.trace_points(libraries):
@@ -205,16 +211,16 @@ class EbpfTracer:
             )
         return libraries
 
-    def _mapped(self) -> tuple[tp.TracingLibrary, ...]:
+    def _mapped(self) -> tuple[TracingLibrary, ...]:
         parent_of = parents()
         family = descendants(parent_of, *self._pids)
-        mapped = tp.mapped_libraries(
+        mapped = mapped_libraries(
             pid for pid in parent_of if pid in family or user_of(pid) in self._users
         )
         unsuited = [pid for pid in self._pids if not descendants(parent_of, pid) & mapped.keys()]
         if unsuited:
             raise InputError(
-                f"process {', '.join(map(str, unsuited))} neither uses {tp.LIBRARY} nor has "
+                f"process {', '.join(map(str, unsuited))} neither uses {LIBRARY} nor has "
                 "started what does: give processes of nodes (`chainshaper threads` lists them)"
             )
         wanted = family if self._pids else mapped.keys()
@@ -222,7 +228,7 @@ class EbpfTracer:
         if not libraries:
             users = ", ".join(map(user_name, sorted(self._users)))
             raise OperationError(
-                f"no process of {users} uses {tp.LIBRARY}, so there is no ROS 2 node to attach to: "
+                f"no process of {users} uses {LIBRARY}, so there is no ROS 2 node to attach to: "
                 "start the application, give its COMMAND behind `--`, or name its --user"
             )
         return tuple(libraries)

@@ -1,4 +1,4 @@
-"""Functions: those that a library exports, and those that a process's callbacks are.
+"""The functions that a process's callbacks are, found in its memory.
 
 With uprobes no event says which function a callback is, but what stands around the address that is
 its handle (64 bits, GCC's library):
@@ -8,25 +8,22 @@ its handle (64 bits, GCC's library):
 * that of a subscription or service begins with a `std::function`, which has the address of
   `std::_Function_handler<…, F>::_M_invoke`. Files name it unless they were stripped.
 
-Upstream: elf(5); Itanium C++ ABI, 2.5.2 and 2.9.5; libstdc++, `bits/std_function.h`.
+Upstream: Itanium C++ ABI, 2.5.2 and 2.9.5; libstdc++, `bits/std_function.h`.
 """
 
 import ctypes
 import os
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from itertools import groupby
 from operator import itemgetter
 from pathlib import Path
 
-from chainshaper.linux.processes import Region, region_at, regions_in
-from chainshaper.linux.threads import read_proc
+from chainshaper.linux.processes import Region, region_at
+from chainshaper.sources.elf import function_offsets, mapped_regions
 from chainshaper.values.errors import text_of
-from chainshaper.values.files import read_regular
 
-_SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
-_NO_ELF = (OSError, LookupError, struct.error, ValueError)
 _TIMERS = ("rclcpp::WallTimer<", "rclcpp::GenericTimer<")
 _INVOKER = "_ZNSt17_Function_handlerI"
 _BEFORE, _BEHIND = 64, 16
@@ -34,58 +31,8 @@ _BEFORE, _BEHIND = 64, 16
 _SHORTEST_NAME, _LONGEST_NAME = 3, 16_384
 
 
-def exported_functions(path: Path) -> frozenset[str]:
-    """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
-    with suppress(*_NO_ELF):
-        return frozenset(name for _, name in _functions(read_regular(path), (_DYNSYM,)))
-    return frozenset()
-
-
-def function_offsets(path: Path) -> dict[int, str]:
-    """Where functions begin in a file, in bytes, and their names; also of those not exported."""
-    with suppress(*_NO_ELF):
-        content = read_regular(path)
-        loaded = [s[2:6] for s in _entries(content, 32, 54, "IIQQQQQQ") if s[0] == _LOAD]
-        return {
-            address - memory + offset: name
-            for address, name in _functions(content, (_DYNSYM, _SYMTAB))
-            for offset, memory, _, size in loaded
-            if memory <= address < memory + size
-        }
-    return {}
-
-
-def _entries(content: bytes, at: int, count_at: int, layout: str) -> Iterator[tuple[int, ...]]:
-    """The table of which the file's header says at these places where it is, and how long."""
-    if content[:5] != b"\x7fELF\x02":
-        raise ValueError("no ELF-64 file")
-    order = {1: "<", 2: ">"}[content[5]]
-    (begin,) = struct.unpack_from(f"{order}Q", content, at)
-    size, count = struct.unpack_from(f"{order}HH", content, count_at)
-    for number in range(count):
-        yield struct.unpack_from(order + layout, content, begin + size * number)
-
-
-def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, str]]:
-    """Addresses and names of the functions that a file's symbol tables define."""
-    sections = list(_entries(content, 40, 58, "IIQQQQIIQQ"))
-    layout = {1: "<IBBHQ", 2: ">IBBHQ"}[content[5]]
-    for _, kind, _, _, start, length, names, *_ in sections:
-        for at in range(start, start + length, 24) if kind in tables else ():
-            name, info, _, section, address = struct.unpack_from(layout, content, at)
-            if info & 0xF == _FUNCTION and section:  # of section 0: imported, not defined
-                begin = sections[names][4] + name
-                yield address, text_of(content[begin : content.index(b"\0", begin)])
-
-
-def mapped_regions(pid: int) -> Iterator[Region]:
-    """The regions that files are mapped to, by address. Raises OSError: gone, or another user's."""
-    regions = regions_in(read_proc(f"/proc/{pid}/maps"))
-    return (one for one in regions if one.path.startswith("/"))
-
-
-class _Process:
-    """A process that runs: its memory; ``invokers`` by path, offset: their mangled names so far."""
+class _ProcessMemory:
+    """The memory of a running process. ``invokers``: path → offset → mangled name, read so far."""
 
     def __init__(self, pid: int, memory: int, invokers: dict[str, dict[int, str]]) -> None:
         self.pid, self.memory, self.invokers = pid, memory, invokers
@@ -149,7 +96,7 @@ def callback_functions(callbacks: Iterable[tuple[int, int]]) -> dict[tuple[int, 
     found: dict[tuple[int, int], str] = {}
     for pid, handles in groupby(sorted(set(callbacks)), key=itemgetter(0)):
         with suppress(OSError), Path(f"/proc/{pid}/mem").open("rb") as memory:
-            process = _Process(pid, memory.fileno(), invokers)
+            process = _ProcessMemory(pid, memory.fileno(), invokers)
             for _, address in handles:
                 name = process.timer(address)
                 if name is None or name.startswith("std::function<"):

@@ -23,31 +23,20 @@ Upstream: `tracetools/tracetools.h` of ros2_tracing, tags 4.1.1 to 8.10.1; bpftr
 rmw, `rmw/types.h`; rcl, `publisher_impl.h` (Humble, Iron).
 """
 
-import ctypes
-import os
 import re
-import sys
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import polars as pl
-from numpy.typing import NDArray
 
-from chainshaper.sources.ebpf.functions import exported_functions, mapped_regions
+from chainshaper.sources.registers import table_of_registers
+from chainshaper.sources.tracing_library import FUNCTION_PREFIX, TracingLibrary
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, text_of
-from chainshaper.values.files import read_regular
-
-FUNCTION_PREFIX = "ros_trace_"
-LIBRARY = "libtracetools.so"
-_INSTALLATIONS = Path("/opt/ros")
-_VERSION = re.compile(r"<version>\s*((\d{1,9})(?!\d)[^<\s]{0,99})\s*</version>")
-_LONGEST_PACKAGE = 1 << 20  # bytes
-_OVERLAY = 0x794C7630
+from chainshaper.values.event_declarations import EVENTS, EventField
 
 CODE = ("code", "time", "pid", "tid", "cpu")
 VALUES = tuple(f"value_{number}" for number in range(10))
@@ -77,34 +66,6 @@ _SWITCH = {  # column of `sched_switch` → the kernel's name, in the order of p
     "next_tid": "next_pid",
     "next_prio": "next_prio",
 }
-_Kind: TypeAlias = Literal["number", "flag", "text", "gid"]
-_KINDS: Mapping[object, _Kind] = {pl.String: "text", pl.List: "gid", pl.Int32: "flag"}
-
-
-@dataclass(frozen=True)
-class TracingLibrary:
-    """A `libtracetools.so`; ``functions`` are those that it exports."""
-
-    path: Path
-    functions: frozenset[str]
-    version: str | None
-
-    @property
-    def major(self) -> int:
-        """The first number of the version: where it is not known, one of today's."""
-        return 8 if self.version is None else int(self.version.partition(".")[0])
-
-    @property
-    def handles_at_rmw(self) -> bool:
-        return self.major >= 8
-
-
-class Argument(NamedTuple):
-    """A function's argument that becomes a column; ``place`` counts from 0."""
-
-    column: str
-    place: int
-    kind: _Kind
 
 
 @dataclass(frozen=True)
@@ -116,20 +77,10 @@ class TracePoint:
     tracing_library: TracingLibrary
 
     @property
-    def arguments(self) -> tuple[Argument, ...]:
-        types = events.FIELDS[self.event]
-        columns: tuple[str | None, ...] = tuple(types)
-        if self.event == "rcl_init":  # the version is the library's own, from its `package.xml`
-            columns = ("context_handle",)
-        elif self.event == "rclcpp_publish":  # the publisher's address, mostly null, comes first
-            columns = (None, "message")
-        elif self.event == "rmw_publish" and not self.tracing_library.handles_at_rmw:
-            columns = ("message",)
-        return tuple(
-            Argument(column, place, _KINDS.get(types[column].base_type(), "number"))
-            for place, column in enumerate(columns)
-            if column is not None
-        )
+    def arguments(self) -> tuple[tuple[EventField, int], ...]:
+        """The fields that are arguments of the function, and which arguments, from 0."""
+        fields = EVENTS[self.event].fields_of_version(self.tracing_library.major)
+        return tuple((field, field.argument) for field in fields if field.argument is not None)
 
     @property
     def handle(self) -> str | None:
@@ -151,69 +102,6 @@ def trace_points(libraries: Sequence[TracingLibrary]) -> tuple[TracePoint, ...]:
         for library in libraries
         if FUNCTION_PREFIX + event in library.functions
     )
-
-
-def installed_libraries(environment: Mapping[str, str]) -> tuple[TracingLibrary, ...]:
-    """The libraries that a command with this environment can find, and all below `/opt/ros`."""
-    prefixes = environment.get("AMENT_PREFIX_PATH", "").split(":")
-    folders = [f"{prefix}/lib" for prefix in prefixes if prefix]
-    folders += filter(None, environment.get("LD_LIBRARY_PATH", "").split(":"))
-    folders += map(str, sorted(_INSTALLATIONS.glob("*/lib")))
-    files = [Path(folder, LIBRARY) for folder in folders]
-    return tuple(dict.fromkeys(_found([file.absolute() for file in files if file.is_file()], {})))
-
-
-def mapped_libraries(pids: Iterable[int]) -> dict[int, tuple[TracingLibrary, ...]]:
-    """Process → the libraries that it has mapped; only those that have one."""
-    known: dict[tuple[int, ...], TracingLibrary] = {}
-    found = {pid: tuple(_found(_mapped(pid), known)) for pid in pids}
-    return {pid: libraries for pid, libraries in found.items() if libraries}
-
-
-def _mapped(pid: int) -> Iterator[Path]:
-    """Files of that name which a process has mapped, by paths that lead there from here."""
-    with suppress(OSError):  # it is gone, or another user's
-        paths = {one.path for one in mapped_regions(pid) if f"/{LIBRARY}" in one.path}
-        for mapped in sorted(paths):
-            inside = Path(f"/proc/{pid}/root{mapped}")  # as a container has it
-            if inside.is_file():  # else replaced since: its new contents are not what runs
-                outside = Path(mapped)
-                yield outside if outside.is_file() and outside.samefile(inside) else inside
-
-
-def _found(
-    paths: Iterable[Path], known: dict[tuple[int, ...], TracingLibrary]
-) -> Iterator[TracingLibrary]:
-    """The libraries at some paths; ``known`` has them by what uprobes are set in.
-
-    That is a device's inode. Containers of one image share it, each through an overlay of its own:
-    a probe in every one of these would fire for all.
-    """
-    for path in paths:
-        status = path.stat()
-        key: tuple[int, ...] = (status.st_dev, status.st_ino)
-        if _is_overlaid(path):
-            key = (status.st_ino, status.st_size, status.st_mtime_ns, status.st_ctime_ns)
-        if key not in known:
-            known[key] = TracingLibrary(path, exported_functions(path), version_of(path))
-        yield known[key]
-
-
-def _is_overlaid(path: Path) -> bool:
-    """Whether an overlay shows the file. Upstream: statfs(2), OVERLAYFS_SUPER_MAGIC."""
-    status = ctypes.create_string_buffer(256)
-    ctypes.CDLL(None).statfs(os.fsencode(path), status)
-    return int.from_bytes(status.raw[:4], sys.byteorder) == _OVERLAY
-
-
-def version_of(library: Path) -> str | None:
-    """The version of tracetools, as its package says beside the library; None if none does."""
-    for folder in library.parents[1:3]:  # `lib`, or `lib/x86_64-linux-gnu`, is in the prefix
-        with suppress(OSError):
-            package = read_regular(folder / "share/tracetools/package.xml", _LONGEST_PACKAGE)
-            if found := _VERSION.search(package.decode(errors="replace")):
-                return found[1]
-    return None
 
 
 def bpftrace_script(
@@ -263,14 +151,14 @@ def _statements(point: TracePoint, code: int, attached: bool) -> Iterator[str]:
     came = _printf(SWITCH_CODE, ["tid"], "\\t" * 4 + "%d")
     yield f"if (@running[tid] == 0) {{ @running[tid] = 1; {came} }}"
     values: dict[int, str] = {}
-    for _, place, kind in point.arguments:
-        if kind == "gid":
+    for field, place in point.arguments:
+        if field.kind == "gid":
             values |= {place: f"*(uint64 *)arg{place}", place + 1: f"*(uint64 *)(arg{place} + 8)"}
-        elif kind != "text":
+        elif field.kind != "text":
             values[place] = f"arg{place}"
     yield _printf(code, [values.get(place, "0") for place in range(max(values, default=-1) + 1)])
-    for _, place, kind in point.arguments:
-        if kind == "text":
+    for field, place in point.arguments:
+        if field.kind == "text":
             yield from _text(f"arg{place}", place)
     if attached and point.handle is not None:
         yield f"$handle = {point.handle};"
@@ -300,40 +188,6 @@ def _text(address: str, place: int) -> Iterator[str]:
     yield "  $word = $word + 64;"
     yield "  $line = $line + 1;"
     yield "}"
-
-
-def event_table(
-    point: TracePoint,
-    arguments: Iterable[Argument],
-    common: pl.DataFrame,
-    values: NDArray[np.uint64],
-    texts: Callable[[int], Any],
-) -> pl.DataFrame:
-    """The table of one trace point's events in order of time, the ``common`` columns in front.
-
-    ``values`` has a row of registers for each event, a gid in two of them; ``texts`` gives those of
-    a place.
-    """
-    columns: dict[str, Any] = {}
-    for column, place, kind in arguments:
-        if kind == "text":
-            columns[column] = pl.Series(texts(place), dtype=pl.String)
-        elif kind == "gid":
-            gids = np.ascontiguousarray(values[:, place : place + 2])
-            columns[column] = pl.Series(gids.view(np.uint8)).cast(pl.List(pl.UInt8))
-        else:  # the upper bytes of a register with a bool are undefined
-            register = np.ascontiguousarray(values[:, place])
-            columns[column] = pl.Series(register & 0xFF if kind == "flag" else register)
-    frame = common.with_columns(**columns)
-    if point.event == "rcl_init":
-        frame = frame.with_columns(version=pl.lit(point.tracing_library.version, pl.String))
-    types = {n: t for n, t in events.column_types(point.event).items() if n in frame.columns}
-    return frame.select(
-        pl.col(n).reinterpret(signed=True)
-        if t == pl.Int64() and frame.schema[n] == pl.UInt64()
-        else pl.col(n).cast(t)
-        for n, t in types.items()
-    ).sort("time", maintain_order=True)
 
 
 class Printed(NamedTuple):
@@ -374,7 +228,14 @@ def read_printed(path: Path, points: Sequence[TracePoint], ahead_ns: int) -> Pri
                 return rows.join(own, on=["time", "tid"], how="left", maintain_order="left")["text"]
 
             values = rows.select(VALUES).fill_null(0).to_numpy().view(np.uint64)
-            table = event_table(point, point.arguments, rows.select(CODE[1:]), values, said)
+            table = table_of_registers(
+                point.event,
+                point.arguments,
+                rows.select(CODE[1:]),
+                values,
+                said,
+                version=point.tracing_library.version,
+            )
             parts.setdefault(point.event, []).append(table)
     switches = lines.filter(code=SWITCH_CODE)
     if switches.height:

@@ -13,7 +13,7 @@ they really happened.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -34,11 +34,11 @@ from chainshaper.sources.system import (
     distribution_of,
     processes_of,
     rmw_of_gids,
-    rmw_of_threads,
 )
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.events import CREATION
+from chainshaper.values.middleware import rmw_of_threads
 from chainshaper.values.progress import Progress
 from chainshaper.values.recording import Recording, RecordingInfo
 
@@ -155,6 +155,12 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             if name not in self._read:
                 self._decode(next(group for group in _GROUPS if name in group))
         return self._read[name]
+
+    def let_go(self, names: Collection[str]) -> None:
+        """Forget tables, which are decoded again when they are asked for."""
+        with self._decoding:
+            for name in names:
+                self._read.pop(name, None)
 
     def __contains__(self, name: object) -> bool:
         return name in events.FIELDS and self._counted(str(name)) > 0

@@ -23,7 +23,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import polars as pl
@@ -40,21 +40,16 @@ from chainshaper.linux.threads import (
     time_namespace,
 )
 from chainshaper.robot.clocks import clock_offset
-from chainshaper.sources.ebpf.trace_points import (
-    Argument,
-    TracePoint,
-    TracingLibrary,
-    event_table,
-    version_of,
-)
+from chainshaper.sources.preload.events_header import FORMAT
+from chainshaper.sources.registers import table_of_registers
 from chainshaper.sources.system import NEXT_HOST, info_of, own_pid_namespace
+from chainshaper.sources.tracing_library import TracingLibrary, version_of
 from chainshaper.values import events
 from chainshaper.values.errors import InputError, OperationError, PlatformError, text_of
+from chainshaper.values.event_declarations import EVENTS, events_of_library
 from chainshaper.values.events import EventTables
 from chainshaper.values.files import open_output
 from chainshaper.values.recording import RecordingInfo
-
-SOURCE = Path(__file__).with_name("preload.c")
 
 RECORD = np.dtype(
     [("time", "<i8"), ("tid", "<u4"), ("cpu", "<u2"), ("event", "<u2"), ("values", "<u8", 6)]
@@ -72,7 +67,7 @@ _HEADER = np.dtype(
     ]
 )
 _RING = np.dtype([("written", "<u8"), ("taken", "<u4"), ("unused", "<u4", 13)])
-_MAGIC, _FORMAT = 0x63687368, 2
+_MAGIC, _FORMAT = 0x63687368, FORMAT
 _TEXT, _LIBRARY, _FIRST_EVENT = 1, 2, 3
 _TEXT_BYTES, _PLACES = 40, 16
 _RINGS, _RING_RECORDS, _OBJECT_RECORDS = 64, 1 << 14, 1 << 15  # of this format, no others
@@ -82,21 +77,13 @@ _SIZE = _OF_RECORDS + _RINGS * _RING_RECORDS * RECORD.itemsize
 _F_GET_SEALS, _F_SEAL_SHRINK = 1034, 2  # linux/fcntl.h
 _LONGEST_TEXT = 4096  # `LONGEST_TEXT` in preload.c
 _MOST_WRITTEN = 1 << 40  # records between two looks: a week of as many as one core can write
+_COMMON = ("time", "tid", "cpu")
 _LARGEST_ID = 1 << 22  # of processes and threads: linux/threads.h, PID_MAX_LIMIT
-_THREAD_TIME = 2  # the value of callback_start and callback_end that is no argument
-_CALL: dict[str, tuple[int, Literal["number", "gid"]]] = {  # where the values of a CALL are
-    **{"rmw_client_handle": (0, "number"), "rmw_service_handle": (0, "number")},
-    **{"request": (1, "number"), "response": (1, "number"), "client_gid": (2, "gid")},
-    **{"sequence_number": (4, "number"), "source_timestamp": (5, "number")},
-}
-
-_NAME = re.compile(r"^  (?:EVENT|CREATION|CALL)\((\w+)", re.MULTILINE)
 
 
-@functools.cache
 def event_names() -> tuple[str, ...]:
-    """The events in the order of their numbers, as the library's source has them."""
-    return tuple(_NAME.findall(SOURCE.read_text("utf-8")))
+    """The events that the library records, in the order of their numbers."""
+    return tuple(event.name for event in events_of_library())
 
 
 @functools.cache
@@ -311,16 +298,21 @@ def _tables(
             def said(place: int, events: NDArray[np.int64] = places) -> list[str | None]:
                 return [texts.get(event, {}).get(place) for event in events.tolist()]
 
-            own, point = records.take(places), TracePoint(name, library.path, library)
-            common = {one: np.ascontiguousarray(own[one]) for one in ("time", "tid", "cpu")}
-            arguments = point.arguments
-            if "sequence_number" in events.FIELDS[name]:
-                known = [column for column in events.column_types(name) if column in _CALL]
-                arguments = tuple(Argument(column, *_CALL[column]) for column in known)
-            elif "thread_time" in events.column_types(name):
-                arguments += (Argument("thread_time", _THREAD_TIME, "number"),)
+            rows, event = records.take(places), EVENTS[name]
+            common = {column: np.ascontiguousarray(rows[column]) for column in _COMMON}
+            # Service calls come from rmw, not from a tracetools that has functions for them.
+            fields = event.fields
+            if event.recorded_by_library == "arguments":
+                fields = event.fields_of_version(library.major)
+            recorded = [
+                (field, place)
+                for field in fields
+                if (place := event.place_in_record(field)) is not None
+            ]
             frame = pl.DataFrame({**common, "pid": pids[places]})
-            tables[name] = event_table(point, arguments, frame, own["values"], said)
+            tables[name] = table_of_registers(
+                name, recorded, frame, rows["values"], said, version=library.version
+            )
     return tables
 
 

@@ -49,8 +49,9 @@
 #include <time.h>
 #include <unistd.h>
 
+#include "events.h"  // made when this is built, by events_header.py
+
 #define NAME "chainshaper-trace"
-#define FORMAT 2
 #define RINGS 64u
 #define RING_RECORDS (1u << 14)  // 0.8 s of 20,000 events a second, of each thread
 #define OBJECT_RECORDS (1u << 15)
@@ -420,51 +421,7 @@ static void create(uint16_t event, unsigned texts, unsigned gid, uint64_t *value
   append(event, values, texts);
 }
 
-#define BIT(place) (1u << (place))
-// EVENT: name, arguments that are values, whether the third is the thread's CPU time. CREATION: name,
-// the places of texts as bits, that of a gid (0: none). CALL: handle, message, gid, sequence number
-// and source timestamp of a service's call. A record's number is the place in this list.
-// Not in it: rclcpp_executor_get_next_ready and _wait_for_work, which are some 100,000 a second.
-#define ALL_EVENTS(EVENT, CREATION, CALL) \
-  CREATION(rcl_init, 0, 0) \
-  CREATION(rcl_node_init, BIT(2) | BIT(3), 0) \
-  CREATION(rmw_publisher_init, 0, 1) \
-  CREATION(rcl_publisher_init, BIT(3), 0) \
-  CREATION(rmw_subscription_init, 0, 1) \
-  CREATION(rcl_subscription_init, BIT(3), 0) \
-  CREATION(rclcpp_subscription_init, 0, 0) \
-  CREATION(rclcpp_subscription_callback_added, 0, 0) \
-  CREATION(rcl_service_init, BIT(3), 0) \
-  CREATION(rclcpp_service_callback_added, 0, 0) \
-  CREATION(rcl_client_init, BIT(3), 0) \
-  CREATION(rcl_timer_init, 0, 0) \
-  CREATION(rclcpp_timer_callback_added, 0, 0) \
-  CREATION(rclcpp_timer_link_node, 0, 0) \
-  CREATION(rclcpp_callback_register, BIT(1), 0) \
-  CREATION(rclcpp_construct_ring_buffer, 0, 0) \
-  CREATION(rclcpp_buffer_to_ipb, 0, 0) \
-  CREATION(rclcpp_ipb_to_subscription, 0, 0) \
-  CREATION(rcl_lifecycle_state_machine_init, 0, 0) \
-  CREATION(rcl_lifecycle_transition, BIT(1) | BIT(2), 0) \
-  EVENT(callback_start, 2, true) \
-  EVENT(callback_end, 1, true) \
-  EVENT(rclcpp_publish, 2, false) \
-  EVENT(rclcpp_intra_publish, 2, false) \
-  EVENT(rcl_publish, 2, false) \
-  EVENT(rmw_publish, 3, false) \
-  EVENT(rmw_take, 4, false) \
-  EVENT(rcl_take, 1, false) \
-  EVENT(rclcpp_take, 1, false) \
-  EVENT(rclcpp_ring_buffer_enqueue, 4, false) \
-  EVENT(rclcpp_ring_buffer_dequeue, 3, false) \
-  EVENT(rclcpp_ring_buffer_clear, 1, false) \
-  EVENT(rclcpp_executor_execute, 1, false) \
-  EVENT(rcl_timer_call, 1, false) \
-  CALL(rmw_send_request) \
-  CALL(rmw_take_request) \
-  CALL(rmw_send_response) \
-  CALL(rmw_take_response)
-
+// A record's number is its event's place in ALL_EVENTS (`events.h`), from FIRST_EVENT on.
 #define NUMBER(name, ...) number_##name,
 enum { before_first = FIRST_EVENT - 1, ALL_EVENTS(NUMBER, NUMBER, NUMBER) };
 

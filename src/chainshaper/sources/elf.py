@@ -1,0 +1,67 @@
+"""Functions in ELF files, and the files that a process has mapped.
+
+Upstream: elf(5), proc(5).
+"""
+
+import struct
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+
+from chainshaper.linux.processes import Region, regions_in
+from chainshaper.linux.threads import read_proc
+from chainshaper.values.errors import text_of
+from chainshaper.values.files import read_regular
+
+_SYMTAB, _DYNSYM, _FUNCTION, _LOAD = 2, 11, 2, 1  # elf.h: SHT_…, STT_FUNC, PT_LOAD
+_NO_ELF = (OSError, LookupError, struct.error, ValueError)
+
+
+def exported_functions(path: Path) -> frozenset[str]:
+    """The functions in an ELF-64 file's dynamic symbol table; none if it is no such file."""
+    with suppress(*_NO_ELF):
+        return frozenset(name for _, name in _functions(read_regular(path), (_DYNSYM,)))
+    return frozenset()
+
+
+def function_offsets(path: Path) -> dict[int, str]:
+    """Where functions begin in a file, in bytes, and their names; also of those not exported."""
+    with suppress(*_NO_ELF):
+        content = read_regular(path)
+        loaded = [s[2:6] for s in _entries(content, 32, 54, "IIQQQQQQ") if s[0] == _LOAD]
+        return {
+            address - memory + offset: name
+            for address, name in _functions(content, (_DYNSYM, _SYMTAB))
+            for offset, memory, _, size in loaded
+            if memory <= address < memory + size
+        }
+    return {}
+
+
+def _entries(content: bytes, at: int, count_at: int, layout: str) -> Iterator[tuple[int, ...]]:
+    """The table of which the file's header says at these places where it is, and how long."""
+    if content[:5] != b"\x7fELF\x02":
+        raise ValueError("no ELF-64 file")
+    order = {1: "<", 2: ">"}[content[5]]
+    (begin,) = struct.unpack_from(f"{order}Q", content, at)
+    size, count = struct.unpack_from(f"{order}HH", content, count_at)
+    for number in range(count):
+        yield struct.unpack_from(order + layout, content, begin + size * number)
+
+
+def _functions(content: bytes, tables: tuple[int, ...]) -> Iterator[tuple[int, str]]:
+    """Addresses and names of the functions that a file's symbol tables define."""
+    sections = list(_entries(content, 40, 58, "IIQQQQIIQQ"))
+    layout = {1: "<IBBHQ", 2: ">IBBHQ"}[content[5]]
+    for _, kind, _, _, start, length, names, *_ in sections:
+        for at in range(start, start + length, 24) if kind in tables else ():
+            name, info, _, section, address = struct.unpack_from(layout, content, at)
+            if info & 0xF == _FUNCTION and section:  # of section 0: imported, not defined
+                begin = sections[names][4] + name
+                yield address, text_of(content[begin : content.index(b"\0", begin)])
+
+
+def mapped_regions(pid: int) -> Iterator[Region]:
+    """The regions that files are mapped to, by address. Raises OSError: gone, or another user's."""
+    regions = regions_in(read_proc(f"/proc/{pid}/maps"))
+    return (one for one in regions if one.path.startswith("/"))

@@ -1,0 +1,65 @@
+"""`events.h`: the events that `preload.c` records, as their declarations have them.
+
+`core/preloaded/CMakeLists.txt` runs this file when the library is built. It imports the standard
+library and :mod:`chainshaper.values.event_declarations` only.
+"""
+
+import sys
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+from chainshaper.values.event_declarations import Event, FieldKind, events_of_library
+
+_LAYOUT = 3
+"""Goes up when the memory of a traced process changes in another way than by its events."""
+
+_TEMPLATE = """\
+// Made by sources/preload/events_header.py from values/event_declarations.py.
+// EVENT: name, arguments that are recorded, whether the third value is the thread's CPU time.
+// CREATION: name, the places of texts as bits, that of a gid (0: none).
+// CALL: name of the function in rmw.
+#define ALL_EVENTS(EVENT, CREATION, CALL) \\
+  {lines}
+"""
+
+
+def event_line(event: Event) -> str:
+    """An event in the list of `preload.c`."""
+    if event.recorded_by_library == "service call":
+        return f"CALL({event.name})"
+    if event.group == "creation":
+        texts = sum(1 << place for place in _places(event, "text"))
+        gid = next(iter(_places(event, "gid")), 0)
+        return f"CREATION({event.name}, {texts}, {gid})"
+    count = 1 + max(_places(event))
+    is_timed = any(field.name == "thread_time" for field in event.fields)
+    return f"EVENT({event.name}, {count}, {str(is_timed).lower()})"
+
+
+def _places(event: Event, kind: FieldKind | None = None) -> list[int]:
+    """The places of the arguments of an event that are of a kind, or of any."""
+    return [
+        field.argument
+        for field in event.fields
+        if field.argument is not None and kind in (None, field.kind)
+    ]
+
+
+def events_header(events: Iterable[Event]) -> str:
+    """The text of `events.h`, but for its format's number."""
+    return _TEMPLATE.format(lines=" \\\n  ".join(map(event_line, events)))
+
+
+def format_of(header: str) -> int:
+    """A number of 32 bits that says which events a memory has, and how it is laid out."""
+    return zlib.crc32(header.encode(), _LAYOUT)
+
+
+FORMAT = format_of(events_header(events_of_library()))
+"""The format of memories that this version writes, and the only one it reads."""
+
+
+if __name__ == "__main__":
+    header = events_header(events_of_library())
+    Path(sys.argv[1]).write_text(f"{header}#define FORMAT {format_of(header)}u\n", "utf-8")
