@@ -140,7 +140,10 @@ def test_figures_are_those_of_a_recording_of_the_same_time(tmp_path: Path) -> No
     times = flow.instances.filter(within, callback_id=ran.id)
     assert second.starts == "/ebpf1"
     assert second.longest_ns[0] == (times["end"] - times["start"]).max()
-    assert abs(other_seen.chains[0].spans["hour"].count - count) <= 5
+    # A busy machine has the second look later: it is judged by the cycles until then.
+    until = other_seen.at_ns - LONGEST_NS
+    due = whole.filter(pl.col("start").is_between(other._began_ns, until, "right")).height
+    assert abs(other_seen.chains[0].spans["hour"].count - due) <= 2
     assert seen.lost == 0
 
 
@@ -254,7 +257,7 @@ def test_a_node_that_dies_in_a_callback_leaves_a_cycle_that_is_incomplete() -> N
         time.sleep(2 * LONGEST_NS / SECOND)
         after = late.look().chains[0].counted
     assert (seen.counted["incomplete"], after["incomplete"], late.lost) == (0, 1, 0)
-    assert after["complete"] > 10
+    assert after["complete"] >= 5, "cycles that were complete before are counted as such"
 
 
 def test_a_full_disk_stops_neither_the_watch_nor_loses_what_it_has(
@@ -568,7 +571,9 @@ def test_whoever_scrapes_disturbs_neither_the_watch_nor_others(
             slow[-1].sendall(b"GET /metr")
         serving = [one for one in threading.enumerate() if "process_request" in one.name]
         assert len(serving) <= 2 * SCRAPERS, "those that were closed may be about to end"
-        assert b"chainshaper_" in urlopen(f"http://127.0.0.1:{port}/metrics", timeout=60).read()
+        url, deadline = f"http://127.0.0.1:{port}/metrics", time.monotonic() + 60
+        while b"chainshaper_" not in urlopen(url, timeout=60).read():  # until the first look
+            assert time.monotonic() < deadline
         assert slow[0].recv(1) == b"", "it was closed for those that came later"
     for connection in slow:
         connection.close()

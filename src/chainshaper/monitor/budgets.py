@@ -7,8 +7,8 @@
     callbacks:
       - {node: /filter, starts: /t2, response: 25ms, execution: 22ms}
 
-Limits are of all cycles, those that the machine disturbed included: a limit that is broken by these
-alone is broken, and says so. ``missing`` is the share of outputs that were late or never came;
+Limits hold for all cycles, also those that the machine disturbed. A limit that only these break is
+broken, and its message says so. ``missing`` is the share of outputs that were late or never came;
 ``starts`` is the topic that starts a callback, or the declared period of its timer, as
 `chainshaper callbacks` shows it.
 """
@@ -46,12 +46,10 @@ if TYPE_CHECKING:
     from chainshaper.monitor.watch import Seen
     from chainshaper.verify.slowdowns import Compared
 
-ROOM = 0.1
-"""A proposal leaves as much room beyond what was measured."""
-GRAIN_NS = 10_000
-"""Proposed limits are whole multiples of it."""
-LEAST_MISSING = 0.01
-EVENTS = "its events"  # what a recording lacks that cannot be read
+ROOM = 0.1  # a proposed limit is so much above what was measured (a share of it)
+GRAIN_NS = 10_000  # proposed limits are whole multiples of it
+LEAST_MISSING = 0.01  # the lowest limit that is proposed for `missing`
+EVENTS = "its events"  # what cannot be measured of a recording that cannot be read
 
 
 def _share_in(value: object) -> object:
@@ -71,20 +69,20 @@ Share = Annotated[
     float, BeforeValidator(_share_in), PlainSerializer(_share_out), Field(ge=0, le=1, strict=False)
 ]
 Percentile = Literal["0.5", "1", "5", "25", "50", "75", "95", "99", "99.5"]
-assert {f"{one:g}" for one in PERCENTILES} == set(Percentile.__args__)  # type: ignore[attr-defined]  # noqa: S101
+assert {f"{percentile:g}" for percentile in PERCENTILES} == set(Percentile.__args__)  # type: ignore[attr-defined]  # noqa: S101
 
 
 class HopBudget(Part):
-    """The longest that one hop may take; ``topic`` is what it publishes."""
+    """The longest times that one hop may take."""
 
-    topic: str
+    topic: str  # that it publishes
     communication_ns: PositiveDuration | None = None
     computation_ns: PositiveDuration | None = None
     waiting_ns: PositiveDuration | None = None
 
 
 class ChainBudget(Part):
-    """What the latency of a chain may be."""
+    """The limits of a chain's latency."""
 
     chain: str
     maximum_ns: PositiveDuration | None = None
@@ -95,12 +93,12 @@ class ChainBudget(Part):
 
 
 class CallbackBudget(Part):
-    """The longest that one callback may take, from start to end, and of CPU time."""
+    """The longest times that one callback may take."""
 
     node: str
-    starts: str
-    response_ns: PositiveDuration | None = None
-    execution_ns: PositiveDuration | None = None
+    starts: str  # the topic that starts it, or its timer's declared period
+    response_ns: PositiveDuration | None = None  # from start to end
+    execution_ns: PositiveDuration | None = None  # of CPU time
 
 
 class Budget(Part):
@@ -113,20 +111,15 @@ class Budget(Part):
 
 @dataclass(frozen=True)
 class Judged:
-    """One limit and what was found in one recording: ns, or a share for ``missing``.
-
-    ``found`` is None where nothing was measured, which breaks the limit; ``undisturbed`` is the
-    figure of cycles that the machine did not disturb (None: not known). ``because`` says where a
-    broken limit of a chain comes from, or why nothing was measured.
-    """
+    """One limit, and the figure of one recording beside it: ns, or a share for ``missing``."""
 
     recording: str
-    where: str
-    what: str
+    where: str  # the chain, or the callback
+    what: str  # the figure that is limited, such as "maximum"
     limit: float
-    found: float | None
-    undisturbed: float | None = None
-    because: str | None = None
+    found: float | None  # the figure; None: nothing was measured, which breaks the limit
+    undisturbed: float | None = None  # of cycles that the machine did not disturb; None: unknown
+    because: str | None = None  # where a broken limit comes from, or why nothing was measured
 
     @property
     def met(self) -> bool:
@@ -165,10 +158,11 @@ def save_budget(budget: Budget, path: str | Path) -> Path:
 
 
 def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float = ROOM) -> Budget:
-    """What was measured, and ``room`` beyond it, as limits for chains, hops and callbacks.
+    """Propose limits for chains, hops and callbacks: what was measured, and ``room`` above it.
 
-    Without ``chains``, of the chain that it names, or the only one in it. Raises InputError: no
-    such chain.
+    Without ``chains``, for the chain that the recording names, or the only one in it.
+
+    Raises InputError: no such chain.
     """
 
     def limit(ns: float | None) -> int | None:
@@ -204,19 +198,20 @@ def propose_budget(recording: Recording, chains: Sequence[str] = (), room: float
 
 
 def check_budget(recording: Recording, budget: Budget, name: str | None = None) -> list[Judged]:
-    """Every limit of a budget beside what one recording has, in the budget's order.
+    """Judge every limit of a budget by one recording, in the budget's order.
 
-    What is not in the recording breaks its limits. ``name`` stands for the recording.
+    A chain, hop or callback that is not in the recording breaks its limits. ``name`` is that of
+    the recording in messages.
     """
-    found: list[Judged] = []
+    judged: list[Judged] = []
     name = name or str(recording.path)
     flow = recorded_flow(recording)
     for chain in budget.chains:
         try:
             analysis = measure_latency(recording, chain.chain, flow=flow).analysis
         except InputError as error:
-            limits = _chain_limits(chain, None, None)
-            found += [Judged(name, chain.chain, *one, because=str(error)) for one in limits]
+            for what, limit, figure in _chain_limits(chain, None, None):
+                judged.append(Judged(name, chain.chain, what, limit, figure, because=str(error)))
             continue
         parts = hop_breakdown(analysis)
         hops = list(_judged_hops(name, chain, _longest_parts(parts)))
@@ -224,11 +219,11 @@ def check_budget(recording: Recording, budget: Budget, name: str | None = None) 
         calm = undisturbed_outputs_due(analysis).share
         every = _chain_limits(chain, analysis.statistics, outputs_due(analysis).share)
         undisturbed = _chain_limits(chain, analysis.undisturbed, calm)
-        for limit, (_, _, at_rest) in zip(every, undisturbed, strict=True):
-            one = Judged(name, chain.chain, *limit, at_rest)
-            found.append(one if one.met else replace(one, because=because))
-        found += hops
-    return [*found, *_judged_callbacks(name, budget.callbacks, longest_times(flow))]
+        for (what, limit, figure), (_, _, calm_figure) in zip(every, undisturbed, strict=True):
+            verdict = Judged(name, chain.chain, what, limit, figure, calm_figure)
+            judged.append(verdict if verdict.met else replace(verdict, because=because))
+        judged += hops
+    return [*judged, *_judged_callbacks(name, budget.callbacks, longest_times(flow))]
 
 
 def check_budgets(
@@ -237,10 +232,10 @@ def check_budgets(
     progress: Callable[[float, str], None] = lambda *_: None,
     scheduler: str | None = None,
 ) -> list[list[Judged]]:
-    """Recordings and traces against a budget, in their order, as many at a time as there are cores,
-    or as the cluster of a Dask ``scheduler`` computes.
+    """Judge recordings and traces by a budget, several at a time; the verdicts in their order.
 
-    What cannot be read breaks the budget as well, with the reason. Raises: as
+    They are computed on the cores of this machine, or on the cluster of a Dask ``scheduler``. A
+    recording that cannot be read breaks the budget, with the reason. Raises: as
     :func:`~chainshaper.values.many_tasks.engine`.
     """
     return computed(
@@ -258,12 +253,13 @@ def _checked(
 
 
 def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
-    """What is broken of a budget's limits in the last minute; what has never run breaks none.
+    """The limits of a budget that the last minute broke.
 
-    All outputs are missing of a chain that has run, and had none in the last minute.
+    A chain or callback that has never run breaks none. Of a chain that has run before, and had no
+    output in the last minute, all outputs are missing.
     """
-    of_chain = {one.chain: one for one in seen.chains}
-    found: list[Judged] = []
+    of_chain = {chain.chain: chain for chain in seen.chains}
+    judged: list[Judged] = []
     for chain in budget.chains:
         now = of_chain.get(chain.chain)
         if now is None:
@@ -271,46 +267,51 @@ def broken_limits(budget: Budget, seen: "Seen") -> list[Judged]:
         minute = now.spans["minute"]
         stopped = None if minute.count else now.problem or "no output in the last minute"
         if stopped and chain.missing is not None and now.counted["complete"]:
-            found.append(Judged("now", chain.chain, "missing", chain.missing, 1.0, because=stopped))
+            judged.append(
+                Judged("now", chain.chain, "missing", chain.missing, 1.0, because=stopped)
+            )
             chain = chain.model_copy(update={"missing": None})  # noqa: PLW2901
         missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).share
         if missing is not None:
             why = None if minute.count else "no cycle was complete"
-            limits = _chain_limits(chain, minute, missing)
-            found += [Judged("now", chain.chain, *one, because=why) for one in limits]
-            longest = {one.topic: dict(zip(PARTS, one.longest_ns, strict=True)) for one in now.hops}
-            found += _judged_hops("now", chain, longest)
-    times = {(one.node, one.starts): one.longest_ns for one in seen.callbacks}
-    running = [one for one in budget.callbacks if (one.node, one.starts) in times]
-    found += _judged_callbacks("now", running, times)
-    return [one for one in found if not one.met]
+            for what, limit, figure in _chain_limits(chain, minute, missing):
+                judged.append(Judged("now", chain.chain, what, limit, figure, because=why))
+            longest = {hop.topic: dict(zip(PARTS, hop.longest_ns, strict=True)) for hop in now.hops}
+            judged += _judged_hops("now", chain, longest)
+    times = {(callback.node, callback.starts): callback.longest_ns for callback in seen.callbacks}
+    running = [
+        callback for callback in budget.callbacks if (callback.node, callback.starts) in times
+    ]
+    judged += _judged_callbacks("now", running, times)
+    return [verdict for verdict in judged if not verdict.met]
 
 
 def not_running(budget: Budget, seen: "Seen") -> Iterator[str]:
-    """What a budget names and has never run, each in words."""
-    ran, named = {(c.node, c.starts) for c in seen.callbacks}, {c.chain for c in budget.chains}
+    """Yield a sentence for each chain and callback of a budget that has never run."""
+    ran = {(callback.node, callback.starts) for callback in seen.callbacks}
+    named = {chain.chain for chain in budget.chains}
     for chain in seen.chains:
         if chain.problem and chain.chain in named and not any(chain.counted.values()):
             yield f"the budget's chain {chain.chain} has not run yet: {chain.problem}"
-    for one in budget.callbacks:
-        if (one.node, one.starts) not in ran:
+    for callback in budget.callbacks:
+        if (callback.node, callback.starts) not in ran:
             yield (
-                f"the budget's callback {one.node} ({one.starts}) has not run yet: `chainshaper "
-                "callbacks` shows node and start of those in a recording"
+                f"the budget's callback {callback.node} ({callback.starts}) has not run yet:"
+                " `chainshaper callbacks` shows node and start of those in a recording"
             )
 
 
 def _chain_limits(
     chain: ChainBudget, figures: LatencyStatistics | None, missing: float | None
 ) -> Iterator[tuple[str, float, float | None]]:
-    """The limits that a chain has, each with what was found."""
-    found = figures or latency_statistics([])
+    """Yield the limits that a chain has: the figure's name, the limit, and the figure or None."""
+    statistics = figures or latency_statistics([])
     if chain.maximum_ns is not None:
-        yield "maximum", chain.maximum_ns, found.max_ns
+        yield "maximum", chain.maximum_ns, statistics.max_ns
     for which, limit in chain.percentiles.items():
-        yield f"p{which}", limit, found.percentiles_ns.get(which)
+        yield f"p{which}", limit, statistics.percentiles_ns.get(which)
     if chain.jitter_ns is not None:
-        yield "jitter", chain.jitter_ns, found.jitter_ns
+        yield "jitter", chain.jitter_ns, statistics.jitter_ns
     if chain.missing is not None:
         yield "missing", chain.missing, missing
 
@@ -325,24 +326,28 @@ def _longest_parts(parts: pl.DataFrame) -> dict[str, dict[str, float | None]]:
 def _judged_hops(
     name: str, chain: ChainBudget, longest: Mapping[str, Mapping[str, float | None]]
 ) -> Iterator[Judged]:
-    """The limits of hops; ``longest`` are the parts of each by its topic."""
+    """Judge the limits of hops; ``longest`` has the longest parts of each hop, by its topic."""
     for hop in chain.hops:
-        named = {f"{part} of {hop.topic}": getattr(hop, f"{part}_ns") for part in PARTS}
-        times = longest.get(hop.topic)
-        found = None if times is None else tuple(times[part] for part in PARTS)
-        yield from _judged(name, chain.chain, named, found, "the chain has no such hop here")
+        limits = {f"{part} of {hop.topic}": getattr(hop, f"{part}_ns") for part in PARTS}
+        of_parts = longest.get(hop.topic)
+        times = None if of_parts is None else tuple(of_parts[part] for part in PARTS)
+        yield from _judged(name, chain.chain, limits, times, "the chain has no such hop here")
 
 
 def _judged_callbacks(
     name: str, callbacks: Sequence[CallbackBudget], longest: Mapping[tuple[str, str], Longest]
 ) -> Iterator[Judged]:
-    """Their limits; ``longest`` are response and execution times by node and what starts it."""
-    for one in callbacks:
-        found = longest.get((one.node, one.starts))
-        limits = {"response": one.response_ns, "execution": one.execution_ns}
-        starts, times = (found.shown, found.times) if found else (one.starts, None)
-        why = f"the recording has no such {'time' if times else 'callback'}"
-        yield from _judged(name, f"{one.node} ({starts})", limits, times, why)
+    """Judge the limits of callbacks; ``longest`` has their times by node and what starts them."""
+    for callback in callbacks:
+        measured = longest.get((callback.node, callback.starts))
+        limits = {"response": callback.response_ns, "execution": callback.execution_ns}
+        if measured is None:
+            where, times = f"{callback.node} ({callback.starts})", None
+            why = "the recording has no such callback"
+        else:
+            where, times = f"{callback.node} ({measured.shown})", measured.times
+            why = "the recording has no such time"
+        yield from _judged(name, where, limits, times, why)
 
 
 def _judged(
@@ -352,17 +357,20 @@ def _judged(
     times: Sequence[float | None] | None,
     why: str,
 ) -> Iterator[Judged]:
-    """Those of the limits that there are, beside the times; ``why`` one of these is not known."""
+    """Judge the limits that are given (not None) by the times, in the same order.
+
+    ``times`` is None where nothing was measured; ``why`` says why a time is not known.
+    """
     for (what, limit), most in zip(limits.items(), times or [None] * len(limits), strict=True):
         if limit is not None:
             yield Judged(name, where, what, limit, most, because=why if most is None else None)
 
 
 def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
-    """The hop that exceeds its budget by most; without one, that with the longest mean."""
-    broken = [one for one in hops if one.found is not None and not one.met]
+    """Name the hop that exceeds its budget by most; without one, that with the longest mean."""
+    broken = [verdict for verdict in hops if verdict.found is not None and not verdict.met]
     if broken:
-        worst = max(broken, key=lambda one: (one.found or 0) - one.limit)
+        worst = max(broken, key=lambda verdict: (verdict.found or 0) - verdict.limit)
         return f"from {worst.text.partition(': ')[2]}"
     if not parts["count"].sum():
         return None
@@ -372,7 +380,7 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
         for part in ("computation", "waiting")
         if row[f"{part}_ns"] is not None
     ]
-    mean, part, longest = max(means, key=lambda one: one[0])
+    mean, part, longest = max(means, key=lambda mean_part_row: mean_part_row[0])
     took = f"{duration_text(round(mean))} of {part} on average"
     return f"its longest hop is {longest['node']} ({took} to {longest['topic']})"
 
@@ -380,16 +388,16 @@ def _from_where(hops: Sequence[Judged], parts: pl.DataFrame) -> str | None:
 def junit_report(judged: "Sequence[Judged | Compared]") -> str:
     """JUnit XML: a suite for each recording, a test case for each limit or callback."""
     root = ElementTree.Element("testsuites", name="chainshaper check")
-    for recording in dict.fromkeys(one.recording for one in judged):
-        own = [one for one in judged if one.recording == recording]
-        broken = sum(not one.met for one in own)
-        counts = {"tests": str(len(own)), "failures": str(broken)}
+    for recording in dict.fromkeys(verdict.recording for verdict in judged):
+        of_recording = [verdict for verdict in judged if verdict.recording == recording]
+        broken = sum(not verdict.met for verdict in of_recording)
+        counts = {"tests": str(len(of_recording)), "failures": str(broken)}
         suite = ElementTree.SubElement(root, "testsuite", {"name": shown(recording), **counts})
-        for one in own:
-            named = {"classname": shown(one.where), "name": shown(one.what)}
+        for verdict in of_recording:
+            named = {"classname": shown(verdict.where), "name": shown(verdict.what)}
             case = ElementTree.SubElement(suite, "testcase", named)
-            if not one.met:
-                ElementTree.SubElement(case, "failure", {"message": shown(one.text)})
+            if not verdict.met:
+                ElementTree.SubElement(case, "failure", {"message": shown(verdict.text)})
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode", xml_declaration=True) + "\n"
 
@@ -402,10 +410,12 @@ def markdown_report(
     ``words`` are for what is judged, and for both verdicts.
     """
     noun, bad, good = words
-    broken = [one for one in judged if not one.met]
+    broken = [verdict for verdict in judged if not verdict.met]
     if not broken:
         return f"**All {len(judged)} {noun} are {good}**\n"
     lines = [f"**{len(broken)} of {len(judged)} {noun} are {bad}**", ""]
     lines += [f"| recording | {noun.removesuffix('s')} |", "|---|---|"]
-    cells = ((shown(t).replace("|", "\\|") for t in (o.recording, o.text)) for o in broken)
-    return "\n".join([*lines, *(f"| {' | '.join(own)} |" for own in cells), ""])
+    for verdict in broken:
+        cells = (shown(text).replace("|", "\\|") for text in (verdict.recording, verdict.text))
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join([*lines, ""])

@@ -1,7 +1,7 @@
-"""Where the metrics of a watch go: a port of this machine, and an OpenTelemetry collector.
+"""Serve the metrics of a watch on a local port, and send them to an OpenTelemetry collector.
 
-Neither may disturb the watch. Whoever scrapes may be slow, talk nonsense, or come a thousand times;
-a collector may not be there, hang or die: that is said in a line, once, and so is that it is back.
+Neither may disturb the watch. A scraper may be slow, send nonsense, or connect a thousand times. A
+collector may be absent, hang or die: one line says that it is away, and one that it is back.
 """
 
 import contextlib
@@ -18,17 +18,18 @@ from urllib.parse import urlsplit
 from chainshaper.values.errors import InputError, OperationError
 
 LONGEST_END_MS = 3_000
-"""So long a collector that does not answer may keep the end of the watch waiting."""
+"""A collector that does not answer delays the end of the watch by no more than this."""
 SCRAPERS = 16
-"""Of more connections at a time than these, the one that has been there longest is closed."""
-PATIENCE_S = 5  # with a scraper that says nothing
-EVERY_MS = 10_000  # metrics are sent
-_REASON = re.compile(r"\[Errno -?\d+\] ([^'\")\]]+)|reason: (.+)")  # at its innermost in a message
+"""With more connections than these at a time, the oldest is closed."""
+PATIENCE_S = 5  # a scraper that sends nothing for longer is disconnected
+EVERY_MS = 10_000  # between two sends to the collector
+_REASON = re.compile(r"\[Errno -?\d+\] ([^'\")\]]+)|reason: (.+)")
+"""The innermost reason in a message of the library."""
 _LIBRARY = "opentelemetry"
 
 
 class _Server(ThreadingHTTPServer):
-    """A thread for each connection, of which there are a few."""
+    """An HTTP server with a thread for each of its few connections."""
 
     daemon_threads = True
     request_queue_size = 128
@@ -52,12 +53,12 @@ class _Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: that a scraper went away is none of the watch's business."""
+        """Print nothing: a scraper that went away is of no interest to the user of the watch."""
 
 
 @contextlib.contextmanager
 def serving(port: int, handler: type[BaseHTTPRequestHandler]) -> Iterator[None]:
-    """Answer on a port of this machine. Raises OperationError: it cannot be had."""
+    """Answer requests on a local port. Raises OperationError: the port cannot be opened."""
     patient = type("Scraped", (handler,), {"timeout": PATIENCE_S})
     try:
         server = _Server(port, patient)
@@ -74,7 +75,7 @@ def serving(port: int, handler: type[BaseHTTPRequestHandler]) -> Iterator[None]:
 
 
 def check_endpoint(endpoint: str) -> None:
-    """See that metrics can be sent to an address. Raises InputError: it is none of HTTP."""
+    """Check the address of a collector. Raises InputError: it is not one of HTTP or HTTPS."""
     with contextlib.suppress(ValueError):  # no such port, or half an address of IPv6
         parts = urlsplit(endpoint)
         if parts.scheme in ("http", "https") and parts.hostname and parts.port != 0:
@@ -84,18 +85,23 @@ def check_endpoint(endpoint: str) -> None:
     )
 
 
-def tell_delivery(exporter: Any, endpoint: str) -> Callable[[], list[str]]:
-    """Have an OTLP exporter say when its collector is away and when it is back, instead of what its
-    library logs at each attempt; what it gives has what is to be said since the last time.
+def delivery_news(exporter: Any, endpoint: str) -> Callable[[], list[str]]:
+    """Note when the collector of an OTLP exporter goes away and when it is back.
+
+    Returns a function that returns the sentences about it since its last call. They replace what
+    the exporter's library logs at each attempt.
     """
     reasons, news, export = deque[str](maxlen=1), deque[str](), exporter.export
     arrives = True
 
     class Listening(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            found = _REASON.search(text := record.getMessage())
-            if found or not reasons:  # the last line of an attempt says only that it has failed
-                reasons.append(next(filter(None, found.groups())) if found else text)
+            text = record.getMessage()
+            match = _REASON.search(text)
+            if match is not None:
+                reasons.append(match[1] or match[2])
+            elif not reasons:  # the last line of an attempt says only that it has failed
+                reasons.append(text)
 
     def exported(*arguments: Any, **options: Any) -> Any:
         nonlocal arrives
@@ -104,18 +110,18 @@ def tell_delivery(exporter: Any, endpoint: str) -> Callable[[], list[str]]:
         if arrives is not (result.name == "SUCCESS"):
             arrives = not arrives
             why = reasons[0].strip() if reasons else "it does not say why"
-            news.append(
-                f"metrics arrive at {endpoint} again"
-                if arrives
-                else f"metrics do not arrive at {endpoint} ({why}): it is tried every ten seconds"
-            )
+            if arrives:
+                news.append(f"metrics arrive at {endpoint} again")
+            else:
+                retry = "it is tried every ten seconds"
+                news.append(f"metrics do not arrive at {endpoint} ({why}): {retry}")
         return result
 
     exporter.export = exported
     logger = logging.getLogger(_LIBRARY)
     logger.handlers, logger.propagate = [Listening()], False
 
-    def told() -> list[str]:
+    def take_news() -> list[str]:
         return [news.popleft() for _ in range(len(news))]
 
-    return told
+    return take_news

@@ -2,11 +2,11 @@
 
     memories of the nodes ─► events of the last seconds ─► traversals ─► figures over three spans
 
-The library of :mod:`chainshaper.sources.preload` is in front of ROS 2 in each process; whoever may
-read the process's memory can follow it and go away without a trace. Every look runs the analysis of
-`chainshaper latency` over the last few seconds and takes over the cycles that are surely over:
-those that began longer ago than a cycle may take. So figures are those of a recording of the same
-time, and memory does not grow: events are there for seconds, cycles for an hour as four numbers.
+The library of :mod:`chainshaper.sources.preload` is in front of ROS 2 in each process. The watch
+reads its memory in the process, and changes nothing there. Every look runs the analysis of
+`chainshaper latency` over the last few seconds and adds the cycles that are surely over: those that
+began longer ago than a cycle may take. So the figures are those of a recording of the same time.
+Memory does not grow: events are kept for seconds, and cycles, as four numbers each, for an hour.
 """
 
 import contextlib
@@ -43,8 +43,8 @@ from chainshaper.monitor.metrics import (
     EVERY_MS,
     LONGEST_END_MS,
     check_endpoint,
+    delivery_news,
     serving,
-    tell_delivery,
 )
 from chainshaper.planning import ChainPlan, Plan
 from chainshaper.planning.plan_file import plan_values
@@ -72,82 +72,71 @@ from chainshaper.verify.promises import OutputsDue
 SECOND = 1_000_000_000
 SPANS = {"second": SECOND, "minute": 60 * SECOND, "hour": 3600 * SECOND}
 RECORDER_NS = 10 * SECOND
-"""So much of the past the flight recorder has."""
+"""How much of the past :meth:`Watch.save` writes."""
 
-_SEARCH_NS, _FIRST_SEARCH_NS = 5 * SECOND, SECOND  # between two looks for new processes
+_SEARCH_NS = 5 * SECOND  # between two searches for new processes
+_FIRST_SEARCH_NS = SECOND  # the same, while there are none
 _STEP_NS = 1_000_000  # of CLOCK_REALTIME: more than reading its offset can be off
-_AHEAD_NS = 100_000  # a stamp, or a phase, is not exact: outputs seem to leave before their slot
+_AHEAD_NS = 100_000  # stamps and phases are not exact: outputs seem to leave before their slot
 
 
 @dataclass(frozen=True)
 class Hop:
-    """A callback of the chain: its mean shares of the latency over the last minute (ns), and in
-    ``longest_ns`` the longest of each, in the order of :data:`~.measure.PARTS`.
-    """
+    """A callback of the chain: its shares of the latency over the last minute."""
 
     node: str
-    topic: str
-    communication_ns: float
-    computation_ns: float
-    waiting_ns: float
-    longest_ns: tuple[int | None, ...]
+    topic: str  # that it publishes
+    communication_ns: float  # mean
+    computation_ns: float  # mean
+    waiting_ns: float  # mean
+    longest_ns: tuple[int | None, ...]  # of each share, in the order of `PARTS`
 
 
 @dataclass(frozen=True)
 class CallbackNow:
-    """A callback, what starts it, and its longest response and execution time over the last minute
-    (ns; None: not known).
-    """
+    """A callback and its longest times over the last minute."""
 
     node: str
-    starts: str
-    longest_ns: Longest
+    starts: str  # the topic that starts it, or its timer's declared period
+    longest_ns: Longest  # response and execution time; None: not known
 
 
 @dataclass(frozen=True)
 class ChainNow:
-    """One chain: statistics by span (:data:`SPANS`), over all cycles that began in it.
+    """The figures of one chain at one look.
 
-    ``rate_hz`` is of cycles that began, over the last minute; ``shares`` of all outputs those that
-    left within each of the plan's slots, over the hour (empty: without a plan), ``early`` those
-    before the first slot; ``promised_ns`` is the end of the last slot, which is ``moved_ns`` behind
-    the plan's; ``counted`` are cycles since the watch began: ``complete``, of these ``late``,
-    ``incomplete``, ``unclear``, whose messages no event before Iron tells apart while
-    CLOCK_REALTIME is set, and ``not_used``: older than the message that the chain's timer or
-    synchroniser used, so no output is missing. ``kept`` says whether the plan's promise was kept
-    over the hour, as ``outputs`` has it (None: no plan, or no cycle). ``problem`` says why nothing
-    goes through the chain.
+    ``counted`` has the cycles since the watch began:
+
+    * ``complete``, and of these ``late``;
+    * ``incomplete``;
+    * ``unclear``: CLOCK_REALTIME was set, and before Iron no event says which message was whose;
+    * ``not_used``: the chain's timer or synchroniser used a newer message, so no output is missing.
     """
 
     chain: str
-    spans: Mapping[str, LatencyStatistics]
-    rate_hz: float
+    spans: Mapping[str, LatencyStatistics]  # by span (SPANS), over all cycles that began in it
+    rate_hz: float  # at which cycles began, over the last minute
     hops: tuple[Hop, ...]
-    shares: tuple[float, ...]
-    early: float
-    promised_ns: int | None
-    moved_ns: int
+    shares: tuple[float, ...]  # of outputs in each of the plan's slots, over the hour; () without
+    early: float  # share of outputs before the first slot, over the hour
+    promised_ns: int | None  # the end of the last slot, as it is now
+    moved_ns: int  # how far slots are behind those of the plan
     counted: Mapping[str, int]
-    problem: str | None
-    outputs: OutputsDue
-    kept: bool | None
+    problem: str | None  # why nothing goes through the chain
+    outputs: OutputsDue  # over the hour
+    kept: bool | None  # whether they keep the plan's promise; None: no plan, or no cycle
 
 
 @dataclass(frozen=True)
 class Seen:
-    """One look: its instant (CLOCK_MONOTONIC, ns), the nodes by process, and the chains.
+    """What one look shows."""
 
-    ``lost`` counts events that were overwritten before we read them, or found no room.
-    ``callbacks`` are there where they are asked for. ``left_out`` are sentences: which processes
-    have the library in front, and are not seen all the same, and why.
-    """
-
-    at_ns: int
-    processes: Mapping[int, str]
-    lost: int
+    at_ns: int  # its instant (CLOCK_MONOTONIC)
+    processes: Mapping[int, str]  # the node of each, by pid
+    lost: int  # events that were overwritten before they were read, or found no room
     chains: tuple[ChainNow, ...]
-    callbacks: tuple[CallbackNow, ...] = ()
-    left_out: tuple[str, ...] = ()
+    callbacks: tuple[CallbackNow, ...] = ()  # where the watch was asked for them
+    left_out: tuple[str, ...] = ()  # which processes with the library are not seen, and why
 
     def as_json(self) -> dict[str, Any]:
         return asdict(self)
@@ -158,25 +147,26 @@ class Seen:
         ERROR: nothing was to be seen in the last minute. WARN: an output was late or never came.
         """
         statuses = []
-        for one in self.chains:
-            minute = one.spans["minute"]
+        for chain in self.chains:
+            minute = chain.spans["minute"]
             missing = OutputsDue.of(minute.count, minute.late, minute.incomplete).missed
-            level, text = 2, one.problem or "no output in the last minute"
+            level, text = 2, chain.problem or "no output in the last minute"
             if minute.count:
                 level = int(missing > 0)
                 text = f"{minute.count} outputs in the last minute, {missing} late or missing"
-            values = {"cycles per second": f"{one.rate_hz:.3f}"}
-            for span, own in one.spans.items():
-                for which, ns in (("p50", own.percentiles_ns.get("50")), ("max", own.max_ns)):
+            values = {"cycles per second": f"{chain.rate_hz:.3f}"}
+            for span, figures in chain.spans.items():
+                shown = (("p50", figures.percentiles_ns.get("50")), ("max", figures.max_ns))
+                for which, ns in shown:
                     if ns is not None:
                         values[f"{which} of the last {span} [ms]"] = f"{ns / 1e6:.3f}"
-            about = {"name": f"chainshaper: {one.chain}", "level": level, "message": text}
+            about = {"name": f"chainshaper: {chain.chain}", "level": level, "message": text}
             statuses.append({**about, "values": values})
         return statuses
 
 
-# A callback, also of a node that was started again, or whose timer is seen at another period.
 _SAME = ("node", "kind", "topic", "declared_ns")
+"""A callback with the same is the same one, although its node was started again."""
 _CYCLE = pl.Schema(
     {"start": pl.Int64, "latency_ns": pl.Int64, "late": pl.Boolean, "place_ns": pl.Int64}
 )
@@ -184,7 +174,20 @@ _CYCLE = pl.Schema(
 
 @dataclass
 class _Chain:
-    """What is known of a chain: a row for each cycle, in the order of beginning, for an hour."""
+    """A watched chain and its cycles of the last hour.
+
+    Columns of ``cycles``, a row for each, in the order in which they began:
+        start: when it began (CLOCK_MONOTONIC, ns).
+        latency_ns: of its output; null: it has none.
+        late: whether the output left behind the cycle it was due in.
+        place_ns: where in the cycle it left, counted from the anchor.
+
+    Columns of a frame of ``hops``, a row for each hop, with the instant of the look it is of:
+        hop: its place in the chain.
+        communication_ns, computation_ns, waiting_ns: sums over cycles.
+        longest_communication_ns, longest_computation_ns, longest_waiting_ns: of one cycle.
+        count: how many cycles.
+    """
 
     text: str
     output: str  # its topic, as far as that is known
@@ -199,23 +202,24 @@ class _Chain:
     problem: str | None = None
 
     def take_over(self, traversals: pl.DataFrame, hops: pl.DataFrame, now_ns: int) -> None:
-        """Cycles that are over."""
+        """Add cycles that are over, with their hops."""
         recent = self.cycles.filter(pl.col("start") > now_ns - SPANS["hour"])
         new = traversals.select(_CYCLE.names()).cast(_CYCLE)
         # Else each look of the hour is a chunk, and the next looks take 100 times as long.
         self.cycles = pl.concat([recent, new], rechunk=True)
-        whole = int(traversals["complete"].sum())
-        self.counted["complete"] += whole
-        self.counted["incomplete"] += traversals.height - whole
+        complete = int(traversals["complete"].sum())
+        self.counted["complete"] += complete
+        self.counted["incomplete"] += traversals.height - complete
         self.counted["late"] += int(traversals["late"].sum() or 0)
-        own = hops.join(traversals.filter("complete"), on="traversal", how="semi")
-        if own.height:
+        of_complete = hops.join(traversals.filter("complete"), on="traversal", how="semi")
+        if of_complete.height:
             shares = pl.col([f"{part}_ns" for part in PARTS])
             most = shares.max().name.prefix("longest_")
-            figures = own.group_by("hop").agg(shares.sum(), most, count=pl.len())
+            figures = of_complete.group_by("hop").agg(shares.sum(), most, count=pl.len())
             self.hops.append((now_ns, figures))
 
     def statistics(self, since_ns: int) -> LatencyStatistics:
+        """Statistics over the cycles that began since an instant."""
         begun = self.cycles.filter(pl.col("start") >= since_ns)
         whole = begun.drop_nulls("latency_ns")
         late = None if whole["late"].null_count() else int(whole["late"].sum())
@@ -223,13 +227,13 @@ class _Chain:
         return latency_statistics(whole["latency_ns"].to_numpy(), incomplete=gone, late=late)
 
     def worst_ns(self, since_ns: int) -> tuple[int, ...]:
-        """The start of the cycle, since an instant, that has no output, or took longest."""
+        """The start of the worst cycle since an instant: without an output, or the longest."""
         rows = self.cycles.filter(pl.col("start") >= since_ns)
         worst = rows.sort("latency_ns", descending=True, nulls_last=False, maintain_order=True)
         return tuple(worst["start"].head(1))
 
     def shares(self) -> tuple[tuple[float, ...], float]:
-        """Of all outputs those within each slot, and those before the first one."""
+        """The share of outputs within each slot, and that of those before the first one."""
         places = self.cycles.drop_nulls("latency_ns")["place_ns"].drop_nulls().to_numpy()
         if not self.slots or not places.size:
             return (), 0.0
@@ -240,11 +244,14 @@ class _Chain:
         return tuple((counted / places.size).tolist()), float((slots < 0).mean())
 
     def beginning(self, graph: ApplicationGraph) -> Chain | None:
-        """The part of the chain that begins cycles, where it is not found any more but was."""
-        for one in graph.callbacks if self.first else ():
-            alike = (getattr(one, n) == getattr(self.first, n) for n in _SAME)
-            if all(alike) and self.names[0][1] in one.publishes:
-                return Chain(self.text, (one.id,), (self.names[0][1],))
+        """The first callback as a chain, where the whole one was found once and is no longer."""
+        if self.first is None:
+            return None
+        topic = self.names[0][1]
+        for callback in graph.callbacks:
+            alike = (getattr(callback, name) == getattr(self.first, name) for name in _SAME)
+            if all(alike) and topic in callback.publishes:
+                return Chain(self.text, (callback.id,), (topic,))
         return None
 
 
@@ -252,18 +259,19 @@ def _is_running(pid: int) -> bool:
     return Path(f"/proc/{pid}").exists()
 
 
-def _forget(seen: deque[tuple[int, Any]], before_ns: int) -> None:
-    while seen and seen[0][0] < before_ns:
-        seen.popleft()
+def _forget(timed: deque[tuple[int, Any]], before_ns: int) -> None:
+    """Drop the entries from before an instant, with which each begins."""
+    while timed and timed[0][0] < before_ns:
+        timed.popleft()
 
 
 class Watch:
-    """The chains of what runs, or will run, with the library in front.
+    """Follows the chains of an application that runs, or will run, with the library in front.
 
-    ``chains`` as `--chain` has them; ``users`` are whose processes are followed; a cycle that takes
+    ``chains`` are written as for `--chain`. Processes of ``users`` are followed. A cycle that takes
     longer than ``longest_ns`` counts as incomplete. ``plan`` says when outputs are due. With
-    ``callbacks`` their times are looked at, too. Between two looks :meth:`read` wants to be called
-    every tenth of a second or so.
+    ``callbacks`` the watch follows the times of all callbacks, too. Call :meth:`read` every tenth
+    of a second or so between two looks, or events are overwritten before they are read.
     """
 
     def __init__(
@@ -277,24 +285,27 @@ class Watch:
     ) -> None:
         self.callbacks: deque[tuple[int, Any]] | None = deque() if callbacks else None
         self.users, self.plan, self.longest_ns = users, plan, longest_ns
-        self.due = [] if plan is None else [due for one in plan.chains for due in due_of(one)]
+        self.due = [] if plan is None else [due for chain in plan.chains for due in due_of(chain)]
         ends = [(text, text.rpartition("..")[2]) for text in chains]
         self.chains = [_Chain(text, end, self._slots(end)) for text, end in ends]
         self.processes: dict[int, TracedProcess] = {}
-        self._left_out: dict[int, str] = {}  # why nothing is seen of these, in sentences
+        self._left_out: dict[
+            int, str
+        ] = {}  # by pid, a sentence that says why nothing is seen of it
         self._created: dict[int, tuple[int, dict[str, pl.DataFrame], TracingLibrary]] = {}
-        self._fresh: list[tuple[int, NDArray[Any]]] = []  # of a process, not yet in a table
-        self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # and their last instant
-        self._latest: dict[int, int] = {}  # a process's last event
+        self._fresh: list[tuple[int, NDArray[Any]]] = []  # pid and records, not yet in a table
+        self._recent: deque[tuple[int, dict[str, pl.DataFrame]]] = deque()  # last instant, events
+        self._latest: dict[int, int] = {}  # by pid, the time of its last event
         self._tabled_ns = 0
-        self._stepped_ns = 0  # until then it is not clear which message a cycle had
+        self._stepped_ns = 0  # when CLOCK_REALTIME was set: cycles from before are unclear
         self._known: list[tuple[Any, ...]] = []
         self._resolved = resolve_objects({})
         self._clock_offset_ns = clock_offset()
         self._searched_ns = 0
         self._lost_with_ended = 0
-        self._over_ns = time.monotonic_ns()  # cycles that began until then have been taken over
-        self._began_ns = self._looked_from_ns = self._over_ns  # the last look's cycles from then on
+        self._over_ns = time.monotonic_ns()  # cycles that began until then are counted
+        self._looked_from_ns = self._over_ns  # the last look counted cycles from then on
+        self._began_ns = self._over_ns
 
     def _due(self, output: str) -> Due | None:
         return next((due for due in self.due if due.output in (None, output)), None)
@@ -302,7 +313,7 @@ class Watch:
     def _plan_of(self, output: str) -> ChainPlan | None:
         """The plan whose promise is about a chain with this output."""
         plans = () if self.plan is None else self.plan.chains
-        return next((one for one in plans if one.chain.output in (None, output)), None)
+        return next((plan for plan in plans if plan.chain.output in (None, output)), None)
 
     def _slots(self, output: str) -> tuple[tuple[int, int], ...]:
         due = self._due(output) or Due(0)
@@ -310,12 +321,14 @@ class Watch:
         return tuple((start + delay, end + delay) for start, end in due.slots)
 
     def read(self) -> None:
-        """Take what is new in all memories, and look for new processes now and then."""
+        """Read what is new in all memories, and search for new processes now and then."""
         now = time.monotonic_ns()
         searches = now - self._searched_ns > (_SEARCH_NS if self.processes else _FIRST_SEARCH_NS)
         if searches:
             self._searched_ns = now
-            self._left_out = {p: why for p, why in self._left_out.items() if _is_running(p)}
+            self._left_out = {
+                pid: reason for pid, reason in self._left_out.items() if _is_running(pid)
+            }
             known = {*self.processes, *self._left_out}
             for pid, memory in memories(self.users, known, self._left_out.__setitem__):
                 self.processes[pid], self._latest[pid] = memory, 0
@@ -343,14 +356,14 @@ class Watch:
                 self._latest[pid] = max(self._latest[pid], int(new["time"][-1]))
 
     def _ended(self) -> list[int]:
-        return [one for one in self.processes if not _is_running(one)]
+        return [pid for pid in self.processes if not _is_running(pid)]
 
     def _needed_ns(self, now_ns: int) -> int:
-        """From when on events may be asked for: by the flight recorder, or by a late look."""
+        """From when on events are needed, by :meth:`save` or by a look that comes late."""
         return min(now_ns - RECORDER_NS, self._looked_from_ns) - self.longest_ns
 
     def look(self) -> Seen:
-        """What is to be seen now; cycles that began ``longest_ns`` ago or earlier are counted."""
+        """Look at all chains; cycles that began ``longest_ns`` ago or earlier are counted."""
         self.read()
         now, offset = time.monotonic_ns(), clock_offset()
         if abs(offset - self._clock_offset_ns) > _STEP_NS:
@@ -370,92 +383,103 @@ class Watch:
         clear_ns = self._stepped_ns if stampless else 0
         within = pl.col("start").is_between(self._over_ns, over, "right")
         graph = graph_of(flow)
-        for one in self.chains:
-            _forget(one.hops, now - SPANS["minute"])
-            if (found := self._judged(one, flow, graph)) is not None:
-                judged, hops = found
-                begun = judged.filter(within)
-                # A lifecycle node that is not active owes no output, nor does an older message.
-                idle = pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False)
-                new = begun.filter(~idle)
-                one.counted["not_used"] += begun.filter(reason="not used").height
-                new = new.with_columns(pl.col("place_ns") - moved.get(one.output, 0))
-                one.take_over(clear := new.filter(pl.col("start") > clear_ns), hops, now)
-                one.counted["unclear"] += new.height - clear.height
+        for chain in self.chains:
+            _forget(chain.hops, now - SPANS["minute"])
+            traversed = self._judged(chain, flow, graph)
+            if traversed is None:
+                continue
+            judged, hops = traversed
+            begun = judged.filter(within)
+            # A lifecycle node that is not active owes no output, nor does an older message.
+            idle = pl.col("reason").is_in(OWES_NO_OUTPUT).fill_null(False)
+            new = begun.filter(~idle)
+            new = new.with_columns(pl.col("place_ns") - moved.get(chain.output, 0))
+            clear = new.filter(pl.col("start") > clear_ns)
+            chain.take_over(clear, hops, now)
+            chain.counted["not_used"] += begun.filter(reason="not used").height
+            chain.counted["unclear"] += new.height - clear.height
         if self.callbacks is not None:
-            own = replace(flow, instances=flow.instances.filter(within))
-            self.callbacks.append((now, longest_times(own)))
+            of_over = replace(flow, instances=flow.instances.filter(within))
+            self.callbacks.append((now, longest_times(of_over)))
             _forget(self.callbacks, now - SPANS["minute"])
         self._looked_from_ns, self._over_ns = self._over_ns, over
         return Seen(
             at_ns=now,
             processes=processes_of(tables, dict.fromkeys(self.processes, "")),
             lost=self.lost,
-            chains=tuple(self._now(one, over, moved) for one in self.chains),
-            callbacks=tuple(_callbacks([own for _, own in self.callbacks or ()])),
+            chains=tuple(self._now(chain, over, moved) for chain in self.chains),
+            callbacks=tuple(_callbacks([times for _, times in self.callbacks or ()])),
             left_out=tuple(self._left_out.values()),
         )
 
     def _judged(
-        self, one: _Chain, flow: DataFlow, graph: ApplicationGraph
+        self, watched: _Chain, flow: DataFlow, graph: ApplicationGraph
     ) -> tuple[pl.DataFrame, pl.DataFrame] | None:
-        """The traversals of a chain, judged, and their hops; None where it is not to be found."""
-        one.problem, chain = None, None
+        """The traversals of a chain, late ones marked, and their hops; None: it is in no graph.
+
+        Where only its beginning is in the graph, each cycle that began is incomplete.
+        """
+        watched.problem, chain = None, None
         try:
-            chain = find_chain(graph, one.text)
+            chain = find_chain(graph, watched.text)
         except InputError as error:
-            nobody = " ".join(self._left_out.values()) or NO_PROCESS
-            one.problem = str(error) if self.processes else nobody
+            if self.processes:
+                watched.problem = str(error)
+            else:
+                watched.problem = " ".join(self._left_out.values()) or NO_PROCESS
             # Every cycle that is over had its events here: none of them has arrived.
             if not isinstance(error, SeveralPathsError):
-                chain = one.beginning(graph)
+                chain = watched.beginning(graph)
         if chain is None:
             return None
-        found = traverse(flow, chain, graph)
-        judged, _ = with_punctuality(flow, found, self._due(chain.topics[-1]))
-        if one.problem is not None:
-            return judged.with_columns(latency_ns=None, late=None, complete=False), found.hops
+        traversals = traverse(flow, chain, graph)
+        judged, _ = with_punctuality(flow, traversals, self._due(chain.topics[-1]))
+        if watched.problem is not None:
+            return judged.with_columns(latency_ns=None, late=None, complete=False), traversals.hops
         path = graph.path(chain)
-        one.first, one.output = path[0], chain.topics[-1]
-        one.slots = self._slots(one.output)  # the text may end with a node
-        one.names = [(c.node or "", t) for c, t in zip(path, chain.topics, strict=True)]
-        return judged, found.hops
+        watched.first, watched.output = path[0], chain.topics[-1]
+        watched.slots = self._slots(watched.output)  # the text may end with a node
+        watched.names = [
+            (callback.node or "", topic) for callback, topic in zip(path, chain.topics, strict=True)
+        ]
+        return judged, traversals.hops
 
     def _objects(self, tables: EventTables, since_ns: int) -> Objects:
-        """Who exists: as at the last look where nothing was created, and the same ran, since then.
+        """The objects of all processes: those of the last look, if none can have come since.
 
-        That is half of a look, and what is created stays; which callbacks ran, and which
-        subscriptions took, makes known those that say so only thereby (Python's).
+        To resolve them is half of the work of a look. Objects of Python nodes become known only
+        when a callback runs or a subscription takes, so these are compared, too.
         """
         what_ran = [("callback_start", "callback"), ("rmw_take", "rmw_subscription_handle")]
-        known = [tuple(sorted((pid, one[0]) for pid, one in self._created.items()))]
+        known = [tuple(sorted((pid, created[0]) for pid, created in self._created.items()))]
         for name, column in what_ran:
             rows = events.table(tables, name).select("pid", column).unique()
             known.append(tuple(sorted(rows.iter_rows())))
-        created = (tables[one]["time"][-1] for one in events.CREATION & tables.keys())
-        if known != self._known or max(created, default=0) >= since_ns:
+        times = (tables[name]["time"][-1] for name in events.CREATION & tables.keys())
+        if known != self._known or max(times, default=0) >= since_ns:
             self._known, self._resolved = known, resolve_objects(tables)
         return self._resolved
 
-    def _now(self, one: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
-        moved_ns = moved.get(one.output, 0)
-        begun = one.cycles["start"].filter(one.cycles["start"] > over_ns - SPANS["minute"])
-        shares, early = one.shares()
+    def _now(self, chain: _Chain, over_ns: int, moved: Mapping[str, int]) -> ChainNow:
+        """The figures of a chain whose cycles until ``over_ns`` are counted."""
+        moved_ns = moved.get(chain.output, 0)
+        begun = chain.cycles["start"].filter(chain.cycles["start"] > over_ns - SPANS["minute"])
+        shares, early = chain.shares()
         lasted = begun[-1] - begun[0] if len(begun) > 1 else 0
-        spans = {name: one.statistics(over_ns - span) for name, span in SPANS.items()}
-        hour, plan = spans["hour"], self._plan_of(one.output)
+        spans = {name: chain.statistics(over_ns - span) for name, span in SPANS.items()}
+        hour, plan = spans["hour"], self._plan_of(chain.output)
         outputs = OutputsDue.of(hour.count, hour.late, hour.incomplete, plan)
         return ChainNow(
-            chain=one.text,
+            chain=chain.text,
             spans=spans,
             rate_hz=(len(begun) - 1) * SECOND / lasted if lasted else 0.0,
-            hops=tuple(_hops(one)),
+            hops=tuple(_hops(chain)),
             shares=shares,
             early=early,
-            promised_ns=one.slots[-1][1] + moved_ns if one.slots else None,
+            promised_ns=chain.slots[-1][1] + moved_ns if chain.slots else None,
             moved_ns=moved_ns,
-            counted=dict(one.counted),
-            problem=one.problem,
+            counted=dict(chain.counted),
+            problem=chain.problem,
             outputs=outputs,
             kept=outputs.kept,
         )
@@ -463,29 +487,30 @@ class Watch:
     @property
     def lost(self) -> int:
         """Events that were overwritten before they were read, or found no room."""
-        there = sum(one.lost + one.dropped for one in self.processes.values())
-        return there + self._lost_with_ended
+        running = sum(process.lost + process.dropped for process in self.processes.values())
+        return running + self._lost_with_ended
 
     def _tables(self, since_ns: int) -> EventTables:
-        """All that was created, but for what ended before an instant, and what happened since."""
+        """Events since an instant, and the creation of all objects but those of ended processes."""
         self._take_fresh(time.monotonic_ns())
         gone = {pid for pid in self._ended() if self._latest[pid] < since_ns}
         created = (tables for pid, (_, tables, _) in self._created.items() if pid not in gone)
-        return joined_tables([*created, *(own for last, own in self._recent if last >= since_ns)])
+        recent = (tables for last_ns, tables in self._recent if last_ns >= since_ns)
+        return joined_tables([*created, *recent])
 
     def _take_fresh(self, now_ns: int) -> None:
-        """Make tables of what was read since the last time, and drop those that are too old."""
+        """Make tables of the records that were read since the last time; drop tables too old."""
         by_library: dict[TracingLibrary, list[tuple[NDArray[Any], int]]] = {}
         for pid, process in self.processes.items():
             asked = int(process.header["objects"][0])
             if pid not in self._created or self._created[pid][0] != asked:
                 self._created[pid] = (asked, *creation_tables(process))
         for pid, part in self._fresh:
-            own = by_library.setdefault(self._created[pid][2], [])
-            own.append((part, self.processes[pid].pid))
-        for library, own in by_library.items():
-            records = np.concatenate([part for part, _ in own])
-            pids = np.repeat([pid for _, pid in own], [part.size for part, _ in own])
+            parts = by_library.setdefault(self._created[pid][2], [])
+            parts.append((part, self.processes[pid].pid))
+        for library, parts in by_library.items():
+            records = np.concatenate([part for part, _ in parts])
+            pids = np.repeat([pid for _, pid in parts], [part.size for part, _ in parts])
             tables = event_tables(records, pids.astype(np.int32), library)
             self._recent.append((int(records["time"].max()), tables))
         self._fresh, self._tabled_ns = [], now_ns
@@ -494,16 +519,15 @@ class Watch:
     def save(self, output: str | Path, *, reasons: Sequence[str] = ()) -> Recording:
         """Write the last ten seconds as a recording, or more if the last look had cycles before.
 
-        ``reasons`` why stand in its notes. `report` shows the worst cycle of each chain first.
+        ``reasons`` for it stand in its notes. `report` shows the worst cycle of each chain first.
 
         Raises InputError: the folder exists. OperationError: it cannot be written, or there is
         nothing to be written.
         """
         output = refuse_existing(output)
         self.read()
-        since = (
-            self._needed_ns(time.monotonic_ns()) + self.longest_ns
-        )  # with the last look's cycles
+        # The last look's cycles are in it.
+        since = self._needed_ns(time.monotonic_ns()) + self.longest_ns
         tables = events.happened(self._tables(since), since)
         if not tables:
             raise OperationError(f"{output} is not written: no event has been seen yet")
@@ -517,7 +541,9 @@ class Watch:
                 *reasons,
                 *self._left_out.values(),
             ),
-            "worst_ns": tuple(at for one in self.chains for at in one.worst_ns(since)),
+            "worst_ns": tuple(
+                start_ns for chain in self.chains for start_ns in chain.worst_ns(since)
+            ),
         }
         if self.plan is not None:
             facts["plan"] = plan_values(self.plan)
@@ -526,36 +552,39 @@ class Watch:
         return write_recording(output, tables, info)
 
 
-def _hops(one: _Chain) -> Iterator[Hop]:
-    if not one.hops:
+def _hops(chain: _Chain) -> Iterator[Hop]:
+    """Yield the hops of a chain with their shares over the last minute."""
+    if not chain.hops:
         return
-    figures = pl.concat([frame for _, frame in one.hops]).group_by("hop")
+    figures = pl.concat([frame for _, frame in chain.hops]).group_by("hop")
     sums = figures.agg(pl.exclude("^longest_.*$").sum(), pl.col("^longest_.*$").max()).sort("hop")
     for row in sums.iter_rows(named=True):
         communication, computation, waiting = (row[f"{part}_ns"] / row["count"] for part in PARTS)
         longest = tuple(row[f"longest_{part}_ns"] for part in PARTS)
-        node, topic = one.names[row["hop"]]
+        node, topic = chain.names[row["hop"]]
         yield Hop(node, topic, communication, computation, waiting, longest)
 
 
 def _callbacks(looks: Sequence[Mapping[tuple[str, str], Longest]]) -> Iterator[CallbackNow]:
-    for node, starts in dict.fromkeys(name for own in looks for name in own):
-        found = [own[node, starts] for own in looks if (node, starts) in own]
+    """Yield the longest times of each callback over some looks, by node and what starts it."""
+    for node, starts in dict.fromkeys(name for times in looks for name in times):
+        longest = [times[node, starts] for times in looks if (node, starts) in times]
         response, execution = (
-            max((one for one in times if one is not None), default=None)
-            for times in zip(*(one.times for one in found), strict=True)
+            max((time_ns for time_ns in times if time_ns is not None), default=None)
+            for times in zip(*(of_look.times for of_look in longest), strict=True)
         )
-        yield CallbackNow(node, starts, Longest(response, execution, found[-1].shown))
+        yield CallbackNow(node, starts, Longest(response, execution, longest[-1].shown))
 
 
 @contextlib.contextmanager
 def exporting(
     port: int | None = None, endpoint: str | None = None
 ) -> Iterator[Callable[[Seen], list[str]]]:
-    """Metrics of what was seen last: OpenMetrics on a local port, OTLP to an HTTP endpoint.
+    """Export metrics of the last look: OpenMetrics on a local port, OTLP to an HTTP endpoint.
 
-    What it gives wants every look, and answers with what there is to say about the collector. Times
-    are in seconds, as both conventions have it; cycles count from the beginning of the watch.
+    Yields a function that takes each look and returns the sentences about the collector since the
+    last one. Times are in seconds, as both conventions have it; cycles count from the beginning of
+    the watch.
 
     Raises PlatformError: the OpenTelemetry SDK is not installed. OperationError: no such port.
     InputError: no such endpoint.
@@ -566,7 +595,7 @@ def exporting(
     library = partial(extra_library, purpose="exporting metrics", extra="metrics")
     metrics, export = (library(f"opentelemetry.sdk.metrics{sub}") for sub in ("", ".export"))
     observation = library("opentelemetry.metrics").Observation
-    readers, told = [], list[Callable[[], list[str]]]()
+    readers, news = [], list[Callable[[], list[str]]]()
     with contextlib.ExitStack() as until:
         if endpoint is not None:
             check_endpoint(endpoint)
@@ -576,7 +605,7 @@ def exporting(
         if endpoint is not None:
             otlp = library("opentelemetry.exporter.otlp.proto.http.metric_exporter")
             exporter = otlp.OTLPMetricExporter(endpoint=endpoint)
-            told.append(tell_delivery(exporter, endpoint))
+            news.append(delivery_news(exporter, endpoint))
             readers.append(export.PeriodicExportingMetricReader(exporter, EVERY_MS))
         provider = metrics.MeterProvider(metric_readers=readers)
         until.callback(provider.shutdown, timeout_millis=LONGEST_END_MS)
@@ -595,7 +624,7 @@ def exporting(
 
         def take(seen: Seen) -> list[str]:
             last[:] = [seen]
-            return [text for one in told for text in one()]
+            return [sentence for take_news in news for sentence in take_news()]
 
         yield take
 
@@ -609,18 +638,18 @@ _METRICS = {
 
 
 def _values(seen: Seen) -> Iterator[tuple[str, float, dict[str, str]]]:
-    """Each value of :data:`_METRICS`, and its attributes."""
+    """Yield each value of :data:`_METRICS`, with its name and attributes."""
     yield "events.lost", float(seen.lost), {}
-    for one in seen.chains:
-        chain = {"chain": one.chain}
-        for span, own in one.spans.items():
-            percentiles = {f"p{which}": ns for which, ns in own.percentiles_ns.items()}
-            for which, ns in {"min": own.min_ns, "max": own.max_ns, **percentiles}.items():
+    for chain in seen.chains:
+        named = {"chain": chain.chain}
+        for span, figures in chain.spans.items():
+            percentiles = {f"p{which}": ns for which, ns in figures.percentiles_ns.items()}
+            for which, ns in {"min": figures.min_ns, "max": figures.max_ns, **percentiles}.items():
                 if ns is not None:
-                    yield "chain.latency", ns / SECOND, {**chain, "span": span, "statistic": which}
-        for hop in one.hops:
-            about = {**chain, "node": hop.node, "topic": hop.topic}
+                    yield "chain.latency", ns / SECOND, {**named, "span": span, "statistic": which}
+        for hop in chain.hops:
+            about = {**named, "node": hop.node, "topic": hop.topic}
             for part in PARTS:
                 yield "hop.time", getattr(hop, f"{part}_ns") / SECOND, {**about, "part": part}
-        for outcome, count in one.counted.items():
-            yield "chain.cycles", count, {**chain, "outcome": outcome}
+        for outcome, count in chain.counted.items():
+            yield "chain.cycles", count, {**named, "outcome": outcome}

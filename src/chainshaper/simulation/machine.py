@@ -1,7 +1,7 @@
-"""What is simulated, as the engine has it: a :class:`System` with its times, gates and servers.
+"""The engine's description of a :class:`System`: its times, gates, servers and cores.
 
-The engine (core/simulation) is told everything in one description, by places in lists, and asks for
-numbers while it runs.
+The engine (core/simulation) gets one description, in which things refer to each other by their
+places in lists. While it runs it asks for random numbers, by stream.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,13 +23,14 @@ from chainshaper.workload.timing import Timing
 Int64s = npt.NDArray[np.int64]
 
 FIRST_COST = 1 << 20
-"""Costs are numbered from here, callbacks of a node from 0: no two draw the same sequence."""
-FIRST_DELIVERY = 1 << 21  # and deliveries from here, by publishing node, callback and input
+"""Threads' costs are numbered from here, a node's callbacks from 0: each draws its own sequence."""
+FIRST_DELIVERY = 1 << 21
+"""Deliveries are numbered from here, by publishing node, callback and input."""
 COSTS = ("wake_up", "take", "publish", "receive", "delivery")  # numbered in this order
-BEST_EFFORT = 1000
+BEST_EFFORT = 1000  # the rank of threads of the fair class, behind all real-time ones
 LOG_ROWS = 1 << 17  # of a kind, in a part of the log
-INSTANTS = 1 << 18  # after so many the engine is left for a moment: Ctrl-C is heard
-POOL = 4096  # messages under way, besides those in histories
+INSTANTS = 1 << 18  # after so many the engine pauses, so that Ctrl-C ends the simulation
+POOL = 4096  # room for messages under way, besides those in histories
 
 _EXECUTORS = {
     "single-threaded": _core.ExecutorKind.single_threaded,
@@ -39,7 +40,7 @@ _EXECUTORS = {
 
 
 class Streams:
-    """All streams of a simulation: drawn here, block by block, as the engine asks for them.
+    """The random numbers of a simulation, in streams, drawn block by block as the engine asks.
 
     A callback's stream is that of the live workload, value for value.
     """
@@ -50,7 +51,7 @@ class Streams:
         self._drawn: list[Iterator[Int64s]] = []
 
     def add(self, times: ExecutionTime, node: str | None, index: int) -> int:
-        """The place of a new stream of CPU times or delays (ns)."""
+        """Add a stream of CPU times or delays (ns); return its place."""
         self.constants.append(times.constant_ns)
         self._drawn.append(blocks(times, self._seed, node or "", index))
         return len(self.constants) - 1
@@ -61,17 +62,17 @@ class Streams:
 
 
 class Handles(NamedTuple):
-    """Of entities: callback, own, rmw; of publishers: own, rmw."""
+    """The handles of a system's objects, by their places."""
 
-    entities: Sequence[tuple[int, int, int]]
-    publishers: Sequence[tuple[int, int]]
+    entities: Sequence[tuple[int, int, int]]  # of the callback, of rcl and of rmw
+    publishers: Sequence[tuple[int, int]]  # of rcl and of rmw
 
 
 class Machine:
-    """What the engine is told about a system, a plan that is in force, and the instants of a run.
+    """The engine, with the description of a system, the plan in force and the instants of a run.
 
-    ``latencies`` is for how many recorded instances of the chain the latency is noted; where it is
-    for none, events are logged, with ``switches`` those of threads as well.
+    With ``latencies`` it notes the latency of so many recorded instances of the chain, and logs no
+    events. With 0 it logs events, and with ``switches`` context switches as well.
     """
 
     def __init__(
@@ -190,13 +191,17 @@ class Machine:
         system, plan = self._system, self._plan
         cores = []
         for core in system.cores:
-            governed = {number: one for number, one in system.servers.items() if one.core == core}
+            governed = {
+                thread: server for thread, server in system.servers.items() if server.core == core
+            }
             if plan is None or not governed:
                 cores.append(_core.CoreDescription())
                 continue
             ranked = [server for server in plan.servers if server in governed.values()]
             ranked.sort(key=lambda server: server.priority)
-            receiving = {n: one for n, one in system.receivers.items() if one.core == core}
+            receiving = {
+                thread: place for thread, place in system.receivers.items() if place.core == core
+            }
             self._rank(threads, plan, governed, ranked, receiving)
             cores.append(_governed_core(plan, ranked, self._timing))
         return cores
@@ -209,29 +214,37 @@ class Machine:
         ranked: list[Server],
         receiving: dict[int, ReceiverPlace],
     ) -> None:
-        """Server and rank of the threads that are ``governed`` on a core: by the priority of the
-        server and, within one, in the plan's order, as `server_priorities` has them live; and the
-        rank of those ``receiving`` an output, behind all of their priority.
+        """Set server and rank of the threads that a plan governs on a core.
+
+        ``governed`` threads rank by the priority of their server and, within one, in the plan's
+        order, as `server_priorities` has them live. Threads that are ``receiving`` an output rank
+        behind all of their priority. Both are by the thread's place.
         """
         order = plan.most_urgent_first
         place_of = {node: place for place, node in enumerate(order)}
-        named = {
+        position = {
             number: place_of.get(self._system.threads[number].node, len(order))
             for number in governed
         }
-        taken = {
-            server.name: sorted({named[n] for n, one in governed.items() if one is server})
+        positions = {
+            server.name: sorted(
+                {
+                    position[thread]
+                    for thread, its_server in governed.items()
+                    if its_server is server
+                }
+            )
             for server in ranked
         }
         behind_outputs = plan.behind_outputs
         urgency = {
             number: (
                 server.priority,
-                taken[server.name].index(named[number]) + (server.name in behind_outputs),
+                positions[server.name].index(position[number]) + (server.name in behind_outputs),
             )
             for number, server in governed.items()
         }
-        behind = {number: (one.priority, len(governed)) for number, one in receiving.items()}
+        behind = {number: (place.priority, len(governed)) for number, place in receiving.items()}
         urgent = sorted({*urgency.values(), *behind.values()})
         for number, key in behind.items():
             threads[number].rank = urgent.index(key) - len(urgent)
@@ -243,7 +256,7 @@ class Machine:
 
     def _entities(self) -> list[_core.EntityDescription]:
         system, entities = self._system, []
-        # What the entities of a callback share: its streams, and its gate or synchroniser.
+        # The entities of a callback share its streams, and its gate or synchroniser.
         executions: dict[tuple[int, int], dict[str, int]] = {}
         bodies: dict[tuple[int, int], int] = {}
         for number, entity in enumerate(system.entities):
@@ -285,7 +298,7 @@ class Machine:
         return self._groups.setdefault((process, group), len(self._groups))
 
     def _add_body(self, described: CallbackDescription) -> int:
-        """The place of a callback's gate, or of its synchroniser."""
+        """Add the callback's gate or synchroniser, if it has one; return its place."""
         if described.gate is not None:
             self._gates.append(self._gate(described))
             return len(self._gates) - 1
@@ -312,7 +325,7 @@ class Machine:
             self._synchronisers[place].inputs = inputs
 
     def _set_trigger(self, described: _core.EntityDescription, entity: Entity) -> None:
-        """When a timer expires, or how many messages a reader's history has, and for how long."""
+        """Set when a timer expires, or how many messages a reader's history holds, how long."""
         system, gate = self._system, entity.described.gate
         if entity.topic is None:
             key = system.processes[entity.process].key
@@ -328,7 +341,7 @@ class Machine:
     def _gate(self, described: CallbackDescription) -> _core.GateDescription:
         gate, timing = described.gate, self._timing
         assert gate is not None  # noqa: S101 - the caller has seen it
-        found = _core.GateDescription(
+        description = _core.GateDescription(
             slots=list(gate.slots),
             depth=gate.gate().depth,
             moves=gate.moved(timing.start_ns),
@@ -336,18 +349,20 @@ class Machine:
             pause_ns=gate.pause_ns,
             **values_of(gate.gate()),
         )
-        found.phase_ns = timing.anchor_ns
+        description.phase_ns = timing.anchor_ns
         if gate.phase_ns is not None:
-            found.phase_ns = timing.start_ns + gate.phase_ns
+            description.phase_ns = timing.start_ns + gate.phase_ns
         if (modes := gate.modes) is not None:
-            found.mode_names, found.bands = list(modes.bands), list(modes.bands.values())
-            found.modes = [self._system.modes.index(mode) for mode in modes.bands]
-            found.first_mode, found.late = found.mode_names.index(modes.default), modes.late
-        return found
+            description.mode_names = list(modes.bands)
+            description.bands = list(modes.bands.values())
+            description.modes = [self._system.modes.index(mode) for mode in modes.bands]
+            description.first_mode = description.mode_names.index(modes.default)
+            description.late = modes.late
+        return description
 
     def _publishers(self) -> list[_core.PublisherDescription]:
         system, publishers = self._system, []
-        owner = {one: entity for entity in system.entities for one in entity.publishers}
+        owner = {place: entity for entity in system.entities for place in entity.publishers}
         last = system.chain.callbacks[-1:]
         reading: dict[str | None, list[int]] = {}
         for number, entity in enumerate(system.entities):
@@ -355,7 +370,7 @@ class Machine:
         for number, publisher in enumerate(system.publishers):
             topic: TopicDescription = system.application.topic(publisher.topic)
             handle, rmw_handle = self._handles.publishers[number]
-            ends = any(number in system.entities[one].publishers for one in last)
+            ends = any(number in system.entities[entity].publishers for entity in last)
             announces = owner[number].described.announces
             readers = [
                 _core.ReaderDescription(
@@ -378,7 +393,7 @@ class Machine:
         return publishers
 
     def _delivery(self, reader: Entity, publisher: SimulatedPublisher) -> int | None:
-        """The stream of a reader's own times of delivery from a publisher; None: it has none."""
+        """The stream of delivery times that are described for a reader alone; None: none are."""
         process = self._system.processes[reader.process]
         described: Mapping[str, ExecutionTime] = self._system.application.simulation.deliveries.get(
             process.key, {}
@@ -396,7 +411,7 @@ class Machine:
 
 
 def _governed_core(plan: Plan, ranked: Sequence[Server], timing: Timing) -> _core.CoreDescription:
-    """A core with servers. The run starts anywhere in a cycle."""
+    """A core with servers, in the state that it has at the run's start, anywhere in a cycle."""
     table = _slot_table(plan, ranked)
     anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
     elapsed = (timing.start_ns - anchor) % plan.cycle_ns
@@ -412,15 +427,18 @@ def _governed_core(plan: Plan, ranked: Sequence[Server], timing: Timing) -> _cor
 
 
 def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
-    """Rows (offset in the cycle, mask of the servers that are open from then on)."""
+    """The slot table of a core: (offset in the cycle (ns), bit mask of the servers open then)."""
     # A free shaping node times its messages itself: its thread needs no slot to run in.
     slots = [
         server.slots if plan.free_threads.isdisjoint(server.threads) else ((0, plan.cycle_ns),)
         for server in ranked
     ]
-    offsets = {0} | {instant for own in slots for slot in own for instant in slot}
+    offsets = {0} | {instant for of_server in slots for slot in of_server for instant in slot}
     table = []
     for offset in sorted(offset for offset in offsets if offset < plan.cycle_ns):
-        is_open = [any(start <= offset < end for start, end in own) for own in slots]
-        table.append((offset, sum(1 << bit for bit, one in enumerate(is_open) if one)))
+        mask = 0
+        for bit, of_server in enumerate(slots):
+            if any(start <= offset < end for start, end in of_server):
+                mask |= 1 << bit
+        table.append((offset, mask))
     return table

@@ -1,9 +1,9 @@
-"""Simulate an application, with or without a plan in force, and write what the engine logs.
+"""Simulate an application, with or without a plan in force, and record its events.
 
-Instead of described times, measured ones may be drawn: the CPU times of each callback's instances
-in a recording, in the order in which they happened, so that stretches of them stay correlated in
-time, and those of callbacks that all ran once a cycle are of the same cycles. What publishing costs
-is not in them: a callback computes before it publishes.
+Instead of described execution times, measured ones may be drawn: the CPU times of each callback's
+instances in a recording, in the order in which they happened. So stretches of them stay correlated
+in time, and those of callbacks that all ran once a cycle are of the same cycles. They end where the
+callback first publishes: what publishing costs is described apart.
 """
 
 from collections import Counter
@@ -49,7 +49,7 @@ from chainshaper.workload.timing import Timing, timing_of
 
 START_NS = 1_000_000_000
 LONGEST_NS = 1 << 62
-MOST = 100_000  # samples: enough for any distribution
+MOST = 100_000  # samples of an execution time: enough for any distribution
 
 
 def simulate(
@@ -103,11 +103,11 @@ def simulate_latencies(
     seed: int | None = None,
     progress: Progress | None = None,
 ) -> Int64s:
-    """The end-to-end latencies of an application's chain, by simulation (ns).
+    """Simulate an application; return its chain's end-to-end latencies (ns), without any event.
 
-    What :func:`simulate` and the latency analysis of its recording give, without any event being
-    written: one per instance of the chain, ``cycles`` at most. −1 stands for an instance that did
-    not complete: its message was discarded, lost, or merged with another's.
+    They are those of :func:`simulate` and the latency analysis of its recording: one per instance
+    of the chain, ``cycles`` at most. −1 stands for an instance that did not complete: its message
+    was discarded, lost, or merged with another's.
 
     Raises: as :func:`simulate`.
     """
@@ -121,7 +121,10 @@ def simulate_latencies(
 def _checked(
     application: Application, plan: Plan | None, cycles: int, seed: int | None
 ) -> tuple[Application, Timing]:
-    """The application with the seed and the plan's shaping nodes, and the run's instants."""
+    """Give the application seed and shaping nodes; return it, and the instants of its run.
+
+    Raises InputError: too few or too many cycles, or a callback that computes.
+    """
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
     for name, callback in application.callbacks():
@@ -134,8 +137,10 @@ def _checked(
     if seed is not None:
         application = application.model_copy(update={"seed": seed})
     if plan is not None:
-        shaping = [bool(one.shaping_node) or any(publisher_servers(one)) for one in plan.chains]
-        if all(shaping):
+        shapes_every_chain = all(
+            chain.shaping_node is not None or any(publisher_servers(chain)) for chain in plan.chains
+        )
+        if shapes_every_chain:
             application = splice_application(application, plan)
         else:  # a baseline
             application = at_offsets(application, plan)
@@ -158,6 +163,7 @@ def _built(
     switches: bool = False,
     latencies: int = 0,
 ) -> tuple[System, list[live.ProcessLog], Machine]:
+    """Build what is simulated, the log of its objects' creation, and the engine's description."""
     in_force = None if plan is None else open_until_done(plan)
     system = build_system(application, in_force, follow_chain=latencies > 0)
     objects, handles = _create_objects(system)
@@ -166,7 +172,10 @@ def _built(
 
 
 def _runs(machine: Machine, progress: Progress | None = None) -> Iterator[_core.Pause]:
-    """Run to the end; why the engine stopped, each time that it did."""
+    """Run to the end; yield why the engine paused, each time that it does.
+
+    Raises OperationError: messages pile up, or callbacks call each other, without end.
+    """
     simulation, described = machine.simulation, machine.description
     while (reason := simulation.run(INSTANTS)) != _core.Pause.over:
         if reason == _core.Pause.messages_full:
@@ -193,7 +202,7 @@ def _event_tables(
     machine: Machine,
     progress: Progress | None,
 ) -> Iterator[dict[str, pl.DataFrame]]:
-    """The event tables part by part as the log fills up, the objects' first."""
+    """Yield the event tables part by part as the log fills up, those of objects first."""
     yield live.event_tables(objects, from_ns=0)
     for reason in _runs(machine, progress):
         if reason != _core.Pause.none:
@@ -206,8 +215,10 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
     for process, log in zip(system.processes, logs, strict=True):
         log.node(process.node, "simulation")
     publishers = [
-        logs[one.process].publisher(one.topic, system.depth(one.topic), one.asynchronous)
-        for one in system.publishers
+        logs[publisher.process].publisher(
+            publisher.topic, system.depth(publisher.topic), publisher.asynchronous
+        )
+        for publisher in system.publishers
     ]
     entities = []
     for entity in system.entities:
@@ -216,10 +227,11 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
         node = system.processes[entity.process].node
         callback = log.callback(f"{filtered}{node}::callback{entity.index}")
         if entity.topic is None:
-            own = (log.timer(callback, entity.described.timer_ns or 0), 0)
+            handle, rmw_handle = log.timer(callback, entity.described.timer_ns or 0), 0
         else:
-            own = log.subscription(callback, entity.topic, system.depth(entity.topic))
-        entities.append((callback, *own))
+            depth = system.depth(entity.topic)
+            handle, rmw_handle = log.subscription(callback, entity.topic, depth)
+        entities.append((callback, handle, rmw_handle))
     core_of = {info.pid: info.cores[0] for info in system.threads if info.role == "executor"}
     created = [
         live.ProcessLog(process.pid, core_of[process.pid], b"", tuple(log.objects))
@@ -231,9 +243,10 @@ def _create_objects(system: System) -> tuple[list[live.ProcessLog], Handles]:
 def _logged(
     system: System, log: Mapping[str, Mapping[str, npt.NDArray[Any]]]
 ) -> dict[str, pl.DataFrame]:
-    """What is in the log, as event tables: those in which there is something."""
+    """Make event tables of a part of the log; those without a row are left out."""
     tables = dict(live.logged_tables(log, system.modes))
-    for name in {"asynchronous_send", "gate_release"} & tables.keys():  # of when they began
+    # The engine logs these when they end, and their time is when they began.
+    for name in {"asynchronous_send", "gate_release"} & tables.keys():
         tables[name] = tables[name].sort("time", maintain_order=True)
     switches = log["context_switch"]
     if switches["time"].size:
@@ -242,7 +255,7 @@ def _logged(
 
 
 def _switches(system: System, switches: Mapping[str, npt.NDArray[Any]]) -> pl.DataFrame:
-    """The table of context switches, of threads by their numbers: -1, the last, is the idle one."""
+    """The table `sched_switch`; the log has threads' places, and −1, the last, for the idle one."""
     pids = np.array([*(info.pid for info in system.threads), 0], dtype=np.int32)
     tids = np.array([*(info.tid for info in system.threads), 0], dtype=np.int32)
     comms = np.array([*(info.comm for info in system.threads), "swapper"])
@@ -263,7 +276,7 @@ def _switches(system: System, switches: Mapping[str, npt.NDArray[Any]]) -> pl.Da
 def with_recorded_times(
     application: Application, recording: Recording | str | Path, *, block: int = 1
 ) -> Application:
-    """The application with execution times drawn from a recording of it, in stretches of ``block``.
+    """Have execution times drawn from a recording of the application, in stretches of ``block``.
 
     Gates keep what they have: they compute nothing. Callbacks of a node with the same period or
     topic are told apart by the order in which they were registered.
@@ -276,8 +289,8 @@ def with_recorded_times(
     nodes = {}
     for key, node in application.nodes.items():
         name = node_name(key)
-        own = {trigger: found for (of, trigger), found in times.items() if of == name}
-        callbacks = tuple(_with_times(node, own, f"{recording.path}: {name}", block))
+        recorded = {trigger: callbacks for (of, trigger), callbacks in times.items() if of == name}
+        callbacks = tuple(_with_times(node, recorded, f"{recording.path}: {name}", block))
         nodes[key] = node.model_copy(update={"callbacks": callbacks})
     return application.model_copy(update={"nodes": nodes})
 
@@ -295,21 +308,24 @@ def _with_times(
     where: str,
     block: int,
 ) -> Iterator[CallbackDescription]:
-    """A node's callbacks with the times of those that were ``recorded``: a node's part of
-    :func:`_computing_times`."""
-    described = Counter(one for callback in node.callbacks for one in _triggers(callback))
+    """Yield a node's callbacks with the execution times that were recorded.
+
+    ``recorded`` is the node's part of :func:`_computing_times`: a frame per callback, by trigger.
+    ``where`` names recording and node in messages.
+    """
+    described = Counter(trigger for callback in node.callbacks for trigger in _triggers(callback))
     before = Counter[_Trigger]()
     for callback in node.callbacks:
         parts: list[pl.DataFrame] = []
         for trigger in _triggers(callback):
-            found, place = recorded.get(trigger, ()), before[trigger]
-            parts += found[place : place + 1]
+            candidates, place = recorded.get(trigger, ()), before[trigger]
+            parts += candidates[place : place + 1]
             before[trigger] += 1
-            if callback.gate is None and len(found) != described[trigger]:
+            if callback.gate is None and len(candidates) != described[trigger]:
                 timers = "" if isinstance(trigger, str) else f"timers of {duration_text(trigger)}"
                 raise InputError(
-                    f"{where} has CPU times of {len(found)} callbacks of {timers or trigger}, and"
-                    f" {described[trigger]} are described: record the application that is"
+                    f"{where} has CPU times of {len(candidates)} callbacks of {timers or trigger},"
+                    f" and {described[trigger]} are described: record the application that is"
                     " described, with its threads' CPU times or sched_switch"
                 )
         if callback.gate is not None:
@@ -329,8 +345,13 @@ def _with_times(
 
 
 def _computing_times(flow: DataFlow) -> dict[tuple[str, _Trigger], list[pl.DataFrame]]:
-    """``start, used, published`` of each callback's instances, in order of registration by node and
-    trigger; what they ``used`` is CPU time up to the first publication."""
+    """The callbacks' instances, a frame per callback, by node and trigger, as they were registered.
+
+    Columns:
+        start: when the instance began (ns).
+        used: its CPU time up to its first publication (ns).
+        published: whether it published.
+    """
     published = flow.publications.group_by("instance").agg(first=pl.col("time").min())
     callbacks = flow.objects.callbacks.select("callback_id", "node", "topic", "period_ns")
     frame = (
@@ -343,15 +364,15 @@ def _computing_times(flow: DataFlow) -> dict[tuple[str, _Trigger], list[pl.DataF
         .drop_nulls("used")
         .sort("callback_id")  # they are numbered in order of registration
     )
-    found: dict[tuple[str, _Trigger], list[pl.DataFrame]] = {}
+    frames: dict[tuple[str, _Trigger], list[pl.DataFrame]] = {}
     columns = ("callback_id", "node", "topic", "period_ns")
-    for (_, node, topic, period), own in frame.group_by(*columns, maintain_order=True):
+    for (_, node, topic, period), rows in frame.group_by(*columns, maintain_order=True):
         trigger = str(topic) if period is None else int(period)
-        instances = own.select("start", "used", "published")
-        found.setdefault((str(node), trigger), []).append(instances)
-    return found
+        instances = rows.select("start", "used", "published")
+        frames.setdefault((str(node), trigger), []).append(instances)
+    return frames
 
 
 def samples(values: pl.Series) -> ExecutionTime:
-    """Times that are drawn as they were measured (ns)."""
+    """An execution time that draws from measured ones (ns)."""
     return ExecutionTime(samples_ns=tuple(values.drop_nulls().clip(0).head(MOST).to_list()))

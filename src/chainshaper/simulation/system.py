@@ -1,6 +1,6 @@
-"""What is simulated, in words: an application with everything that runs in it, numbered.
+"""An application as it is simulated: its processes, threads, callbacks and publishers in lists.
 
-The order is that of the lists that the engine has: a number in its log leads to a name.
+The engine has the same lists in the same order: a number in its log is a place in one of these.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,71 +19,69 @@ from chainshaper.workload.description import (
     node_name,
 )
 
-FIRST_PID, FIRST_TID = 1000, 100_000  # of processes, and of executors' threads but the first
+FIRST_PID = 1000  # of the processes
+FIRST_TID = 100_000  # of an executor's threads behind its first
 ROLES = ("executor", "publisher", "dds")
 KINDS = ("timer", "subscription", "service", "client")
+"""The order in which executors look for ready callbacks (Jazzy)."""
 STATIC_ORDER = ("subscription", "timer", "client", "service")
-"""The orders in which executors look at what is ready, the static one and others (Jazzy)."""
+"""The order in which the static single-threaded executor looks for them (Jazzy)."""
 
 
 @dataclass(frozen=True)
 class Entity:
     """A timer or a subscription with its callback."""
 
-    process: int
+    process: int  # place in the system's processes
     index: int  # of the callback in its node
     number: int  # of the input of a synchronising callback
-    kind: str
+    kind: str  # one of KINDS
     topic: str | None  # None: a timer
     described: CallbackDescription
-    publishers: tuple[int, ...]
-    listens: bool = False  # for modes on behalf of the gate
+    publishers: tuple[int, ...]  # places in the system's publishers
+    listens: bool = False  # to the modes that are announced for the callback's gate
 
 
 class SimulatedPublisher(NamedTuple):
     """One callback's publisher of a topic."""
 
-    process: int
+    process: int  # place in the system's processes
     topic: str
     asynchronous: bool
 
 
 class SimulatedProcess(NamedTuple):
-    """A node's process; ``key`` is the node's name in the description."""
+    """A node's process."""
 
-    node: str
-    key: str
+    node: str  # full name
+    key: str  # the node's name in the description
     pid: int
 
 
 @dataclass(frozen=True)
 class System:
-    """An application with everything that runs in it, numbered as the engine has it.
-
-    ``servers`` are by thread, and ``receivers`` of outputs, which are in none, with their places.
-    ``chain`` has its callbacks by entity; it is empty where it is not followed.
-    """
+    """An application with everything that runs in it, in the order of the engine's lists."""
 
     application: Application
     processes: tuple[SimulatedProcess, ...]
     threads: tuple[ThreadInfo, ...]
-    servers: Mapping[int, Server]
-    receivers: Mapping[int, ReceiverPlace]
+    servers: Mapping[int, Server]  # by place of the thread, of threads that are in one
+    receivers: Mapping[int, ReceiverPlace]  # by place of the thread, of outputs' receivers
     cores: tuple[int, ...]
     entities: tuple[Entity, ...]
     publishers: tuple[SimulatedPublisher, ...]
-    chain: Chain
+    chain: Chain  # its callbacks are places of entities; empty where no chain is followed
     modes: tuple[str, ...]
 
     def depth(self, topic: str) -> int:
-        """How many messages of a topic a history has."""
+        """How many messages of a topic a history holds."""
         return self.application.topic(topic).depth
 
 
 def build_system(
     application: Application, plan: Plan | None = None, *, follow_chain: bool
 ) -> System:
-    """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
+    """List everything that runs in an application; find its chain where ``follow_chain`` asks.
 
     Raises InputError: the application's chain is not one path through it, or a server of the plan
     has a thread that the application does not have.
@@ -96,8 +94,8 @@ def build_system(
     publishers: list[SimulatedPublisher] = []
     order = STATIC_ORDER if application.simulation.executor == "static" else KINDS
     for number, process in enumerate(processes):
-        own = list(_entities(application, number, process.key, publishers))
-        entities += sorted(own, key=lambda entity: order.index(entity.kind))
+        of_process = list(_entities(application, number, process.key, publishers))
+        entities += sorted(of_process, key=lambda entity: order.index(entity.kind))
     modes: list[str] = []
     for _, callback in application.callbacks():
         modes += callback.announces
@@ -108,9 +106,9 @@ def build_system(
     servers = {} if plan is None else _servers(plan, threads)
     cores = sorted({thread.cores[0] for thread in threads})
     receivers = {} if plan is None else _receivers(plan, threads, servers)
-    homes = {number: one.core for number, one in (servers | receivers).items()}
-    for number, core in homes.items():
-        threads[number] = threads[number].model_copy(update={"cores": (core,)})
+    homes = {thread: place.core for thread, place in (servers | receivers).items()}
+    for thread, core in homes.items():
+        threads[thread] = threads[thread].model_copy(update={"cores": (core,)})
     chain = Chain(application.chain, (), ())
     if follow_chain:
         chain = find_chain(_graph(processes, entities, publishers), application.chain)
@@ -131,20 +129,23 @@ def build_system(
 def _entities(
     application: Application, process: int, key: str, publishers: list[SimulatedPublisher]
 ) -> Iterator[Entity]:
-    """A node's entities in the order of registration; their publishers are added to the list."""
+    """Yield a node's entities in the order of registration; add their publishers to the list."""
     for index, described in enumerate(application.nodes[key].callbacks):
-        own = tuple(range(len(publishers), len(publishers) + len(described.publishes)))
+        places = tuple(range(len(publishers), len(publishers) + len(described.publishes)))
         for topic in described.publishes:
             asynchronous = application.topic(topic).publication == "asynchronous"
             publishers.append(SimulatedPublisher(process, topic, asynchronous))
         if described.timer_ns is not None:
-            yield Entity(process, index, 0, "timer", None, described, own)
+            yield Entity(process, index, 0, "timer", None, described, places)
+        # Subscriptions to the modes of a gate stand before the inputs.
         of_modes = len(described.subscriptions) - len(described.inputs)
         for number, topic in enumerate(described.subscriptions):
             if number < of_modes:
-                yield Entity(process, index, number, "subscription", topic, described, (), True)
+                yield Entity(
+                    process, index, number, "subscription", topic, described, (), listens=True
+                )
             else:
-                yield Entity(process, index, number, described.kind, topic, described, own)
+                yield Entity(process, index, number, described.kind, topic, described, places)
 
 
 def _threads(
@@ -152,21 +153,24 @@ def _threads(
     processes: Sequence[SimulatedProcess],
     publishers: Sequence[SimulatedPublisher],
 ) -> Iterator[ThreadInfo]:
+    """Yield each process's threads: of its executor, its publisher thread, its DDS thread."""
     for number, process in enumerate(processes):
-        own = application.scheduling_of(process.key)
-        named = process.node.strip("/").replace("/", ".")[:15]
+        executor = application.scheduling_of(process.key)
+        name = process.node.strip("/").replace("/", ".")[:15]
         executing = application.cores_of(process.key)
-        wanted = [("executor", named, core, own.priority) for core in executing]
+        threads = [("executor", name, core, executor.priority) for core in executing]
         if any(p.asynchronous for p in publishers if p.process == number):
-            below = max(1, own.priority - 1)  # as the live workload has it
-            wanted.append(("publisher", "dds.publisher", own.core, below))
+            below = max(1, executor.priority - 1)  # as the live workload has it
+            threads.append(("publisher", "dds.publisher", executor.core, below))
         if application.simulation.receive is not None:
             dds = application.dds_scheduling_of(process.key)
-            wanted.append(("dds", "dds.dds", dds.core, dds.priority))
-        for place, (role, comm, core, priority) in enumerate(wanted):
-            beside = 0 < place < len(executing)
+            threads.append(("dds", "dds.dds", dds.core, dds.priority))
+        for place, (role, comm, core, priority) in enumerate(threads):
+            tid = process.pid + ROLES.index(role)
+            if 0 < place < len(executing):
+                tid = FIRST_TID + 100 * number + place
             yield ThreadInfo(
-                tid=FIRST_TID + 100 * number + place if beside else process.pid + ROLES.index(role),
+                tid=tid,
                 pid=process.pid,
                 comm=comm,
                 node=process.node,
@@ -178,34 +182,37 @@ def _threads(
 
 
 def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
-    """The server of each thread that is in one."""
-    numbers: dict[Thread, list[int]] = {}
-    for number, one in enumerate(threads):
-        if one.role != "dds":
-            named = Thread(node=one.node, role=one.role)  # type: ignore[arg-type]
-            numbers.setdefault(named, []).append(number)
-    found: dict[int, Server] = {}
+    """The server of each thread that is in one, by the thread's place.
+
+    Raises InputError: a server has a thread that the application does not have.
+    """
+    places: dict[Thread, list[int]] = {}
+    for place, info in enumerate(threads):
+        if info.role != "dds":
+            planned = Thread(node=info.node, role=info.role)  # type: ignore[arg-type]
+            places.setdefault(planned, []).append(place)
+    server_of: dict[int, Server] = {}
     for server in plan.servers:
         for thread in server.threads:
-            if thread not in numbers:
+            if thread not in places:
                 raise InputError(
                     f"server {server.name!r} of the plan holds {thread.text}, which the application"
                     " does not have: plan again from a recording of it"
                 )
-            found |= dict.fromkeys(numbers[thread], server)
-    return found
+            server_of |= dict.fromkeys(places[thread], server)
+    return server_of
 
 
 def _receivers(
     plan: Plan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
 ) -> dict[int, ReceiverPlace]:
-    """The place of each thread that receives an output, and is in no server."""
+    """Core and priority of the threads that receive an output outside servers, by place."""
     place_of = plan.receivers_at
     return {
         number: place
-        for number, one in enumerate(threads)
-        if number not in servers and one.role == "executor"
-        if (place := place_of.get(one.node or "")) is not None
+        for number, info in enumerate(threads)
+        if number not in servers and info.role == "executor"
+        if (place := place_of.get(info.node or "")) is not None
     }
 
 
@@ -214,7 +221,10 @@ def _graph(
     entities: Sequence[Entity],
     publishers: Sequence[SimulatedPublisher],
 ) -> ApplicationGraph:
-    """Where the chain is found: callbacks alone publish, so topics need not name their nodes."""
+    """The graph in which the chain is found; the id of a callback is its entity's place.
+
+    Callbacks alone publish here, so topics need not name their nodes.
+    """
     callbacks = [
         Callback(
             id=number,
