@@ -12,6 +12,8 @@ memory is the process's peak.
 
 With decoder and joins compiled by Numba before, and in C++ now, in turns in one run on two busy
 cores: 20,000,000 events in 8.0 and 5.5 s of processor time, with peaks of 1,897 and 1,831 MiB.
+Since the analysis lets go of tables that are spent, the peak is 1,500 MiB: opening alone takes 990,
+of which the tables keep 700; the frames of flow, traversals and hops come to as much again.
 """
 
 from __future__ import annotations

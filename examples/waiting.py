@@ -3,7 +3,7 @@
 import random
 import time
 
-from chainshaper.robot.serialized import origin_of
+from chainshaper import origin_of
 from chainshaper.workload.dds import data_message, data_of
 
 _random = random.Random(1)

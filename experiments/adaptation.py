@@ -27,9 +27,9 @@ from rich.console import Console
 from rich.table import Table
 
 import chainshaper as cs
-from chainshaper.planning import PlanRequest, publish_slots
+from chainshaper.planning import Plan, PlanRequest, publish_slots
+from chainshaper.planning.chain_plan import Adaptation, revised
 from chainshaper.planning.margins import HOP_NS, Tail, covered_latency
-from chainshaper.planning.plan import Adaptation, revised
 from chainshaper.workload.description import Application
 
 MS, PROMISED, PER_MINUTE, AFTER_STEP, DELAY = 1_000_000, 0.01, 600, 50, 2
@@ -193,7 +193,7 @@ def live(minutes: float, folder: Path) -> Table:
     app, count = application(), round(minutes * 60_000 / CYCLE_MS)
     before = cs.run_application(app, folder / "before", cycles=1_000)
     # As simulated, no room but for what latencies do not contain: the way to the shaping node.
-    plan = cs.plan_recording(before, request=PlanRequest(epsilon_ns=HOP_NS))
+    plan = cs.plan_recording(before, request=PlanRequest(epsilon_ns=HOP_NS)).chains[0]
     # What 1,000 cycles show is less, for which a window of 4,000 is hardly long enough.
     margin = plan.margin.model_copy(update={"overrun_probability": PROMISED})
     plan = revised(plan, margin=margin)
@@ -201,7 +201,7 @@ def live(minutes: float, folder: Path) -> Table:
     table = new_table(f"{count:,} cycles of {CYCLE_MS} ms, live, {PROMISED:.0%} promised")
     for change in ("step", "drift"):
         os.environ |= {"CHANGE": change, "CYCLES": str(count)}
-        shaped = cs.shape_application(app, plan, folder / change, cycles=count, adapt=True)
+        shaped = cs.shape_application(app, Plan.of(plan), folder / change, cycles=count, adapt=True)
         rows = shaped.events["gate_release"].sort("arrival")
         latencies = (rows["arrival"] - rows["origin"]).to_numpy().astype(float)
         starts = planned + rows["moved"].to_numpy().astype(float)

@@ -15,7 +15,7 @@ that was made before has not seen.
         runs = [simulated("FIFO", application, cycles=options.simulated_cycles)]
         if options.live:
             live("profile", application, cycles=options.cycles, folder=options.keep)
-            plan = plan_recording(options.keep / "profile")
+            plan = plan_recording(options.keep / "profile").chains[0]
             both = Configuration("FIFO", application), Configuration("1 band", application, plan)
             runs += live_in_turns(both, cycles=options.cycles, folder=options.keep)
 """
@@ -47,8 +47,8 @@ from chainshaper import (
 )
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.planning import Plan
-from chainshaper.planning.plan import Slot, publisher_servers
+from chainshaper.planning import ChainPlan, Plan
+from chainshaper.planning.chain_plan import Slot, publisher_servers
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import OperationError
 from chainshaper.values.recording import Recording
@@ -144,7 +144,7 @@ def missing_for_ros() -> str:
 def simulated(
     name: str,
     application: Application,
-    plan: Plan | None = None,
+    plan: ChainPlan | None = None,
     *,
     cycles: int,
     chain: str | None = None,
@@ -154,14 +154,16 @@ def simulated(
     Raises: as :func:`chainshaper.simulate`.
     """
     with tempfile.TemporaryDirectory() as folder:
-        recording = simulate(application, Path(folder) / "simulated", plan, cycles=cycles)
+        recording = simulate(
+            application, Path(folder) / "simulated", Plan.of(plan) if plan else None, cycles=cycles
+        )
         return latencies_of(name, recording, chain)
 
 
 def live(
     name: str,
     application: Application,
-    plan: Plan | None = None,
+    plan: ChainPlan | None = None,
     *,
     cycles: int,
     folder: Path,
@@ -186,7 +188,7 @@ def live(
         elif servers or not _shapes(plan):
             in_force.write_text(str(_apply(application, plan, output, cycles)))
         else:
-            shape_application(application, plan, output, cycles=cycles, realtime=True)
+            shape_application(application, Plan.of(plan), output, cycles=cycles, realtime=True)
     since = int(in_force.read_text()) if in_force.exists() else 0
     found = latencies_of(name, open_recording(output), chain, since_ns=since)
     return first_cycles(found, cycles)
@@ -202,7 +204,7 @@ class Configuration:
 
     name: str
     application: Application
-    plan: Plan | None = None
+    plan: ChainPlan | None = None
     chain: str | None = None
     servers: bool = False
 
@@ -308,14 +310,14 @@ def latencies_of(
     )
 
 
-def _shapes(plan: Plan) -> bool:
+def _shapes(plan: ChainPlan) -> bool:
     return plan.shaping_node is not None or any(publisher_servers(plan))
 
 
-def _apply(application: Application, plan: Plan, output: Path, cycles: int) -> int:
+def _apply(application: Application, plan: ChainPlan, output: Path, cycles: int) -> int:
     """Put a plan in force on `chainshaper run`; since when (CLOCK_MONOTONIC, ns) all of it is."""
     described = output.with_name(f"{output.name}_application.yaml")
-    spliced = splice_application(application, plan) if _shapes(plan) else application
+    spliced = splice_application(application, Plan.of(plan)) if _shapes(plan) else application
     described.write_text(yaml.safe_dump(application_as_written(spliced), sort_keys=False))
     seen: list[int] = []
 
@@ -326,7 +328,7 @@ def _apply(application: Application, plan: Plan, output: Path, cycles: int) -> i
 
     run = [sys.executable, "-m", "chainshaper", "run", str(described), "-o", str(output)]
     command = [*run, "--cycles", str(cycles + BEFORE_IN_FORCE)]
-    done = apply_plan(plan, command, back_end="freezer", watch=watch)
+    done = apply_plan(Plan.of(plan), command, back_end="freezer", watch=watch)
     if done.exit_code or not seen:
         raise OperationError(
             f"{output.name}: the servers were not in force before the run ended, which was with"

@@ -28,7 +28,7 @@ from on_ros import Shaping, ros_runs
 from results import COLUMNS, MS, OURS, PICTURES, Column, Line, Run, earlier_runs, lines_of, save
 
 from chainshaper import load_application
-from chainshaper.planning import Plan, PlanRequest, plan_shaping
+from chainshaper.planning import ChainPlan, PlanRequest, plan_shaping
 
 APPLICATION = Path(__file__).parents[1] / "examples" / "asynchronous_chain.yaml"
 PERIOD_NS = 100 * MS
@@ -61,7 +61,7 @@ NOTES = (
 )
 
 
-def plan_with_slot(latencies_ns: NDArray[np.int64], slot_ms: int) -> Plan:
+def plan_with_slot(latencies_ns: NDArray[np.int64], slot_ms: int) -> ChainPlan:
     """The chain in [0, 59) ms, its publisher's thread in the ``slot_ms`` behind."""
     known = latencies_ns[latencies_ns < SLOT_MS * MS]
     return plan_shaping(

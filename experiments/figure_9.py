@@ -26,7 +26,7 @@ from on_ros import Shaping, ros_runs
 from results import HERE, MS, OURS, PICTURES, Line, Run, earlier_runs, lines_of, save
 
 from chainshaper import load_application
-from chainshaper.planning import Plan, PlanRequest, plan_shaping
+from chainshaper.planning import ChainPlan, PlanRequest, plan_shaping
 from chainshaper.planning.shaping import over_cores, with_sink
 from chainshaper.workload.description import Application
 
@@ -82,7 +82,7 @@ def chain_to(application: Application, sink: str) -> str:
     return "..".join([*path[: path.index(SINKS[sink][0])], *SINKS[sink], sink])
 
 
-def shaped_plan(application: Application, latencies: Mapping[str, Run]) -> Plan:
+def shaped_plan(application: Application, latencies: Mapping[str, Run]) -> ChainPlan:
     """The graph in [0, L̄ + ε) on both cores, each sink of ``latencies`` in a slot of its own.
 
     L̄ + ε is on whole ms, ε between 1 and 2 ms.

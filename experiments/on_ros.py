@@ -34,7 +34,7 @@ from chainshaper.flow.launch_shaping import plan_in_force
 from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition
 from chainshaper.flow.record import record_command
 from chainshaper.linux.processes import run_users
-from chainshaper.planning import PlanRequest, load_application_plan
+from chainshaper.planning import PlanRequest, load_plan
 from chainshaper.splicing.spliced_launch import parse_launch_command
 from chainshaper.values.errors import ChainshaperError, OperationError
 from chainshaper.workload.description import Application, origin_timer
@@ -232,7 +232,7 @@ def record_shaped(
     The plan is that of the command, and so is the launch file, if it spliced anything. Raises: as
     :func:`chainshaper.shape_launch`.
     """
-    first, plan = open_recording(shaped / "first"), load_application_plan(shaped / "plan.yaml")
+    first, plan = open_recording(shaped / "first"), load_plan(shaped / "plan.yaml")
     for spliced in (shaped / "launch").glob("*.launch.*"):
         words = parse_launch_command(words).with_file(spliced)
     record_command(

@@ -43,7 +43,7 @@ from chainshaper import load_application, measure_latency, simulate
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.flow import DataFlow
 from chainshaper.flow.plan import profile_chains
-from chainshaper.planning import Plan, PlanRequest, plan_application
+from chainshaper.planning import ChainPlan, PlanRequest, plan_application
 from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.recording import Recording
@@ -206,7 +206,7 @@ def judged(number: int, cycles: int, folder: Path) -> dict[str, Any]:
     return row
 
 
-def outcome(shaped: Recording, flow: DataFlow, plan: Plan) -> dict[str, Any]:
+def outcome(shaped: Recording, flow: DataFlow, plan: ChainPlan) -> dict[str, Any]:
     """A chain's outputs: how many, how many late, never published, promised, and how likely."""
     from scipy.stats import binom
 

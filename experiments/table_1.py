@@ -26,7 +26,7 @@ from on_ros import Shaping, ros_runs
 from results import MS, OURS, PICTURES, Line, Run, Value, earlier_runs, lines_of, save
 
 from chainshaper import load_application
-from chainshaper.planning import CallbackTimes, Plan, PlanRequest, plan_shaping
+from chainshaper.planning import CallbackTimes, ChainPlan, PlanRequest, plan_shaping
 from chainshaper.planning.shaping import server_per_callback
 from chainshaper.workload.description import Application, ExecutionTime
 
@@ -76,7 +76,7 @@ def application(interference_ms: int, longest_ms: int = 15) -> Application:
     return described.model_copy(update={"nodes": nodes})
 
 
-def five_servers(latencies_ns: NDArray[np.int64]) -> Plan:
+def five_servers(latencies_ns: NDArray[np.int64]) -> ChainPlan:
     """A server per callback: [0, 16), [16, 32), … [64, 80) ms, as in the paper."""
     shaped = plan_shaping(
         latencies_ns, PERIOD_NS, output="/t5", publisher=NODES[-1], nodes=NODES, core=1

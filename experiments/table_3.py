@@ -49,7 +49,7 @@ from table_4 import ROW_1, plans, slots_text
 
 from chainshaper import load_application
 from chainshaper.flow.plan import plan_recording
-from chainshaper.planning import Plan, PlanRequest, load_plan, publish_slots
+from chainshaper.planning import ChainPlan, PlanRequest, load_plan, publish_slots
 from chainshaper.simulation.simulating import with_recorded_times
 from chainshaper.values.errors import ChainshaperError
 from chainshaper.workload.description import Application
@@ -164,15 +164,15 @@ def run_under_fifo(options: Options) -> tuple[Run, Path]:
     return run, options.keep / FIFO
 
 
-def live_plan(recording: Path, request: PlanRequest) -> Plan:
+def live_plan(recording: Path, request: PlanRequest) -> ChainPlan:
     """The plan of a row from the live recording of the first."""
-    return plan_recording(recording, request=request, period_ns=PERIOD_NS)
+    return plan_recording(recording, request=request, period_ns=PERIOD_NS).chains[0]
 
 
-def run_live(options: Options) -> tuple[list[Run], dict[str, Plan], list[str]]:
+def run_live(options: Options) -> tuple[list[Run], dict[str, ChainPlan], list[str]]:
     """All rows live, in turns: latencies, the plans, and what could not be planned, and why."""
     _, recording = run_under_fifo(options)
-    application, planned, failed = real_application(), dict[str, Plan](), list[str]()
+    application, planned, failed = real_application(), dict[str, ChainPlan](), list[str]()
     for name, row in ROWS.items():
         try:
             planned[name] = live_plan(recording, row.request)
@@ -203,7 +203,7 @@ def shapings() -> list[Shaping]:
     ]
 
 
-def run_simulated(cycles: int) -> tuple[list[Run], dict[str, Plan]]:
+def run_simulated(cycles: int) -> tuple[list[Run], dict[str, ChainPlan]]:
     """All rows by simulation, with the slots of table 4."""
     application = load_application(DRAWN)
     runs = [simulated(FIFO, application, cycles=cycles)]
@@ -226,7 +226,7 @@ def resampled(options: Options) -> list[Line]:
     return lines_of(RESAMPLED, [again, replace(measured, name=RESAMPLED)], figures, why=WHY_AGAIN)
 
 
-def widest_band(run: Run, plan: Plan) -> float:
+def widest_band(run: Run, plan: ChainPlan) -> float:
     """The largest jitter within a band (ms): of the latencies next to the same slot's start."""
     latencies = run.undisturbed_ns[run.undisturbed_ns < PERIOD_NS]
     starts = np.array([start for start, _ in publish_slots(plan)])
@@ -235,13 +235,13 @@ def widest_band(run: Run, plan: Plan) -> float:
     return float(max(widths)) / MS
 
 
-def ros_plans(keep: Path, column: Column) -> dict[str, Plan]:
+def ros_plans(keep: Path, column: Column) -> dict[str, ChainPlan]:
     """What the command planned on ROS 2; nothing where it was not measured now."""
     paths = {name: output_of(keep / column, name) / "plan.yaml" for name in ROWS}
-    return {name: load_plan(path) for name, path in paths.items() if path.exists()}
+    return {name: load_plan(path).chains[0] for name, path in paths.items() if path.exists()}
 
 
-def lines(runs: Sequence[Run], plans_of: Mapping[Column, Mapping[str, Plan]]) -> list[Line]:
+def lines(runs: Sequence[Run], plans_of: Mapping[Column, Mapping[str, ChainPlan]]) -> list[Line]:
     """Average, maximum and jitter of every row; what was late; what a band's jitter is."""
     paper: dict[str, Value] = {"average": 67.4, "maximum": 84.7, "jitter": 51.8}
     made = lines_of(FIFO, runs, paper, why=WHY_LIVE, no_evidence=FITTED)
@@ -264,14 +264,14 @@ def lines(runs: Sequence[Run], plans_of: Mapping[Column, Mapping[str, Plan]]) ->
     return made
 
 
-def slots_of_row_1(live_plans: dict[str, Plan]) -> Line:
+def slots_of_row_1(live_plans: dict[str, ChainPlan]) -> Line:
     """The live slots of the schedule whose plan needs more than latencies; for table 4."""
     plan = live_plans.get(ROW_1)
     text = None if plan is None else slots_text(plan)
     return Line(f"{ROW_1}: slots", "ms", None, None, text, "planned from the live callbacks' times")
 
 
-def picture(runs: Sequence[Run], planned: dict[str, Plan], name: str) -> Path:
+def picture(runs: Sequence[Run], planned: dict[str, ChainPlan], name: str) -> Path:
     """Figure 6, (a) to (f)."""
     panels = [
         Panel(
@@ -305,7 +305,7 @@ def main() -> None:
         options = parse_options(__doc__, cycles=280, until=until)
         runs, drawn_plans = run_simulated(options.simulated_cycles)
         pictures = [picture(runs, drawn_plans, "figure_6_simulated.png")]
-        live_plans: dict[str, Plan] = {}
+        live_plans: dict[str, ChainPlan] = {}
         notes, again = "", list[Line]()
         if options.live:
             real, live_plans, failed = run_live(options)
@@ -321,7 +321,10 @@ def main() -> None:
             if own := [run for run in on_ros if run.column == column]:
                 pictures.append(picture(own, {}, f"figure_6_{column}.png"))
         runs += on_ros
-        plans_of: dict[Column, dict[str, Plan]] = {"simulated": drawn_plans, "live": live_plans}
+        plans_of: dict[Column, dict[str, ChainPlan]] = {
+            "simulated": drawn_plans,
+            "live": live_plans,
+        }
         plans_of |= {column: ros_plans(options.keep, column) for column in ROS}
         save(
             "table_3",

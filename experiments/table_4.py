@@ -21,7 +21,7 @@ from avp_sample import MS, ORIGIN, PERIOD_NS, avp_sample
 from numpy.typing import NDArray
 from results import RESULTS, Column, Line, Value, save
 
-from chainshaper.planning import CallbackTimes, Plan, plan_shaping
+from chainshaper.planning import CallbackTimes, ChainPlan, plan_shaping
 from chainshaper.planning.bands import with_bands, with_long_slot
 from chainshaper.planning.shaping import (
     server_per_callback,
@@ -75,7 +75,7 @@ OF_TABLE_2: dict[Column, str] = {
 }
 
 
-def plans(latencies: NDArray[np.int64]) -> dict[str, Plan]:
+def plans(latencies: NDArray[np.int64]) -> dict[str, ChainPlan]:
     """The plan of every row."""
     epsilon = -(-int(latencies.max()) // MS) * MS + MS - int(latencies.max())  # L̄ + ε = 86 ms
     shaped = plan_shaping(
@@ -107,13 +107,13 @@ def plans(latencies: NDArray[np.int64]) -> dict[str, Plan]:
     }
 
 
-def slots_text(plan: Plan) -> str:
+def slots_text(plan: ChainPlan) -> str:
     """All slots of a plan on one line: ``[0,2) [2,86) [86,87)``."""
     slots = [slot for server in plan.servers for slot in server.slots]
     return " ".join(f"[{start // MS},{end // MS})" for start, end in slots)
 
 
-def average(plan: Plan) -> Value:
+def average(plan: ChainPlan) -> Value:
     """The predicted average (ms), for outputs at the start of their slots."""
     if plan.policy == "server-per-callback":
         return None

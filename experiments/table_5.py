@@ -42,7 +42,7 @@ from results import (
 )
 
 from chainshaper import load_application, plan_recording, simulate
-from chainshaper.planning import Plan, PlanRequest
+from chainshaper.planning import ChainPlan, PlanRequest
 from chainshaper.planning.shaping import let_per_callback, let_per_chain
 from chainshaper.workload.description import Application
 
@@ -112,7 +112,7 @@ def synthetic() -> Application:
     return load_application(SYNTHETIC).model_copy(update={"topics": {}, "chain": "/node1../t5"})
 
 
-def plan_as(column: str, chain: str, profile: Path, fifo: Run) -> Plan:
+def plan_as(column: str, chain: str, profile: Path, fifo: Run) -> ChainPlan:
     """The plan of a column, from a recording under SCHED_FIFO.
 
     L̄ + ε is the next whole ms, as 59 ms is in the paper; for valet parking the one after that, as
@@ -120,7 +120,9 @@ def plan_as(column: str, chain: str, profile: Path, fifo: Run) -> Plan:
     """
     longest = int(fifo.undisturbed_ns.max())
     end = -(-longest // MS) * MS + (MS if chain == "valet parking" else 0)
-    shaped = plan_recording(profile, request=PlanRequest(epsilon_ns=end - longest, overrun="wait"))
+    shaped = plan_recording(
+        profile, request=PlanRequest(epsilon_ns=end - longest, overrun="wait")
+    ).chains[0]
     if column == "LET per callback":
         return let_per_callback(shaped, TOPICS[chain])
     return let_per_chain(shaped) if column == "LET per chain" else shaped

@@ -35,8 +35,8 @@ from chainshaper import (
     plan_recording,
     simulate,
 )
-from chainshaper.planning import Plan, PlanRequest
-from chainshaper.planning.plan import publish_slots, shaping_nodes
+from chainshaper.planning import ChainPlan, Plan, PlanRequest
+from chainshaper.planning.chain_plan import publish_slots, shaping_nodes
 from chainshaper.values import events
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
@@ -144,7 +144,7 @@ def compare(name: str, measured: pl.DataFrame, simulated: pl.DataFrame) -> None:
 
 
 def block_of(
-    name: str, described: Application, plan: Plan | None, block: int, folder: Path
+    name: str, described: Application, plan: ChainPlan | None, block: int, folder: Path
 ) -> tuple[pl.DataFrame, ...]:
     """The cycles of a block: measured, measured again, and simulated with default costs and with
     its calibration's.
@@ -162,13 +162,14 @@ def block_of(
     for one in (default, default.model_copy(update={"simulation": costs})):
         with tempfile.TemporaryDirectory() as scratch:
             most = int(measured["cycle"].max()) + 1  # type: ignore[arg-type]
-            simulate(one, output := Path(scratch) / "simulated", plan, cycles=most)
+            output, in_force = Path(scratch) / "simulated", Plan.of(plan) if plan else None
+            simulate(one, output, in_force, cycles=most)
             frames.append(by_cycle(output))
     numbered = pl.col("cycle") + block * 1_000_000
     return tuple(frame.with_columns(numbered) for frame in frames)
 
 
-def shares(plan: Plan, measured: pl.DataFrame, others: Mapping[str, pl.DataFrame]) -> None:
+def shares(plan: ChainPlan, measured: pl.DataFrame, others: Mapping[str, pl.DataFrame]) -> None:
     """Print which share of outputs left with each band and which was late, of the same cycles."""
     starts = [start for start, _ in publish_slots(plan)]
     edges = [*starts, starts[0] + plan.cycle_ns]
@@ -188,7 +189,9 @@ def shares(plan: Plan, measured: pl.DataFrame, others: Mapping[str, pl.DataFrame
         print(f"{'':<28}at most {apart:.1%} apart, goal {SHARE_OF_BAND:.0%}  {met}")
 
 
-def cases(described: Application, folder: Path) -> Iterator[tuple[str, Application, Plan | None]]:
+def cases(
+    described: Application, folder: Path
+) -> Iterator[tuple[str, Application, ChainPlan | None]]:
     """What is compared: the application without a plan, and with plans from a run of its own."""
     for name, application in with_and_without_interference(described):
         yield name, application, None
@@ -196,7 +199,7 @@ def cases(described: Application, folder: Path) -> Iterator[tuple[str, Applicati
     live("profile", other, cycles=PROFILE_CYCLES, folder=folder)
     for bands in (1, 3):
         request = PlanRequest(bands=bands, overrun="wait")
-        plan = plan_recording(output_of(folder, "profile"), request=request)
+        plan = plan_recording(output_of(folder, "profile"), request=request).chains[0]
         yield f"{bands} band{'s' if bands > 1 else ''}", described, plan
 
 
@@ -234,7 +237,7 @@ def main() -> None:
             )
 
 
-def report(name: str, plan: Plan | None, blocks: list[tuple[pl.DataFrame, ...]]) -> None:
+def report(name: str, plan: ChainPlan | None, blocks: list[tuple[pl.DataFrame, ...]]) -> None:
     """Print how far a case is apart from its simulation, and from itself."""
     measured, again, default, simulated = (
         pl.concat(frames) for frames in zip(*blocks, strict=True)

@@ -17,7 +17,7 @@ from ros2 import ros2_environment
 from small_chain import EXECUTOR_CORE, small_chain, small_chain_plan, small_chain_text
 
 from chainshaper import run_application, shape_application, simulate
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan, Plan
 from chainshaper.values.recording import Recording
 
 CYCLES = 12
@@ -106,7 +106,7 @@ def application_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="session")
-def plan() -> Plan:
+def plan() -> ChainPlan:
     """Single-band shaping of the small chain: publish slot [21 ms, 22 ms)."""
     return small_chain_plan(5_000_000, 20_000_000, core=EXECUTOR_CORE)
 
@@ -122,12 +122,13 @@ def unshaped(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
+def shaped(tmp_path_factory: pytest.TempPathFactory, plan: ChainPlan) -> Recording:
     """The same with the shaping node, anchored to the messages' stamps."""
     folder = tmp_path_factory.mktemp("shaped")
     application = small_chain(folder)
     return calm_run(
-        lambda place: shape_application(application, plan, place / "after", cycles=CYCLES), folder
+        lambda place: shape_application(application, Plan.of(plan), place / "after", cycles=CYCLES),
+        folder,
     )
 
 
@@ -139,10 +140,10 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Recording:
 
 
 @pytest.fixture(scope="session")
-def simulated_shaped(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
+def simulated_shaped(tmp_path_factory: pytest.TempPathFactory, plan: ChainPlan) -> Recording:
     """The same as ``shaped``, simulated."""
     folder = tmp_path_factory.mktemp("simulated_shaped")
-    return simulate(small_chain(folder), folder / "after", plan, cycles=CYCLES)
+    return simulate(small_chain(folder), folder / "after", Plan.of(plan), cycles=CYCLES)
 
 
 @pytest.fixture

@@ -26,7 +26,7 @@ import pytest
 from command_line import Finished, called, json_of
 from cores import cores
 
-from chainshaper import load_application_plan, open_recording
+from chainshaper import load_plan, open_recording
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -192,7 +192,7 @@ def test_the_python_example_about_several_chains_runs(tmp_path: Path, recorded: 
     for command in (simulated, shlex.join([sys.executable, "-c", example])):
         run = executed(command, tmp_path, recorded)
         assert run.code == 0, run.err
-    assert len(load_application_plan(tmp_path / "planned.yaml").chains) == 2
+    assert len(load_plan(tmp_path / "planned.yaml").chains) == 2
 
 
 def test_links_between_pages_lead_somewhere() -> None:

@@ -53,7 +53,7 @@ def run(*arguments: str | Path) -> str:
 
 def drifting(plan: Path, application: Path, ppm: float) -> dict[str, object]:
     """The application with its shaping nodes, and timers that are off."""
-    spliced = splice_application(cs.load_application(application), cs.load_application_plan(plan))
+    spliced = splice_application(cs.load_application(application), cs.load_plan(plan))
     described = application_as_written(spliced)
     for node, period_ns in TIMERS_NS.items():
         timer = f"{(period_ns + round(period_ns * ppm / 1e6)) / 1e3}us"

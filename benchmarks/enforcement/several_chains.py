@@ -88,7 +88,7 @@ def shaped(
     run("run", application, "-o", folder / "before", "--cycles", str(cycles))
     wanted = [word for chain in chains for word in ("--chain", chain)]
     run("plan", folder / "before", *wanted, "--epsilon", epsilon, "-o", plan)
-    spliced = splice_application(cs.load_application(application), cs.load_application_plan(plan))
+    spliced = splice_application(cs.load_application(application), cs.load_plan(plan))
     (folder / "spliced.yaml").write_text(json.dumps(application_as_written(spliced)))
     command = (*CHAINSHAPER, "run", folder / "spliced.yaml", "-o", folder / "after")
     run("apply", plan, "--", *command, "--cycles", str(cycles))

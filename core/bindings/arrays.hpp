@@ -35,8 +35,8 @@ inline void check_length(const char * name, std::size_t length, std::size_t expe
 template <typename T>
 nb::ndarray<nb::numpy, T, nb::ndim<1>> array_of(std::vector<T> && rows) {
   auto * owned = new std::vector<T>(std::move(rows));
-  const nb::capsule owner(owned, [](void * kept) noexcept {
-    delete static_cast<std::vector<T> *>(kept);  // NOLINT(cppcoreguidelines-owning-memory)
+  const nb::capsule owner(owned, [](void * vector) noexcept {
+    delete static_cast<std::vector<T> *>(vector);  // NOLINT(cppcoreguidelines-owning-memory)
   });
   return {owned->data(), {owned->size()}, owner};
 }

@@ -17,8 +17,8 @@ namespace chainshaper::bindings {
 
 // A class whose constructor takes any of the fields that are bound, by name; others are as usual.
 template <typename Struct>
-nb::class_<Struct> record(nb::module_ & module, const char * name, const char * says) {
-  return nb::class_<Struct>(module, name, says)
+nb::class_<Struct> record(nb::module_ & module, const char * name, const char * description) {
+  return nb::class_<Struct>(module, name, description)
       .def("__init__", [](nb::pointer_and_handle<Struct> self, const nb::kwargs & fields) {
         new (self.p) Struct();
         nb::inst_mark_ready(self.h);
@@ -43,10 +43,10 @@ nb::object column_of(std::vector<Number> && numbers) {
 // The same, of the first numbers of an array.
 template <typename Number>
 nb::object column_of(std::unique_ptr<Number[]> && numbers, std::size_t count) {
-  Number * kept = numbers.release();
-  const nb::capsule owner(kept,
-                          [](void * column) noexcept { delete[] static_cast<Number *>(column); });
-  return nb::cast(nb::ndarray<nb::numpy, Number, nb::ndim<1>>(kept, {count}, owner));
+  Number * column = numbers.release();
+  const nb::capsule owner(column,
+                          [](void * memory) noexcept { delete[] static_cast<Number *>(memory); });
+  return nb::cast(nb::ndarray<nb::numpy, Number, nb::ndim<1>>(column, {count}, owner));
 }
 
 }  // namespace chainshaper::bindings

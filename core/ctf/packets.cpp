@@ -79,8 +79,9 @@ private:
     return std::nullopt;
   }
 
-  std::int64_t known_or(const StreamLayout & stream, Variable variable, std::int64_t other) const {
-    return stream.knows(variable) ? run_.variable(variable) : other;
+  std::int64_t known_or(const StreamLayout & stream, Variable variable,
+                        std::int64_t fallback) const {
+    return stream.knows(variable) ? run_.variable(variable) : fallback;
   }
 
   std::span<const StreamLayout> streams_;
@@ -101,24 +102,24 @@ std::int64_t find(Bytes file, Bytes content, std::int64_t start) {
 }  // namespace
 
 FoundPackets find_packets(const Layout & layout, std::size_t trace, Bytes file, Bytes beginning) {
-  FoundPackets found;
-  if (layout.streams_of(trace).empty()) return found;
+  FoundPackets result;
+  if (layout.streams_of(trace).empty()) return result;
   Search search(layout, trace, file);
   for (std::int64_t offset = 0; offset >= 0;) {
-    auto place = search.read_from(offset, found.packets);
+    auto place = search.read_from(offset, result.packets);
     if (!place) break;
     if (!beginning.empty() && place->damage != Damage::costly &&
-        found.damaged.size() < most_damaged)
+        result.damaged.size() < most_damaged)
       place->following = find(file, beginning, place->offset + 1);
     if (place->damage == Damage::cut && place->following >= 0) {
-      Packet & cut = found.packets.back();
+      Packet & cut = result.packets.back();
       cut.size = place->following - place->offset;
       cut.content_bits = std::min(cut.content_bits, 8 * cut.size);
     }
-    found.damaged.push_back(*place);
+    result.damaged.push_back(*place);
     offset = place->following;
   }
-  return found;
+  return result;
 }
 
 }  // namespace chainshaper::ctf

@@ -14,9 +14,9 @@
 namespace chainshaper::fuzz {
 namespace {
 
-void expect(bool condition, const char * what) {
+void expect(bool condition, const char * statement) {
   if (condition) return;
-  std::fprintf(stderr, "not so: %s\n", what);
+  std::fprintf(stderr, "not so: %s\n", statement);
   std::abort();
 }
 
@@ -106,9 +106,9 @@ void run(std::span<const std::uint8_t> input) {
     return;
   }
   const std::uint8_t beginning[] = {0xC1, 0x1F, 0xFC, 0xC1};
-  const auto found = ctf::find_packets(layout, 0, file, beginning);
+  const auto search = ctf::find_packets(layout, 0, file, beginning);
   std::vector<ctf::PacketEvents> packets;
-  for (const auto & packet : found.packets) {
+  for (const auto & packet : search.packets) {
     packets.push_back({packet.offset, packet.content_bits, packet.stream_class, packet.cpu});
     if (cut) packets.back().earliest = packet.begin;
   }

@@ -102,11 +102,11 @@ std::vector<std::uint32_t> nearest_rows(const Events & left, const Events & righ
     const auto row = forward ? step : lefts - 1 - step;
     const auto now_ns = left.times_ns[row];
     for (; passed < rights; ++passed) {
-      const auto other = forward ? passed : rights - 1 - passed;
-      const auto then_ns = right.times_ns[other];
+      const auto candidate = forward ? passed : rights - 1 - passed;
+      const auto then_ns = right.times_ns[candidate];
       const bool beyond = forward ? then_ns > now_ns : then_ns < now_ns;
       if (beyond || (strictly && then_ns == now_ns)) break;
-      latest[right.keys.at(other)] = static_cast<std::uint32_t>(other);
+      latest[right.keys.at(candidate)] = static_cast<std::uint32_t>(candidate);
     }
     if (const auto * match = latest.find(left.keys.at(row))) rows[row] = *match;
   }

@@ -17,8 +17,8 @@ struct Key {
   std::int64_t second{0};
   std::int64_t third{0};
 
-  bool operator==(const Key & other) const {
-    return first == other.first && second == other.second && third == other.third;
+  bool operator==(const Key & key) const {
+    return first == key.first && second == key.second && third == key.third;
   }
 };
 

@@ -1,4 +1,4 @@
-// What is going to happen, in the order in which it will.
+// The agenda of the simulation: what will happen, in order of time.
 
 #pragma once
 
@@ -25,25 +25,25 @@ struct SleepOver {
 };
 using Happening = std::variant<Expiry, Delivery, SleepOver>;
 
-// Of what happens at the same time, the first that was planned comes first.
+// Happenings at the same time come in the order in which they were planned.
 class Agenda {
 public:
-  void plan(Nanoseconds time, Happening what) { coming_.push({time, planned_++, what}); }
+  void plan(Nanoseconds time, Happening happening) { coming_.push({time, planned_++, happening}); }
 
   Nanoseconds next_time() const { return coming_.empty() ? forever : coming_.top().time; }
 
-  // Only where `next_time` is not forever.
+  // Takes the earliest happening; the agenda must not be empty.
   Happening take_next() {
-    const Happening what = coming_.top().what;
+    const Happening happening = coming_.top().happening;
     coming_.pop();
-    return what;
+    return happening;
   }
 
 private:
   struct Planned {
     Nanoseconds time;
     std::uint64_t number;
-    Happening what;
+    Happening happening;
   };
 
   struct Later {

@@ -41,7 +41,7 @@ bool Engine::go_on_publishing(Thread & thread) {
   return end(thread);
 }
 
-// So long it takes with the interrupts that come meanwhile.
+// Draws a CPU time and adds the share that interrupts take meanwhile.
 Nanoseconds Engine::computing_time(Stream & stream) {
   constexpr Nanoseconds million = 1'000'000;
   const Nanoseconds time = draw(stream);

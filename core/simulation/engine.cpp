@@ -34,12 +34,12 @@ void Engine::count_step() {
   if (++steps_ > most) pause_ = Pause::endless;
 }
 
-void Engine::happen(const Happening & what) {
-  if (const auto * delivery = std::get_if<Delivery>(&what))
+void Engine::happen(const Happening & happening) {
+  if (const auto * delivery = std::get_if<Delivery>(&happening))
     deliver(*delivery->message);
-  else if (const auto * expiry = std::get_if<Expiry>(&what))
+  else if (const auto * expiry = std::get_if<Expiry>(&happening))
     expire(*expiry->timer);
-  else if (const auto * sleep = std::get_if<SleepOver>(&what))
+  else if (const auto * sleep = std::get_if<SleepOver>(&happening))
     wake(*sleep->thread, sleep->thread->step);
 }
 
@@ -90,7 +90,7 @@ void Engine::charge(Core & core) const {
   core.since = now_;
 }
 
-// Servers open and close; the next boundary may be in the next cycle.
+// Opens and closes servers. The boundary after that may be in the next cycle.
 void Engine::cross_boundary(Core & core) const {
   const OpenServers & row = core.table[core.next];
   core.open_servers = row.servers;
@@ -146,13 +146,13 @@ void Engine::switch_to(Core & core, Thread * thread) {
   core.quantum = given_.quantum_ns;
 }
 
-// A thread has nothing to do.
+// Stops running a thread that has nothing to do.
 void Engine::wait(Thread & thread) {
   thread.runnable = false;
   thread.core->changed = true;
 }
 
-// A thread that waits with that step as its next one becomes runnable, last of its rank.
+// Makes a thread runnable, last of its rank, if it waits with `step` as its next one.
 void Engine::wake(Thread & thread, Step step) {
   if (thread.runnable || thread.step != step) return;
   thread.runnable = true;

@@ -72,7 +72,7 @@ public:
 
 private:
   // engine.cpp: time, and which thread runs
-  void happen(const Happening & what);
+  void happen(const Happening & happening);
   Nanoseconds next_instant() const;
   bool let_one_thread_go_on();
   void run_until_next_step(Core & core) const;

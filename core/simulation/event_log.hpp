@@ -1,4 +1,4 @@
-// What happened, as columns of numbers: an entry for each trace point that a process passes.
+// The log of events, as columns of numbers: an entry for each trace point that a process passes.
 //
 // Entries and fields have the names of chainshaper/workload/event_log.py, as have those of live
 // runs.
@@ -15,7 +15,7 @@
 
 namespace chainshaper::simulation {
 
-// In fields that say nothing.
+// The value of a field that is not known or does not apply.
 inline constexpr std::int64_t absent = -1;
 
 enum class TracePoint : std::size_t {
@@ -53,10 +53,10 @@ struct EntryColumns {
 
 class EventLog {
 public:
-  // With room for so many entries of a kind, until there are more.
+  // `rows`: the room for entries of each kind, which doubles when it is full.
   explicit EventLog(std::size_t rows);
 
-  // How many entries it has of the kind that was added.
+  // Adds an entry; returns how many entries of its kind the log has now.
   std::size_t add(TracePoint point, Nanoseconds time, std::int32_t thread,
                   std::initializer_list<std::int64_t> fields) {
     EntryColumns & columns = entries_[static_cast<std::size_t>(point)];

@@ -6,7 +6,7 @@
 
 namespace chainshaper::simulation {
 
-// Goes on with a running thread that needs no more CPU time for its step.
+// Does the next steps of a running thread whose CPU time for the present step is used up.
 void Engine::advance(Thread & thread) {
   while (thread.runnable && thread.left == 0 && pause_ != Pause::endless) {
     count_step();
@@ -44,7 +44,7 @@ bool Engine::go_on_with_callback(Thread & thread) {
   return pass_gate(thread);
 }
 
-// A timer's time has come: its executor sees it in its next snapshot, or gets an event.
+// Handles a timer's expiry: the executor sees it in its next snapshot, or gets an event.
 void Engine::expire(Entity & timer) {
   if (timer.executor->kind == ExecutorKind::events) {
     mark_event(timer);

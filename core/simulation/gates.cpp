@@ -66,7 +66,8 @@ bool Engine::publish_from_gate(Thread & thread) {
   return true;
 }
 
-// What has come meanwhile may leave for the message at the gate, or leave no room for it.
+// Looks at the messages that came meanwhile: a newer one may replace the message at the gate, or
+// there may be no room for more.
 void Engine::look_at_waiting(const Entity & entity) {
   GateAtWork & gate = *entity.gate;
   if (entity.history.size() == entity.given->depth) {
@@ -91,7 +92,7 @@ bool Engine::leave_gate(Thread & thread) {
   return end(thread);
 }
 
-// The oldest message that waits has no room any more.
+// Logs the oldest message of a full history as overflowed.
 void Engine::overflow(Entity & entity) {
   const Carried & oldest = entity.history.oldest().carried;
   const Arrival arrival{oldest.arrival, oldest.origin, entity.gate->phase};
@@ -110,7 +111,7 @@ void Engine::log_release(const Entity & entity, Nanoseconds time, const Thread &
        number_of(release.overrun), mode, number_of(release.dropped), release.moved_ns});
 }
 
-// A mode of the application is announced; one that the gate does not know changes nothing.
+// Tells a gate the application's mode; a mode that the gate does not know changes nothing.
 void Engine::announce(GateAtWork & gate, std::optional<std::int64_t> mode) const {
   if (!mode) return;
   if (const auto known = place_of(gate.modes, *mode)) gate.turns.switch_mode(*known, now_);

@@ -32,7 +32,8 @@ struct Message {
   Carried carried;
 };
 
-// Every message that was ever needed; those that are not in use now are used again.
+// Owns all messages. A message that is given back is handed out again, so that a long run allocates
+// no more than the most messages that were under way at once.
 class MessagePool {
 public:
   Message & take() {
@@ -61,7 +62,7 @@ class MessageQueue {
 public:
   std::size_t size() const { return size_; }
 
-  // Only where there is one.
+  // The queue must not be empty.
   Message & oldest() const { return *oldest_; }
 
   void append(Message & message) {
@@ -71,7 +72,7 @@ public:
     ++size_;
   }
 
-  // Only where there is one.
+  // The queue must not be empty.
   Message & take_oldest() {
     Message & message = *oldest_;
     oldest_ = message.next;

@@ -1,4 +1,5 @@
-// Sequences of CPU times and delays, which whoever simulates draws in blocks as they are needed.
+// Sequences of CPU times and delays. Python draws the numbers, in blocks, when the engine needs
+// them.
 
 #pragma once
 
@@ -13,7 +14,7 @@
 
 namespace chainshaper::simulation {
 
-// Gives the next numbers of the stream at that place. What it throws ends the simulation.
+// Gives the next block of numbers of the stream at a place. An exception ends the simulation.
 using Source = std::function<std::vector<Nanoseconds>(Place)>;
 
 class Stream {

@@ -19,7 +19,7 @@ std::int64_t next_address(const Publisher & publisher) {
 
 }  // namespace
 
-// The executor publishes what its thread carries.
+// Publishes a message with what the thread carries.
 void Engine::publish(Thread & thread, Publisher & publisher) {
   const PublisherDescription & given = *publisher.given;
   Message & message = new_message();
@@ -38,7 +38,7 @@ void Engine::publish(Thread & thread, Publisher & publisher) {
     send(thread, message);
 }
 
-// An asynchronous publisher's message waits for the publisher thread.
+// Queues an asynchronous publisher's message for the publisher thread.
 void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message) {
   if (publisher.history.size() < publisher.given->depth) {
     sender.to_send.push_back(&publisher);
@@ -53,7 +53,7 @@ void Engine::hand_over(Thread & sender, Publisher & publisher, Message & message
   wake(sender, Step::send);
 }
 
-// A message leaves now, sent by a thread; readers get copies.
+// Sends a message from a thread, now; each reader gets a copy.
 void Engine::send(Thread & thread, Message & message) {
   note_latency(message);
   for (ReaderOf & reader : message.publisher->readers) {
@@ -79,7 +79,7 @@ void Engine::note_latency(const Message & message) {
   if (latency == absent) latency = now_ - *carried.chain_start;
 }
 
-// A message reaches its reader's process, where a thread of DDS may have to work for it.
+// Brings a message to its reader's process, where a DDS thread may have to spend time on it.
 void Engine::deliver(Message & message) {
   Thread * receiver = message.entity->executor->dds_thread;
   if (receiver == nullptr) {
@@ -90,7 +90,7 @@ void Engine::deliver(Message & message) {
   }
 }
 
-// A message enters its reader's history, and wakes the executor if it waits for work.
+// Puts a message into its reader's history, and wakes the executor if it waits for work.
 void Engine::arrive(Message & message) {
   Entity & entity = *message.entity;
   const bool overwrites = entity.history.size() == entity.given->depth;
@@ -102,7 +102,7 @@ void Engine::arrive(Message & message) {
   if (entity.may_run()) wake_owner(*entity.executor);
 }
 
-// The next step of a publisher thread or a thread of DDS.
+// Does the next step of a publisher thread or a DDS thread.
 void Engine::work_for_executor(Thread & thread) {
   switch (thread.step) {
     case Step::sent: {
@@ -149,7 +149,7 @@ void Engine::send_next(Thread & thread) {
   thread.step = Step::sent;
 }
 
-// A message goes to the end of a queue; the oldest one of a full queue is gone.
+// Appends a message to a queue; a full queue loses its oldest message.
 void Engine::put_newest(MessageQueue & queue, std::size_t depth, Message & message) {
   if (queue.size() == depth) messages_.give_back(queue.take_oldest());
   queue.append(message);
@@ -163,7 +163,7 @@ void Engine::drop_expired(Entity & entity) {
     messages_.give_back(entity.history.take_oldest());
 }
 
-// An events executor has something to do for an entity: to the end of its queue.
+// Appends an entity to the queue of its events executor.
 void Engine::mark_event(Entity & entity) {
   entity.executor->events.push_back(&entity);
   ++marks_;

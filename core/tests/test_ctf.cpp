@@ -50,7 +50,7 @@ void append_packet(File & file, const std::string & events) {
 
 // What a trace of one event class is read as.
 struct Read {
-  FoundPackets found;
+  FoundPackets search;
   std::vector<std::int64_t> times_ns;
   std::vector<std::vector<std::int64_t>> columns;  // integers; of texts the codes
   std::vector<std::string> texts;
@@ -71,9 +71,9 @@ Read read(const TraceClass & trace, const File & file, const std::vector<std::si
   const auto layout = lay_out(std::span(&trace, 1), std::span(&wanted, 1));
   Read read;
   const std::uint8_t beginning[] = {0xC1, 0x1F, 0xFC, 0xC1};
-  read.found = find_packets(layout, 0, file, beginning);
+  read.search = find_packets(layout, 0, file, beginning);
   std::vector<PacketEvents> packets;
-  for (const auto & packet : read.found.packets)
+  for (const auto & packet : read.search.packets)
     packets.push_back({packet.offset, packet.content_bits, packet.stream_class, packet.cpu});
   EventReader reader(layout, file, packets);
   const auto chunk = reader.count(packets.size());
@@ -104,7 +104,7 @@ using namespace std::string_literals;
 void clocks_of_few_bits_wrap_forward() {
   File file;
   append_packet(file, "\xF0\x01\xFE\x02\x03\x03"s);
-  const auto [found, times_ns, columns, texts, bad] =
+  const auto [search, times_ns, columns, texts, bad] =
       read(trace_of({{{"x", integer(8)}}, 8}), file, {0});
   EXPECT((times_ns == std::vector<std::int64_t>{0xF0, 0xFE, 0x103}));
   EXPECT((columns[0] == std::vector<std::int64_t>{1, 2, 3}));
@@ -176,11 +176,11 @@ void packets_behind_damage_are_found() {
   append(file, 8 * 100);
   const auto result = read(trace_of({{{"x", integer(8)}}, 8}), file, {0});
   EXPECT((result.columns[0] == std::vector<std::int64_t>{1, 2}));
-  EXPECT(result.found.damaged.size() == 2);
-  EXPECT(result.found.damaged[0].damage == Damage::bad_magic);
-  EXPECT(result.found.damaged[0].offset == 14 && result.found.damaged[0].following == 19);
-  EXPECT(result.found.damaged[1].damage == Damage::cut);
-  EXPECT(result.found.packets.size() == 3 && result.found.packets[2].size == 12);
+  EXPECT(result.search.damaged.size() == 2);
+  EXPECT(result.search.damaged[0].damage == Damage::bad_magic);
+  EXPECT(result.search.damaged[0].offset == 14 && result.search.damaged[0].following == 19);
+  EXPECT(result.search.damaged[1].damage == Damage::cut);
+  EXPECT(result.search.packets.size() == 3 && result.search.packets[2].size == 12);
 }
 
 void rows_are_sorted_by_time_and_stay_in_order() {

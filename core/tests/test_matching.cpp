@@ -37,12 +37,12 @@ Table random_table(std::mt19937 & chance, std::size_t rows, std::uint32_t keys) 
 std::uint32_t nearest(const Table & left, std::size_t row, const Table & right, bool before,
                       bool strictly) {
   auto nearest = no_row;
-  for (std::size_t other = 0; other < right.times_ns.size(); ++other) {
-    const auto apart_ns = (left.times_ns[row] - right.times_ns[other]) * (before ? 1 : -1);
-    const bool alike = left.processes[row] == right.processes[other] &&
-                       left.addresses[row] == right.addresses[other];
+  for (std::size_t candidate = 0; candidate < right.times_ns.size(); ++candidate) {
+    const auto apart_ns = (left.times_ns[row] - right.times_ns[candidate]) * (before ? 1 : -1);
+    const bool alike = left.processes[row] == right.processes[candidate] &&
+                       left.addresses[row] == right.addresses[candidate];
     if (!alike || apart_ns < 0 || (strictly && apart_ns == 0)) continue;
-    if (before || nearest == no_row) nearest = static_cast<std::uint32_t>(other);
+    if (before || nearest == no_row) nearest = static_cast<std::uint32_t>(candidate);
   }
   return nearest;
 }

@@ -1,6 +1,6 @@
 """The localizer's callback; the map is loaded when this module is."""
 
-from chainshaper.robot.serialized import origin_of
+from chainshaper import origin_of
 
 from .drive import recorded_drive
 from .localizer import Localizer

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.robot.serialized import origin_of
+from chainshaper import origin_of
 from chainshaper.workload.dds import data_message, data_of, number_in
 
 __all__ = ["cloud_message", "cloud_of", "pose_message", "pose_of", "scan_message"]

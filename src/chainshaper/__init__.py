@@ -53,17 +53,16 @@ if TYPE_CHECKING:
     from chainshaper.flow.sweep import sweep as sweep
     from chainshaper.flow.threads import find_threads as find_threads
     from chainshaper.flow.threads import planned_changes as planned_changes
-    from chainshaper.planning import ApplicationPlan as ApplicationPlan
+    from chainshaper.planning import ChainPlan as ChainPlan
     from chainshaper.planning import Plan as Plan
     from chainshaper.planning import PlanRequest as PlanRequest
     from chainshaper.planning import Profile as Profile
-    from chainshaper.planning import load_application_plan as load_application_plan
+    from chainshaper.planning import convert_plan as convert_plan
     from chainshaper.planning import load_plan as load_plan
     from chainshaper.planning import place_chains as place_chains
     from chainshaper.planning import plan_application as plan_application
     from chainshaper.planning import plan_chain as plan_chain
     from chainshaper.planning import plan_shaping as plan_shaping
-    from chainshaper.planning import save_application_plan as save_application_plan
     from chainshaper.planning import save_plan as save_plan
     from chainshaper.reporting.figures import draw_distribution as draw_distribution
     from chainshaper.reporting.figures import draw_latency as draw_latency
@@ -71,6 +70,7 @@ if TYPE_CHECKING:
     from chainshaper.reporting.page import write_report as write_report
     from chainshaper.reporting.perfetto import export_mcap as export_mcap
     from chainshaper.reporting.perfetto import export_perfetto as export_perfetto
+    from chainshaper.robot.serialized import origin_of as origin_of
     from chainshaper.simulation import simulate as simulate
     from chainshaper.simulation import simulate_latencies as simulate_latencies
     from chainshaper.sources import open_source as open_source

@@ -55,9 +55,12 @@ def test_every_call_is_followed_to_the_client_that_made_it(recording: Path, node
     # In the order of events: the timer's start, BEGAN, ..., SENT, the publication.
     assert (found[:, 0] <= truth[:, 0]).all()
     assert (truth[:, 1] <= found[:, 1]).all()
-    found_each_other = truth[1:, 0] > truth[0, 0] + 1_000_000_000  # first answers may take 0.1 s
-    own = truth[1:, 0] >= found[:-1, 1]
-    assert own[found_each_other].all(), "each is its own cycle's"
+    known = truth[1:, 0] > truth[0, 0] + 1_000_000_000  # first answers may take 0.1 s
+    # On a busy machine an answer may come when the next cycle has begun, in the truth as well.
+    apart = truth[1:, 0] >= truth[:-1, 1]
+    assert apart.sum() > 50
+    before_next = truth[1:, 0] >= found[:-1, 1]
+    assert before_next[known & apart].all(), "each is its own cycle's"
     span = truth[:, 1] - truth[:, 0]
     assert np.median(np.abs(found[:, 1] - found[:, 0] - span) / span) < 0.1
     hops = analysis.hops.filter(hop=1)["computation_ns"].drop_nulls().to_numpy()

@@ -16,7 +16,7 @@ from command_line import called, chainshaper, message_of, refused
 from reference_traces import DATA
 from small_chain import small_chain_plan, small_chain_text
 
-from chainshaper.planning import Plan, save_plan
+from chainshaper.planning import ChainPlan, Plan, save_plan
 from chainshaper.planning.shaping import server_per_chain
 from chainshaper.values.recording import Recording
 
@@ -29,11 +29,11 @@ OTHERS = "is a plan; wanted is a file "
 
 
 @pytest.fixture
-def folder(application_file: Path, plan: Plan) -> Path:
+def folder(application_file: Path, plan: ChainPlan) -> Path:
     """An application, plans for it with and without shaping, latencies longer than the period."""
-    save_plan(plan, application_file.with_name("plan.yaml"))
+    save_plan(Plan.of(plan), application_file.with_name("plan.yaml"))
     servers = server_per_chain(small_chain_plan(8_000_000, 12_000_000))
-    save_plan(servers, application_file.with_name("servers.yaml"))
+    save_plan(Plan.of(servers), application_file.with_name("servers.yaml"))
     application_file.with_name("latencies.txt").write_text("30ms\n120ms\n")
     return application_file.parent
 

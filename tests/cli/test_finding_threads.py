@@ -15,7 +15,7 @@ from story import OFFSET, Story
 from chainshaper import find_threads
 from chainshaper.flow import threads
 from chainshaper.linux.scheduling import may_use_fifo
-from chainshaper.planning import Plan, save_plan
+from chainshaper.planning import ChainPlan, Plan, save_plan
 from chainshaper.values.recording import RecordingInfo, write_recording
 
 pytestmark = pytest.mark.timed
@@ -71,9 +71,9 @@ def test_the_nodes_of_a_running_application_are_found(application: Running) -> N
 
 
 def test_a_plan_shows_the_nodes_of_its_servers(
-    application: Running, plan: Plan, tmp_path: Path
+    application: Running, plan: ChainPlan, tmp_path: Path
 ) -> None:
-    save_plan(plan, tmp_path / "plan.yaml")
+    save_plan(Plan.of(plan), tmp_path / "plan.yaml")
     found = json_of("threads", tmp_path / "plan.yaml")
     shown = {node for thread in found["threads"] for node in thread["nodes"]}
     assert shown == {"/first", "/second", "/third"}

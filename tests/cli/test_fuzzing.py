@@ -22,9 +22,8 @@ from command_line import called
 from ctf_writing import write_lttng_trace
 from small_chain import small_chain_text
 
-from chainshaper.planning import Plan, dump_plan, plan_shaping
-from chainshaper.planning.plan import revised
-from chainshaper.planning.plan_file import plans_as_text
+from chainshaper.planning import ChainPlan, Plan, dump_plan, plan_shaping
+from chainshaper.planning.chain_plan import revised
 from chainshaper.values.recording import Recording
 
 CASES = int(os.environ.get("CHAINSHAPER_FUZZ_CASES", "25"))
@@ -193,19 +192,19 @@ def applications(chance: random.Random, folder: Path, recording: Recording) -> A
     return ("simulate", file, "-o", folder / "out", "--cycles", "3")
 
 
-def _with_a_branch(plan: Plan) -> str:
+def _with_a_branch(plan: ChainPlan) -> str:
     """The plan and that of a second output, [22 ms, 23 ms), in one file: they share a server."""
     about = {"spec": "/t1../t2", "output": "/t2", "publisher": "/second"}
     core, latencies = plan.servers[0].core, np.array([5_000_000, 21_000_000])
     other = plan_shaping(latencies, plan.cycle_ns, core=core, **about)  # type: ignore[arg-type]
     output = other.servers[1].model_copy(update={"name": "output_2"})
-    return plans_as_text([plan, revised(other, servers=(plan.servers[0], output))])
+    return dump_plan(Plan.of(plan, revised(other, servers=(plan.servers[0], output))))
 
 
-def plans(chance: random.Random, folder: Path, recording: Recording, plan: Plan) -> Arguments:
+def plans(chance: random.Random, folder: Path, recording: Recording, plan: ChainPlan) -> Arguments:
     """A plan of a chain, or of two, in use with an application and with a recording."""
     (folder / "application.yaml").write_text(small_chain_text())
-    text = chance.choice([dump_plan, _with_a_branch])(plan)
+    text = chance.choice([dump_plan(Plan.of(plan)), _with_a_branch(plan)])
     file = _write_damaged(chance, folder / "plan.yaml", text)
     output = ("-o", folder / "out")
     launch = folder / "robot.launch.xml"
@@ -287,7 +286,7 @@ def _peak() -> int:
 
 @pytest.mark.parametrize("kind", KINDS, ids=lambda kind: str(kind.__name__))
 def test_whatever_is_damaged_there_is_a_result_or_one_message(
-    kind: Callable[..., Arguments], tmp_path: Path, simulated: Recording, plan: Plan
+    kind: Callable[..., Arguments], tmp_path: Path, simulated: Recording, plan: ChainPlan
 ) -> None:
     before, codes = _peak(), set()
     for number in range(FIRST, FIRST + CASES):

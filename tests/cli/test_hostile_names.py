@@ -23,7 +23,8 @@ from small_chain import small_chain
 
 from chainshaper import load_plan, open_source, plan_recording, save_plan, simulate
 from chainshaper.cli.app import VERBS
-from chainshaper.planning.plan import revised
+from chainshaper.planning import Plan
+from chainshaper.planning.chain_plan import revised
 from chainshaper.reporting.figures import draw_latency
 from chainshaper.values.errors import shown
 from chainshaper.values.recording import Recording, write_recording
@@ -86,12 +87,12 @@ def recording(folder: Path) -> Recording:
 @pytest.fixture(scope="module")
 def plan(recording: Recording, folder: Path) -> Path:
     """A plan with such names where it may have them; nodes and topics must have ROS 2's."""
-    planned = plan_recording(open_source(folder / "plain"))
+    planned = plan_recording(open_source(folder / "plain")).chains[0]
     servers = tuple(
         one.model_copy(update={"name": f"{one.name}{IN_A_WORD}"}) for one in planned.servers
     )
     chain = planned.chain.model_copy(update={"spec": CHAIN})
-    save_plan(revised(planned, servers=servers, chain=chain), folder / "plan.yaml")
+    save_plan(Plan.of(revised(planned, servers=servers, chain=chain)), folder / "plan.yaml")
     return folder / "plan.yaml"
 
 
@@ -194,7 +195,7 @@ def test_a_plan_and_a_launch_file_are_named_harmlessly(plan: Path, folder: Path)
     finished = called("apply", plan, "--dry-run")
     harmless(finished, code=finished.code)
     harmless(called("threads", plan), code=called("threads", plan).code)
-    assert load_plan(plan).chain.spec == CHAIN
+    assert load_plan(plan).chains[0].chain.spec == CHAIN
 
 
 @pytest.mark.parametrize(

@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 from command_line import called, json_of, refused
 
-from chainshaper import load_application_plan, load_plan, plan_shaping, save_plan
+from chainshaper import convert_plan, load_plan, plan_shaping, save_plan
 from chainshaper.planning import (
+    ChainPlan,
     Modes,
     Plan,
     PlanRequest,
@@ -23,11 +24,12 @@ from chainshaper.planning import (
     plan_json,
     read_latencies,
 )
-from chainshaper.planning.plan import revised
+from chainshaper.planning.chain_plan import revised
 from chainshaper.values.recording import Recording
 
 MS = 1_000_000
 TWO_CHAINS = Path(__file__).parents[2] / "examples" / "two_chains.yaml"
+EARLIER = Path(__file__).with_name("plan_of_an_earlier_version.yaml")
 PNG = b"\x89PNG\r\n"
 TINY = "--period 1ms --epsilon 0 --grid 1us --publish-slot 3us"
 Words: TypeAlias = list[str | Path]
@@ -188,7 +190,7 @@ def test_every_policy_is_planned_from_a_recording(
 ) -> None:
     file = tmp_path / "plan.yaml"
     values = json_of("plan", unshaped.path, "--policy", policy, "-o", file)
-    assert values["policy"] == load_plan(file).policy == policy
+    assert values["policy"] == load_plan(file).chains[0].policy == policy
     assert [server["name"] for server in values["servers"]] == servers
     assert values["evidence"]["utilisation"] > 0
 
@@ -201,7 +203,7 @@ def saved(tmp_path: Path) -> Callable[..., Path]:
         latencies = np.array([longest_ms // 2, longest_ms]) * MS
         about = {"spec": name, "output": f"/{name}", "publisher": "/p", "nodes": [f"/{name}_node"]}
         planned = plan_shaping(latencies, period_ms * MS, **about)  # type: ignore[arg-type]
-        save_plan(planned, tmp_path / f"{name}.yaml")
+        save_plan(Plan.of(planned), tmp_path / f"{name}.yaml")
         return tmp_path / f"{name}.yaml"
 
     return save
@@ -214,7 +216,7 @@ def test_chains_take_turns_where_they_can(saved: Callable[..., Path], tmp_path: 
     assert (first["offset_ns"], second["offset_ns"]) == (0, 41 * MS)
     assert "cycle 100.000, offset 41.000" in " ".join(called("offsets", *files).out.split())
     assert [Path(file).name for file in values["files"]] == ["1_a.yaml", "2_b.yaml"]
-    assert load_plan(tmp_path / "placed" / "2_b.yaml").offset_ns == 41 * MS
+    assert load_plan(tmp_path / "placed" / "2_b.yaml").chains[0].offset_ns == 41 * MS
     again = refused(2, "offsets", *files, "-o", tmp_path / "placed")
     assert "exists already and is not overwritten" in again
     assert "a, c fill 102.0% of the time of core 1" in refused(
@@ -225,10 +227,10 @@ def test_chains_take_turns_where_they_can(saved: Callable[..., Path], tmp_path: 
 
 
 def test_an_offset_is_refused_where_nothing_stops_the_chain(
-    application_file: Path, plan: Plan
+    application_file: Path, plan: ChainPlan
 ) -> None:
     file, output = application_file.with_name("plan.yaml"), application_file.with_name("rec")
-    save_plan(revised(plan, offset_ns=7 * MS), file)
+    save_plan(Plan.of(revised(plan, offset_ns=7 * MS)), file)
     for words in (("apply", file, "--dry-run"), ("apply", file)):
         said = refused(2, *words, "--backend", "fifo")
         assert "fifo sets priorities only, and chains whose cycles start at offsets" in said
@@ -241,7 +243,7 @@ def test_several_chains_of_a_recording_and_a_further_sink(tmp_path: Path) -> Non
     chains = ("--chain", "/scan../command", "--chain", "/image../label")
     values = json_of("plan", recording, *chains, "-o", file)
     assert [plan["chain"]["spec"] for plan in values["plans"]] == list(chains[1::2])
-    written = load_application_plan(file)
+    written = load_plan(file)
     assert [plan.chain.spec for plan in written.chains] == list(chains[1::2])
     assert "the plan is of several chains" in refused(
         *(2, "sweep", TWO_CHAINS, file, "--vary", "plan.margin.epsilon=1ms", "-o", "x.parquet")
@@ -253,6 +255,28 @@ def test_several_chains_of_a_recording_and_a_further_sink(tmp_path: Path) -> Non
     assert "/scan../command is given twice" in twice
 
 
+def test_a_plan_of_an_earlier_version_is_refused_and_converted(
+    plan: ChainPlan, application_file: Path, tmp_path: Path
+) -> None:
+    new = tmp_path / "new.yaml"
+    convert = ("plan", "--convert", EARLIER, "-o", new)
+    for verb in (
+        ("apply", EARLIER, "--dry-run"),
+        ("simulate", application_file, EARLIER, "-o", new),
+    ):
+        said = refused(2, *verb)
+        assert (
+            f"a plan of an earlier version, converted by `chainshaper plan --convert {EARLIER}"
+            in said
+        )
+    assert called(*convert).out.strip() == str(new)
+    assert load_plan(new) == convert_plan(EARLIER)
+    assert load_plan(new).chains[0].servers == plan.servers
+    assert "not overwritten" in refused(2, *convert)
+    assert "a plan; wanted is a file that" in refused(2, "plan", "--convert", new, "-o", "x.yaml")
+    assert "goes with --output" in refused(2, "plan", "--convert", EARLIER)
+
+
 def test_modes_get_their_bands(unshaped: Recording, tmp_path: Path) -> None:
     plan = ("plan", unshaped.path, "--publish-slot", "100us", "--epsilon", "1ms")
     modes = ("--modes", "/mode:city=2,highway=1")
@@ -260,7 +284,9 @@ def test_modes_get_their_bands(unshaped: Recording, tmp_path: Path) -> None:
     values = json_of(*two, "--late", "discard", "-o", tmp_path / "plan.yaml")
     wanted = {"topic": "/mode", "default": "city", "bands": {"city": 2, "highway": 1}}
     assert values["modes"] == {**wanted, "late": "discard"}
-    assert load_plan(tmp_path / "plan.yaml").modes == Modes.model_validate(values["modes"])
+    assert load_plan(tmp_path / "plan.yaml").chains[0].modes == Modes.model_validate(
+        values["modes"]
+    )
     assert "from 1 to 1, or add a slot" in refused(2, *plan, *modes)
     asynchronous = ("--publication", "asynchronous", "--publish-slot", "1ms")
     assert "/third has no thread that publishes" in refused(2, *two, *asynchronous)

@@ -18,7 +18,7 @@ from chainshaper.cli import output
 from chainshaper.cli.app import VERBS
 from chainshaper.flow import doctor
 from chainshaper.flow.describing import application_file
-from chainshaper.planning import Plan, save_plan
+from chainshaper.planning import ChainPlan, Plan, save_plan
 from chainshaper.reporting.tables import ResultTable, figures, words
 from chainshaper.values.durations import parse_duration
 from chainshaper.values.recording import Recording
@@ -131,9 +131,9 @@ def test_doctor_says_what_is_limited_on_a_middleware(
 
 
 def test_tables_are_for_people(
-    unshaped: Recording, shaped: Recording, plan: Plan, tmp_path: Path
+    unshaped: Recording, shaped: Recording, plan: ChainPlan, tmp_path: Path
 ) -> None:
-    save_plan(plan, tmp_path / "plan.yaml")
+    save_plan(Plan.of(plan), tmp_path / "plan.yaml")
     dry_run: list[str | Path] = [
         "apply",
         tmp_path / "plan.yaml",
@@ -165,7 +165,7 @@ def test_a_plan_is_written_and_printed(tmp_path: Path, unshaped: Recording) -> N
     file = folder / "plan.yaml"
     options = ("--epsilon", "2ms", "--anchor", "cycle")
     values = json_of("plan", unshaped.path, "-o", file, *options)
-    planned = load_plan(file)
+    planned = load_plan(file).chains[0]
     assert values["anchor"] == planned.anchor == "cycle"
     assert values["margin"]["epsilon_ns"] == planned.margin.epsilon_ns == 2_000_000
     assert values["bands_ns"] == [planned.servers[-1].slots[-1][1]]

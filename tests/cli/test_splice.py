@@ -10,9 +10,9 @@ from known import known
 from small_chain import small_chain_plan
 
 from chainshaper.flow.launch_shaping import _with_types
-from chainshaper.planning import Plan, save_plan
-from chainshaper.planning.application_plan import whole
-from chainshaper.planning.plan import revised
+from chainshaper.planning import ChainPlan, save_plan
+from chainshaper.planning.chain_plan import revised
+from chainshaper.planning.plan import Plan
 
 ROBOT = '<launch>\n  <node pkg="robot" exec="third" name="third"/>\n</launch>\n'
 
@@ -21,9 +21,9 @@ Files: TypeAlias = tuple[Path, Path, Path]
 
 
 @pytest.fixture
-def files(tmp_path: Path, plan: Plan) -> Files:
+def files(tmp_path: Path, plan: ChainPlan) -> Files:
     """A plan, a launch file that starts its publisher, and a folder that is not there yet."""
-    save_plan(plan, tmp_path / "plan.yaml")
+    save_plan(Plan.of(plan), tmp_path / "plan.yaml")
     (tmp_path / "robot.launch.xml").write_text(ROBOT)
     return tmp_path / "plan.yaml", tmp_path / "robot.launch.xml", tmp_path / "spliced"
 
@@ -61,13 +61,13 @@ def test_it_shows_what_is_redirected_and_what_to_launch(files: Files) -> None:
 
 
 def test_a_dry_run_of_a_gate_in_the_publishers_process_names_nothing_that_is_not_there(
-    files: Files, plan: Plan, monkeypatch: pytest.MonkeyPatch
+    files: Files, plan: ChainPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No ROS 2 is needed here: such a gate redirects no topic."""
     _, robot, folder = files
     file = folder.with_name("inside.yaml")
     inside = known(plan.shaping_node).model_copy(update={"in_process": True})
-    save_plan(revised(plan, shaping_node=inside, anchor="cycle"), file)
+    save_plan(Plan.of(revised(plan, shaping_node=inside, anchor="cycle")), file)
     flow = "chainshaper.flow.launch_splicing"
     library = "chainshaper.splicing.gate_settings.gate_library"
     monkeypatch.setattr(library, lambda: Path("/gate.so"))
@@ -134,7 +134,9 @@ def test_nothing_is_written_where_it_could_not_be_built(
     assert not folder.exists()
 
 
-def test_a_plan_s_own_recording_tells_publishers_where_it_exists(files: Files, plan: Plan) -> None:
+def test_a_plan_s_own_recording_tells_publishers_where_it_exists(
+    files: Files, plan: ChainPlan
+) -> None:
     path, robot, folder = files
     recording = path.parent / "recording"
     recording.mkdir()
@@ -153,7 +155,7 @@ def test_a_plan_s_own_recording_tells_publishers_where_it_exists(files: Files, p
 
 def test_types_are_those_of_the_recording_that_saw_them(tmp_path: Path) -> None:
     """Discovery of Fast DDS has not always shown all types when a recording ends."""
-    plan = whole(small_chain_plan(5_000_000, 20_000_000, core=1))
+    plan = Plan.of(small_chain_plan(5_000_000, 20_000_000, core=1))
     ends, header = [("/n", "/t3", "publisher")], "std_msgs/msg/Header"
     folders = [tmp_path / name for name in ("first", "before")]
     for folder in folders:

@@ -51,7 +51,7 @@ from chainshaper import __file__ as package_file
 from chainshaper.enforcement.journal import all_runs_locked, journals_folder
 from chainshaper.linux import cgroups
 from chainshaper.linux.threads import list_threads, parents
-from chainshaper.planning import Plan, plan_shaping, save_plan
+from chainshaper.planning import ChainPlan, Plan, plan_shaping, save_plan
 
 pytestmark = [pytest.mark.timed, needs_fifo, needs_cgroups]
 FIFO = ("--backend", "fifo")
@@ -113,14 +113,14 @@ KILLED = ("sh", "-c", "kill -9 $$")
 
 def test_a_command_that_fails_is_reported_and_so_is_one_without_the_nodes(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
-    save_plan(one_server_plan(), path)
+    save_plan(Plan.of(one_server_plan()), path)
     for words, how in (("false",), "ended with code 1"), (KILLED, "was killed by SIGKILL"):
         ended = called("apply", path, *FIFO, "--", *words)
         assert ended.code == 1
         assert f"the command {how} before all nodes" in ended.err
     named = {"output": "/out", "publisher": "/origin", "nodes": ("/origin",)}
     shaped = plan_shaping(np.array([8, 12]) * MS, 50 * MS, **named)  # type: ignore[arg-type]
-    save_plan(shaped, tmp_path / "shaped.yaml")
+    save_plan(Plan.of(shaped), tmp_path / "shaped.yaml")
     command = ("timeout", "3", *node_command("origin", tmp_path / "windows"))
     without = chainshaper("apply", tmp_path / "shaped.yaml", *FIFO, "--", *command)
     assert without.code == 1
@@ -161,7 +161,7 @@ def open_files(pid: int) -> list[Path]:
     return found
 
 
-def slow_plan() -> Plan:
+def slow_plan() -> ChainPlan:
     """Its chain begins once in ten seconds, so measuring where takes two minutes."""
     plan, cycle_ns = one_server_plan(), LONG_S * 100_000_000
     chain = plan.chain.model_copy(update={"period_ns": cycle_ns})
@@ -367,7 +367,7 @@ def test_without_the_privileges_nothing_is_changed_and_the_missing_one_is_named(
     with node_to_govern(tmp_path) as governed, tempfile.TemporaryDirectory() as readable:
         folder = Path(readable)
         folder.chmod(0o777)
-        save_plan(one_server_plan(), folder / "plan.yaml")
+        save_plan(Plan.of(one_server_plan()), folder / "plan.yaml")
         (folder / "plan.yaml").chmod(0o644)
         for granted, missing in (
             ("", "CAP_DAC_OVERRIDE"),

@@ -12,9 +12,9 @@ from command_line import called, json_of
 from gated import needs_cgroups
 from ros2 import ros2_environment
 
-from chainshaper.enforcement.threads import IN_ORDER
+from chainshaper.enforcement.node_threads import IN_ORDER
 from chainshaper.planning import load_plan
-from chainshaper.planning.plan import Thread
+from chainshaper.planning.chain_plan import Thread
 
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(300), needs_fifo, needs_cgroups]
 
@@ -67,7 +67,7 @@ def test_one_callback_group_is_gated_and_the_other_runs_on(
     options = ("--policy", "server-per-chain", "-o", path)
     finished = called("plan", recording, "--chain", "/groups../out", *options)
     assert finished.code == 0, finished
-    (server,) = load_plan(path).servers
+    (server,) = load_plan(path).chains[0].servers
     assert server.threads == (Thread(node="/groups", callbacks=("every 100ms",)),)
     server = server.model_copy(update={"slots": (SLOT,)})
 

@@ -30,7 +30,7 @@ from strangers import needs_root
 from chainshaper.enforcement.freezer import CoreNumbers, CounterPage, run_of
 from chainshaper.enforcement.guardian import GROUP, _Watch, let_go
 from chainshaper.enforcement.journal import Journal, find_journals
-from chainshaper.enforcement.threads import _BEST_SERVER_PRIORITY, DDS_PRIORITY
+from chainshaper.enforcement.thread_scheduling import _BEST_SERVER_PRIORITY, DDS_PRIORITY
 from chainshaper.enforcement.undoing import undo_run
 from chainshaper.linux.cgroups import cgroup_of, mount_options, mount_point
 from chainshaper.linux.scheduling import available_cores, state_of

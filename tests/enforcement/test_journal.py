@@ -46,7 +46,7 @@ from chainshaper.enforcement.undoing import (
     remove_run,
     save_run_state,
 )
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan, Plan
 from chainshaper.values.errors import OperationError, PlatformError
 
 pytestmark = pytest.mark.timed
@@ -228,7 +228,7 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
     application, file = tmp_path / "app.yaml", tmp_path / "plan.yaml"
     application.write_text(small_chain_text(publication="asynchronous"))
     plan = _asynchronous_plan()
-    save_plan(plan, file)
+    save_plan(Plan.of(plan), file)
     command = [sys.executable, "-m", "chainshaper"]
     output = tmp_path / "rec"
     run = [*command, "run", str(application), "-o", str(output), "--cycles", "160"]
@@ -268,7 +268,7 @@ def test_applied_and_released_in_the_midst_of_a_recording(tmp_path: Path) -> Non
     assert measured.prediction.mean.measured_ns is not None
 
 
-def _asynchronous_plan() -> Plan:
+def _asynchronous_plan() -> ChainPlan:
     return small_chain_plan(
         4 * MS, 24 * MS, publication="asynchronous", publish_slot_ns=10 * MS, core=EXECUTOR_CORE
     )

@@ -29,15 +29,15 @@ from chainshaper.enforcement.litmus import (
     restore_plugin,
     turned,
 )
+from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.enforcement.scheduling_memory import release_threads
 from chainshaper.enforcement.servers import BackEnd, ReservationServer, ServerTable
-from chainshaper.enforcement.threads import Allocation
 from chainshaper.flow import threads
 from chainshaper.flow.phase import Phase
 from chainshaper.flow.threads import planned_changes
 from chainshaper.linux.scheduling import available_cores, state_of
-from chainshaper.planning import save_plan
-from chainshaper.planning.plan import Server, Thread, revised
+from chainshaper.planning import Plan, save_plan
+from chainshaper.planning.chain_plan import Server, Thread, revised
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 
 pytestmark = pytest.mark.timed
@@ -63,7 +63,7 @@ def test_the_commands_of_a_plan_are_these() -> None:
 
 def test_litmus_commands_are_printed_on_any_kernel(tmp_path: Path) -> None:
     path = tmp_path / "plan.yaml"
-    save_plan(one_server_plan(), path)
+    save_plan(Plan.of(one_server_plan()), path)
     said = called("apply", path, "--backend", "litmus", "--dry-run")
     core = available_cores()[-1]
     number = core * 1000 + 1
@@ -77,7 +77,7 @@ def test_litmus_commands_are_printed_on_any_kernel(tmp_path: Path) -> None:
 def test_printed_commands_have_the_slots_that_apply_would_enforce() -> None:
     """A timer at 17 ms, cycles of 100 that start 20 ms behind the anchor: the slot opens at 19."""
     plan = revised(one_server_plan(), offset_ns=20 * MS)
-    changes = planned_changes(plan, "litmus", phase_ns=17 * MS)
+    changes = planned_changes(Plan.of(plan), "litmus", phase_ns=17 * MS)
     assert [command[-1] for command in changes.commands if "-n" in command] == ["[19,49)"]
 
 
@@ -90,7 +90,7 @@ def test_printed_commands_open_servers_for_overruns_as_apply_does(
     plan = revised(small_chain_plan(10 * MS, 20 * MS), offset_ns=10 * MS)
     monkeypatch.setattr(threads, "chain_phases", lambda *_: [Phase(17 * MS, 0)])
     monkeypatch.setattr(threads, "find_threads", lambda *_, **__: Allocation((), ()))
-    _, created, *_ = planned_changes(plan, "litmus").commands
+    _, created, *_ = planned_changes(Plan.of(plan), "litmus").commands
     assert created[-3:] == ("[0,9)", "[9,16)", "[19,50)")
 
 
@@ -113,7 +113,7 @@ def test_printed_commands_close_the_papers_servers_where_the_plan_does(
         for number in range(1, 6)
     ]
     plan = bare_plan("/t1../t5", 100 * MS, *servers, policy="server-per-callback")
-    closed = planned_changes(revised(plan, slot_ends="closed"), "litmus").commands
+    closed = planned_changes(Plan.of(revised(plan, slot_ends="closed")), "litmus").commands
     assert [" ".join(command) for command in closed] == [
         "setsched P-RES",
         "resctl -n 1001 -t table-driven -c 1 -m 100 -q 1 [0,16)",
@@ -123,7 +123,7 @@ def test_printed_commands_close_the_papers_servers_where_the_plan_does(
         "resctl -n 1005 -t table-driven -c 1 -m 100 -q 1 [64,80)",
         *(f"resctl -a TID:/node{number} -r 100{number} -c 1" for number in range(1, 6)),
     ]
-    left_open = planned_changes(plan, "litmus").commands
+    left_open = planned_changes(Plan.of(plan), "litmus").commands
     assert [one[-1] for one in left_open if "-n" in one] == [
         "[0,16)",
         *(f"[{start},97)" for start in (16, 32, 48, 64)),

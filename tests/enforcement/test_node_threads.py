@@ -13,32 +13,33 @@ from hypothesis import given
 from hypothesis import strategies as st
 from known import known
 
-from chainshaper.enforcement.threads import (
-    DDS_PRIORITY,
+from chainshaper.enforcement.node_threads import (
     IN_ORDER,
     Allocation,
     NodeThread,
     RecordedProcess,
     RecordedThread,
-    WantedScheduling,
     allocate,
-    first_planned,
-    left_by_back_end,
     new_and_ended,
+    with_gates,
+)
+from chainshaper.enforcement.planned_threads import first_planned, server_members
+from chainshaper.enforcement.thread_scheduling import (
+    DDS_PRIORITY,
+    WantedScheduling,
+    left_by_back_end,
     plan_scheduling,
-    server_members,
     server_priorities,
     waiting_receivers,
-    with_gates,
 )
 from chainshaper.flow.threads import check_publishers, first_threads
 from chainshaper.linux.processes import RunningProcess, read_process
 from chainshaper.linux.scheduling import SchedulingRequest
 from chainshaper.linux.threads import RunningThread, ThreadRole, gate_thread_name, role_of
 from chainshaper.planning import plan_shaping
-from chainshaper.planning.application_plan import ApplicationPlan, whole
-from chainshaper.planning.plan import ReceiverPlace, Server, ShapingNode, revised
-from chainshaper.planning.plan import Thread as PlannedThread
+from chainshaper.planning.chain_plan import ReceiverPlace, Server, ShapingNode, revised
+from chainshaper.planning.chain_plan import Thread as PlannedThread
+from chainshaper.planning.plan import Plan
 from chainshaper.planning.shaping import let_per_chain, over_cores
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.middleware import thread_work
@@ -241,10 +242,10 @@ def test_a_process_started_after_the_recording_is_not_in_it(
     assert (found.threads[0].nodes == ("/a",)) is not started_later
 
 
-def _plan(*servers: Server) -> ApplicationPlan:
+def _plan(*servers: Server) -> Plan:
     """A plan with these servers and nothing to publish."""
     plan = plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS)
-    return whole(revised(plan, servers=servers))
+    return Plan.of(revised(plan, servers=servers))
 
 
 def _server(
@@ -269,7 +270,7 @@ def _allocation(*nodes: list[NodeThread]) -> Allocation:
 
 
 def _by_tid(wanted: tuple[WantedScheduling, ...]) -> dict[int, SchedulingRequest]:
-    return {one.thread.thread.tid: one.wanted for one in wanted}
+    return {one.node_thread.thread.tid: one.scheduling for one in wanted}
 
 
 def _text(wanted: tuple[WantedScheduling, ...]) -> str:
@@ -331,7 +332,9 @@ def test_the_cycle_begins_with_the_first_node() -> None:
     nodes = enumerate(("/b", "/chainshaper_out", "/a"))
     found = _allocation(*(_node(name, pid, "executor") for pid, name in nodes))
     for one in (plan, let_per_chain(plan)):
-        assert [[thread.pid for thread in own] for own in first_threads(whole(one), found)] == [[2]]
+        assert [[thread.pid for thread in own] for own in first_threads(Plan.of(one), found)] == [
+            [2]
+        ]
 
 
 def test_servers_that_are_scheduling_classes_get_ordinary_threads() -> None:
@@ -357,7 +360,7 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     node = GATE.model_copy(update={"receivers": ("/sink", "/a", "/absent")})
     chain = _server("chain", EXECUTOR_A, priority=2)
     bare = _plan(chain, _server("output", node.thread, priority=1, start=1)).chains[0]
-    plan = whole(revised(bare, shaping_node=node))
+    plan = Plan.of(revised(bare, shaping_node=node))
     gate, sink = _node("/gate", 100, "executor"), _node("/sink", 300, "executor", "dds", "unknown")
     receiving = replace(sink[1], thread=replace(sink[1].thread, kind="receive"))
     allocation = _allocation(gate, _node("/a", 200, "executor"), [sink[0], receiving, sink[2]])
@@ -367,7 +370,7 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
     more_cores = _by_tid(plan_scheduling(plan, allocation, (0, 1, 2, 3)))
     assert more_cores[301] == SchedulingRequest(91, (0,)), "the core that is kept clear for them"
     assert 300 not in _by_tid(left_by_back_end("scx", wanted)), "it would outrank the servers"
-    (gate_thread,) = (one.wanted for one in wanted if one.thread.thread.tid == 100)
+    (gate_thread,) = (one.scheduling for one in wanted if one.node_thread.thread.tid == 100)
     free = _by_tid(left_by_back_end("scx", wanted, plan.free_threads))
     assert (free[100], free[200].priority) == (gate_thread, None), "no back end keeps it"
     assert more_cores[300] == SchedulingRequest(83, (1,)), (
@@ -380,14 +383,14 @@ def test_who_receives_the_output_stands_below_all_servers_on_the_gates_core() ->
         assert scheduled.get(300) == (None if stays else SchedulingRequest(83, (1,)))
         assert scheduled[301] == SchedulingRequest(91, (0,))
     other = _server("other", PlannedThread(node="/b"), core=2, priority=2)
-    several = ApplicationPlan(chains=(plan.chains[0], _plan(other).chains[0]))
+    several = Plan(chains=(plan.chains[0], _plan(other).chains[0]))
     both = _allocation(gate, _node("/a", 200, "executor"), _node("/b", 400, "executor"), sink)
     for cores, core, notes in (((0, 1, 2), 0, 0), ((1, 2), 1, 1)):
         found = plan_scheduling(several, both, cores)
         assert _by_tid(found)[300] == SchedulingRequest(83, (core,))
         assert len(waiting_receivers(several, found)) == notes
         assert not waiting_receivers(several, left_by_back_end("scx", found))
-    alone = whole(revised(bare, shaping_node=GATE))
+    alone = Plan.of(revised(bare, shaping_node=GATE))
     assert set(_by_tid(plan_scheduling(alone, allocation, (0, 1)))) == {100, 200}
 
 
@@ -400,7 +403,7 @@ def test_receivers_with_a_place_stand_above_the_chain_and_behind_its_gates() -> 
     allocation = _allocation(gate, _node("/a", 200, "executor"), sink)
     for core in (1, 2):
         own = {"receivers": ("/sink",), "receivers_at": place.model_copy(update={"core": core})}
-        plan = whole(revised(bare, shaping_node=GATE.model_copy(update=own)))
+        plan = Plan.of(revised(bare, shaping_node=GATE.model_copy(update=own)))
         wanted = plan_scheduling(plan, allocation, (0, 1, 2))
         assert _text(wanted) == f"100:87@1 200:84@1 300:86@{core}"
         assert 300 in _by_tid(left_by_back_end("scx", wanted)), "above the servers, as planned"
@@ -427,10 +430,10 @@ def test_a_gate_inside_the_chain_stands_behind_that_of_its_output() -> None:
         _node("/a", 200, "executor"),
         _node("/sink", 300, "executor"),
     )
-    plan = whole(revised(bare, policy="let-per-callback", **nodes))
+    plan = Plan.of(revised(bare, policy="let-per-callback", **nodes))
     wanted = _text(plan_scheduling(plan, allocation, (0, 1)))
     assert wanted == "100:87@1 150:86@1 200:83@1 300:85@1"
-    sinks = whole(revised(bare, **nodes))
+    sinks = Plan.of(revised(bare, **nodes))
     wanted = _text(plan_scheduling(sinks, allocation, (0, 1)))
     assert wanted == "100:87@1 150:87@1 200:84@1 300:86@1", "both are outputs"
 
@@ -453,7 +456,7 @@ def test_best_effort_runs_under_the_fair_class_and_equal_servers_take_turns() ->
         _server("other", EXECUTOR_B, priority=1, start=1),
         last.model_copy(update={"best_effort": True}),
     )
-    turns = whole(revised(apart.chains[0], equal_priorities="round-robin"))
+    turns = Plan.of(revised(apart.chains[0], equal_priorities="round-robin"))
     nodes = [_node(name, tid, "executor") for name, tid in (("/a", 1), ("/b", 2), ("/noise", 3))]
     for plan, turn in ((apart, False), (turns, True)):
         real_time = SchedulingRequest(87, (1,), turn)
@@ -564,7 +567,7 @@ def test_more_priorities_than_there_are_are_refused() -> None:
 
 
 @st.composite
-def applications(draw: st.DrawFn) -> tuple[ApplicationPlan, Allocation]:
+def applications(draw: st.DrawFn) -> tuple[Plan, Allocation]:
     """Nodes with executors, publishers and DDS threads, spread over servers on two cores."""
     count = draw(st.integers(1, 5))
     nodes: list[list[NodeThread]] = []
@@ -589,7 +592,7 @@ def applications(draw: st.DrawFn) -> tuple[ApplicationPlan, Allocation]:
 
 @given(applications())
 def test_whatever_the_plan_the_order_of_priorities_holds(
-    application: tuple[ApplicationPlan, Allocation],
+    application: tuple[Plan, Allocation],
 ) -> None:
     plan, allocation = application
     wanted = plan_scheduling(plan, allocation, (0, 1, 2))
@@ -597,34 +600,34 @@ def test_whatever_the_plan_the_order_of_priorities_holds(
     first = first_planned(plan.chains[0])
 
     def begins(one: WantedScheduling) -> int:
-        return first is not None and first.node in one.thread.nodes
+        return first is not None and first.node in one.node_thread.nodes
 
-    assert len({one.thread.thread.tid for one in wanted}) == len(wanted), "one wish per thread"
+    assert len({one.node_thread.thread.tid for one in wanted}) == len(wanted), "one wish per thread"
     for one in wanted:
-        priority, role = one.wanted.priority, one.thread.thread.role
+        priority, role = one.scheduling.priority, one.node_thread.thread.role
         assert (role == "dds") == (priority == DDS_PRIORITY)
         if role == "dds" or priority is None or one.server is None:
             continue
         assert 1 <= priority < 89
         for other in wanted:
-            if other.server is None or other.wanted.priority is None:
+            if other.server is None or other.scheduling.priority is None:
                 continue
             if ranks[one.server] < ranks[other.server] and role != "publisher":
-                assert priority > other.wanted.priority
-            if role == other.thread.thread.role == "executor" and one.server == other.server:
+                assert priority > other.scheduling.priority
+            if role == other.node_thread.thread.role == "executor" and one.server == other.server:
                 above = begins(one) - begins(other)
-                assert priority - other.wanted.priority == above
-    after = {one.thread.thread.tid: one.wanted for one in wanted}
+                assert priority - other.scheduling.priority == above
+    after = {one.node_thread.thread.tid: one.scheduling for one in wanted}
     for one in wanted:
-        if one.thread.thread.role != "publisher":
+        if one.node_thread.thread.role != "publisher":
             continue
         for sibling in allocation.threads:
-            same_process = sibling.thread.pid == one.thread.thread.pid
+            same_process = sibling.thread.pid == one.node_thread.thread.pid
             if not same_process or sibling.thread.role == "publisher":
                 continue
             new = after.get(sibling.thread.tid, SchedulingRequest(None, None))
-            if set(new.cores or sibling.thread.cores) & set(one.wanted.cores or ()):
-                assert known(one.wanted.priority) < known(new.priority)
+            if set(new.cores or sibling.thread.cores) & set(one.scheduling.cores or ()):
+                assert known(one.scheduling.priority) < known(new.priority)
 
 
 @pytest.mark.parametrize(
@@ -650,7 +653,7 @@ def test_how_a_process_publishes_is_looked_up_before_its_publisher_is_gated(
         monkeypatch.setenv("FASTRTPS_DEFAULT_PROFILES_FILE", str(tmp_path / "profiles.xml"))
     monkeypatch.setenv("RMW_FASTRTPS_PUBLICATION_MODE", mode)
     values: dict[str, Any] = {"output": "/out", "publisher": "/b", "publication": "asynchronous"}
-    plan = whole(plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS, **values))
+    plan = Plan.of(plan_shaping(np.array([5 * MS, 20 * MS]), 100 * MS, **values))
     names = [("/b", "/out"), ("/b", "/rosout"), ("/beside", "/debug"), ("/other", "/rosout")]
     ends = [EndpointInfo(node=n, topic=t, kind="publisher", depth=5) for n, t in names]
     arguments = ("--ros-args", "-r", "b:__node:=b", "-r", "c:__node:=beside")
@@ -674,6 +677,6 @@ def test_how_a_process_publishes_is_looked_up_before_its_publisher_is_gated(
         (warning,) = checked()
         assert warning.startswith(said)
         ends[0] = ends[0].model_copy(update={"depth": 1})
-        plan = whole(revised(plan.chains[0], cycle_ns=300 * MS))
+        plan = Plan.of(revised(plan.chains[0], cycle_ns=300 * MS))
         with pytest.raises(InputError, match="history of 1, but 3 messages"):
             checked()

@@ -21,8 +21,8 @@ from story import OFFSET, Story
 from chainshaper import find_threads, planned_changes
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import list_threads
-from chainshaper.planning import Plan, save_plan
-from chainshaper.planning.plan import ShapingNode, revised
+from chainshaper.planning import ChainPlan, Plan, save_plan
+from chainshaper.planning.chain_plan import ShapingNode, revised
 from chainshaper.values.recording import RecordingInfo, write_recording
 
 pytestmark = pytest.mark.timed
@@ -61,7 +61,7 @@ def recorded(pid: int, path: Path) -> Path:
     return write_recording(path, story.tables(), info).path
 
 
-def plan_of(recording: Path | None) -> Plan:
+def plan_of(recording: Path | None) -> ChainPlan:
     bare = plan_for(
         server("chain", "chain_of_receivers", (0, 50)), server("output", GATE.name, (50, 60))
     )
@@ -98,11 +98,13 @@ def test_receivers_are_known_by_the_recording_that_the_plan_names(
 def test_who_asks_first_sees_the_same(receiver: int, tmp_path: Path) -> None:
     plan = plan_of(recorded(receiver, tmp_path / "recording"))
     (changed,) = (
-        one for one in planned_changes(plan, "fifo").threads if "/sink" in one.thread.nodes
+        one
+        for one in planned_changes(Plan.of(plan), "fifo").threads
+        if "/sink" in one.node_thread.nodes
     )
-    assert changed.thread.thread.pid == receiver
-    assert changed.wanted.cores == (GATE.core,)
-    save_plan(plan, tmp_path / "plan.yaml")
+    assert changed.node_thread.thread.pid == receiver
+    assert changed.scheduling.cores == (GATE.core,)
+    save_plan(Plan.of(plan), tmp_path / "plan.yaml")
     shown = called("apply", tmp_path / "plan.yaml", "--backend", "fifo", "--dry-run")
     assert "/sink" in shown.out
     assert f"note: {ABSENT}" in shown.err
@@ -126,6 +128,6 @@ def test_without_a_recording_it_is_said_who_is_left_out(
         (note,) = (note for note in states[0].notes if "not recognised" in note)
     assert "/sink, which receives /out" in note
     assert reason in note
-    notes = find_threads(plan).notes
+    notes = find_threads(Plan.of(plan)).notes
     assert any("/sink, which receives /out" in note for note in notes)
     assert any(reason in note for note in notes)

@@ -17,7 +17,7 @@ from strangers import NOBODY, named, needs_root, open_folder, strange
 from chainshaper import find_threads
 from chainshaper.linux.processes import read_process, run_users, user_of
 from chainshaper.linux.threads import has_ended, list_threads, start_of
-from chainshaper.planning import Plan, save_plan
+from chainshaper.planning import ChainPlan, Plan, save_plan
 from chainshaper.sources import ros
 from chainshaper.sources.ros import environment_of, own_environment, start_with_rclpy
 from chainshaper.values.errors import InputError, OperationError
@@ -52,7 +52,7 @@ def realtime(pid: int) -> list[str]:
 
 @needs_fifo
 def test_nothing_of_a_strangers_environment_runs_unless_its_user_is_named_and_then_as_that_user(
-    plan: Plan, tmp_path: Path, open_folder: Path
+    plan: ChainPlan, tmp_path: Path, open_folder: Path
 ) -> None:
     environment, ran = trap(open_folder)
     nodes = [thread.node[1:] for one in plan.servers for thread in one.threads]
@@ -121,7 +121,7 @@ def test_every_verb_that_finds_by_name_takes_processes_of_the_users_that_it_name
     tmp_path: Path,
 ) -> None:
     plan_file = tmp_path / "plan.yaml"
-    save_plan(plan_for(server("first", "strange_origin", (0, 30))), plan_file)
+    save_plan(Plan.of(plan_for(server("first", "strange_origin", (0, 30)))), plan_file)
 
     def nodes(*arguments: str | Path) -> set[str]:
         return {n for t in json_of("threads", *arguments)["threads"] for n in t["nodes"]}

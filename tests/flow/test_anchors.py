@@ -11,15 +11,17 @@ from hypothesis import strategies as st
 
 from chainshaper.flow.phase import Phase
 from chainshaper.flow.threads import placed
-from chainshaper.planning.application_plan import ApplicationPlan, combined
+from chainshaper.planning.chain_plan import ChainPlan, Server, Thread
 from chainshaper.planning.offsets import LEAD_NS
-from chainshaper.planning.plan import Plan, Server, Thread
+from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import OperationError
 
 LEAD = LEAD_NS // MS
 
 
-def _chain(name: str, cycle: int, offset: int, end: int, *, core: int = 1, rank: int = 2) -> Plan:
+def _chain(
+    name: str, cycle: int, offset: int, end: int, *, core: int = 1, rank: int = 2
+) -> ChainPlan:
     """A chain whose one server is open for its first ``end`` ms."""
     own = (Thread(node=f"/{name}"),)
     slots = ((0, end * MS),)
@@ -27,15 +29,15 @@ def _chain(name: str, cycle: int, offset: int, end: int, *, core: int = 1, rank:
     return bare_plan(f"{name}..", cycle * MS, server, output=f"/{name}", offset_ns=offset * MS)
 
 
-def _waits(plan: ApplicationPlan, anchor_ns: int, phases: Sequence[int]) -> list[int]:
+def _waits(plan: Plan, anchor_ns: int, phases: Sequence[int]) -> list[int]:
     """From each chain's timer to its slot, in ms."""
     pairs = zip(plan.chains, phases, strict=True)
     return [(anchor_ns + c.offset_ns - at * MS) % c.cycle_ns // MS for c, at in pairs]
 
 
-def _placed(chains: Sequence[Plan], phases: Sequence[int], *, gated: bool = True) -> list[int]:
+def _placed(chains: Sequence[ChainPlan], phases: Sequence[int], *, gated: bool = True) -> list[int]:
     found = [Phase(at * MS, 0) for at in phases]
-    return _waits(*placed(combined(chains), found, gated=gated), phases)
+    return _waits(*placed(Plan.of(*chains), found, gated=gated), phases)
 
 
 def test_chains_of_one_core_are_moved_together_and_wait_for_no_other() -> None:
@@ -43,12 +45,12 @@ def test_chains_of_one_core_are_moved_together_and_wait_for_no_other() -> None:
     timer at 40 ms would expire in its slot of 83 ms.
     """
     one, two = _chain("a", 100, 0, 83), _chain("b", 100, 0, 83, core=0)
-    plan, anchor_ns = placed(combined([one, two]), [Phase(10 * MS, 0), Phase(40 * MS, 0)])
+    plan, anchor_ns = placed(Plan.of(one, two), [Phase(10 * MS, 0), Phase(40 * MS, 0)])
     assert (anchor_ns, plan.chains[1].offset_ns) == ((10 + LEAD) * MS, 30 * MS)
     assert _waits(plan, anchor_ns, [10, 40]) == [LEAD, LEAD]
     shared = _chain("a", 100, 0, 20), _chain("c", 100, 30, 20)
     chains = [shared[0], _chain("b", 100, 70, 20, core=0), shared[1]]
-    plan, _ = placed(combined(chains), [Phase(at * MS, 0) for at in (0, 50, 40)])
+    plan, _ = placed(Plan.of(*chains), [Phase(at * MS, 0) for at in (0, 50, 40)])
     first, second, third = (chain.offset_ns // MS for chain in plan.chains)
     assert (third - first) % 100 == 30
     assert (second - first) % 100 == 40  # its wait is LEAD, a's 10 ms longer, for c's is LEAD
@@ -95,7 +97,7 @@ def test_the_anchor_is_the_best_of_all(
     ]
     phases = phases[: len(chains)]
     closed = [(chain.cycle_ns - chain.servers[0].slots[0][1]) // MS for chain in chains]
-    plan, hyper = combined(chains), math.lcm(*(cycle for cycle, _, _ in wanted))
+    plan, hyper = Plan.of(*chains), math.lcm(*(cycle for cycle, _, _ in wanted))
 
     def cost(waits: Sequence[int]) -> tuple[int, int]:
         # Before its lead is over, a chain waits for its slot in the next cycle.
@@ -138,7 +140,7 @@ def test_chains_that_take_turns_are_refused_only_where_nothing_helps(
         for at, (cycle, length) in zip(phases, wanted, strict=True)
     ]
     if any(map(apart, product(*windows))):
-        plan, anchor_ns = placed(combined(chains), [Phase(at * MS, 0) for at in phases])
+        plan, anchor_ns = placed(Plan.of(*chains), [Phase(at * MS, 0) for at in phases])
         waits = _waits(plan, anchor_ns, phases)
         # By how much a chain waits is known up to a cycle.
         at = [(begin % cycle) for begin, (cycle, _) in zip(waits, wanted, strict=True)]

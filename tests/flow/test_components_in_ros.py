@@ -19,7 +19,7 @@ from chainshaper import measure_latency, open_recording, splice_launch_files
 from chainshaper.analysis import data_flow
 from chainshaper.analysis.messages import gate_decisions
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.planning import Plan, Profile, plan_chain
+from chainshaper.planning import ChainPlan, Plan, Profile, plan_chain
 from chainshaper.splicing.spliced_launch import NODES
 from chainshaper.values import events
 
@@ -50,7 +50,7 @@ def clouds(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def plan() -> Plan:
+def plan() -> ChainPlan:
     latencies = np.linspace(5 * MS, 26 * MS, 300).astype(np.int64)
     profile = Profile(latencies, 100 * MS, nodes=("/source", "/filter"), topics=("/raw", "/points"))
     profile = replace(profile, core_of={"/source": 1, "/filter": 1}, intra_process=True)
@@ -59,12 +59,12 @@ def plan() -> Plan:
 
 @pytest.fixture(scope="module")
 def with_node(
-    clouds: dict[str, str], plan: Plan, tmp_path_factory: pytest.TempPathFactory
+    clouds: dict[str, str], plan: ChainPlan, tmp_path_factory: pytest.TempPathFactory
 ) -> dict[str, str]:
     """The environment with the shaping node's package too."""
     folder = tmp_path_factory.mktemp("node")
     launch = HERE / "clouds/launch/clouds.launch.py"
-    splice_launch_files(plan, [launch], folder / "out", node="cpp", message_type=TYPE)
+    splice_launch_files(Plan.of(plan), [launch], folder / "out", node="cpp", message_type=TYPE)
     return built(folder, folder / "out" / NODES, clouds)
 
 
@@ -83,10 +83,12 @@ def handed_on(said: str) -> list[tuple[str, int]]:
     ],
 )
 def test_a_container_loads_the_shaping_node_and_nothing_is_copied(
-    with_node: dict[str, str], plan: Plan, language: str, arguments: list[str], tmp_path: Path
+    with_node: dict[str, str], plan: ChainPlan, language: str, arguments: list[str], tmp_path: Path
 ) -> None:
     launch = HERE / f"clouds/launch/clouds.launch.{language}"
-    spliced = splice_launch_files(plan, [launch], tmp_path / "out", node="cpp", message_type=TYPE)
+    spliced = splice_launch_files(
+        Plan.of(plan), [launch], tmp_path / "out", node="cpp", message_type=TYPE
+    )
     (file,) = spliced.launch.values()
     counting = Path(with_node["AMENT_PREFIX_PATH"].split(":")[1]) / "lib/liblarge_allocations.so"
     assert counting.is_file()

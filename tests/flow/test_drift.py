@@ -2,7 +2,7 @@
 
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Event
@@ -17,18 +17,24 @@ from small_chain import small_chain_plan
 
 from chainshaper.enforcement.back_ends import Choice
 from chainshaper.enforcement.freezer import Freezer
+from chainshaper.enforcement.node_threads import Allocation, NodeThread
 from chainshaper.enforcement.servers import ServerCounters
-from chainshaper.enforcement.threads import Allocation, NodeThread
 from chainshaper.enforcement.undoing import RunState, SlotMove
-from chainshaper.flow import apply as applying
-from chainshaper.flow import threads
-from chainshaper.flow.apply import _Run
+from chainshaper.flow import apply, threads
 from chainshaper.flow.drift import SlotFollower, TimerTrack
 from chainshaper.flow.phase import DriftWatch, Phase
+from chainshaper.flow.plan_in_force import origins, supervision
+from chainshaper.flow.plan_in_force import threads as run_threads
+from chainshaper.flow.plan_in_force.anchor import AnchoredPlan
+from chainshaper.flow.plan_in_force.followers import Followers
+from chainshaper.flow.plan_in_force.origins import OriginWatches, follow_timer
+from chainshaper.flow.plan_in_force.phases import PhaseMessages
+from chainshaper.flow.plan_in_force.supervision import Supervision
+from chainshaper.flow.plan_in_force.threads import RunThreads, assign_threads
 from chainshaper.linux.threads import RunningThread
-from chainshaper.planning.application_plan import combined, open_until_done, whole
+from chainshaper.planning.chain_plan import ChainPlan, revised
 from chainshaper.planning.margins import Tail
-from chainshaper.planning.plan import Plan, revised
+from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.reporting.overviews import servers_table
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.errors import InputError, OperationError, PlatformError
@@ -98,22 +104,51 @@ def test_without_looking_a_timer_that_falls_behind_is_followed() -> None:
 
 def run_of(
     folder: Path,
-    plan: Plan,
+    plan: ChainPlan,
     back_end: str = "freezer",
     waits_ns: Sequence[int] = (),
     slots: tuple[tuple[int, int], ...] | None = None,
     **seen: Any,
-) -> tuple[_Run, Any]:
+) -> tuple[Supervision, Any]:
     """A run that has begun, with others' ``slots``, and what stands for all else that it sees."""
     if slots is not None:
         server = plan.servers[0].model_copy(update={"slots": slots})
         plan = plan.model_copy(update={"servers": (server,), "cycle_ns": 100 * MS})
     here: Any = SimpleNamespace(path=folder / "j", strangers=None, **{"threads": (), **seen})
-    joint = whole(plan)
-    run = _Run(joint, open_until_done(joint), Choice(back_end, ""), here, (), frozenset(), Event())
-    run.waits_ns, run.found, run.anchor_ns = [*waits_ns], here, 50 * MS
-    run.begin_state((), "")
+    joint, stop = Plan.of(plan), Event()
+
+    def go_on() -> None:
+        if stop.is_set():
+            raise OperationError("the run was asked to end")
+
+    anchored = AnchoredPlan(joint, open_until_done(joint), back_end, 50 * MS, [*waits_ns])
+    run = Supervision(
+        anchored=anchored,
+        threads=RunThreads(here, (), frozenset(), latest=here),
+        report=apply._begin_report(here, Choice(back_end, ""), joint, (), ""),
+        phases=PhaseMessages(),
+        followers=Followers(anchored, here),
+        origins=OriginWatches(),
+        servers=here,
+        stop=stop,
+        go_on=go_on,
+    )
     return run, here
+
+
+def following(run: Supervision, servers: Any, watches: list[Any]) -> Iterator[int]:
+    return follow_timer(run.anchored, servers, watches, run.report, run.stop)
+
+
+def find_anchor(run: Supervision, phase_ns: int | None) -> None:
+    apply._find_anchor(
+        run.anchored,
+        run.threads,
+        run.report,
+        phase_ns,
+        go_on=run.go_on,
+        progress=lambda *_: None,
+    )
 
 
 MOVED: dict[str, Any] = {"latest_ns": MS, "looks": 1, "expect": lambda _: None}
@@ -127,9 +162,9 @@ def test_every_back_end_that_gates_follows_a_phase_that_was_measured(
     armed = list[int]()
     waits = [0] * measured
     run, here = run_of(tmp_path, one_server_plan(), back_end, waits, **MOVED, arm=armed.append)
-    moved = next(run.follow(here, [here]))
+    moved = next(following(run, here, [here]))
     assert bool(moved) == (measured and back_end != "fifo")
-    assert armed == [(50 * MS + moved) % run.plan.cycle_ns] * bool(moved)
+    assert armed == [(50 * MS + moved) % run.anchored.plan.cycle_ns] * bool(moved)
 
 
 def test_a_timer_that_comes_earlier_is_not_counted_twice(
@@ -153,8 +188,8 @@ def test_a_timer_that_comes_earlier_is_not_counted_twice(
     run, here = run_of(
         tmp_path, one_server_plan(), waits_ns=[LEAD_NS], slots=open_, arm=lambda _: None
     )
-    moved_ns = next(run.follow(here, [watch]))
-    assert moved_ns == run.anchor_ns - 50 * MS == -MS // 2
+    moved_ns = next(following(run, here, [watch]))
+    assert moved_ns == run.anchored.anchor_ns - 50 * MS == -MS // 2
     assert moved_ns + known(watch.surely_ns) == -MS // 2
 
 
@@ -166,12 +201,12 @@ def test_a_run_that_is_to_end_while_its_slots_move_has_not_failed(tmp_path: Path
 
     run, here = run_of(tmp_path, one_server_plan(), waits_ns=[0], **MOVED, arm=arm)
     with pytest.raises(OperationError):
-        next(run.follow(here, [here]))
+        next(following(run, here, [here]))
     run.stop.set()
-    following = run.follow(here, [here])
-    assert next(following) == 0, "they stay where they were"
-    next(following)
-    assert run.state.anchor_ns is None
+    moves = following(run, here, [here])
+    assert next(moves) == 0, "they stay where they were"
+    next(moves)
+    assert run.report.state.anchor_ns is None
 
 
 @pytest.mark.parametrize(
@@ -193,8 +228,8 @@ def test_a_chain_begins_with_its_timer_unless_its_server_is_closed_then(
     longer = tuple((start * MS, end * MS) for start, end in slots)
     waits = [] if wait is None else [wait * MS]
     run, _ = run_of(tmp_path, one_server_plan(), back_end, waits, longer)
-    assert run.early(0) == early * MS
-    assert run.begins(0) == (50 - early) * MS
+    assert run.anchored.early(0) == early * MS
+    assert run.anchored.begins(0) == (50 - early) * MS
 
 
 @pytest.mark.parametrize(("end", "slots"), [(30, ((0, 30 * MS),)), (100, ())])
@@ -205,12 +240,12 @@ def test_short_runs_are_looked_at_where_no_server_stops_a_thread(
     plan = one_server_plan()
     run, _ = run_of(tmp_path, plan, waits_ns=[3 * MS], slots=((0, end * MS),))
     governed = SimpleNamespace(name=plan.servers[0].name, threads=(7,))
-    run.state = SimpleNamespace(servers=[governed], anchor_ns=0)  # type: ignore[assignment]
+    run.report.state = SimpleNamespace(servers=[governed], anchor_ns=0)  # type: ignore[assignment]
     first = SimpleNamespace(pid=7, tid=7, identity=(7, 1))
     watched: list[Any] = []
     monkeypatch.setattr(threads, "first_threads", lambda *_: [(first,)])
-    monkeypatch.setattr(applying, "DriftWatch", lambda *given, **_: watched.append(given[-1]))
-    run.drift_watches()
+    monkeypatch.setattr(origins, "DriftWatch", lambda *given, **_: watched.append(given[-1]))
+    run.origins.start(run.anchored, run.threads.latest, run.report)
     assert watched == [slots]
 
 
@@ -222,7 +257,7 @@ def test_a_place_that_another_chain_has_is_why_slots_do_not_follow() -> None:
 
     follower = object.__new__(SlotFollower)
     follower._cores, follower._stop, follower.failure = (), Event(), None
-    follower._chain, follower._planned_ns = cast("Plan", SimpleNamespace(cycle_ns=MS)), 0
+    follower._chain, follower._planned_ns = cast("ChainPlan", SimpleNamespace(cycle_ns=MS)), 0
     tail = SimpleNamespace(start_ns=0)
     tail.saw = lambda seen_ns: setattr(tail, "start_ns", seen_ns)
     follower._tail, follower._put_in_force = cast("Tail", tail), refuse
@@ -237,14 +272,14 @@ def test_servers_and_gate_move_with_the_same_cycle(
 ) -> None:
     """Cycles of 50 ms begin at 7 ms; R_m [0, 21 ms) is open to their end, R_m° [21, 22) is not."""
     run, _ = run_of(tmp_path, revised(small_chain_plan(10 * MS, 20 * MS), shaping_thread=thread))
-    plan, run.servers = run.given, object.__new__(Freezer)
+    plan, run.followers.servers = run.anchored.given, object.__new__(Freezer)
     changed: list[Any] = []
     in_force = 10**15 // (50 * MS) * 50 * MS + 7 * MS
     monkeypatch.setattr(Freezer, "change", lambda _, table, anchor: changed.append((table, anchor)))
     monkeypatch.setattr(Freezer, "in_force_from", lambda _: in_force)
-    run.find_anchor(5 * MS, lambda *_: None)  # the timer expires 2 ms before its slot
-    run.state = replace(run.state, anchor_ns=7 * MS)
-    from_ns = run.move_slots(0, 3 * MS)
+    find_anchor(run, 5 * MS)  # the timer expires 2 ms before its slot
+    run.report.state = replace(run.report.state, anchor_ns=7 * MS)
+    from_ns = run.followers.move_slots(0, 3 * MS)
     assert from_ns % (50 * MS) == (7 - 25) * MS % (50 * MS), "half a cycle before one begins"
     if thread == "free":
         assert not changed, "only the gate moves"
@@ -256,20 +291,22 @@ def test_servers_and_gate_move_with_the_same_cycle(
         assert from_ns == in_force - 25 * MS, "with the first cycle that the servers have so"
     move = SlotMove(from_ns, "/t1..", 3 * MS, 24 * MS, "its promise did not hold any more")
     follower: Any = SimpleNamespace(moves=(move,), failure=OperationError("gone"), end=lambda: None)
-    run.followers[0] = follower
-    run.show_moves()
-    assert run.state.moves == (move,)
-    slots = {one.name: one.slots for one in run.state.servers}
+    run.followers.running[0] = follower
+    run.followers.show(run.report)
+    assert run.report.state.moves == (move,)
+    slots = {one.name: one.slots for one in run.report.state.servers}
     assert slots["chain"] == ((0, 50 * MS),)
     assert (
         slots["output"] == ((19 * MS, 50 * MS),) if thread == "in-slots" else ((24 * MS, 25 * MS),)
     )
-    assert run.state.notes[-1] == "slots are as planned, and do not follow any more: gone"
-    assert not run.followers
-    assert run.plan == open_until_done(plan)
+    assert run.report.state.notes[-1] == "slots are as planned, and do not follow any more: gone"
+    assert not run.followers.running
+    assert run.anchored.plan == open_until_done(plan)
     if thread == "in-slots":
         assert {s.name: s.slots for s in changed[-1][0].servers}["output"] == ((16 * MS, 50 * MS),)
-    assert "begins at 24 ms now: its promise did not hold" in str(servers_table(run.state).caption)
+    assert "begins at 24 ms now: its promise did not hold" in str(
+        servers_table(run.report.state).caption
+    )
 
 
 # Threads that appear while a plan is in force.
@@ -303,18 +340,19 @@ TIMERS = {7: 5 * MS, 8: 61 * MS}  # where they expire in each 100 ms, by their t
 
 
 @pytest.fixture
-def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> _Run:
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Supervision:
     """A run of the freezer on node 7, whose slot opens 2 ms behind its timer."""
     run, _ = run_of(tmp_path, one_server_plan(), read=lambda *_: ())
-    monkeypatch.setattr(applying, "change_all", lambda *_: None)
-    monkeypatch.setattr(applying, "note_descendants", lambda *_: set())
-    monkeypatch.setattr(applying, "DriftWatch", Watch)
+    monkeypatch.setattr(run_threads, "change_all", lambda *_: None)
+    monkeypatch.setattr(supervision, "note_descendants", lambda *_: set())
+    monkeypatch.setattr(origins, "DriftWatch", Watch)
     monkeypatch.setattr(
         threads, "measure_phase", lambda _, tids, *__, **___: Phase(TIMERS[tids[0]], 0)
     )
-    run.found = found(7)
-    run.find_anchor(None, lambda *_: None)
-    run.drift_watches()  # it knows who begins the chain
+    run.threads.latest = found(7)
+    find_anchor(run, None)
+    run.origins.start(run.anchored, run.threads.latest, run.report)
+    run.origins.watches.clear()  # it knows who begins the chain, and watches anew
     return run
 
 
@@ -325,83 +363,88 @@ def servers(assign: Callable[[int, str, int], None], arm: Callable[[int], None])
 
 @pytest.mark.parametrize("error", [OperationError, PlatformError])
 def test_a_thread_that_cannot_be_put_into_its_server_is_named_and_ends_no_plan(
-    run: _Run, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
+    run: Supervision, monkeypatch: pytest.MonkeyPatch, error: type[Exception]
 ) -> None:
     """As in a container that began later, whose cgroups are not to be seen."""
 
     def assign(tid: int, _: str, __: int) -> None:
         raise error(f"thread {tid} is in the cgroup /../x")
 
-    monkeypatch.setattr(run, "find", lambda: found(8))
-    new, untaken = run.look_again(servers(assign, lambda _: None), ())
+    monkeypatch.setattr(run.threads, "find", lambda _: found(8))
+    run.servers = servers(assign, lambda _: None)
+    new, untaken = run.look_again(())
     assert [one.thread.tid for one in new] == [8]
     assert untaken == "threads that have appeared are as they were: thread 8 is in the cgroup /../x"
-    assert [one.thread.tid for one in run.found.threads] == [7], "it is tried again"
+    assert [one.thread.tid for one in run.threads.latest.threads] == [7], "it is tried again"
 
 
 def test_slots_count_from_the_new_timer_of_a_first_node_that_is_started_again(
-    run: _Run, monkeypatch: pytest.MonkeyPatch
+    run: Supervision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It expires at 61 ms instead of 5: they had stayed at 7, and nobody had looked any more."""
     done: list[tuple[str, int]] = []
-    here = servers(
+    run.servers = servers(
         lambda tid, _, __: done.append(("assigned", tid)), lambda at: done.append(("armed", at))
     )
-    monkeypatch.setattr(applying, "_LOOK_S", 0.001)
-    monkeypatch.setattr(applying, "put_back", lambda *_: None)
-    monkeypatch.setattr(run, "find", lambda: found(8))
-    monkeypatch.setattr(run, "tell", lambda _: done.append(("told", run.begins(0))))
-    run.assign(here)
+    monkeypatch.setattr(supervision, "LOOK_S", 0.001)
+    monkeypatch.setattr(apply, "put_back", lambda *_: None)
+    monkeypatch.setattr(run.threads, "find", lambda _: found(8))
+    monkeypatch.setattr(
+        run.phases, "send", lambda *_: done.append(("told", run.anchored.begins(0)))
+    )
+    assign_threads(run.threads, run.anchored, run.servers, run.report, run.go_on)
     watches: list[Any] = []
     states: list[RunState] = []
 
     def watch(state: RunState) -> None:
         states.append(state)
-        watches.extend(one for one in run.drifts if one not in watches)
+        watches.extend(one for one in run.origins.watches if one not in watches)
         if len(states) == 4:
             run.stop.set()
 
-    run.watch_over(here, watch)
+    run.watch_over(watch)
     assert done == [("assigned", 7), ("armed", 63 * MS), ("told", 63 * MS), ("assigned", 8)]
     assert [one.watched for one in watches] == [(7, 7 * MS), (8, 63 * MS)]
     assert [one.ended for one in watches] == [True, False]
     assert {state.anchor_ns for state in states[1:]} == {63 * MS}
     (note,) = states[-1].notes
     assert "was started again: slots count from its new timer since" in note
-    run.put_back()
+    apply._Run(run.threads.journal, origins=run.origins).put_back()
     assert watches[1].ended, "a program that goes on would keep it"
 
 
 def test_a_thread_more_in_the_executor_that_begins_is_no_other_beginning(
-    run: _Run, monkeypatch: pytest.MonkeyPatch
+    run: Supervision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As rclpy's pool gets: the slots, which stop its other threads, stay where they are."""
     assigned: list[int] = []
-    here = servers(lambda tid, _, __: assigned.append(tid), lambda _: pytest.fail("slots moved"))
+    run.servers = servers(
+        lambda tid, _, __: assigned.append(tid), lambda _: pytest.fail("slots moved")
+    )
     pool = tuple(replace(node(tid), thread=replace(node(tid).thread, pid=7)) for tid in (7, 8))
-    monkeypatch.setattr(run, "find", lambda: Allocation(pool, ()))
-    assert run.look_again(here, ())[1] == ""
+    monkeypatch.setattr(run.threads, "find", lambda _: Allocation(pool, ()))
+    assert run.look_again(())[1] == ""
     assert 8 in assigned
-    assert run.anchor_ns == 7 * MS
+    assert run.anchored.anchor_ns == 7 * MS
 
 
 def test_a_first_node_that_is_started_again_without_a_timer_yet_is_looked_at_again(
-    run: _Run, monkeypatch: pytest.MonkeyPatch
+    run: Supervision, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It runs freely until then: in its server it would begin with the slot, wherever that is."""
     assigned: list[int] = []
-    here = servers(lambda tid, _, __: assigned.append(tid), lambda _: None)
-    monkeypatch.setattr(run, "find", lambda: found(8))
+    run.servers = servers(lambda tid, _, __: assigned.append(tid), lambda _: None)
+    monkeypatch.setattr(run.threads, "find", lambda _: found(8))
 
     def measure(*_: Any, **__: Any) -> Phase:
         raise OperationError("thread 8 does not wake up at one place of the cycle 100 ms")
 
     with monkeypatch.context() as until:
         until.setattr(threads, "measure_phase", measure)
-        assert "thread 8 does not wake up" in run.look_again(here, ())[1]
-    assert (assigned, run.anchor_ns) == ([], 7 * MS)
-    assert run.look_again(here, ())[1] == ""
-    assert (assigned, run.anchor_ns) == ([8], 63 * MS)
+        assert "thread 8 does not wake up" in run.look_again(())[1]
+    assert (assigned, run.anchored.anchor_ns) == ([], 7 * MS)
+    assert run.look_again(())[1] == ""
+    assert (assigned, run.anchored.anchor_ns) == ([8], 63 * MS)
 
 
 def test_of_two_chains_only_the_timer_that_is_new_is_measured(
@@ -413,7 +456,7 @@ def test_of_two_chains_only_the_timer_that_is_new_is_measured(
         revised(plan_for(server(name, name, (0, 20))), offset_ns=at * MS)
         for name, at in (("a", 0), ("b", 50))
     )
-    plan = combined([one, other])
+    plan = Plan.of(one, other)
     start = Allocation((node(7, "/a"), node(9, "/b")), ())
     phases = [Phase(5 * MS, 0), Phase(58 * MS, 0)]
 
@@ -444,6 +487,9 @@ def test_a_thread_that_fails_while_it_looks_or_follows_says_why(
     assert watch.failure == "looking for it has failed (ZeroDivisionError: nothing to divide by)"
     follower = SlotFollower.__new__(SlotFollower)
     follower._cores, follower._stop, follower.failure = (), Event(), None
-    follower._chain, follower._tail = cast("Plan", SimpleNamespace(cycle_ns=1)), cast("Tail", None)
+    follower._chain, follower._tail = (
+        cast("ChainPlan", SimpleNamespace(cycle_ns=1)),
+        cast("Tail", None),
+    )
     follower._follow()
     assert str(follower.failure).startswith("following has failed (AttributeError: ")

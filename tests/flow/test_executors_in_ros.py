@@ -233,7 +233,7 @@ def test_one_command_shapes_a_chain_on_this_executor(
     before, after = values["recordings"]
     assert after["count"] > 80
     assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 10
-    servers = {one.name: one for one in load_plan(folder / "plan.yaml").servers}
+    servers = {one.name: one for one in load_plan(folder / "plan.yaml").chains[0].servers}
     assert [one.node for one in servers["chain"].threads] == ["/worker"]
     names, recording = ("timer", "work", "last"), open_recording(folder / "after")
     raised = {

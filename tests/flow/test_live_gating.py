@@ -35,10 +35,16 @@ from chainshaper.flow import described
 from chainshaper.flow.described import gated_threads
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import RunningThread
-from chainshaper.planning import Plan, PlanRequest, save_plan
-from chainshaper.planning.application_plan import whole
+from chainshaper.planning import ChainPlan, PlanRequest, save_plan
+from chainshaper.planning.chain_plan import (
+    Thread,
+    publish_slots,
+    publisher_servers,
+    revised,
+    with_slots,
+)
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import Thread, publish_slots, publisher_servers, revised, with_slots
+from chainshaper.planning.plan import Plan
 from chainshaper.values.plan_choices import SlotEnds
 from chainshaper.values.recording import Recording
 from chainshaper.workload import live
@@ -58,10 +64,10 @@ def test_a_shaping_node_kept_in_its_server_publishes_when_its_gate_says(tmp_path
 
     def run(place: Path) -> Recording:
         (place / "app.yaml").write_text(small_chain_text())
-        save_plan(plan, place / "plan.yaml")
+        save_plan(Plan.of(plan), place / "plan.yaml")
         words = ("shape", place / "app.yaml", place / "plan.yaml", "-o", place / "rec")
         command = [sys.executable, "-m", "chainshaper", *map(str, words), "--cycles", "120"]
-        states.append(apply_plan(plan, command, back_end="freezer").state)
+        states.append(apply_plan(Plan.of(plan), command, back_end="freezer").state)
         return open_recording(place / "rec")
 
     measured = measure_latency(calm_run(run, tmp_path)).analysis
@@ -90,7 +96,8 @@ def test_an_asynchronous_publisher_waits_for_its_slot_and_its_executor_does_not(
     plan = small_chain_plan(5 * MS, 19 * MS, publication="asynchronous", publish_slot_ns=10 * MS)
     ((_, server, _),) = publisher_servers(plan)
     recording = calm_run(
-        lambda place: shape_application(application, plan, place / "rec", cycles=26), tmp_path
+        lambda place: shape_application(application, Plan.of(plan), place / "rec", cycles=26),
+        tmp_path,
     )
     measured = measure_latency(recording)
     assert measured.analysis.incomplete == {}, "nothing is lost"
@@ -126,14 +133,15 @@ def test_a_chain_of_1_6_or_2_4_periods_is_constant_once_a_cycle_and_in_order(
         lambda place: run_application(application, place / "profile", cycles=20), tmp_path
     )
     request = PlanRequest(policy="pipelined", cores=cores, epsilon_ns=6 * MS)
-    plan = plan_recording(profile, request=request)
+    plan = plan_recording(profile, request=request).chains[0]
     assert [server.core for server in plan.servers[:-1]] == stages
     assert cycles_until_output(plan) == cycles_later
     ((start, _),) = publish_slots(plan)
     folder = tmp_path / "shaped"
     folder.mkdir()
     shaped = calm_run(
-        lambda place: shape_application(application, plan, place / "rec", cycles=28), folder
+        lambda place: shape_application(application, Plan.of(plan), place / "rec", cycles=28),
+        folder,
     )
     analysis = measure_latency(shaped).analysis
     latencies = analysis.traversals.filter(~pl.col("disturbed"))["latency_ns"]
@@ -145,7 +153,7 @@ def test_a_chain_of_1_6_or_2_4_periods_is_constant_once_a_cycle_and_in_order(
     assert not leftovers()
 
 
-def _overrunning(folder: Path, slot_ends: SlotEnds) -> tuple[Application, Plan]:
+def _overrunning(folder: Path, slot_ends: SlotEnds) -> tuple[Application, ChainPlan]:
     """A chain of 6, 6, 6, 15 ms, again and again, in [0, 14) of 50 ms; its output in [25, 26).
 
     What is left of a long one, a late output and the chain have room in the next slot.
@@ -162,12 +170,12 @@ def test_closed_servers_of_a_described_application_gate_its_executors(tmp_path: 
     """Its gate sees to its slots itself, unless it is to be kept in them too."""
     _, left_open = _overrunning(tmp_path, "open-until-done")
     _, closed = _overrunning(tmp_path, "closed")
-    assert gated_threads(whole(left_open)) == []
-    ((server, threads),) = gated_threads(whole(closed))
+    assert gated_threads(Plan.of(left_open)) == []
+    ((server, threads),) = gated_threads(Plan.of(closed))
     assert (server.name, server.slots) == ("chain", ((0, 14 * MS),))
     assert [one.node for one in threads] == ["/first", "/second", "/third"]
     kept = revised(closed, shaping_thread="in-slots")
-    assert [one.name for one, _ in gated_threads(whole(kept))] == ["chain", "output"]
+    assert [one.name for one, _ in gated_threads(Plan.of(kept))] == ["chain", "output"]
 
 
 def test_every_thread_of_an_executor_is_gated(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -183,8 +191,8 @@ def test_every_thread_of_an_executor_is_gated(monkeypatch: pytest.MonkeyPatch) -
     assert described._threads_of(Thread(node="/filter"), started) == [7, 8]
 
 
-def _shaped(application: Application, plan: Plan, folder: Path) -> Recording:
-    return shape_application(application, plan, folder / "rec", cycles=80)
+def _shaped(application: Application, plan: ChainPlan, folder: Path) -> Recording:
+    return shape_application(application, Plan.of(plan), folder / "rec", cycles=80)
 
 
 def test_a_described_application_overruns_into_the_next_slot_where_servers_are_closed(

@@ -34,7 +34,7 @@ from chainshaper.flow.phase import (
     measure_phase,
     watch_wake_ups,
 )
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan
 from chainshaper.sources.ros import Script
 from chainshaper.values.errors import OperationError
 
@@ -214,7 +214,7 @@ def _longest_rest(wake_ups: npt.NDArray[np.int64], period: int) -> int:
 
 @contextmanager
 def applied(
-    plan: Plan,
+    plan: ChainPlan,
     folder: Path,
     tell: Callable[[int], Telling],
     monkeypatch: pytest.MonkeyPatch,

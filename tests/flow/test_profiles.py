@@ -15,7 +15,7 @@ from story import OFFSET, Callback, Publisher, Story
 from chainshaper.flow.plan import plan_recording, profile_chains
 from chainshaper.planning import (
     CallbackTimes,
-    Plan,
+    ChainPlan,
     PlanRequest,
     Profile,
     band_choice,
@@ -102,7 +102,7 @@ def _profile() -> Profile:
     return profile
 
 
-def _slots_ms(plan: Plan) -> dict[str, list[tuple[int, int]]]:
+def _slots_ms(plan: ChainPlan) -> dict[str, list[tuple[int, int]]]:
     return {server.name: [(a // MS, b // MS) for a, b in server.slots] for server in plan.servers}
 
 
@@ -194,32 +194,34 @@ def test_a_server_per_callback_is_the_papers_table_4_row_1() -> None:
 
 def test_shaping_opens_servers_and_reaches_receivers() -> None:
     wishes: dict[str, Any] = {"epsilon_ns": 2 * MS}
-    plan = plan_recording(_recorded(), CHAIN, PlanRequest(**wishes))
+    plan = plan_recording(_recorded(), CHAIN, PlanRequest(**wishes)).chains[0]
     servers = [("chain_core1", 1), ("chain_core0", 0), ("output", 1)]
     assert [(server.name, server.core) for server in plan.servers] == servers
     assert [thread.node for thread in plan.servers[1].threads] == ["/front_filter"]
-    apart = plan_recording(_recorded(), CHAIN, PlanRequest(**wishes, first_slot_ns=2 * MS))
+    apart = plan_recording(_recorded(), CHAIN, PlanRequest(**wishes, first_slot_ns=2 * MS)).chains[
+        0
+    ]
     assert _slots_ms(apart)["first"] == [(0, 2)]
     sink: dict[str, Any] = {"sinks": ["/rear_raw../small"]}
     with pytest.raises(InputError, match=r"pose waits for /small, which"):
-        plan_recording(_recorded(), CHAIN, **sink)
+        plan_recording(_recorded(), CHAIN, **sink).chains[0]
     with pytest.raises(InputError, match="further sinks are shaped"):
-        plan_recording(_recorded(), CHAIN, PlanRequest(policy="server-per-chain"), **sink)
+        plan_recording(_recorded(), CHAIN, PlanRequest(policy="server-per-chain"), **sink).chains[0]
     for chain, request, receivers in (
         ("/rear_raw../fused", PlanRequest(), ("/voxel",)),
         ("/rear_raw../fused", PlanRequest(with_receivers=False), ()),
         (CHAIN, PlanRequest(), ()),  # no node takes /pose
     ):
-        node = known(plan_recording(_recorded(), chain, request).shaping_node)
+        node = known(plan_recording(_recorded(), chain, request).chains[0].shaping_node)
         assert node.receivers == receivers
 
 
 def test_who_publishes_decides_what_can_be_gated() -> None:
-    plan = plan_recording(_recorded(), CHAIN, PlanRequest(publication="asynchronous"))
+    plan = plan_recording(_recorded(), CHAIN, PlanRequest(publication="asynchronous")).chains[0]
     assert plan.shaping_node is None
     (thread,) = plan.servers[-1].threads
     assert (thread.node, thread.role) == ("/ndt", "publisher")
-    plan = plan_recording(_recorded(), CHAIN, PlanRequest(policy="let-per-callback"))
+    plan = plan_recording(_recorded(), CHAIN, PlanRequest(policy="let-per-callback")).chains[0]
     assert len(plan.further_shaping_nodes) == 4, "a node per topic"
     assert plan.predicted.max_ns == 501 * MS
     with pytest.raises(InputError, match=r"/ndt has no thread that publishes.*ASYNCHRONOUS"):
@@ -247,13 +249,13 @@ def test_stalled_cycles_are_left_out_unless_all_were_disturbed(stalls: int) -> N
         assert profile.latencies_ns.max() == 95 * MS - 1
         assert profile.callbacks[-1].max_response_ns == 50 * MS
         return
-    plan = plan_recording(recording, CHAIN)
+    plan = plan_recording(recording, CHAIN).chains[0]
     assert plan.evidence.all_disturbed
     assert (plan.evidence.samples, plan.evidence.disturbed) == (3, stalls)
     assert plan.servers[0].slots == ((0, 97 * MS - 1),), "1 ms behind the longest of all"
     assert any("disturbed every cycle" in warning for warning in plan_warnings(plan))
     with pytest.raises(OperationError, match="leave out --ideal-machine, or record again"):
-        plan_recording(recording, CHAIN, PlanRequest(ideal_machine=True))
+        plan_recording(recording, CHAIN, PlanRequest(ideal_machine=True)).chains[0]
 
 
 def test_a_stall_longer_than_the_cycle_is_not_covered_where_all_cycles_are_disturbed() -> None:
@@ -310,7 +312,7 @@ def test_the_executor_of_a_callback_group_is_named_by_its_callbacks(
     executor |= {"policy": "SCHED_OTHER", "priority": 0}
     cores = {60: (0,), 61: (1,), 62: (1,)}
     threads = (ThreadInfo(**executor, tid=tid, cores=own) for tid, own in cores.items())
-    plan = plan_recording(_told(story, *threads), "/t1../t2")
+    plan = plan_recording(_told(story, *threads), "/t1../t2").chains[0]
     (thread,) = (t for server in plan.servers for t in server.threads if t.node == "/relay")
     assert thread.callbacks == expected
     (server,) = (server for server in plan.servers if thread in server.threads)

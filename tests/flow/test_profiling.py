@@ -15,7 +15,7 @@ from lttng_node import LTTNG, chain_command, required_node
 from processes import wait_for
 
 from chainshaper import InputError, OperationError, PlanRequest, open_recording
-from chainshaper.enforcement.threads import RecordedProcess, RecordedThread, allocate
+from chainshaper.enforcement.node_threads import RecordedProcess, RecordedThread, allocate
 from chainshaper.flow import profiling
 from chainshaper.flow.profiling import (
     chain_nodes,

@@ -18,7 +18,6 @@ from ros2 import ros2_environment
 
 from chainshaper import (
     load_application,
-    load_application_plan,
     load_plan,
     measure_latency,
     open_recording,
@@ -211,7 +210,7 @@ def test_two_chains_are_shaped_by_one_command(
     assert {"/front_filter", "/ndt"} <= raised[0]
     assert {"/tick", "/control"} <= raised[1]
     assert not raised[0] & raised[1], "each is measured as if it were alone"
-    plan = load_application_plan(folder / "plan.yaml")
+    plan = load_plan(folder / "plan.yaml")
     assert [chain.chain.output for chain in plan.chains] == ["/pose", "/commands"]
     assert {server.core for server in plan.chains[0].servers} == {first, last}
     for one in values["chains"]:
@@ -240,7 +239,7 @@ def test_a_graph_of_18_callbacks_runs_on_two_cores(run: Callable[..., Result]) -
     before, after = values["recordings"]
     assert after["count"] > 80
     assert after["undisturbed"]["spread_ns"] < before["spread_ns"] / 10
-    servers = load_plan(folder / "plan.yaml").servers
+    servers = load_plan(folder / "plan.yaml").chains[0].servers
     assert [one.name for one in servers] == ["chain_core1", "chain_core0", "output"]
 
 
@@ -254,7 +253,7 @@ def test_a_chain_longer_than_its_period_becomes_a_pipeline(
         nodes, cores = WAITING, ["--cores", f"{last},{first},{first}"]
     options = ("--chain", chain, "--policy", "pipelined", "--duration", "30s", *cores)
     values, folder = run(nodes, "shape", f"pipelined_{further_cycles}", *options)
-    plan = load_plan(folder / "plan.yaml")
+    plan = load_plan(folder / "plan.yaml").chains[0]
     assert {one.core for one in plan.servers} == {first, last}
     assert cycles_until_output(plan) == further_cycles
     before, after = values["recordings"]
@@ -268,7 +267,7 @@ def test_a_chain_longer_than_its_period_becomes_a_pipeline(
 def test_policies_that_shaping_is_compared_with(run: Callable[..., Result], policy: str) -> None:
     options = ("--chain", "/raw../rear../pose", "--policy", policy, "--duration", "20s")
     values, folder = run(PARKING[:6], "shape", policy, *options, "--overrun", "wait")
-    plan = load_plan(folder / "plan.yaml")
+    plan = load_plan(folder / "plan.yaml").chains[0]
     before, after = values["recordings"]
     assert (plan.policy, after["count"] > 40) == (policy, True)
     assert after["percentiles_ns"]["50"] // (100 * MS) == cycles_until_output(plan)
@@ -289,7 +288,7 @@ def test_each_mode_has_the_slot_of_its_own_profile(
         options += ["--mode-profile", f"{mode}={place}"]
     options += ["--epsilon", "2ms", "--duration", "30s"]
     values, folder = run(MODES, "shape", "modes", *options, MODES="city highway")
-    plan = load_plan(folder / "plan.yaml")
+    plan = load_plan(folder / "plan.yaml").chains[0]
     assert plan.modes is not None
     assert plan.modes.bands == {"city": 1, "highway": 2}
     longest = {mode: one.max_latency_ns for mode, one in (plan.evidence.modes or {}).items()}

@@ -15,7 +15,14 @@ from story import OFFSET, Story
 
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.threads import planned_changes
-from chainshaper.planning import PlanRequest, Profile, plan_application, plan_chain, plan_shaping
+from chainshaper.planning import (
+    Plan,
+    PlanRequest,
+    Profile,
+    plan_application,
+    plan_chain,
+    plan_shaping,
+)
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, RecordingInfo
 
@@ -85,9 +92,9 @@ def test_running_nodes_that_follow_clock_are_refused_before_anything_changes(
             wait_for(lambda: output.exists() and output.stat().st_size > 0, "the node")
             if given != "otherwise":
                 with pytest.raises(InputError, match="/origin follows /clock"):
-                    planned_changes(stamped, "fifo")
+                    planned_changes(Plan.of(stamped), "fifo")
             with pytest.raises(OperationError, match=r"/chainshaper_t2 .* is not running"):
-                planned_changes(stamped if given == "otherwise" else cycled, "fifo")
+                planned_changes(Plan.of(stamped if given == "otherwise" else cycled), "fifo")
         finally:
             process.kill()
 
@@ -106,7 +113,7 @@ def test_a_shaping_node_of_another_clock_is_refused_before_anything_changes(
             (pid,) = children_of(process.pid)
             said = rf"/chainshaper_t2 \(process {pid}\) has another clock .*nsenter --time"
             with pytest.raises(PlatformError, match=said):
-                planned_changes(plan, "fifo")
+                planned_changes(Plan.of(plan), "fifo")
         finally:
             process.kill()
 

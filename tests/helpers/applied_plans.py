@@ -24,8 +24,8 @@ from chainshaper.linux import cgroups
 from chainshaper.linux.processes import descendants
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import list_threads, parents, start_of
-from chainshaper.planning import Plan, save_plan
-from chainshaper.planning.plan import Server, Thread
+from chainshaper.planning import ChainPlan, Plan, save_plan
+from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.values.errors import ChainshaperError
 
 MS = 1_000_000
@@ -42,7 +42,7 @@ MODULES = {
 FREEZER = ("--backend", "freezer", "--phase", "0ms")
 
 
-def plan_for(*servers: Server) -> Plan:
+def plan_for(*servers: Server) -> ChainPlan:
     return bare_plan(None, CYCLE, *servers)
 
 
@@ -72,11 +72,11 @@ def running_node(name: str, output: Path, **options: int) -> Iterator[subprocess
 
 
 @contextmanager
-def started(plan: Plan, folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+def started(plan: ChainPlan, folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`chainshaper apply` as its own process, just started."""
     path = folder / "plan.yaml"
     path.unlink(missing_ok=True)
-    save_plan(plan, path)
+    save_plan(Plan.of(plan), path)
     with subprocess.Popen(
         [*CLI, "apply", str(path), *options],
         stderr=subprocess.PIPE,
@@ -90,7 +90,7 @@ def started(plan: Plan, folder: Path, *options: str) -> Iterator[subprocess.Pope
 
 
 @contextmanager
-def applied(plan: Plan, folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
+def applied(plan: ChainPlan, folder: Path, *options: str) -> Iterator[subprocess.Popen[str]]:
     """`chainshaper apply` as its own process, in force."""
     with started(plan, folder, *options) as process:
         wait_until_in_force(process)
@@ -99,7 +99,7 @@ def applied(plan: Plan, folder: Path, *options: str) -> Iterator[subprocess.Pope
 
 @contextmanager
 def applied_here(
-    plan: Plan, runs: Path, stop: threading.Event | None = None, **how: Any
+    plan: ChainPlan, runs: Path, stop: threading.Event | None = None, **how: Any
 ) -> Iterator[list[RunState]]:
     """A plan in force by a thread of this process, with `fifo` unless ``how`` says else; what was
     seen of its state.
@@ -114,7 +114,7 @@ def applied_here(
 
     def run() -> None:
         try:
-            apply_plan(plan, **options)
+            apply_plan(Plan.of(plan), **options)
         except ChainshaperError as error:
             failures.append(error)
 
@@ -193,7 +193,7 @@ def class_and_cores(pid: int) -> list[tuple[str, int, tuple[int, ...]]]:
     return [(t.policy, t.priority, t.cores) for t in list_threads(pid)]
 
 
-def one_server_plan() -> Plan:
+def one_server_plan() -> ChainPlan:
     return plan_for(server("first", "origin", (0, 30)))
 
 

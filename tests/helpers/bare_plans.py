@@ -2,16 +2,23 @@
 
 from typing import Any
 
-from chainshaper.planning.plan import ChainOfPlan, Evidence, Margin, Plan, Prediction, Server
+from chainshaper.planning.chain_plan import (
+    ChainOfPlan,
+    ChainPlan,
+    Evidence,
+    Margin,
+    Prediction,
+    Server,
+)
 
 MS = 1_000_000
 
 
 def bare_plan(
     spec: str | None, cycle_ns: int, *servers: Server, output: str | None = None, **fields: Any
-) -> Plan:
+) -> ChainPlan:
     """A plan that shapes nothing, unless ``fields`` say so."""
-    return Plan(
+    return ChainPlan(
         chain=ChainOfPlan(spec=spec, output=output, period_ns=cycle_ns),
         evidence=Evidence(samples=1000, min_latency_ns=0, mean_latency_ns=1, max_latency_ns=1),
         margin=Margin(epsilon_ns=0),
@@ -22,6 +29,6 @@ def bare_plan(
     )
 
 
-def slots_ms(plan: Plan) -> dict[str, list[tuple[float, float]]]:
+def slots_ms(plan: ChainPlan) -> dict[str, list[tuple[float, float]]]:
     """The slots of each server, in ms."""
     return {one.name: [(start / MS, end / MS) for start, end in one.slots] for one in plan.servers}

@@ -36,6 +36,8 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from chainshaper.planning import Plan
+
 HERE = Path(__file__).parent
 CLI = [sys.executable, "-m", "chainshaper"]
 WORK, SMALL = Path("/mnt"), "3m"
@@ -198,7 +200,7 @@ def write_inputs(folder: Path) -> None:
 
     from chainshaper.planning import save_plan
 
-    save_plan(plan_for(server("first", "victim", (0, 30))), folder / "servers.yaml")
+    save_plan(Plan.of(plan_for(server("first", "victim", (0, 30)))), folder / "servers.yaml")
     (folder / "live.yaml").write_text(LIVE.replace("CORE", str(core())))
     (folder / "app.launch.py").write_text(_LAUNCH)
     for words in (

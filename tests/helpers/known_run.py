@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from story import OFFSET, Story
 
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import ChainPlan, plan_shaping
 from chainshaper.values.recording import (
     Recording,
     RecordingInfo,
@@ -27,7 +27,7 @@ PERIOD_NS = 100 * MS
 LATENCY_NS = 30 * MS + 20_000
 
 
-def known_plan(**changes: Any) -> Plan:
+def known_plan(**changes: Any) -> ChainPlan:
     """Single-band shaping for latencies up to 27 ms: publish slot [30 ms, 31 ms)."""
     return plan_shaping(
         np.array([15, 27]) * MS,

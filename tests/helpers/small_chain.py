@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import ChainPlan, plan_shaping
 from chainshaper.workload.description import Application, ExecutionTime, load_application
 
 DDS_CORE = available_cores()[0]
@@ -63,7 +63,7 @@ def with_times(application: Application, times: Mapping[str, ExecutionTime]) -> 
     return application.model_copy(update={"nodes": nodes})
 
 
-def small_chain_plan(shortest_ns: int, longest_ns: int, **wishes: Any) -> Plan:
+def small_chain_plan(shortest_ns: int, longest_ns: int, **wishes: Any) -> ChainPlan:
     """A plan for the chain as if its latencies lay between two; ``wishes`` go to the planner."""
     return plan_shaping(
         np.array([shortest_ns, longest_ns]),

@@ -1,12 +1,17 @@
 """The guest's file system: an initramfs with Python, libbpf, the package, and the checks."""
 
+import os
 import shutil
 import subprocess
+import sys
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
+PYTHON = "3.13"
+"""The guest's version of Python, which the package's compiled library has to be of."""
 
 _NOT_NEEDED = (
     "usr/include",
@@ -23,7 +28,7 @@ _NOT_NEEDED = (
     "usr/lib/*/libdb-*",
     "var",
 )
-_INIT = """#!/usr/bin/python3.13
+_INIT = f"""#!/usr/bin/python{PYTHON}
 import sys
 sys.path.insert(0, "/checks")
 import guest_init
@@ -60,7 +65,7 @@ def make_image(
         if not (root / name).exists():
             (root / name).symlink_to(f"usr/{name}")
     ignored = shutil.ignore_patterns("__pycache__")
-    shutil.copytree(ROOT / "src", root / "src", ignore=ignored)
+    _unpack_package(root / "src")
     shutil.copytree(HERE / "guest", root / "checks", ignore=ignored)
     subprocess.run(
         ["cc", "-O2", "-Wall", "-static", "-o", root / "checks/spin", HERE / "guest/spin.c"],
@@ -71,6 +76,24 @@ def make_image(
         (root / name).write_bytes(data)
     (root / "init").chmod(0o755)
     return _archive(root, folder / "initramfs.cpio")
+
+
+def _unpack_package(folder: Path) -> None:
+    """Unpack a wheel for the guest's Python: the package with its compiled libraries."""
+    of_pyenv = (Path.home() / ".pyenv/versions").glob(f"{PYTHON}.*/bin/python3")
+    python = next(map(str, of_pyenv), None) or shutil.which(f"python{PYTHON}")
+    if python is None:
+        raise FileNotFoundError(f"no Python {PYTHON} is here to build the guest's library with")
+    wheels = folder.with_name("wheels")
+    subprocess.run(
+        [sys.executable, ROOT / "scripts/build_wheels", wheels],
+        env={**os.environ, "PYTHONS": python, "TRY": "0"},
+        check=True,
+    )
+    (wheel,) = wheels.glob("*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(folder)
+    shutil.rmtree(wheels)
 
 
 def _archive(root: Path, output: Path) -> Path:

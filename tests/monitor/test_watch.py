@@ -40,7 +40,7 @@ from chainshaper.monitor.budgets import load_budget
 from chainshaper.monitor.metrics import SCRAPERS
 from chainshaper.monitor.watch import SECOND, SPANS, ChainNow, Hop, Seen, Watch, exporting
 from chainshaper.planning import publish_slots
-from chainshaper.planning.application_plan import ApplicationPlan, whole
+from chainshaper.planning.plan import Plan
 from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.preload import (
     VARIABLE,
@@ -97,7 +97,7 @@ def watched(watch: Watch, seconds: float, every: float = 0.25) -> list[Seen]:
     return [*seen, watch.look()]
 
 
-def own_watch(*chains: str, plan: ApplicationPlan | None = None, callbacks: bool = False) -> Watch:
+def own_watch(*chains: str, plan: Plan | None = None, callbacks: bool = False) -> Watch:
     wishes: dict[str, Any] = {"longest_ns": LONGEST_NS, "plan": plan, "callbacks": callbacks}
     return Watch(chains or (CHAIN,), users={os.geteuid()}, **wishes)
 
@@ -197,9 +197,9 @@ def test_late_outputs_and_shares_are_counted_beside_a_plan(tmp_path: Path) -> No
         recording = watch.save(tmp_path / "flight", reasons=["too slow"])
         with pytest.raises(InputError, match="exists"):
             watch.save(tmp_path / "flight")
-        plan = plan_recording(recording, CHAIN)
+        plan = plan_recording(recording, CHAIN).chains[0]
         (slot,) = publish_slots(plan)
-        beside = own_watch(CHAIN, "/first../second", plan=whole(plan))
+        beside = own_watch(CHAIN, "/first../second", plan=Plan.of(plan))
         in_time, by_nodes = watched(beside, 1.0)[-1].chains
         beside.due = [replace(beside.due[0], cycle_ns=1_000_000, slots=())]
         too_late = watched(beside, 1.0)[-1].chains[0]

@@ -21,16 +21,21 @@ from small_chain import small_chain_plan
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.threads import followed_chains
 from chainshaper.planning import margins
-from chainshaper.planning.application_plan import (
-    ApplicationPlan,
-    combined,
-    open_until_done,
-    reach,
-    whole,
-    with_slots_moved,
+from chainshaper.planning.chain_plan import (
+    Adaptation,
+    ChainPlan,
+    Modes,
+    Thread,
+    revised,
+    with_slots,
 )
 from chainshaper.planning.margins import Tail
-from chainshaper.planning.plan import Adaptation, Modes, Plan, Thread, revised, with_slots
+from chainshaper.planning.plan import (
+    Plan,
+    open_until_done,
+    reach,
+    with_slots_moved,
+)
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.robot import handover
 from chainshaper.robot.decision import Release
@@ -169,28 +174,28 @@ def test_a_step_is_one_also_where_outputs_wait(grown: float) -> None:
 # Plans ------------------------------------------------------------------------------------------
 
 
-def small(**changes: Any) -> Plan:
+def small(**changes: Any) -> ChainPlan:
     """R_m is [0, 21 ms), R_m° [21, 22), the cycle 50 ms."""
     return revised(small_chain_plan(10 * MS, 20 * MS), **changes)
 
 
 def test_the_chains_slot_and_the_outputs_move_together() -> None:
-    moved = with_slots_moved(whole(small()), {0: 3 * MS}).chains[0]
+    moved = with_slots_moved(Plan.of(small()), {0: 3 * MS}).chains[0]
     assert {one.name: one.slots for one in moved.servers} == {
         "chain": ((0, 24 * MS),),
         "output": ((24 * MS, 25 * MS),),
     }
-    assert reach(whole(small()), 0) == (-20_999_000, 28 * MS), "the chain's slot is not empty"
-    assert reach(whole(small()), 0, 30 * MS)[1] == 8 * MS
+    assert reach(Plan.of(small()), 0) == (-20_999_000, 28 * MS), "the chain's slot is not empty"
+    assert reach(Plan.of(small()), 0, 30 * MS)[1] == 8 * MS
     bands = {"output": [(11 * MS, 12 * MS), (21 * MS, 22 * MS)]}
     banded = revised(small(), servers=with_slots(small().servers, bands))
-    (first, last) = with_slots_moved(whole(banded), {0: -2 * MS}).chains[0].servers[1].slots
+    (first, last) = with_slots_moved(Plan.of(banded), {0: -2 * MS}).chains[0].servers[1].slots
     assert (first, last) == ((9 * MS, 10 * MS), (19 * MS, 20 * MS))
 
 
 def other_chain(
     servers: dict[int, dict[str, Any]], output: str | None = None, **changes: Any
-) -> ApplicationPlan:
+) -> Plan:
     """The small chain, and one like it, but for these changes of the servers that it has."""
     one, other = small(), small().model_copy(deep=True)
     own = tuple(other.servers[place].model_copy(update=new) for place, new in servers.items())
@@ -200,7 +205,7 @@ def other_chain(
         gate = known(other.shaping_node).model_copy(update=names)
     spec = {"spec": "/b..", "output": output, "publisher": output}
     chain = other.chain.model_copy(update=spec)
-    return combined([one, revised(other, chain=chain, servers=own, shaping_node=gate, **changes)])
+    return Plan.of(one, revised(other, chain=chain, servers=own, shaping_node=gate, **changes))
 
 
 def test_slots_do_not_move_into_another_chains_nor_jump_over_them() -> None:
@@ -248,13 +253,13 @@ def test_what_cannot_follow_says_why() -> None:
         (small(shaping_node=None), "no shaping node sees when outputs come"),
     ):
         with pytest.raises(InputError, match=words):
-            followed_chains(whole(plan), "freezer")
+            followed_chains(Plan.of(plan), "freezer")
 
 
 def test_only_slots_that_a_back_end_can_move_with_a_cycle_follow() -> None:
-    bound = whole(revised(small(), shaping_thread="in-slots"))
+    bound = Plan.of(revised(small(), shaping_thread="in-slots"))
     for back_end in ("scx", "litmus"):
-        assert followed_chains(whole(small()), back_end)[1], "the gate alone moves"
+        assert followed_chains(Plan.of(small()), back_end)[1], "the gate alone moves"
         with pytest.raises(InputError, match=f"{back_end} does not move .* choose freezer"):
             followed_chains(bound, back_end)
     plan, reaches_ns, _ = followed_chains(bound, "freezer", 30 * MS)

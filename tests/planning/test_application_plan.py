@@ -9,11 +9,11 @@ from bare_plans import MS, bare_plan
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chainshaper import load_application_plan, load_plan, save_application_plan, save_plan
+from chainshaper import load_plan, save_plan
 from chainshaper.flow.threads import server_table
-from chainshaper.planning.application_plan import ApplicationPlan, combined, plan_of_chain, whole
-from chainshaper.planning.plan import Plan, Server, Slot, Thread, revised
-from chainshaper.planning.plan_file import plan_in, plan_values, plans_as_text
+from chainshaper.planning.chain_plan import ChainPlan, Server, Slot, Thread, revised
+from chainshaper.planning.plan import Plan, plan_of_chain
+from chainshaper.planning.plan_file import dump_plan, plan_in, plan_values
 from chainshaper.values.errors import InputError
 
 
@@ -25,7 +25,7 @@ def _server(
     return Server(name=name, core=core, priority=priority, slots=in_ns, threads=own)
 
 
-def _chain(name: str, cycle: int, offset: int, *servers: Server) -> Plan:
+def _chain(name: str, cycle: int, offset: int, *servers: Server) -> ChainPlan:
     """A chain's plan; times in ms."""
     named = f"/{name}"
     return bare_plan(f"{named}..", cycle * MS, *servers, output=named, offset_ns=offset * MS)
@@ -35,19 +35,19 @@ def test_a_thread_of_several_chains_runs_in_the_slots_of_all() -> None:
     """By hand: x runs at 0–1, 4–5, 8–9 for a, and at 1–2, 7–8 for b; what touches is one slot."""
     a = _chain("a", 4, 0, _server("a", [(0, 1)], "x"))
     b = _chain("b", 6, 1, _server("b", [(0, 1)], "x y"))
-    shared, own = combined([a, b]).servers
+    shared, own = Plan.of(a, b).servers
     assert (shared.name, [thread.node for thread in shared.threads]) == ("a+b", ["/x"])
     assert shared.slots == _server("by hand", [(0, 2), (4, 5), (7, 9)]).slots
     assert (own.name, [thread.node for thread in own.threads]) == ("b", ["/y"])
     assert own.slots == _server("by hand", [(1, 2), (7, 8)]).slots
-    assert whole(a).servers == a.servers
+    assert Plan.of(a).servers == a.servers
 
 
 _SLOTS = st.lists(st.integers(0, 5), min_size=2, max_size=4, unique=True).map(sorted)
 
 
 @st.composite
-def _chains(draw: st.DrawFn) -> list[Plan]:
+def _chains(draw: st.DrawFn) -> list[ChainPlan]:
     found = []
     for number in range(draw(st.integers(1, 3))):
         cycle = draw(st.sampled_from([6, 8, 9, 12]))
@@ -59,7 +59,7 @@ def _chains(draw: st.DrawFn) -> list[Plan]:
     return found
 
 
-def _marked(chain: Plan, hyper_period: int) -> Iterator[int]:
+def _marked(chain: ChainPlan, hyper_period: int) -> Iterator[int]:
     """Every millisecond of the hyper-period in which the chain's server is open, by looking."""
     (server,) = chain.servers
     for instant in range(hyper_period):
@@ -70,7 +70,7 @@ def _marked(chain: Plan, hyper_period: int) -> Iterator[int]:
 
 @settings(max_examples=300, deadline=None)
 @given(_chains())
-def test_slots_and_collisions_are_those_of_a_timeline(chains: list[Plan]) -> None:
+def test_slots_and_collisions_are_those_of_a_timeline(chains: list[ChainPlan]) -> None:
     hyper_period = math.lcm(*(chain.cycle_ns // MS for chain in chains))
     open_at = [set(_marked(chain, hyper_period)) for chain in chains]
     where = [(chain.servers[0].core, chain.servers[0].priority) for chain in chains]
@@ -81,59 +81,56 @@ def test_slots_and_collisions_are_those_of_a_timeline(chains: list[Plan]) -> Non
     )
     if collide:
         with pytest.raises(InputError, match=r"meets .* of server '.*' of /c\d\.\. in some cycles"):
-            combined(chains)
+            Plan.of(*chains)
         return
-    for server, expected in zip(combined(chains).servers, open_at, strict=True):
+    for server, expected in zip(Plan.of(*chains).servers, open_at, strict=True):
         found = [n for a, b in server.slots for n in range(a // MS, b // MS)]
         assert found == sorted(expected)
 
 
 @pytest.fixture
-def three() -> ApplicationPlan:
+def three() -> Plan:
     """Two branches of a graph that share a server, and a chain of 50 ms that takes turns."""
     running = _server("chain", [(0, 20)], "first second")
     branches = [
         _chain(name, 100, 0, running, _server(f"out_{name}", [slot], f"gate_{name}", priority=1))
         for name, slot in (("a", (20, 21)), ("b", (21, 22)))
     ]
-    return combined([*branches, _chain("c", 50, 20, _server("chain_2", [(0, 10)], "third"))])
+    return Plan.of(*branches, _chain("c", 50, 20, _server("chain_2", [(0, 10)], "third")))
 
 
 def test_a_plan_is_written_with_each_server_once_and_read_again(
-    three: ApplicationPlan, tmp_path: Path
+    three: Plan, tmp_path: Path
 ) -> None:
     path, alone = tmp_path / "plan.yaml", tmp_path / "alone.yaml"
-    save_application_plan(three, path)
+    save_plan(three, path)
     text = path.read_text()
     assert text.count("name: chain\n") == 1
     assert "servers:\n  - chain\n" in text
-    assert load_application_plan(path) == three
+    assert load_plan(path) == three
     assert plan_in(plan_values(three)) == three
     assert [one.name for one in three.servers] == ["chain", "out_a", "out_b", "chain_2"]
     assert plan_of_chain(three, "/b") == three.chains[1]
     assert plan_of_chain(three, "/nowhere") is None
-    # Plans of one chain are written as ever.
-    chain = three.chains[2]
-    save_plan(chain, alone)
-    assert "format: 1" in alone.read_text()
-    assert load_application_plan(alone) == plan_in(plan_values(whole(chain))) == whole(chain)
-    assert plans_as_text(whole(chain).chains) == alone.read_text()
-    assert plan_values(whole(chain)) == chain.model_dump(mode="json")
-    with pytest.raises(InputError, match="the plan is of several chains"):
-        load_plan(path)
+    # A plan of one chain is written in the same form.
+    of_one = Plan.of(three.chains[2])
+    save_plan(of_one, alone)
+    assert alone.read_text() == dump_plan(of_one)
+    assert "format: 2\nchains:\n- chain:" in alone.read_text()
+    assert load_plan(alone) == plan_in(plan_values(of_one)) == of_one
 
 
 def test_threads_have_the_plans_order_unless_single_callbacks_were_measured(
-    three: ApplicationPlan,
+    three: Plan,
 ) -> None:
     assert three.most_urgent_first == ("/first", "/second", "/gate_a", "/gate_b", "/third")
     assert [one.places for one in server_table(three).servers] == [2, 1, 1, 1]
-    stages = combined([revised(three.chains[0], policy="pipelined")])
+    stages = Plan.of(revised(three.chains[0], policy="pipelined"))
     assert stages.most_urgent_first == ("/gate_a", "/second", "/first"), "the older first"
-    single = combined([revised(three.chains[0], policy="let-per-callback")])
+    single = Plan.of(revised(three.chains[0], policy="let-per-callback"))
     assert single.most_urgent_first == ("/first",)
     assert [one.places for one in server_table(single).servers] == [2, 1], "the others share one"
-    turns = combined([revised(three.chains[0], equal_priorities="round-robin")])
+    turns = Plan.of(revised(three.chains[0], equal_priorities="round-robin"))
     assert turns.most_urgent_first == ()
 
 
@@ -153,15 +150,15 @@ def test_threads_have_the_plans_order_unless_single_callbacks_were_measured(
     ],
 )
 def test_what_was_edited_wrongly_is_named_with_its_line(
-    old: str, new: str, reason: str, three: ApplicationPlan, tmp_path: Path
+    old: str, new: str, reason: str, three: Plan, tmp_path: Path
 ) -> None:
-    path, text = tmp_path / "plan.yaml", plans_as_text(three.chains)
+    path, text = tmp_path / "plan.yaml", dump_plan(three)
     assert old in text
     path.write_text(text.replace(old, new))
     lines = enumerate(path.read_text().splitlines(), start=1)
     number = max(number for number, line in lines if new.strip() in line)
     with pytest.raises(InputError) as refused:
-        load_application_plan(path)
+        load_plan(path)
     assert str(refused.value).startswith(f"{path}:{number}: ")
     assert reason in str(refused.value)
 
@@ -180,5 +177,5 @@ def test_what_makes_no_plan_together_is_refused() -> None:
         (apart, r"repeat together after .* 10000 is the most"),
     ):
         with pytest.raises(InputError, match=words):
-            combined(chains)
-    assert len(combined(apart[:2]).servers[0].slots) == 1009
+            Plan.of(*chains)
+    assert len(Plan.of(*apart[:2]).servers[0].slots) == 1009

@@ -25,7 +25,7 @@ from chainshaper.planning.bands import (
     with_bands,
     with_long_slot,
 )
-from chainshaper.planning.plan import Plan, band_predictions, publish_slots, revised
+from chainshaper.planning.chain_plan import ChainPlan, band_predictions, publish_slots, revised
 from chainshaper.planning.shaping import plan_shaping, server_per_chain
 from chainshaper.robot.gate import IntoOpenSlot
 from chainshaper.values.errors import InputError, OperationError
@@ -144,7 +144,7 @@ def even(bands: int, **limits: Any) -> Placement:
     return place_bands(BandProblem(EVEN, 52 * MS, **limits), bands)
 
 
-def banded(bands: int | Literal["auto"], **how: Any) -> Plan:
+def banded(bands: int | Literal["auto"], **how: Any) -> ChainPlan:
     return with_bands(LONG, FOUR, bands, **how)
 
 
@@ -200,7 +200,7 @@ def test_one_band_ends_where_the_last_does() -> None:
         assert place(three(), 1).slot_ends_ns == (32 * MS,)
 
 
-def _plan() -> Plan:
+def _plan() -> ChainPlan:
     return plan_shaping(LATENCIES, 100 * MS, output="/t5", publisher="/n5", nodes=["/n5"])
 
 

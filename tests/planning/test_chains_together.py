@@ -25,9 +25,9 @@ from chainshaper.planning import (
     plan_warnings,
     publish_slots,
 )
-from chainshaper.planning.application_plan import combined, open_until_done
+from chainshaper.planning.chain_plan import with_slots
 from chainshaper.planning.overruns import expected
-from chainshaper.planning.plan import with_slots
+from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.profile import Profile, Rival, alone, interference, with_interference
 from chainshaper.reporting.latency import expected_text
 from chainshaper.values.durations import milliseconds
@@ -281,7 +281,7 @@ def test_an_overrun_goes_on_behind_the_next_chain_and_does_not_hit_it(tmp_path: 
         first.model_copy(update={"servers": with_slots(first.servers, earlier)}),
         second.model_copy(update={"offset_ns": 20 * MS}),
     ]
-    shaped = simulate(application, tmp_path / "shaped", combined(tight), cycles=300)
+    shaped = simulate(application, tmp_path / "shaped", Plan.of(*tight), cycles=300)
     late, other = (measure_latency(shaped, chain).analysis.statistics for chain in TURNS)
     assert (other.late, other.jitter_ns) == (0, 0)
     # It had 6 ms to go at most, behind a slot of the second chain that lasts for 10 to 13.
@@ -339,7 +339,7 @@ def test_the_first_node_has_its_slot_on_its_own_core_and_best_effort_is_no_stage
     (stages,) = (one for one in plan_warnings(plan) if "stages:" in one)
     assert "/b1" not in stages
     with pytest.raises(InputError, match="plan with `plan_application`"):
-        plan_recording("absent", ["/a1../a2", "/b1../b2"])  # type: ignore[arg-type]
+        plan_recording("absent", ["/a1../a2", "/b1../b2"]).chains[0]  # type: ignore[arg-type]
 
 
 # Chains of one graph ----------------------------------------------------------------------------
@@ -400,10 +400,10 @@ def test_a_sink_that_forks_off_is_planned_right(
     sink: str, application: Application, recording: Recording, tmp_path: Path
 ) -> None:
     """In force, both outputs come in their slots."""
-    plan = plan_recording(recording, "/t1../t3", REQUEST, sinks=[sink])
+    plan = plan_recording(recording, "/t1../t3", REQUEST, sinks=[sink]).chains[0]
     for server, chain in zip(plan.servers[-2:], ("/t1../t3", sink), strict=True):
         of_chain = application.model_copy(update={"chain": plan.chain.spec})
-        shaped = simulate(of_chain, tmp_path / chain.replace("/", "_"), plan, cycles=200)
+        shaped = simulate(of_chain, tmp_path / chain.replace("/", "_"), Plan.of(plan), cycles=200)
         found = measure_latency(shaped, chain).analysis.statistics
         assert (found.count, found.late) == (200, 0)
         ((opens, closes),) = server.slots
@@ -458,7 +458,7 @@ def test_a_chain_that_waits_for_what_another_has_shaped_is_refused(
 ) -> None:
     with pytest.raises(InputError) as refused:
         if as_sink:
-            plan_recording(recording, chains[0], period_ns=100 * MS, sinks=chains[1:])
+            plan_recording(recording, chains[0], period_ns=100 * MS, sinks=chains[1:]).chains[0]
         else:
             plan_application(profile_chains(recording, chains, period_ns=100 * MS))
     assert words in str(refused.value)
@@ -466,13 +466,15 @@ def test_a_chain_that_waits_for_what_another_has_shaped_is_refused(
 
 
 def test_what_else_has_no_plan_together_is_refused(recording: Recording) -> None:
-    one_by_one = [plan_recording(recording, chain) for chain in ("/t1../t3", "/t1../forked")]
+    one_by_one = [
+        plan_recording(recording, chain).chains[0] for chain in ("/t1../t3", "/t1../forked")
+    ]
     with pytest.raises(InputError, match="begin at the same callback: plan them together"):
         place_chains(one_by_one)
     with pytest.raises(InputError, match="both publish /t3"):
         place_chains(one_by_one[:1] * 2)
     with pytest.raises(InputError, match=r"/o1\.\./o2 begins at /other every 100ms"):
-        plan_recording(recording, "/t1../t3", sinks=["/o1../o2"])
+        plan_recording(recording, "/t1../t3", sinks=["/o1../o2"]).chains[0]
     for chains, words in (
         (("/t1../t3", "behind../end"), r"behind\.\./end waits for /t3, which"),
         # These begin at subscriptions that one timer triggers: no offset moves them apart.

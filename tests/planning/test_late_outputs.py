@@ -25,9 +25,15 @@ from chainshaper.planning import (
     publish_slots,
     save_plan,
 )
-from chainshaper.planning.application_plan import open_until_done as carried_out
-from chainshaper.planning.application_plan import whole
 from chainshaper.planning.bands import with_bands, with_long_slot
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
+    messages_waiting,
+    output_server,
+    publisher_servers,
+    revised,
+    with_slots,
+)
 from chainshaper.planning.overruns import (
     Writer,
     check_publication,
@@ -36,14 +42,8 @@ from chainshaper.planning.overruns import (
     output_lifespan,
     publication_warnings,
 )
-from chainshaper.planning.plan import (
-    Plan,
-    messages_waiting,
-    output_server,
-    publisher_servers,
-    revised,
-    with_slots,
-)
+from chainshaper.planning.plan import Plan
+from chainshaper.planning.plan import open_until_done as carried_out
 from chainshaper.planning.shaping import (
     let_per_chain,
     server_per_chain,
@@ -55,19 +55,19 @@ from chainshaper.values.errors import InputError
 LATENCIES = np.array([26, 40, 50, 58]) * MS
 
 
-def asynchronous(**changes: Any) -> Plan:
+def asynchronous(**changes: Any) -> ChainPlan:
     """The paper's section 5.2: the chain in [0, 59) ms, its publisher in [59, 60) ms."""
     given: dict[str, Any] = {"output": "/t5", "publisher": "/n5", "nodes": ["/n1", "/n5"]}
     given |= {"core": 0, "publication": "asynchronous", "overrun": "wait", **changes}
     return plan_shaping(LATENCIES, 100 * MS, **given)
 
 
-def planned(**changes: Any) -> Plan:
+def planned(**changes: Any) -> ChainPlan:
     """The same with a shaping node, and late outputs at once."""
     return asynchronous(**{"publication": "synchronous", "overrun": "publish", **changes})
 
 
-def _moved(plan: Plan, *slots_ns: tuple[int, int], **changes: object) -> Plan:
+def _moved(plan: ChainPlan, *slots_ns: tuple[int, int], **changes: object) -> ChainPlan:
     """The plan with other slots for the publisher's server."""
     (_, server, _), *_ = publisher_servers(plan)
     changed = server.model_copy(update={"slots": slots_ns or server.slots, **changes})
@@ -248,7 +248,7 @@ def test_the_chain_may_finish_until_the_cycle_ends_and_the_plan_itself_stays() -
 def test_the_slots_of_other_servers_are_left_out_where_a_chain_may_finish() -> None:
     plan = planned()
 
-    def with_other(begin: int, end: int, **changes: int) -> Plan:
+    def with_other(begin: int, end: int, **changes: int) -> ChainPlan:
         slot = ((begin * MS, end * MS),)
         other = plan.servers[0].model_copy(update={"name": "other", "slots": slot, "threads": ()})
         return revised(plan, servers=(*plan.servers, other.model_copy(update=changes)))
@@ -280,13 +280,13 @@ def test_a_publishers_thread_may_send_late_outputs_below_its_executor() -> None:
 # Servers as they are carried out ----------------------------------------------------------------
 
 
-def in_slots(overrun: str = "wait", **wishes: Any) -> Plan:
+def in_slots(overrun: str = "wait", **wishes: Any) -> ChainPlan:
     values = {"spin_ns": MS, "pause_ns": 2 * MS, "shaping_thread": "in-slots", **wishes}
     return small_chain_plan(10 * MS, 20 * MS, overrun=overrun, **values)
 
 
-def open_in_ms(plan: Plan, name: str = "output") -> list[tuple[float, float]]:
-    (server,) = [s for s in carried_out(whole(plan)).servers if s.name == name]
+def open_in_ms(plan: ChainPlan, name: str = "output") -> list[tuple[float, float]]:
+    (server,) = [s for s in carried_out(Plan.of(plan)).servers if s.name == name]
     return [(start / MS, end / MS) for start, end in server.slots]
 
 
@@ -303,7 +303,7 @@ def test_a_shaping_nodes_server_opens_early_enough_for_its_gate() -> None:
 
 
 def test_every_back_end_has_the_server_when_its_node_runs_in_slots() -> None:
-    free, bound = whole(in_slots(shaping_thread="free")), whole(in_slots())
+    free, bound = Plan.of(in_slots(shaping_thread="free")), Plan.of(in_slots())
     assert [s.name for s in server_table(free).servers] == ["chain"]
     assert [t.node for t in free.free_threads] == ["/chainshaper_t3"]
     assert not bound.free_threads
@@ -337,8 +337,8 @@ def test_best_effort_comes_behind_all_others_in_a_server_that_is_always_open(
         ("best_effort_core1", 1, 3),
         ("best_effort_core2", 2, 3),
     ]
-    save_plan(plan, tmp_path / "plan.yaml")
-    assert load_plan(tmp_path / "plan.yaml") == plan
+    save_plan(Plan.of(plan), tmp_path / "plan.yaml")
+    assert load_plan(tmp_path / "plan.yaml") == Plan.of(plan)
     short = revised(plan, servers=with_slots(plan.servers, {"best_effort_core1": [(0, 45 * MS)]}))
     assert open_in_ms(short, "best_effort_core1") == [(0, 45)], "overruns are the chain's"
     better = [s.model_copy(update={"priority": 2}) if s.best_effort else s for s in plan.servers]
@@ -369,9 +369,9 @@ def test_servers_of_one_priority_overlap_only_where_they_take_turns() -> None:
     assert open_in_ms(apart, "chain") == [(0, 21), (22, 50)]
     with pytest.raises(InputError, match="overlaps"):
         revised(apart, servers=with_slots(plan.servers, {"chain": [(0, 40 * MS)]}))
-    refuse_unfit(whole(plan), "freezer")
+    refuse_unfit(Plan.of(plan), "freezer")
     with pytest.raises(InputError, match=r"under the back end scx .* \(--backend freezer\)"):
-        refuse_unfit(whole(plan), "scx")
+        refuse_unfit(Plan.of(plan), "scx")
 
 
 def test_closed_servers_are_open_in_their_slots_only(tmp_path: Path) -> None:
@@ -383,9 +383,9 @@ def test_closed_servers_are_open_in_their_slots_only(tmp_path: Path) -> None:
     assert open_in_ms(open_for_long, "chain") == [(0, 50)]
     both, _ = plan_application([PROFILE], PlanRequest(slot_ends="closed", epsilon_ns=MS))
     assert [chain.slot_ends for chain in both.chains] == ["closed"]
-    save_plan(closed, tmp_path / "closed.yaml")
-    assert load_plan(tmp_path / "closed.yaml") == closed
+    save_plan(Plan.of(closed), tmp_path / "closed.yaml")
+    assert load_plan(tmp_path / "closed.yaml") == Plan.of(closed)
     for back_end in ("freezer", "scx", "litmus"):
-        refuse_unfit(whole(closed), back_end)
+        refuse_unfit(Plan.of(closed), back_end)
     with pytest.raises(InputError, match=r"back end fifo sets priorities only.*closed"):
-        refuse_unfit(whole(closed), "fifo")
+        refuse_unfit(Plan.of(closed), "fifo")

@@ -10,7 +10,15 @@ from numpy.typing import NDArray
 from promises import held_of
 from scipy import stats
 
-from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain, plan_shaping, plan_warnings
+from chainshaper.planning import (
+    ChainPlan,
+    Plan,
+    PlanRequest,
+    Profile,
+    plan_chain,
+    plan_shaping,
+    plan_warnings,
+)
 from chainshaper.planning.margins import (
     covered_latency,
     cycles_needed,
@@ -62,7 +70,7 @@ def test_a_derived_margin_reaches_the_plan() -> None:
     assert derive_margin(latencies, 1e-4) == margin  # repeatable
     plan = plan_shaping(latencies, 100 * MS, margin=margin)
     assert plan.servers[0].slots[0][1] == fit.interval_ns[1] + MS
-    assert "overrun_probability: 0.0001" in dump_plan(plan)
+    assert "overrun_probability: 0.0001" in dump_plan(Plan.of(plan))
     assert any("upper end of an estimate" in warning for warning in plan_warnings(plan))
 
 
@@ -189,7 +197,7 @@ def test_data_that_allow_no_answer_get_none(words: str, latencies: NDArray[np.in
             derive_margin(latencies, outside)
 
 
-def _planned(every_ms: list[float], disturbed: int, **request: object) -> Plan:
+def _planned(every_ms: list[float], disturbed: int, **request: object) -> ChainPlan:
     """A plan for latencies of which the last so many are of disturbed cycles."""
     random = np.random.default_rng(0)
     calm, behind = np.split(np.array(every_ms) * MS, [len(every_ms) - disturbed])

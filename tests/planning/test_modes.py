@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from chainshaper import load_plan, plan_recording, profile_chains, save_plan, simulate
 from chainshaper.planning import (
     Modes,
+    Plan,
     PlanRequest,
     Profile,
     plan_chain,
@@ -74,8 +75,8 @@ def test_each_mode_has_the_slot_of_its_own_latencies(tmp_path: Path) -> None:
     assert (promised["city"].max_ns, promised["city"].jitter_ns) == (32 * MS, MS)
     assert plan.predicted.shares == pytest.approx((8 / 19, 11 / 19))
     assert plan.predicted.mean_ns == round((8 * 14 + 11 * 32) / 19 * MS)
-    save_plan(plan, tmp_path / "plan.yaml")
-    assert load_plan(tmp_path / "plan.yaml") == plan
+    save_plan(Plan.of(plan), tmp_path / "plan.yaml")
+    assert load_plan(tmp_path / "plan.yaml") == Plan.of(plan)
     # By default each mode's margin covers its own disturbed cycles: 1 ms behind 15 ms.
     plan = plan_chain(_profile(), replace(FOUND, epsilon_ns=None))
     assert publish_slots(plan) == ((16 * MS, 17 * MS), (31 * MS, 32 * MS))
@@ -126,7 +127,7 @@ def test_no_output_is_late_in_any_mode(tmp_path: Path) -> None:
     path.write_text(ROBOT)
     robot = load_application(path)
     recording = simulate(robot, tmp_path / "profile", cycles=2000)
-    plan = plan_recording(recording, request=replace(FOUND, epsilon_ns=None))
+    plan = plan_recording(recording, request=replace(FOUND, epsilon_ns=None)).chains[0]
     assert plan.modes is not None and plan.modes.bands == CITY_HIGHWAY.bands
     (whole,) = profile_chains(recording, modes=CITY_HIGHWAY)
     of_modes = [one.latencies_ns for one in whole.of_modes.values()]
@@ -136,7 +137,7 @@ def test_no_output_is_late_in_any_mode(tmp_path: Path) -> None:
     for mode, one in later.of_modes.items():
         assert 995 <= (size := one.latencies_ns.size) <= 1000
         assert np.array_equal(one.latencies_ns, whole.of_modes[mode].latencies_ns[-size:])
-    shaped = simulate(robot, tmp_path / "shaped", plan, cycles=2000)
+    shaped = simulate(robot, tmp_path / "shaped", Plan.of(plan), cycles=2000)
     releases = shaped.events["gate_release"]
     assert releases["overrun"].null_count() == releases.height == 2000
     for mode, (start, _) in zip(("highway", "city"), publish_slots(plan), strict=True):

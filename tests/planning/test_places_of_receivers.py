@@ -9,7 +9,7 @@ from small_chain import small_chain_plan
 
 from chainshaper import load_application, simulate
 from chainshaper.flow.plan import plan_recording, profile_chains
-from chainshaper.planning import Plan, PlanRequest, plan_application, plan_warnings
+from chainshaper.planning import ChainPlan, Plan, PlanRequest, plan_application, plan_warnings
 from chainshaper.planning.plan_file import dump_plan, load_plan, plan_json
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.plan_choices import Policy
@@ -36,9 +36,9 @@ def described(folder: Path, core: int = 1, time: str = "1ms", text: str = CHAIN)
     return load_application(folder / "app.yaml")
 
 
-def received(application: Application, plan: Plan, folder: Path) -> tuple[float, float]:
+def received(application: Application, plan: ChainPlan, folder: Path) -> tuple[float, float]:
     """When the receiver's callbacks start, at the latest, and how far they are apart (ms)."""
-    analysis = measure_latency(simulate(application, folder, plan, cycles=300)).analysis
+    analysis = measure_latency(simulate(application, folder, Plan.of(plan), cycles=300)).analysis
     subscriber = known(analysis.subscriber)
     return known(subscriber.max_ns) / MS, known(subscriber.jitter_ns) / MS
 
@@ -48,7 +48,7 @@ def test_receivers_are_not_behind_the_next_cycle(policy: Policy, tmp_path: Path)
     """Under LET outputs leave as the next cycle begins to compute, for 50 to 70 ms."""
     application = described(tmp_path)
     profile = simulate(application, tmp_path / "profile", cycles=300)
-    plan = plan_recording(profile, request=PlanRequest(policy=policy))
+    plan = plan_recording(profile, request=PlanRequest(policy=policy)).chains[0]
     place = known(known(plan.shaping_node).receivers_at)
     assert (place.core, place.priority) == (1, 1), "behind the gates, above the chain"
     assert MS <= place.time_ns < 1.3 * MS
@@ -60,8 +60,8 @@ def test_receivers_are_not_behind_the_next_cycle(policy: Policy, tmp_path: Path)
     judged = known(measure_latency(tmp_path / "shaped").prediction)
     assert judged.broken == ()
     assert known(judged.receivers).count == 300
-    (tmp_path / "plan.yaml").write_text(dump_plan(plan))
-    assert load_plan(tmp_path / "plan.yaml") == plan
+    (tmp_path / "plan.yaml").write_text(dump_plan(Plan.of(plan)))
+    assert load_plan(tmp_path / "plan.yaml") == Plan.of(plan)
     values = plan_json(plan)
     assert values["predicted"]["receivers"]["max_ns"] == promised.max_ns
     assert values["shaping_node"]["receivers_at"]["core"] == 1
@@ -70,7 +70,7 @@ def test_receivers_are_not_behind_the_next_cycle(policy: Policy, tmp_path: Path)
 def test_receivers_stay_on_a_core_without_servers(tmp_path: Path) -> None:
     application = described(tmp_path, core=2, time="30ms")
     profile = simulate(application, tmp_path / "profile", cycles=100)
-    plan = plan_recording(profile, request=PlanRequest(policy="let-per-chain"))
+    plan = plan_recording(profile, request=PlanRequest(policy="let-per-chain")).chains[0]
     assert known(known(plan.shaping_node).receivers_at).core == 2
     latest, jitter = received(application, plan, tmp_path / "shaped")
     assert latest <= known(plan.predicted.receivers).max_ns / MS
@@ -81,14 +81,14 @@ def test_receivers_that_take_too_long_have_no_place_and_no_promise(tmp_path: Pat
     """45 ms of the actuator and 70 of the chain are more than a cycle of 100."""
     application = described(tmp_path, time="45ms")
     profile = simulate(application, tmp_path / "profile", cycles=100)
-    plan = plan_recording(profile, request=PlanRequest(policy="let-per-chain"))
+    plan = plan_recording(profile, request=PlanRequest(policy="let-per-chain")).chains[0]
     assert known(plan.shaping_node).receivers_at is None
     assert plan.predicted.receivers is None
     (said,) = (one for one in plan_warnings(plan) if "/actuator" in one)
     assert "below all servers, and when their callbacks start is not promised" in said
-    shaped = measure_latency(simulate(application, tmp_path / "shaped", plan, cycles=300))
+    shaped = measure_latency(simulate(application, tmp_path / "shaped", Plan.of(plan), cycles=300))
     assert known(shaped.prediction).broken == (), "the output itself is in time"
-    given = plan_recording(profile, request=PlanRequest(with_receivers=False))
+    given = plan_recording(profile, request=PlanRequest(with_receivers=False)).chains[0]
     assert not [one for one in plan_warnings(given) if "/actuator" in one]
 
 
@@ -129,8 +129,8 @@ def test_what_receivers_take_is_what_other_chains_wait_for(tmp_path: Path) -> No
 def test_live_nodes_that_receive_stand_between_the_chain_and_its_gate(tmp_path: Path) -> None:
     """80 for the chain, 85 for the shaping node."""
     application = described(tmp_path)
-    plan = plan_recording(simulate(application, tmp_path / "profile", cycles=100))
-    spliced = splice_application(application, plan)
+    plan = plan_recording(simulate(application, tmp_path / "profile", cycles=100)).chains[0]
+    spliced = splice_application(application, Plan.of(plan))
     priorities = [spliced.scheduling_of(name).priority for name in ("b", "actuator")]
     gate = known(plan.shaping_node)
     assert [*priorities, gate.fifo_priority] == [80, 84, 85]
@@ -187,7 +187,7 @@ nodes:
 def test_of_further_sinks_receivers_have_no_place_and_the_plan_says_so(tmp_path: Path) -> None:
     application = described(tmp_path, text=FORK)
     recording = simulate(application, tmp_path / "profile", cycles=100)
-    plan = plan_recording(recording, sinks=["/a../d"])
+    plan = plan_recording(recording, sinks=["/a../d"]).chains[0]
     (sink,) = plan.further_shaping_nodes
     assert (sink.receivers, sink.receivers_at) == (("/display",), None)
     (said,) = (one for one in plan_warnings(plan) if "/display" in one)

@@ -2,6 +2,7 @@
 
 import tempfile
 from pathlib import Path
+from textwrap import indent
 from typing import Any
 
 import pytest
@@ -9,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.planning import (
+    ChainPlan,
     Modes,
-    Plan,
     dump_plan,
     load_plan,
     plan_json,
@@ -18,8 +19,7 @@ from chainshaper.planning import (
     save_plan,
     save_plans,
 )
-from chainshaper.planning.application_plan import whole
-from chainshaper.planning.plan import (
+from chainshaper.planning.chain_plan import (
     Adaptation,
     ChainOfPlan,
     Evidence,
@@ -30,8 +30,10 @@ from chainshaper.planning.plan import (
     Thread,
     server_of,
 )
+from chainshaper.planning.plan import Plan
 from chainshaper.values.errors import InputError, OperationError
 
+FILE = "format: 2\nchains:\n- "
 GOOD = """\
 # edited by hand: keys in another order, flow style, comments
 servers:
@@ -58,7 +60,6 @@ anchor: stamp
 shaping_node: {name: chainshaper_t5, input: /t5_tmp, output: /t5, core: 0, fifo_priority: 84,
                spin: 300us, pause: 500us}
 predicted: {mean: 65ms, max: 65ms, jitter: 1ms, shares: [1]}
-format: 1
 """
 
 
@@ -116,7 +117,6 @@ WRONG_VALUES = [
     ("spin: 300us", "spin: 0.1ns", 24, "shaping_node.spin", "finer"),
     ("shares: [1]", "shares: [.nan]", 25, "predicted.shares[0]", "finite"),
     ("shares: [1]", "shares: 1", 25, "predicted.shares", "not a list"),
-    ("format: 1", "format: 2", 26, "format", "should be 1"),
     ('spec: "/t1../t5"', "spec: 7", 13, "chain.spec", "7 is not a text"),
 ]
 
@@ -127,11 +127,11 @@ def test_executors_of_a_node_are_told_apart_by_their_callbacks(tmp_path: Path) -
     plan = _load(tmp_path, named)
     (chain,) = plan.servers[0].threads
     assert chain == Thread(node="/n1", callbacks=("every 100ms", "/t1"))
-    assert "{node: /n1, role: executor, callbacks: [every 100ms, /t1]}" in dump_plan(plan)
-    assert "callbacks" not in dump_plan(_load(tmp_path, GOOD))
+    assert "{node: /n1, role: executor, callbacks: [every 100ms, /t1]}" in dump_plan(Plan.of(plan))
+    assert "callbacks" not in dump_plan(Plan.of(_load(tmp_path, GOOD)))
     text = "- {name: late, core: 0, priority: 2, slots: [[70ms, 80ms]], threads: [{node: /n1%s}]}"
     both = named.replace("cycle: 100ms", f"  {text}\ncycle: 100ms", 1)
-    joint = whole(_load(tmp_path, both % ", callbacks: [/t2]"))
+    joint = Plan.of(_load(tmp_path, both % ", callbacks: [/t2]"))
     assert [server.name for server in joint.servers] == ["chain", "output", "late"]
     for overlapping in ("", ", callbacks: [/t2, /t1]"):
         with pytest.raises(InputError, match=r"runs every 100ms, /t1 is already in .*'chain'"):
@@ -159,10 +159,10 @@ WRONG_MODES = [  # what is replaced, by what, the line in the modes, the key, an
 
 ADAPTED = GOOD + "adaptation: {window: 2000, late: 1.4, gain: 0.02, after: 9, max_latency: 70ms}\n"
 WRONG_ADAPTATIONS = [
-    ("window: 2000", "window: 7", 27, "adaptation.window", "equal to 500"),
-    ("late: 1.4", "late: 1", 27, "adaptation.late", "greater than 1"),
-    ("gain: 0.02", "gain: 2%", 27, "adaptation.gain", "not a number"),
-    ("max_latency: 70ms", "max_latency: 64ms", 27, "adaptation.max_latency", "ends behind it"),
+    ("window: 2000", "window: 7", 26, "adaptation.window", "equal to 500"),
+    ("late: 1.4", "late: 1", 26, "adaptation.late", "greater than 1"),
+    ("gain: 0.02", "gain: 2%", 26, "adaptation.gain", "not a number"),
+    ("max_latency: 70ms", "max_latency: 64ms", 26, "adaptation.max_latency", "ends behind it"),
 ]
 
 
@@ -178,7 +178,8 @@ def test_a_wrong_value_is_named(tmp_path: Path, case: tuple[str, str, int, str, 
     with pytest.raises(InputError) as caught:
         _load(tmp_path, text.replace(old, new, 1))
     problem = str(caught.value).splitlines()[-1]
-    assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: {key}: ")
+    line += FILE.count("\n")
+    assert problem.startswith(f"{tmp_path / 'plan.yaml'}:{line}: chains[0].{key}: ")
     assert words in problem
 
 
@@ -189,7 +190,7 @@ def test_a_mode_publishes_in_a_slot_of_its_own(tmp_path: Path) -> None:
     shorter = _load(tmp_path, WITH_MODES.replace("  late: next-slot\n", "")).modes
     assert shorter == given.model_copy(update={"late": "wait"})
     start, end = WITH_MODES.index("shaping_node:"), WITH_MODES.index("predicted:")
-    with pytest.raises(InputError, match="modes: only a shaping node knows the mode"):
+    with pytest.raises(InputError, match=r"modes: only a shaping node knows the mode"):
         _load(tmp_path, WITH_MODES[:start] + WITH_MODES[end:])
 
 
@@ -198,7 +199,7 @@ def test_every_wrong_value_is_named_once(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         _load(tmp_path, text)
     named = [line.split(": ")[1] for line in str(caught.value).splitlines()]
-    assert named == ["cycle", "servers[0].slots[0][1]", "cycel"]
+    assert named == [f"chains[0].{key}" for key in ("cycle", "servers[0].slots[0][1]", "cycel")]
 
 
 def test_overlap_is_judged_per_core_and_priority(tmp_path: Path) -> None:
@@ -206,7 +207,9 @@ def test_overlap_is_judged_per_core_and_priority(tmp_path: Path) -> None:
     assert publish_slots(_load(tmp_path, inside)) == ((30_000_000, 31_000_000),)
     same_core = inside.replace("core: 0", "core: 1")
     _load(tmp_path, same_core)  # the better priority pre-empts
-    with pytest.raises(InputError, match=r":8: servers\[1\]\.slots\[0\]: .* overlaps .*'chain'"):
+    with pytest.raises(
+        InputError, match=r":10: chains\[0\]\.servers\[1\]\.slots\[0\]: .* overlaps .*'chain'"
+    ):
         _load(tmp_path, same_core.replace("priority: 1", "priority: 2"))
     touching = GOOD.replace("core: 0", "core: 1").replace("priority: 1", "priority: 2")
     _load(tmp_path, touching)  # half-open: [0, 64) and [64, 65) do not overlap
@@ -234,12 +237,14 @@ def test_overlap_is_judged_per_core_and_priority(tmp_path: Path) -> None:
         ("chain: !!python/object:os.system x\n", ":1: chain: 'x' is no !!python/object"),
         (f"chain: {10**30}\n", ":1: chain: a number of more than 64 bits"),
         ("chain: 9" + "9" * 5000 + "\n", "chain"),
-        ("chain: {period: 2020-01-01}\n", "'2020-01-01' is not a duration"),
+        ("chains:\n- chain: {period: 2020-01-01}\n", "'2020-01-01' is not a duration"),
     ],
 )
 def test_what_is_no_plan_at_all_is_refused(tmp_path: Path, text: str, words: str) -> None:
+    file = tmp_path / "plan.yaml"
+    file.write_text(text, encoding="utf-8")
     with pytest.raises(InputError) as caught:
-        _load(tmp_path, text)
+        load_plan(file)
     assert words in str(caught.value)
 
 
@@ -258,20 +263,20 @@ def test_nothing_is_overwritten_unless_told_and_a_failed_write_leaves_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     plan, target = _load(tmp_path, GOOD), tmp_path / "out.yaml"
-    save_plan(plan, target)
+    save_plan(Plan.of(plan), target)
     with pytest.raises(InputError, match="not overwritten"):
-        save_plan(plan, target)
-    save_plan(plan, target, overwrite=True)
-    assert load_plan(target) == plan
+        save_plan(Plan.of(plan), target)
+    save_plan(Plan.of(plan), target, overwrite=True)
+    assert load_plan(target) == Plan.of(plan)
     with pytest.raises(InputError, match="no such folder"):
-        save_plan(plan, tmp_path / "absent" / "plan.yaml")
+        save_plan(Plan.of(plan), tmp_path / "absent" / "plan.yaml")
 
     def full(_: int) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OperationError, match="No space left"):
-        save_plan(plan, tmp_path / "other.yaml")
+        save_plan(Plan.of(plan), tmp_path / "other.yaml")
     assert sorted(file.name for file in tmp_path.iterdir()) == ["out.yaml", "plan.yaml"]
     monkeypatch.undo()
     written = save_plans([plan, plan], tmp_path / "both")
@@ -299,7 +304,7 @@ def modes(slots: int) -> st.SearchStrategy[Modes]:
 
 
 @st.composite
-def plans(draw: st.DrawFn) -> Plan:
+def plans(draw: st.DrawFn) -> ChainPlan:
     """Any plan the rules allow: times anywhere in 64 bits, names as ROS 2 permits them."""
 
     def some(**fields: st.SearchStrategy[Any]) -> dict[str, Any]:
@@ -331,7 +336,7 @@ def plans(draw: st.DrawFn) -> Plan:
     )
     chain = some(spec=st.text(), publisher=NAMES, output_depth=st.integers(1, 100))
     late, after = st.floats(1.1, 10), st.integers(1, 10**6)
-    return Plan(
+    return ChainPlan(
         chain=ChainOfPlan(output=output, period_ns=period, **chain),
         evidence=Evidence(samples=draw(st.integers(1, 10**12)), **latencies, **known),
         margin=draw(st.sampled_from([derived, Margin(epsilon_ns=draw(times))])),
@@ -357,16 +362,17 @@ def plans(draw: st.DrawFn) -> Plan:
 
 @settings(deadline=None, max_examples=40)  # it writes files, on whatever machine
 @given(plans())
-def test_what_is_dumped_is_loaded_equal(plan: Plan) -> None:
+def test_what_is_dumped_is_loaded_equal(plan: ChainPlan) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "plan.yaml"
-        save_plan(plan, file)
+        save_plan(Plan.of(plan), file)
         again = load_plan(file)
-    assert again == plan
-    assert dump_plan(again) == dump_plan(plan)
+    assert again == Plan.of(plan)
+    assert dump_plan(again) == dump_plan(Plan.of(plan))
 
 
-def _load(folder: Path, text: str) -> Plan:
+def _load(folder: Path, text: str) -> ChainPlan:
+    """The chain of a plan's file that has this text as its only chain."""
     file = folder / "plan.yaml"
-    file.write_text(text, encoding="utf-8")
-    return load_plan(file)
+    file.write_text(FILE + indent(text, "  ")[2:], encoding="utf-8")
+    return load_plan(file).chains[0]

@@ -10,11 +10,9 @@ from bare_plans import MS, slots_ms
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from chainshaper.planning.application_plan import combined
 from chainshaper.planning.bands import predict_bands
-from chainshaper.planning.overruns import open_until_done, plan_warnings
-from chainshaper.planning.plan import (
-    Plan,
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
     Thread,
     band_predictions,
     publish_slots,
@@ -22,6 +20,8 @@ from chainshaper.planning.plan import (
     server_of,
     shaping_nodes,
 )
+from chainshaper.planning.overruns import open_until_done, plan_warnings
+from chainshaper.planning.plan import Plan
 from chainshaper.planning.plan_file import plan_json
 from chainshaper.planning.shaping import (
     CallbackTimes,
@@ -38,17 +38,17 @@ from chainshaper.planning.shaping import (
 from chainshaper.values.errors import InputError, OperationError
 
 
-def planned(samples: int = 100, period_ns: int = 100 * MS, **options: Any) -> Plan:
+def planned(samples: int = 100, period_ns: int = 100 * MS, **options: Any) -> ChainPlan:
     latencies = np.linspace(30 * MS, 60 * MS, samples).astype(np.int64)
     return plan_shaping(latencies, period_ns, **options)
 
 
-def gated(**options: Any) -> Plan:
+def gated(**options: Any) -> ChainPlan:
     given = {"publication": "asynchronous", "overrun": "wait", "publisher": "/n2"}
     return planned(output="/t5", **{**given, **options})
 
 
-def avp(**options: Any) -> Plan:
+def avp(**options: Any) -> ChainPlan:
     """The paper's chain (table 3): 32.9 … 84.7 ms, here with a margin that ends at 86 ms."""
     nodes = ("/throttler", "/rear_filter", "/fusion", "/voxel_grid", "/localizer")
     given: dict[str, Any] = {"output": "/pose", "publisher": "/localizer", "nodes": nodes}
@@ -56,7 +56,7 @@ def avp(**options: Any) -> Plan:
     return plan_shaping(latencies, 100 * MS, epsilon_ns=1_300_000, **{**given, **options})
 
 
-def two_nodes(**options: Any) -> Plan:
+def two_nodes(**options: Any) -> ChainPlan:
     """Chain [0, 451), output [451, 452) ms."""
     latencies = np.array([300, 450]) * MS
     return plan_shaping(latencies, 764 * MS, output="/v1", nodes=["/n0", "/n1"], **options)
@@ -227,8 +227,8 @@ def test_let_takes_one_period_for_the_chain_or_for_each_callback() -> None:
     assert [node.spin_ns for node in nodes] == [0, 0, 0, 0, MS]
     assert [node.fifo_priority for node in nodes] == [83, 83, 83, 83, 84]
     inner = {one.name for one in servers[:-1] if one is not None}
-    assert combined([plan]).behind_outputs == inner
-    assert combined([chain]).behind_outputs == set()
+    assert Plan.of(plan).behind_outputs == inner
+    assert Plan.of(chain).behind_outputs == set()
     # Where threads of asynchronous publishers are gated, there are no nodes.
     plan = let_per_callback(gated(), ["/t1", "/t5"], ["/n1", "/n2"])
     assert (plan.shaping_node, plan.further_shaping_nodes) == (None, ())
@@ -287,11 +287,11 @@ def test_further_sinks_get_slots_of_their_own() -> None:
 LATE = np.array([300, 470]) * MS
 
 
-def gated_pair() -> Plan:
+def gated_pair() -> ChainPlan:
     return two_nodes(publisher="/n1", publication="asynchronous")
 
 
-def per_callback(*callbacks: CallbackTimes, margin_ns: int = 0) -> Plan:
+def per_callback(*callbacks: CallbackTimes, margin_ns: int = 0) -> ChainPlan:
     return server_per_callback(avp(), callbacks, margin_ns=margin_ns)
 
 

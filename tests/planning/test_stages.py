@@ -11,9 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from chainshaper.enforcement.slot_dispatcher import boundaries_of
-from chainshaper.planning import CallbackTimes, Plan, PlanRequest, Profile, plan_chain
-from chainshaper.planning.application_plan import open_until_done as joint_until_done
-from chainshaper.planning.application_plan import whole
+from chainshaper.planning import CallbackTimes, ChainPlan, PlanRequest, Profile, plan_chain
+from chainshaper.planning.chain_plan import publish_slots
 from chainshaper.planning.overruns import (
     cycles_until_output,
     in_cycle,
@@ -21,7 +20,8 @@ from chainshaper.planning.overruns import (
     plan_warnings,
 )
 from chainshaper.planning.pipeline import Work, opened_early, shortest_cut, work_of
-from chainshaper.planning.plan import publish_slots
+from chainshaper.planning.plan import Plan
+from chainshaper.planning.plan import open_until_done as joint_until_done
 from chainshaper.planning.plan_file import dump_plan, load_plan
 from chainshaper.planning.request import cores_for
 from chainshaper.values.errors import InputError, OperationError
@@ -182,7 +182,7 @@ def profile(
 
 def planned(
     rows: Sequence[Sequence[int]], nodes: Sequence[str] | None = None, **wishes: object
-) -> Plan:
+) -> ChainPlan:
     request = {"policy": "pipelined", "cores": (0, 1), "epsilon_ns": MS, **wishes}
     return plan_chain(profile(rows, nodes), PlanRequest(**request))  # type: ignore[arg-type]
 
@@ -205,14 +205,14 @@ def test_a_pipeline_by_hand(tmp_path: Path) -> None:
     assert cycles_until_output(plan) == 1
     across = boundaries_of(plan.cycle_ns, tuple(server.slots for server in plan.servers[:2]))
     assert [1 in boundary.open for boundary in across] == [True, False, True, True], "not at 0"
-    (tmp_path / "plan.yaml").write_text(dump_plan(plan))
-    assert load_plan(tmp_path / "plan.yaml") == plan
+    (tmp_path / "plan.yaml").write_text(dump_plan(Plan.of(plan)))
+    assert load_plan(tmp_path / "plan.yaml") == Plan.of(plan)
     note = plan_warnings(plan)[0]
     assert "160.000 ms, 1.60 times its cycle, and has 2 stages: /n1, /n2 on core 1" in note
     assert "leave at 161.000 ms, once a cycle." in note
     enforced = slots_ms(open_until_done(plan))
     assert (enforced["stage1"], enforced["stage2"]) == ([(0, 100)], second), "overruns may finish"
-    slots = {one.name: one.slots for one in joint_until_done(whole(plan), [2 * MS]).servers}
+    slots = {one.name: one.slots for one in joint_until_done(Plan.of(plan), [2 * MS]).servers}
     assert slots["stage1"] == ((0, 97 * MS),), "its timer waits: all slots count from one instant"
 
 

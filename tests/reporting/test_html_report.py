@@ -27,6 +27,7 @@ from chainshaper import (
     save_plan,
     write_report,
 )
+from chainshaper.planning import Plan
 from chainshaper.reporting.latency import headline, verdict
 from chainshaper.reporting.page import (
     distinct_names,
@@ -340,7 +341,7 @@ def test_the_command_writes_the_report_and_never_over_another(
     assert printed == json_of("compare", known.path, known.path)
     # A plan can be named for a recording that does not know it.
     bare, plan = known_run(tmp_path / "known", plan=None), tmp_path / "plan.yaml"
-    save_plan(known_plan(), plan)
+    save_plan(Plan.of(known_plan()), plan)
     assert called("report", bare.path, "-o", tmp_path / "r.html", "--plan", plan).code == 0
     data = _Reader((tmp_path / "r.html").read_text()).data
     assert data["recordings"][0]["slots"] == [[30 * MS, 31 * MS]]

@@ -19,7 +19,7 @@ from chainshaper import (
     measure_latency,
     open_recording,
 )
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan
 from chainshaper.reporting import figures
 from chainshaper.reporting.latency import comparison_json, comparison_table
 from chainshaper.reporting.overviews import plan_table
@@ -35,7 +35,7 @@ def _text(table: ResultTable) -> str:
 
 
 def test_brackets_are_shown_and_not_taken_for_markup(
-    tmp_path: Path, simulated: Recording, simulated_shaped: Recording, plan: Plan
+    tmp_path: Path, simulated: Recording, simulated_shaped: Recording, plan: ChainPlan
 ) -> None:
     """Before and after, the first in a folder whose name looks like Rich's markup."""
     odd = shutil.copytree(simulated.path, tmp_path / "before [bold]")

@@ -11,8 +11,8 @@ import pytest
 from known_run import LATENCY_NS, MS, PERIOD_NS, known_plan, known_run
 
 from chainshaper import data_flow, measure_latency
-from chainshaper.planning import Plan
-from chainshaper.planning.plan import revised
+from chainshaper.planning import ChainPlan, Plan
+from chainshaper.planning.chain_plan import revised
 from chainshaper.reporting.timeline import BARS, CYCLES, KINDS, Timeline, timeline_data, timeline_of
 from chainshaper.values.recording import Recording
 
@@ -22,8 +22,8 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> Recording:
     return known_run(tmp_path_factory.mktemp("timeline") / "known", cycles=2)
 
 
-def _timeline(recording: Recording, plan: Plan | None = None) -> Timeline:
-    measured = measure_latency(recording, plan=plan)
+def _timeline(recording: Recording, plan: ChainPlan | None = None) -> Timeline:
+    measured = measure_latency(recording, plan=Plan.of(plan) if plan else None)
     flow = data_flow(recording.events, recording.info.clock_offset_ns)
     return timeline_of(recording, flow, measured.analysis, measured.plan)
 

@@ -12,14 +12,14 @@ import polars as pl
 import yaml
 
 from chainshaper.analysis import data_flow
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan, Plan
 from chainshaper.simulation import simulate
 from chainshaper.simulation.simulating import START_NS
 from chainshaper.values.durations import parse_duration
 from chainshaper.values.recording import Recording
 from chainshaper.values.yaml_file import AS_YAML
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import WARM_UP_CYCLES
+from chainshaper.workload.timing import WARM_UP_CYCLES
 
 FREE: dict[str, Any] = {
     **{name: {"constant": "0ms"} for name in ("wake_up", "take", "publish", "delivery")},
@@ -50,10 +50,16 @@ def _tuples(value: Any) -> Any:
 
 
 def simulated(
-    folder: Path, described: Application, plan: Plan | None = None, cycles: int = 1
+    folder: Path, described: Application, plan: ChainPlan | None = None, cycles: int = 1
 ) -> Recording:
     """A recording of a few cycles, with what ran where."""
-    return simulate(described, folder / "recording", plan, cycles=cycles, switches=True)
+    return simulate(
+        described,
+        folder / "recording",
+        Plan.of(plan) if plan else None,
+        cycles=cycles,
+        switches=True,
+    )
 
 
 def begin_of(recording: Recording) -> int:

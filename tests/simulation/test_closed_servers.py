@@ -5,8 +5,8 @@ import pytest
 from schedules import MS
 
 from chainshaper.flow.described import synthetic_chain
-from chainshaper.planning import CallbackTimes, Plan, plan_shaping
-from chainshaper.planning.plan import revised
+from chainshaper.planning import CallbackTimes, ChainPlan, Plan, plan_shaping
+from chainshaper.planning.chain_plan import revised
 from chainshaper.planning.shaping import server_per_callback
 from chainshaper.simulation import simulate_latencies
 from chainshaper.workload.description import Application, ExecutionTime, load_application
@@ -25,7 +25,7 @@ def _under_load(load_ms: int) -> Application:
     return described.model_copy(update={"nodes": nodes})
 
 
-def _five_servers() -> Plan:
+def _five_servers() -> ChainPlan:
     """[0, 16), [16, 32), … [64, 80) ms."""
     latencies = np.array([70 * MS, 71 * MS])
     shaped = plan_shaping(
@@ -45,8 +45,8 @@ def test_closed_servers_make_a_chain_independent_of_interference(load_ms: int) -
     assert [server.slots[0] for server in plan.servers[:5]] == [
         (start * MS, (start + 16) * MS) for start in range(0, 80, 16)
     ]
-    alone = simulate_latencies(_under_load(0), plan, cycles=500)
-    beside = simulate_latencies(described, plan, cycles=500)
+    alone = simulate_latencies(_under_load(0), Plan.of(plan), cycles=500)
+    beside = simulate_latencies(described, Plan.of(plan), cycles=500)
     assert alone.tolist() == beside.tolist()
     assert beside.max() / MS == pytest.approx(79, abs=1)
     assert np.ptp(beside) / MS == pytest.approx(10, abs=0.5)

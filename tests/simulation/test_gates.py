@@ -11,12 +11,12 @@ from small_chain import small_chain, small_chain_plan
 
 from chainshaper import plan_recording, simulate
 from chainshaper.analysis import analyse_latency
-from chainshaper.planning import PlanRequest
+from chainshaper.planning import Plan, PlanRequest
 from chainshaper.robot.gate import Overrun
 from chainshaper.simulation import simulate_latencies
 from chainshaper.values.recording import Recording
 from chainshaper.workload.description import Application
-from chainshaper.workload.live import WARM_UP_CYCLES
+from chainshaper.workload.timing import WARM_UP_CYCLES
 
 
 def as_application(case: Case) -> Application:
@@ -136,7 +136,9 @@ nodes:
 def test_every_sink_of_a_plan_has_its_shaping_node(tmp_path: Path) -> None:
     described = application(TWO_SINKS)
     profile = simulate(described, tmp_path / "profile", cycles=5)
-    planned = plan_recording(profile, sinks=["/in../right"])  # longest 5 ms and 9 ms, margin 1 ms
+    planned = plan_recording(profile, sinks=["/in../right"]).chains[
+        0
+    ]  # longest 5 ms and 9 ms, margin 1 ms
     recording = simulated(tmp_path, described, planned, cycles=2)
     assert published(recording, "/left") == [5, 45]
     assert published(recording, "/chainshaper_left") == [6, 46]
@@ -150,7 +152,7 @@ def test_under_let_per_callback_every_output_waits_for_the_next_cycle(tmp_path: 
     planned = plan_recording(
         profile,
         request=PlanRequest(policy="let-per-callback", spin_ns=300_000, pause_ns=500_000),
-    )
+    ).chains[0]
     recording = simulated(tmp_path, described, planned, cycles=3)
     # The nodes share core 1. Before its slot [1, 2) that of /in watches no clock, so the source has
     # its 2 ms from the timer on; /left comes in the slot [0, 1) of the cycle after that.
@@ -161,7 +163,7 @@ def test_under_let_per_callback_every_output_waits_for_the_next_cycle(tmp_path: 
     # The chain starts where it did before /in was shaped.
     analysis = analyse_latency(recording, recording.info.chain or "")
     assert analysis.traversals["latency_ns"].to_list() == [80_000_000] * 3
-    assert simulate_latencies(described, planned, cycles=3).tolist() == [80_000_000] * 3
+    assert simulate_latencies(described, Plan.of(planned), cycles=3).tolist() == [80_000_000] * 3
 
 
 @pytest.mark.parametrize(("overrun", "late"), [(None, 15 * MS), ("wait", 46 * MS), ("discard", -1)])
@@ -176,7 +178,7 @@ def test_an_output_that_missed_its_slot_is_late_by_what_it_is_late_not_by_a_cycl
     """
     usual, longer = (text.replace("EXECUTION", f"execution: {{constant: {n}ms}}") for n in (5, 15))
     profile = simulate(application(usual), tmp_path / "profile", cycles=300)
-    plan = plan_recording(profile, request=PlanRequest(overrun=overrun))  # [6, 7) ms
-    latencies = simulate_latencies(application(longer), plan, cycles=3)
+    plan = plan_recording(profile, request=PlanRequest(overrun=overrun)).chains[0]  # [6, 7) ms
+    latencies = simulate_latencies(application(longer), Plan.of(plan), cycles=3)
     # Each is done in its own cycle, also where it is sent in slots only.
     assert latencies.tolist() == [late] * 3

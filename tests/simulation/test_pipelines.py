@@ -6,7 +6,7 @@ import pytest
 from schedules import MS, application
 
 from chainshaper import plan_recording, simulate
-from chainshaper.planning import PlanRequest
+from chainshaper.planning import Plan, PlanRequest
 from chainshaper.planning.overruns import cycles_until_output
 from chainshaper.values.errors import InputError
 from chainshaper.verify.measure import measure_latency
@@ -54,12 +54,12 @@ def test_outputs_leave_once_a_cycle_in_order(
     described = chain(executions, recorded_on)
     profile = simulate(described, tmp_path / "profile", cycles=300)
     request = PlanRequest(policy="pipelined", cores=cores, epsilon_ns=15 * MS)
-    plan = plan_recording(profile, request=request)
+    plan = plan_recording(profile, request=request).chains[0]
     measured = measure_latency(profile).analysis.statistics.max_ns
     assert plan.evidence.max_latency_ns == measured, "nothing overlapped on any core"
     assert cycles_until_output(plan) == cycles_later
 
-    shaped = simulate(described, tmp_path / "shaped", plan, cycles=1000)
+    shaped = simulate(described, tmp_path / "shaped", Plan.of(plan), cycles=1000)
     analysis = measure_latency(shaped).analysis
     held = judge_prediction(plan, analysis)
     assert held.mean.holds and held.max.holds and held.jitter.holds
@@ -77,11 +77,11 @@ def test_a_recording_in_which_instances_piled_up_tells_the_same(tmp_path: Path) 
     piled_up = simulate(described, tmp_path / "piled_up", cycles=10)
     assert measure_latency(piled_up).analysis.statistics.max_ns > 300 * MS  # type: ignore[operator]
     request = PlanRequest(policy="pipelined", cores=(1, 2))
-    plan = plan_recording(piled_up, request=request)
+    plan = plan_recording(piled_up, request=request).chains[0]
     assert 160 * MS <= plan.evidence.min_latency_ns <= plan.evidence.max_latency_ns
     assert plan.evidence.max_latency_ns <= 160 * MS + 10 * TAKE, "but for what is taken between"
 
-    shaped = simulate(described, tmp_path / "shaped", plan, cycles=100)
+    shaped = simulate(described, tmp_path / "shaped", Plan.of(plan), cycles=100)
     analysis = measure_latency(shaped).analysis
     assert analysis.statistics.late == 0
     assert analysis.traversals["latency_ns"].unique().to_list() == [plan.predicted.max_ns - MS]
@@ -94,10 +94,10 @@ VARIED = ["{uniform: [10ms, 60ms]}", *["{uniform: [10ms, 30ms]}"] * 3]
 def test_the_older_instance_comes_first_in_a_stage(tmp_path: Path) -> None:
     described = chain(VARIED, [1, 2, 2, 2])
     profile = simulate(described, tmp_path / "profile", cycles=600)
-    plan = plan_recording(profile, request=PlanRequest(policy="pipelined"))
+    plan = plan_recording(profile, request=PlanRequest(policy="pipelined")).chains[0]
     stages = [[thread.node for thread in server.threads] for server in plan.servers[:2]]
     assert stages == [["/n0"], ["/n1", "/n2", "/n3"]]
-    shaped = simulate(described, tmp_path / "shaped", plan, cycles=2000)
+    shaped = simulate(described, tmp_path / "shaped", Plan.of(plan), cycles=2000)
     figures = measure_latency(shaped).analysis.statistics
     assert (plan.margin.overrun_probability or 1) <= 0.01
     assert (figures.count, figures.incomplete, figures.late) == (2000, 0, 0)
@@ -129,11 +129,11 @@ def test_a_camera_and_a_lidar_are_joined_in_a_stage(
     """Up to 70 ms of the lidar beside 7 + 65 of the camera, and 60 behind both: 132 every 100."""
     described = application(CAMERA_AND_LIDAR.replace("CORE", "3"))
     profile = simulate(described, tmp_path / "profile", cycles=400)
-    plan = plan_recording(profile, request=PlanRequest(policy="pipelined", cores=cores))
+    plan = plan_recording(profile, request=PlanRequest(policy="pipelined", cores=cores)).chains[0]
     assert 120 * MS < plan.evidence.max_latency_ns < 133 * MS, "on the longest way"
     home = {thread.node: one for one in plan.servers for thread in one.threads}
     assert home["/detector"] is not home["/fusion"], "60 and 20 and 40 ms are more than a cycle"
-    shaped = simulate(described, tmp_path / "shaped", plan, cycles=1000)
+    shaped = simulate(described, tmp_path / "shaped", Plan.of(plan), cycles=1000)
     analysis = measure_latency(shaped).analysis
     figures = analysis.statistics
     assert (figures.count, figures.incomplete, figures.late) == (1000, 0, 0)
@@ -160,13 +160,13 @@ def test_branches_of_one_beginning_are_cut_although_they_piled_up(tmp_path: Path
     """160 ms on one core every 100; on two, a branch runs beside the other."""
     described = application(FORKED, take={"constant": f"{TAKE}ns"})
     profile = simulate(described, tmp_path / "profile", cycles=300)
-    plan = plan_recording(profile, request=PlanRequest(policy="pipelined", cores=(1, 2)))
+    plan = plan_recording(profile, request=PlanRequest(policy="pipelined", cores=(1, 2))).chains[0]
     assert 110 * MS < plan.evidence.max_latency_ns < 121 * MS, "30 + 50 + 40"
-    shaped = simulate(described, tmp_path / "shaped", plan, cycles=1000)
+    shaped = simulate(described, tmp_path / "shaped", Plan.of(plan), cycles=1000)
     figures = measure_latency(shaped).analysis.statistics
     assert (figures.count, figures.incomplete) == (1000, 0)
     assert (figures.late or 0) <= 1000 * (plan.margin.overrun_probability or 0), "of 1 % at most"
     described = application(CAMERA_AND_LIDAR.replace("CORE", "1"))
     piled_up = simulate(described, tmp_path / "piled_up", cycles=50)
     with pytest.raises(InputError, match="for what /camera begins, and how long after /lidar"):
-        plan_recording(piled_up, request=PlanRequest(policy="pipelined", cores=(1, 2)))
+        plan_recording(piled_up, request=PlanRequest(policy="pipelined", cores=(1, 2))).chains[0]

@@ -13,7 +13,8 @@ from schedules import MS, application
 from test_schedules import plan
 
 from chainshaper.analysis import data_flow
-from chainshaper.planning.plan import Server, Thread
+from chainshaper.planning import Plan
+from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.simulation import simulate
 from chainshaper.simulation.simulating import START_NS
 from chainshaper.values import events
@@ -90,7 +91,9 @@ def descriptions(draw: st.DrawFn) -> dict[str, Any]:
 
 def recorded(description: dict[str, Any], servers: tuple[Server, ...] = ()) -> Recording:
     described = application(yaml.safe_dump(description))
-    governed = plan(*servers, chain=description["chain"], cycle_ms=PERIOD_MS) if servers else None
+    governed = None
+    if servers:
+        governed = Plan.of(plan(*servers, chain=description["chain"], cycle_ms=PERIOD_MS))
     with tempfile.TemporaryDirectory() as folder:
         recording = simulate(described, Path(folder) / "r", governed, cycles=12, switches=True)
         loaded = {name: recording.events[name] for name in recording.events}

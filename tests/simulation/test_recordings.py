@@ -14,7 +14,7 @@ from small_chain import small_chain
 
 from chainshaper.analysis import LatencyAnalysis, analyse_latency, data_flow
 from chainshaper.flow.plan import plan_recording
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan, Plan
 from chainshaper.simulation import machine, simulate, simulate_latencies
 from chainshaper.simulation.simulating import with_recorded_times
 from chainshaper.values.durations import parse_duration
@@ -31,9 +31,9 @@ def chain() -> Application:
 
 
 def test_tables_and_columns_are_those_of_a_live_recording(
-    tmp_path: Path, unshaped: Recording, shaped: Recording, plan: Plan
+    tmp_path: Path, unshaped: Recording, shaped: Recording, plan: ChainPlan
 ) -> None:
-    ours = simulate(small_chain(tmp_path), tmp_path / "ours", plan, cycles=12)
+    ours = simulate(small_chain(tmp_path), tmp_path / "ours", Plan.of(plan), cycles=12)
     for theirs in (unshaped, shaped):
         for name in theirs.events:
             if name in {"machine_stall", "machine_pace"}:  # nobody watches the simulated machine

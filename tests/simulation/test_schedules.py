@@ -10,8 +10,8 @@ from bare_plans import bare_plan
 from schedules import MS, application, begin_of, callbacks, ran, simulated
 
 from chainshaper.analysis import data_flow
-from chainshaper.planning import Plan
-from chainshaper.planning.plan import Server, Thread
+from chainshaper.planning import ChainPlan
+from chainshaper.planning.chain_plan import Server, Thread
 from chainshaper.values import events
 from chainshaper.values.durations import parse_duration
 from chainshaper.values.errors import InputError
@@ -22,7 +22,7 @@ CASES = yaml.safe_load(Path(__file__).with_name("schedules.yaml").read_text())
 
 def plan(
     *servers: Server, chain: str = "a", cycle_ms: int = 20, offset_ms: int = 0, **more: Any
-) -> Plan:
+) -> ChainPlan:
     """A plan that consists of servers only."""
     return bare_plan(chain, cycle_ms * MS, *servers, offset_ns=offset_ms * MS, **more)
 
@@ -94,7 +94,7 @@ def test_a_schedule_is_the_one_worked_out_by_hand(tmp_path: Path, case: dict[str
     ],
 )
 def test_a_plan_for_another_application_is_refused(
-    tmp_path: Path, governed: Plan, reason: str
+    tmp_path: Path, governed: ChainPlan, reason: str
 ) -> None:
     with pytest.raises(InputError, match=reason):
         simulated(

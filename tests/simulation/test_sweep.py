@@ -30,7 +30,7 @@ from chainshaper.flow.sweep import (
     row_at,
     rows_beside,
 )
-from chainshaper.planning import Plan, PlanRequest
+from chainshaper.planning import ChainPlan, Plan, PlanRequest
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.verify.measure import measure_latency
@@ -112,7 +112,7 @@ def test_wishes_for_the_plan_are_called_as_options_or_as_in_python() -> None:
     assert application_at(grid, shaped) == grid.application
 
 
-def test_a_given_plan_is_varied_by_paths_of_its_own(plan: Plan) -> None:
+def test_a_given_plan_is_varied_by_paths_of_its_own(plan: ChainPlan) -> None:
     axes = {"plan.overrun": ("wait", "discard"), "plan.servers.1.slots.0.1": ("25ms",)}
     grid = grid_of(quick_chain(), axes, plan, cycles=1)
     with pytest.raises(InputError, match="axis bands is a wish for a plan, but a plan is given"):
@@ -191,9 +191,13 @@ def test_a_point_is_what_simulate_plan_simulate_give(tmp_path: Path) -> None:
     application = quick_chain(VARYING, VARYING, wake_up={"uniform": ["10us", "90us"]})
     (row,) = _rows(application, {"bands": (2,), "epsilon": ("500us",)}, cycles=300)
     profile = simulate(application, tmp_path / "profile", cycles=300)
-    plan = plan_recording(profile, None, PlanRequest(bands=2, epsilon_ns=500_000, seed=7))
+    plan = plan_recording(profile, None, PlanRequest(bands=2, epsilon_ns=500_000, seed=7)).chains[0]
     judged = simulate(
-        application, tmp_path / "judged", plan, cycles=300, seed=application.seed + OTHER_RUN
+        application,
+        tmp_path / "judged",
+        Plan.of(plan),
+        cycles=300,
+        seed=application.seed + OTHER_RUN,
     )
     measured = measure_latency(judged)
     assert list(row) == list(FIGURES)
@@ -238,7 +242,7 @@ def test_constant_times_by_hand() -> None:
 
 def test_outputs_that_outgrow_a_given_plan_are_late_or_lost_by_hand(tmp_path: Path) -> None:
     """10 ms instead of 4 miss the slot [5 ms, 6 ms): they leave 50 ms later, or not at all."""
-    plan = plan_recording(simulate(quick_chain(), tmp_path / "profile", cycles=5))
+    plan = plan_recording(simulate(quick_chain(), tmp_path / "profile", cycles=5)).chains[0]
     axes = {
         "nodes.second.callbacks.0.execution.constant": ("2ms", "8ms"),
         "plan.overrun": ("wait", "discard"),

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import yaml
 
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import ChainPlan, plan_shaping
 
 LAUNCH_FILES = Path(__file__).parent / "launch_files"
 PACKAGES = LAUNCH_FILES / "_packages"
@@ -67,7 +67,7 @@ CASES = [
 ]
 
 
-def plan_for(publisher: str, output: str) -> Plan:
+def plan_for(publisher: str, output: str) -> ChainPlan:
     """A plan that shapes a topic of this publisher."""
     return plan_shaping(
         np.array([5_000_000, 20_000_000]),

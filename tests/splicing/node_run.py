@@ -18,8 +18,8 @@ import yaml
 from known import known
 from passing import serialized
 
-from chainshaper.planning import Modes, Plan
-from chainshaper.planning.plan import revised, with_slots
+from chainshaper.planning import ChainPlan, Modes
+from chainshaper.planning.chain_plan import revised, with_slots
 from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
 from chainshaper.splicing.shaping_process import ShapingProcess
 
@@ -35,12 +35,12 @@ RELIABLE = {"history": 3, "depth": 0, "reliability": 1, "durability": 2, "liveli
 PUBLISHERS = {"/t3_tmp": [{"type": "sensor_msgs/msg/Image", "qos": RELIABLE}]}
 
 
-def leaving_in(plan: Plan, *slots: tuple[int, int], **changes: Any) -> Plan:
+def leaving_in(plan: ChainPlan, *slots: tuple[int, int], **changes: Any) -> ChainPlan:
     """The plan with these publish slots, and other changes."""
     return revised(plan, servers=with_slots(plan.servers, {"output": slots}), **changes)
 
 
-def banded(plan: Plan) -> Plan:
+def banded(plan: ChainPlan) -> ChainPlan:
     modes = Modes(topic="/mode", default="city", bands={"city": 2, "highway": 1}, late="next-slot")
     return leaving_in(plan, *SLOTS, modes=modes)
 

@@ -9,9 +9,9 @@ from known import known
 from small_chain import EXECUTOR_CORE, small_chain
 
 from chainshaper import shape_application
-from chainshaper.planning import Plan, plan_shaping, publish_slots
+from chainshaper.planning import ChainPlan, Plan, plan_shaping, publish_slots
+from chainshaper.planning.chain_plan import revised
 from chainshaper.planning.overruns import Writer
-from chainshaper.planning.plan import revised
 from chainshaper.planning.shaping import let_per_callback
 from chainshaper.splicing.application import splice_application, writers_of
 from chainshaper.values.errors import InputError
@@ -26,10 +26,10 @@ def application(tmp_path: Path) -> Application:
 
 
 def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
-    application: Application, plan: Plan
+    application: Application, plan: ChainPlan
 ) -> None:
     before = application.model_dump_json()
-    spliced = splice_application(application, plan)
+    spliced = splice_application(application, Plan.of(plan))
     assert application.model_dump_json() == before, "the given one is left as it is"
     assert spliced.nodes["third"].callbacks[0].publishes == ("/t3_tmp",)
     shaping = spliced.nodes["chainshaper_t3"]
@@ -46,11 +46,11 @@ def test_the_publisher_is_remapped_and_the_shaping_node_takes_its_place(
     assert (spliced.chain, spliced.seed) == (application.chain, application.seed)
     assert Application.model_validate(spliced.model_dump()) == spliced
     for overrun in ("wait", "discard", "publish"):
-        treated = splice_application(application, revised(plan, overrun=overrun))
+        treated = splice_application(application, Plan.of(revised(plan, overrun=overrun)))
         assert known(treated.nodes["chainshaper_t3"].callbacks[0].gate).overrun == overrun
 
 
-def _changed(plan: Plan, **changes: object) -> Plan:
+def _changed(plan: ChainPlan, **changes: object) -> ChainPlan:
     assert plan.shaping_node is not None
     return plan.model_copy(update={"shaping_node": plan.shaping_node.model_copy(update=changes)})
 
@@ -67,25 +67,25 @@ def _changed(plan: Plan, **changes: object) -> Plan:
     ],
 )
 def test_a_plan_that_does_not_fit_is_refused(
-    application: Application, plan: Plan, changes: dict[str, object], said: str
+    application: Application, plan: ChainPlan, changes: dict[str, object], said: str
 ) -> None:
     with pytest.raises(InputError, match=said):
-        splice_application(application, _changed(plan, **changes))
+        splice_application(application, Plan.of(_changed(plan, **changes)))
 
 
 def test_what_has_no_shaping_node_or_two_publishers_is_refused(
-    application: Application, plan: Plan
+    application: Application, plan: ChainPlan
 ) -> None:
     bare = plan_shaping(np.array([5_000_000, 20_000_000]), plan.cycle_ns)
     with pytest.raises(InputError, match="no `shaping_node`, so there is nothing to splice"):
-        splice_application(application, bare)
+        splice_application(application, Plan.of(bare))
     nodes = {**application.nodes, "fourth": application.nodes["third"]}
     both = application.model_copy(update={"nodes": nodes})
     with pytest.raises(InputError, match="which third, fourth of the application publishes"):
-        splice_application(both, plan)
+        splice_application(both, Plan.of(plan))
 
 
-def _asynchronous(**changes: Any) -> Plan:
+def _asynchronous(**changes: Any) -> ChainPlan:
     return plan_shaping(
         np.array([5_000_000, 20_000_000]),
         50_000_000,
@@ -103,15 +103,15 @@ def _asynchronous(**changes: Any) -> Plan:
 def test_a_gated_publisher_needs_no_node_and_discards_by_a_lifespan(
     application: Application,
 ) -> None:
-    assert splice_application(application, _asynchronous()) == application
+    assert splice_application(application, Plan.of(_asynchronous())) == application
     discarding = _asynchronous(overrun="discard")
-    spliced = splice_application(application, discarding)
+    spliced = splice_application(application, Plan.of(discarding))
     assert spliced.topic("/t3").lifespan_ns == 31_000_000
     assert application.topic("/t3").lifespan_ns is None
     assert Application.model_validate(spliced.model_dump()) == spliced
     shorter = spliced.topic("/t3").model_copy(update={"lifespan_ns": 9_000_000})
     own = application.model_copy(update={"topics": {"/t3": shorter}})
-    shortest = splice_application(own, discarding).topic("/t3")
+    shortest = splice_application(own, Plan.of(discarding)).topic("/t3")
     assert shortest.lifespan_ns == 9_000_000, "the application's own is stricter"
 
 
@@ -121,13 +121,15 @@ def test_a_gated_publisher_has_to_publish_asynchronously(
     writers = [Writer(f"/{node}", f"/t{n}", 10, n == 3) for n, node in enumerate(NODES, start=1)]
     assert writers_of(application) == writers
     with pytest.raises(InputError, match="/third publishes /t3 synchronously"):
-        splice_application(small_chain(tmp_path), _asynchronous())
+        splice_application(small_chain(tmp_path), Plan.of(_asynchronous()))
 
 
 def test_every_topic_of_let_per_callback_gets_a_gate_of_its_own(
-    application: Application, plan: Plan
+    application: Application, plan: ChainPlan
 ) -> None:
-    spliced = splice_application(application, let_per_callback(plan, ["/t1", "/t2", "/t3"]))
+    spliced = splice_application(
+        application, Plan.of(let_per_callback(plan, ["/t1", "/t2", "/t3"]))
+    )
     gates = {
         callback.publishes[0]: callback.gate
         for _, callback in spliced.callbacks()
@@ -145,18 +147,21 @@ def test_every_topic_of_let_per_callback_gets_a_gate_of_its_own(
 
 
 def test_a_plan_is_for_its_own_chain_and_period_also_where_the_application_names_another(
-    application: Application, plan: Plan, tmp_path: Path
+    application: Application, plan: ChainPlan, tmp_path: Path
 ) -> None:
     timer = {"timer": "20ms", "execution": {"constant": "1ms"}, "publishes": ["/image"]}
     camera = NodeDescription.model_validate({"callbacks": [timer]}, strict=False)
     beside = application.model_copy(update={"nodes": {"camera": camera, **application.nodes}})
     other = beside.model_copy(update={"chain": "/image../image"})
-    assert splice_application(other, plan).nodes == splice_application(beside, plan).nodes
+    assert (
+        splice_application(other, Plan.of(plan)).nodes
+        == splice_application(beside, Plan.of(plan)).nodes
+    )
     named = revised(plan, chain=plan.chain.model_copy(update={"spec": "/image../t3"}))
     with pytest.raises(InputError, match=r"period 50 ms, but /image../t3 of 'small chain' has 20"):
-        splice_application(beside, named)
+        splice_application(beside, Plan.of(named))
     chain = plan.chain.model_copy(update={"period_ns": 60_000_000})
     slower = revised(plan, chain=chain, cycle_ns=60_000_000)
     with pytest.raises(InputError, match=r"period 60 ms, but /t1../t3 of 'small chain' has 50 ms"):
-        shape_application(application, slower, tmp_path / "rec")
+        shape_application(application, Plan.of(slower), tmp_path / "rec")
     assert not (tmp_path / "rec").exists(), "before anything starts"

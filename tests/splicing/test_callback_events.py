@@ -11,7 +11,7 @@ import pytest
 from known import known
 from node_run import RELIABLE, parameters_of, running_node, stamped
 
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan
 from chainshaper.splicing.shaping_process import write_shaping_process, write_throttler
 
 MS = 1_000_000
@@ -128,7 +128,7 @@ def test_a_library_in_front_of_the_process_gets_the_events(tmp_path: Path) -> No
 
 
 def test_on_humble_serialized_messages_are_seen_as_on_later_distributions(
-    tmp_path: Path, plan: Plan
+    tmp_path: Path, plan: ChainPlan
 ) -> None:
     """There neither rcl nor rmw has events of them, and a callback gets no source timestamp."""
     log = tmp_path / "gate.csv"
@@ -148,7 +148,7 @@ def test_on_humble_serialized_messages_are_seen_as_on_later_distributions(
     assert (started[0], ended[0]) == ("callback_start", "callback_end"), "where it is executed"
 
 
-def test_on_humble_what_waited_was_taken_when_it_came(tmp_path: Path, plan: Plan) -> None:
+def test_on_humble_what_waited_was_taken_when_it_came(tmp_path: Path, plan: ChainPlan) -> None:
     """Later messages may have been published meanwhile; the stand-in's second and third came while
     the first waited for its slot, one without a source timestamp.
     """

@@ -14,8 +14,9 @@ from bare_recordings import recorded
 from launch_cases import NDT, ROBOTS, plan_for, robot_file
 from node_run import parameters_of
 
-from chainshaper import Plan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
-from chainshaper.planning.plan import publish_slots, revised
+from chainshaper import ChainPlan, Splicing, ThrottledInput, splice_launch_files, splice_throttlers
+from chainshaper.planning import Plan
+from chainshaper.planning.chain_plan import publish_slots, revised
 from chainshaper.splicing.node_kinds import copies_made, kind_of, language_of
 from chainshaper.splicing.spliced_launch import parse_launch_command, undo_splice
 from chainshaper.values.errors import InputError, PlatformError
@@ -54,7 +55,7 @@ def recording(tmp_path: Path) -> Recording:
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_user_s_file_is_included_as_it_is(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_text(ROBOTS[name])
-    spliced = splice_launch_files(PLAN, [tmp_path / name], tmp_path / "out")
+    spliced = splice_launch_files(Plan.of(PLAN), [tmp_path / name], tmp_path / "out")
     assert (tmp_path / name).read_text() == ROBOTS[name]
     assert spliced.launch == {tmp_path / name: tmp_path / "out/robot.launch.py"}
     assert spliced.originals == {tmp_path / "out/robot.launch.py": tmp_path / name}
@@ -71,7 +72,9 @@ def test_the_user_s_file_is_included_as_it_is(name: str, tmp_path: Path) -> None
     assert "+++ " + str(tmp_path / "out/robot.launch.py") in spliced.diff
     other = tmp_path / "sensing.launch.yaml"
     other.write_text("launch: []\n")
-    both = splice_launch_files(PLAN, [tmp_path / name, other, tmp_path / name], tmp_path / "out")
+    both = splice_launch_files(
+        Plan.of(PLAN), [tmp_path / name, other, tmp_path / name], tmp_path / "out"
+    )
     assert both.launch == dict.fromkeys([tmp_path / name, other], tmp_path / "out/robot.launch.py")
     assert launched(both)["LAUNCH_FILES"] == [str(tmp_path / name), str(other)]
 
@@ -81,7 +84,7 @@ def test_a_gate_in_the_publisher_s_process_adds_no_node_and_redirects_nothing(ro
     assert PLAN.shaping_node is not None
     inside = PLAN.shaping_node.model_copy(update={"in_process": True})
     plan, out = revised(PLAN, shaping_node=inside, anchor="cycle"), robot.parent / "out"
-    spliced = splice_launch_files(plan, [robot], out)
+    spliced = splice_launch_files(Plan.of(plan), [robot], out)
     written = launched(spliced)
     assert (written["PROCESSES"], written["REDIRECTS"]) == ([], [])
     assert written["ENVIRONMENT"] == spliced.environment
@@ -106,14 +109,16 @@ def test_both_nodes_are_started_with_their_files_and_again_when_they_end(
 ) -> None:
     nodes = robot.parent / folder / "shaping_nodes"
     same = {"output": "screen", "respawn": True, "respawn_delay": 0.1}
-    for process in launched(splice_launch_files(PLAN, [robot], robot.parent / folder))["PROCESSES"]:
+    for process in launched(splice_launch_files(Plan.of(PLAN), [robot], robot.parent / folder))[
+        "PROCESSES"
+    ]:
         name, words = process["name"], process["cmd"]
         assert process.items() >= same.items()
         assert words[:2] == ["python3", str(nodes / f"{name}.py")]
         assert words[-2:] == ["--params-file", str(nodes / f"{name}.yaml")]
         assert {"__ns:=/", f"__node:={name}", "input:=/pose_tmp", "output:=/pose"} <= {*words}
         assert all(Path(word).is_file() for word in (words[1], words[-1]))
-    spliced = splice_launch_files(PLAN, [robot], robot.parent / folder, node="cpp")
+    spliced = splice_launch_files(Plan.of(PLAN), [robot], robot.parent / folder, node="cpp")
     node, standby = launched(spliced)["PROCESSES"]
     assert (nodes / node["package"] / "package.xml").is_file()
     assert standby.items() >= same.items()
@@ -132,7 +137,7 @@ def test_a_component_goes_into_its_publishers_container_and_has_no_standby(robot
     out, type_ = robot.parent / "out", "sensor_msgs/msg/PointCloud2"
     evidence = PLAN.evidence.model_copy(update={"intra_process": True})
     plan = revised(PLAN, evidence=evidence)
-    spliced = splice_launch_files(plan, [robot], out, node="cpp", message_type=type_)
+    spliced = splice_launch_files(Plan.of(plan), [robot], out, node="cpp", message_type=type_)
     assert "/pose: the shaping node is a component in C++" in spliced.notes[0]
     written, nodes = launched(spliced), out / "shaping_nodes"
     assert written["PROCESSES"] == []
@@ -199,17 +204,17 @@ def test_auto_is_cpp_where_it_is_built_and_can_be(
 
 def test_what_ros2_run_starts_is_launched(tmp_path: Path) -> None:
     words = ["ros2", "run", "l", "n", "--ros-args", "-r", "__node:=ndt"]
-    spliced = splice_launch_files(PLAN, words, tmp_path / "out")
+    spliced = splice_launch_files(Plan.of(PLAN), words, tmp_path / "out")
     assert spliced.launch == {Path("n"): tmp_path / "out/n.launch.py"}
     written = launched(spliced)
     assert (written["LAUNCH_FILES"], written["PROCESSES"][-1]["cmd"]) == ([], words)
-    again = splice_launch_files(PLAN, [*spliced.launch.values()], tmp_path / "again")
+    again = splice_launch_files(Plan.of(PLAN), [*spliced.launch.values()], tmp_path / "again")
     assert launched(again)["PROCESSES"][-1]["cmd"] == words
     other = tmp_path / "robot.launch.xml"
     other.write_text(NDT)
     for both in ([*spliced.launch.values(), other], [other, *spliced.launch.values()]):
         with pytest.raises(InputError, match=r"for `ros2 run l n .*, which is spliced alone"):
-            splice_launch_files(PLAN, both, tmp_path / "third")
+            splice_launch_files(Plan.of(PLAN), both, tmp_path / "third")
 
 
 @pytest.mark.parametrize(
@@ -225,13 +230,13 @@ def test_options_of_ros2_run_are_not_what_it_starts(
 ) -> None:
     words = ["ros2", "run", *options, "l", executable, "--ros-args", "-r", "__node:=ndt"]
     (tmp_path / "here").mkdir()
-    spliced = splice_launch_files(PLAN, words, tmp_path / "here/out")
+    spliced = splice_launch_files(Plan.of(PLAN), words, tmp_path / "here/out")
     assert [*spliced.launch.values()] == [tmp_path / "here/out/n.launch.py"]
     assert launched(spliced)["PROCESSES"][-1]["cmd"] == words
     assert [path.name for path in tmp_path.iterdir()] == ["here"]
 
 
-def with_further_node(plan: Plan, output: str, publisher: str | None = None) -> Plan:
+def with_further_node(plan: ChainPlan, output: str, publisher: str | None = None) -> ChainPlan:
     """The plan with a shaping node for another topic, in slots of its own."""
     assert plan.shaping_node is not None
     name = "chainshaper" + output.replace("/", "_")
@@ -247,7 +252,7 @@ def test_all_shaping_nodes_of_a_plan_are_spliced(robot: Path, known: str) -> Non
     by_plan = known == "by the plan"
     plan = with_further_node(plan_for("/second", "/t2"), "/t1", "/first" if by_plan else None)
     seen = None if by_plan else recorded(robot.parent, ("/first", "/t1", "publisher"))
-    spliced = splice_launch_files(plan, [robot], robot.parent / "out", recording=seen)
+    spliced = splice_launch_files(Plan.of(plan), [robot], robot.parent / "out", recording=seen)
     names = ["chainshaper_t2", "chainshaper_t1"]
     assert [process.name for process in spliced.processes] == names
     started = [process["name"] for process in launched(spliced)["PROCESSES"]]
@@ -277,7 +282,7 @@ def test_a_node_that_would_get_no_message_is_refused(
     refused = (node, distribution, field[:7]) == ("python", "lyrical", "uint8[]")
     with pytest.raises(InputError, match="use --node cpp") if refused else nullcontext():
         spliced = splice_launch_files(
-            PLAN, [robot], robot.parent / "out", node=node, recording=seen
+            Plan.of(PLAN), [robot], robot.parent / "out", node=node, recording=seen
         )
         assert redirects(spliced) == {"/pose": ("/pose_tmp", ("/ndt",))}
         package = "shaping_robot_msgs_cloud" if node == "cpp" else None
@@ -319,8 +324,10 @@ def test_a_plan_is_spliced_into_the_throttled_launch_file_and_again_from_its_own
     out = robot.parent / "throttled"
     throttled = splice_throttlers([REAR], [robot], out, recording=recording)
     text = (out / "robot.launch.py").read_text()
-    shaped = splice_launch_files(PLAN, [*throttled.launch.values()], robot.parent / "shaped")
-    again = splice_launch_files(PLAN, [*shaped.launch.values()], robot.parent / "shaped")
+    shaped = splice_launch_files(
+        Plan.of(PLAN), [*throttled.launch.values()], robot.parent / "shaped"
+    )
+    again = splice_launch_files(Plan.of(PLAN), [*shaped.launch.values()], robot.parent / "shaped")
     assert again.diff == shaped.diff
     assert f"spliced from its original, {out / 'robot.launch.py'}" in again.notes[-1]
     for spliced in (shaped, again):
@@ -348,7 +355,7 @@ def test_what_is_no_launch_file_is_refused(
     if text is not None:
         (tmp_path / name).write_bytes(text)
     with pytest.raises(InputError, match=message):
-        splice_launch_files(PLAN, [tmp_path / name], tmp_path / "spliced")
+        splice_launch_files(Plan.of(PLAN), [tmp_path / name], tmp_path / "spliced")
     assert not (tmp_path / "spliced").exists()
 
 
@@ -361,10 +368,10 @@ def test_a_plan_that_shapes_nothing_or_does_not_know_the_publisher_is_refused(ro
         (further, "does not say who publishes /t1: name a recording"),
     ):
         with pytest.raises(InputError, match=message):
-            splice_launch_files(plan, [robot], robot.parent / "out")
+            splice_launch_files(Plan.of(plan), [robot], robot.parent / "out")
     seen = recorded(robot.parent, *[(node, "/pose", "publisher") for node in ("/ndt", "/other")])
     with pytest.raises(InputError, match="/pose has 2 publishers, /ndt, /other"):
-        splice_launch_files(PLAN, [robot], robot.parent / "out", recording=seen)
+        splice_launch_files(Plan.of(PLAN), [robot], robot.parent / "out", recording=seen)
     assert not (robot.parent / "out").exists()
 
 
@@ -388,7 +395,7 @@ def test_a_dry_run_without_ros_2_says_what_it_needs(
     for name in ("PYTHONPATH", "AMENT_PREFIX_PATH"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(PlatformError, match="a dry run needs ROS 2: source its setup"):
-        splice_launch_files(PLAN, [robot], robot.parent / "out", dry_run=True)
+        splice_launch_files(Plan.of(PLAN), [robot], robot.parent / "out", dry_run=True)
     assert not (robot.parent / "out").exists()
 
 

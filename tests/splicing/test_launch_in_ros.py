@@ -19,7 +19,7 @@ from launch_cases import CASES, PACKAGES, ROBOTS, Case, plan_for
 from ros2 import ros2_environment
 
 from chainshaper import ThrottledInput, splice_launch_files, splice_throttlers
-from chainshaper.planning import save_plan
+from chainshaper.planning import Plan, save_plan
 
 pytestmark = [pytest.mark.ros2, pytest.mark.timeout(300)]
 
@@ -48,7 +48,7 @@ def answers(
         plan = plan_for(case.publisher, case.output)
         for original in case.launch:
             out = tmp_path_factory.mktemp(case.name) / "spliced"
-            (copy,) = splice_launch_files(plan, [original], out).launch.values()
+            (copy,) = splice_launch_files(Plan.of(plan), [original], out).launch.values()
             for arguments in (case.arguments, *case.variants):
                 more = {"arguments": arguments, "topics": [case.output, *NAMES]}
                 jobs += [{"file": str(file), **more} for file in (original, copy)]
@@ -84,7 +84,9 @@ def test_ros_2_remaps_who_listens_to_a_throttler_and_nobody_else(
         throttled = splice_throttlers(inputs, [tmp_path / name], tmp_path / f"{name}.throttled")
         files = [*throttled.launch.values()]
         plan = plan_for("/fusion", "/pose")
-        files += splice_launch_files(plan, files, tmp_path / f"{name}.both").launch.values()
+        files += splice_launch_files(
+            Plan.of(plan), files, tmp_path / f"{name}.both"
+        ).launch.values()
         jobs += [{"file": str(file), "arguments": {}, "topics": topics} for file in files]
     same = {topic: topic for topic in topics}
     throttled_only = {**same, "/rear": "/rear_throttled"}
@@ -130,7 +132,7 @@ def test_a_dry_run_finds_who_would_be_redirected(
     (case,) = (case for case in CASES if case.name == name)
     for variable, value in environment.items():
         monkeypatch.setenv(variable, value)
-    save_plan(plan_for(case.publisher, case.output), tmp_path / "plan.yaml")
+    save_plan(Plan.of(plan_for(case.publisher, case.output)), tmp_path / "plan.yaml")
     out = tmp_path / "out"
     said = json_of("splice", tmp_path / "plan.yaml", *case.launch, "-o", out, "--dry-run")
     (found,) = said["redirected"]
@@ -144,7 +146,7 @@ def test_a_dry_run_fails_where_nothing_would_be_redirected_or_too_much(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     robot, plan = tmp_path / "robot.launch.xml", tmp_path / "plan.yaml"
-    save_plan(plan_for("/ndt", "/pose"), plan)
+    save_plan(Plan.of(plan_for("/ndt", "/pose")), plan)
     node = '<node pkg="l" exec="n" name="{}"/>'
     arguments = ("splice", plan, robot, "-o", tmp_path / "out", "--dry-run")
     for names, said in {
@@ -191,7 +193,7 @@ def launched(tmp_path: Path, environment: dict[str, str]) -> Iterator[Any]:
         texts = {"program": str(OUTPUT), "log": str(tmp_path / "log"), "actions": actions}
         robot.write_text(NODES.format(**texts))
         plan = plan_for(publisher, "/pose")
-        (copy,) = splice_launch_files(plan, [robot], tmp_path / "spliced").launch.values()
+        (copy,) = splice_launch_files(Plan.of(plan), [robot], tmp_path / "spliced").launch.values()
         run = subprocess.Popen(
             ["env", "python3", str(LAUNCHED), str(copy), "chainshaper_within:=10"],
             env=environment,

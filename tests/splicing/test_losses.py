@@ -16,7 +16,7 @@ from known import known
 from node_run import NodeRun, leaving_in, outputs, parameters_of, running_node, stamped
 from processes import wait_for
 
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan
 from chainshaper.sources.gate_log import read_gate_log, rows_missing
 from chainshaper.splicing.shaped_outputs import output_text
 from chainshaper.splicing.shaping_process import write_shaping_process
@@ -27,7 +27,11 @@ OPEN = (0, 50 * MS)  # a slot that is always open
 
 @contextmanager
 def at_work(
-    plan: Plan, folder: Path, log: Path, slot: tuple[int, int] = (20 * MS, 45 * MS), **changes: Any
+    plan: ChainPlan,
+    folder: Path,
+    log: Path,
+    slot: tuple[int, int] = (20 * MS, 45 * MS),
+    **changes: Any,
 ) -> Iterator[NodeRun]:
     """The node of a plan with one slot; ``log_bytes`` is no part of a plan."""
     log_bytes = changes.pop("log_bytes", 100_000_000)
@@ -65,7 +69,7 @@ def wait_for_rows(log: Path, count: int) -> pl.DataFrame:
     [("all-in-order", "overflowed"), ("newest", "replaced")],
 )
 def test_bursts_leave_as_planned_and_the_rest_is_counted(
-    tmp_path: Path, plan: Plan, messages: str, lost: str
+    tmp_path: Path, plan: ChainPlan, messages: str, lost: str
 ) -> None:
     log, bursts, size = tmp_path / "gate.csv", 2, 20
     sent: list[bytes] = []
@@ -96,7 +100,7 @@ def test_bursts_leave_as_planned_and_the_rest_is_counted(
     assert rows_missing(rows) == (0, 0)
 
 
-def test_what_dds_lost_before_the_gate_is_counted(tmp_path: Path, plan: Plan) -> None:
+def test_what_dds_lost_before_the_gate_is_counted(tmp_path: Path, plan: ChainPlan) -> None:
     log = tmp_path / "gate.csv"
     with at_work(plan, tmp_path, log) as run:
         for number in (5, 6, 9, 10, 2):  # the last is from a publisher that was started again
@@ -110,7 +114,7 @@ def test_what_dds_lost_before_the_gate_is_counted(tmp_path: Path, plan: Plan) ->
     assert any("2 lost by DDS" in text for text in run.logged)
 
 
-def test_the_log_is_bounded_and_says_which_rows_are_gone(tmp_path: Path, plan: Plan) -> None:
+def test_the_log_is_bounded_and_says_which_rows_are_gone(tmp_path: Path, plan: ChainPlan) -> None:
     log = tmp_path / "gate.csv"
     with at_work(plan, tmp_path, log, OPEN, log_bytes=4_000) as run:
         for number in range(60):
@@ -124,7 +128,9 @@ def test_the_log_is_bounded_and_says_which_rows_are_gone(tmp_path: Path, plan: P
     assert removed == 60 - rows.height > 0
 
 
-def test_a_full_disk_does_not_stop_the_output(full_disk: Path, tmp_path: Path, plan: Plan) -> None:
+def test_a_full_disk_does_not_stop_the_output(
+    full_disk: Path, tmp_path: Path, plan: ChainPlan
+) -> None:
     log = full_disk / "gate.csv"
     with at_work(plan, tmp_path, log, OPEN) as run:
         sent = send(run, 5, pause_s=0.02)
@@ -136,7 +142,7 @@ def test_a_full_disk_does_not_stop_the_output(full_disk: Path, tmp_path: Path, p
     assert removed + unwritten > 0, "those that found no room"
 
 
-def test_a_log_that_is_removed_is_made_anew(tmp_path: Path, plan: Plan) -> None:
+def test_a_log_that_is_removed_is_made_anew(tmp_path: Path, plan: ChainPlan) -> None:
     folder = tmp_path / "logs"
     folder.mkdir()
     log = folder / "gate.csv"
@@ -156,7 +162,7 @@ def test_a_log_that_is_removed_is_made_anew(tmp_path: Path, plan: Plan) -> None:
     assert rows_missing(rows)[0] == rows["row"][0] - 1
 
 
-def test_a_disk_that_hangs_does_not_stop_the_output(tmp_path: Path, plan: Plan) -> None:
+def test_a_disk_that_hangs_does_not_stop_the_output(tmp_path: Path, plan: ChainPlan) -> None:
     """The process that writes the log stands still."""
     log = tmp_path / "gate.csv"
     with at_work(plan, tmp_path, log, OPEN) as run:
@@ -180,7 +186,7 @@ def test_a_disk_that_hangs_does_not_stop_the_output(tmp_path: Path, plan: Plan) 
     assert rows["row"].to_list() == list(range(1, 32)), "the pipe had room for them"
 
 
-def test_a_link_in_the_place_of_the_log_is_not_followed(tmp_path: Path, plan: Plan) -> None:
+def test_a_link_in_the_place_of_the_log_is_not_followed(tmp_path: Path, plan: ChainPlan) -> None:
     """Before the node starts, and while it runs: the output goes on, the target is not touched."""
     secret, log = tmp_path / "secret", tmp_path / "gate.csv"
     secret.write_text("mine\n")

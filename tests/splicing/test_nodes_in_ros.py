@@ -19,8 +19,8 @@ from known import known
 from node_run import SLOTS, banded
 from ros2 import ros2_environment
 
-from chainshaper.planning import Plan
-from chainshaper.planning.plan import revised
+from chainshaper.planning import ChainPlan
+from chainshaper.planning.chain_plan import revised
 from chainshaper.robot.throttling import RULES, Rule
 from chainshaper.sources.gate_log import read_gate_log
 from chainshaper.sources.ros import own_environment, run_with_rclpy
@@ -49,7 +49,7 @@ def in_ros_environment() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def workspace(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Path:
+def workspace(tmp_path_factory: pytest.TempPathFactory, plan: ChainPlan) -> Path:
     if shutil.which("colcon") is None:
         pytest.skip("colcon is not on the PATH, so no package can be built")
     folder = tmp_path_factory.mktemp("workspace")
@@ -64,7 +64,9 @@ def place(kind: NodeKind, request: pytest.FixtureRequest) -> Path | None:
     return None if kind == "python" else request.getfixturevalue("workspace")
 
 
-def written(plan: Plan, kind: NodeKind, folder: Path, log: Path | None = None) -> ShapingProcess:
+def written(
+    plan: ChainPlan, kind: NodeKind, folder: Path, log: Path | None = None
+) -> ShapingProcess:
     assert plan.shaping_node is not None
     return write_shaping_process(plan, plan.shaping_node, kind, folder, message_type=TYPE, log=log)
 
@@ -119,7 +121,7 @@ def rclpy_has_source_timestamps() -> bool:
 @pytest.mark.parametrize("quality", ["latched", "best_effort"])
 @pytest.mark.parametrize("kind", ["python", "generic", "typed"])
 def test_messages_come_back_in_the_slot_of_their_mode(
-    tmp_path: Path, plan: Plan, kind: NodeKind, quality: str, place: Path | None
+    tmp_path: Path, plan: ChainPlan, kind: NodeKind, quality: str, place: Path | None
 ) -> None:
     plan, log = banded(plan), tmp_path / "gate.csv"
     process = written(plan, kind, tmp_path, log)
@@ -156,7 +158,7 @@ def test_messages_come_back_in_the_slot_of_their_mode(
 @pytest.mark.parametrize("messages", ["all-in-order", "newest"])
 @pytest.mark.parametrize("kind", ["python", "generic", "typed"])
 def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
-    tmp_path: Path, plan: Plan, kind: NodeKind, messages: str, place: Path | None
+    tmp_path: Path, plan: ChainPlan, kind: NodeKind, messages: str, place: Path | None
 ) -> None:
     plan = revised(plan, anchor="cycle", messages=messages, overrun="wait")
     log = tmp_path / "gate.csv"
@@ -175,7 +177,7 @@ def test_of_more_than_one_a_cycle_none_is_lost_that_is_not_counted(
 
 @pytest.mark.parametrize("kind", ["python", "generic"])
 def test_a_running_node_is_told_where_cycles_begin(
-    tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
+    tmp_path: Path, plan: ChainPlan, kind: NodeKind, place: Path | None
 ) -> None:
     plan, log = revised(plan, anchor="cycle"), tmp_path / "gate.csv"
     process = written(plan, kind, tmp_path, log)
@@ -194,7 +196,7 @@ def test_a_running_node_is_told_where_cycles_begin(
 
 @pytest.mark.parametrize("kind", ["python", "generic"])
 def test_it_stops_while_it_waits_for_its_input(
-    tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
+    tmp_path: Path, plan: ChainPlan, kind: NodeKind, place: Path | None
 ) -> None:
     process = written(plan, kind, tmp_path)
     with started(process, place) as child:
@@ -205,7 +207,7 @@ def test_it_stops_while_it_waits_for_its_input(
 
 @pytest.mark.parametrize("kind", ["typed"])
 def test_a_typed_node_refuses_another_type(
-    tmp_path: Path, plan: Plan, kind: NodeKind, place: Path | None
+    tmp_path: Path, plan: ChainPlan, kind: NodeKind, place: Path | None
 ) -> None:
     process = written(plan, kind, tmp_path)
     say = [*("ros2", "topic", "pub", "/t3_tmp", "std_msgs/msg/Header"), "{}"]

@@ -26,8 +26,8 @@ from node_run import (
 from processes import wait_for
 from small_chain import EXECUTOR_CORE
 
-from chainshaper.planning import Plan
-from chainshaper.planning.plan import ShapingNode, revised
+from chainshaper.planning import ChainPlan
+from chainshaper.planning.chain_plan import ShapingNode, revised
 from chainshaper.robot import decision
 from chainshaper.robot.node_parameters import NodeParameters, gate_parameters
 from chainshaper.robot.shaper import READER_DEPTH
@@ -46,12 +46,12 @@ LATENCY = Path("/dev/cpu_dma_latency")
 
 
 @pytest.fixture
-def node(plan: Plan) -> ShapingNode:
+def node(plan: ChainPlan) -> ShapingNode:
     return known(plan.shaping_node)
 
 
 def test_a_python_node_is_one_file_with_the_gate_of_the_live_workload(
-    tmp_path: Path, plan: Plan, node: ShapingNode
+    tmp_path: Path, plan: ChainPlan, node: ShapingNode
 ) -> None:
     process = write_shaping_process(plan, node, "python", tmp_path)
     shaping, standby = (
@@ -79,7 +79,7 @@ def test_a_python_node_is_one_file_with_the_gate_of_the_live_workload(
 
 
 def test_the_parameters_say_what_the_plan_says(
-    tmp_path: Path, plan: Plan, node: ShapingNode
+    tmp_path: Path, plan: ChainPlan, node: ShapingNode
 ) -> None:
     longer = plan.predicted.model_copy(update={"max_ns": 3 * plan.cycle_ns})  # edited: no matter
     plan = revised(plan, overrun="discard", messages="newest", anchor="cycle", offset_ns=7 * MS)
@@ -119,7 +119,7 @@ def test_the_parameters_say_what_the_plan_says(
     [("1", "rmw_fastrtps_cpp", 0), ("", "rmw_fastrtps_cpp", 1), ("1", "rmw_cyclonedds_cpp", 1)],
 )
 def test_a_core_is_cleared_for_delivering_threads_that_have_names(
-    tmp_path: Path, plan: Plan, humble: str, rmw: str, cleared: int
+    tmp_path: Path, plan: ChainPlan, humble: str, rmw: str, cleared: int
 ) -> None:
     """Others have no priority there, and would wait too."""
     process = write_shaping_process(plan, known(plan.shaping_node), "python", tmp_path)
@@ -138,7 +138,9 @@ def test_every_parameter_is_documented() -> None:
     assert [name for name in vars(NodeParameters()) if f"`{name}`" not in text] == sorted(throttled)
 
 
-def test_a_gate_with_modes_is_the_same_behind_its_parameters(plan: Plan, node: ShapingNode) -> None:
+def test_a_gate_with_modes_is_the_same_behind_its_parameters(
+    plan: ChainPlan, node: ShapingNode
+) -> None:
     gate = gate_of(banded(plan), node)
     parameters = gate_parameters(gate, "/mode")
     assert NodeParameters(**parameters).gate() == gate
@@ -151,7 +153,11 @@ def test_a_gate_with_modes_is_the_same_behind_its_parameters(plan: Plan, node: S
 
 @pytest.mark.parametrize("kind", ["python", "generic", "typed"])
 def test_writing_again_changes_nothing_and_what_is_there_is_not_overwritten(
-    tmp_path: Path, plan: Plan, node: ShapingNode, kind: NodeKind, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    plan: ChainPlan,
+    node: ShapingNode,
+    kind: NodeKind,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.delenv("AMENT_PREFIX_PATH", raising=False)
 
@@ -172,12 +178,14 @@ def test_writing_again_changes_nothing_and_what_is_there_is_not_overwritten(
     assert parameters.read_text() == "mine"
 
 
-def test_what_cannot_be_written_is_named(full_disk: Path, plan: Plan, node: ShapingNode) -> None:
+def test_what_cannot_be_written_is_named(
+    full_disk: Path, plan: ChainPlan, node: ShapingNode
+) -> None:
     with pytest.raises(OperationError, match=r"cannot be written: No space left"):
         write_shaping_process(plan, node, "python", full_disk / "new")
 
 
-def test_a_typed_node_needs_a_type(tmp_path: Path, plan: Plan, node: ShapingNode) -> None:
+def test_a_typed_node_needs_a_type(tmp_path: Path, plan: ChainPlan, node: ShapingNode) -> None:
     kinds: list[NodeKind] = ["typed", "component"]
     for kind in kinds:
         with pytest.raises(InputError, match=f"the {kind} shaping .* /t3 is not known: name it"):
@@ -190,7 +198,7 @@ def test_a_typed_node_needs_a_type(tmp_path: Path, plan: Plan, node: ShapingNode
 
 @contextmanager
 def at_work(
-    plan: Plan,
+    plan: ChainPlan,
     folder: Path,
     publishers: dict[str, Any] | None = None,
     change: Mapping[str, object] | None = None,
@@ -204,7 +212,7 @@ def at_work(
         yield run
 
 
-def test_messages_leave_unchanged_inside_their_slot(tmp_path: Path, plan: Plan) -> None:
+def test_messages_leave_unchanged_inside_their_slot(tmp_path: Path, plan: ChainPlan) -> None:
     payloads = []
     with at_work(banded(plan), tmp_path) as run:
         for number in range(6):
@@ -258,7 +266,7 @@ def test_messages_leave_unchanged_inside_their_slot(tmp_path: Path, plan: Plan) 
     ],
 )
 def test_the_output_is_offered_as_the_original_was(
-    tmp_path: Path, plan: Plan, offered: dict[str, Any], publisher: dict[str, Any]
+    tmp_path: Path, plan: ChainPlan, offered: dict[str, Any], publisher: dict[str, Any]
 ) -> None:
     known = [{"type": "sensor_msgs/msg/Image", "qos": {**RELIABLE, **offered}}]
     with at_work(plan, tmp_path, {"/t3_tmp": known * 2}) as run:
@@ -289,7 +297,7 @@ def test_the_output_is_offered_as_the_original_was(
     ],
 )
 def test_it_stops_cleanly(
-    tmp_path: Path, plan: Plan, how: signal.Signals | None, publishers: Any
+    tmp_path: Path, plan: ChainPlan, how: signal.Signals | None, publishers: Any
 ) -> None:
     with at_work(plan, tmp_path, publishers, spinning=False) as run:
         waits = "event" if publishers else "log"
@@ -298,7 +306,9 @@ def test_it_stops_cleanly(
     assert run.said[-1] == {"event": "shutdown"}
 
 
-def test_without_its_log_core_or_class_it_works_on_and_says_so(tmp_path: Path, plan: Plan) -> None:
+def test_without_its_log_core_or_class_it_works_on_and_says_so(
+    tmp_path: Path, plan: ChainPlan
+) -> None:
     no_core = {"core": 1023}  # is refused to all
     with at_work(plan, tmp_path, change=no_core, log=tmp_path / "nowhere/gate.csv") as run:
         run.send(stamped())
@@ -311,7 +321,7 @@ def test_without_its_log_core_or_class_it_works_on_and_says_so(tmp_path: Path, p
 
 
 def test_cores_stay_awake_from_before_the_slot_until_the_message_is_delivered(
-    tmp_path: Path, plan: Plan, node: ShapingNode
+    tmp_path: Path, plan: ChainPlan, node: ShapingNode
 ) -> None:
     def allowed_latency() -> int:
         """How long cores may take to wake up (us): what all who ask for it agree on."""

@@ -16,8 +16,8 @@ from node_run import NodeRun, banded, outputs, parameters_of, running_node, stam
 from processes import wait_for
 from strangers import NOBODY, needs_root, strange
 
-from chainshaper.planning import Plan
-from chainshaper.planning.plan import revised
+from chainshaper.planning import ChainPlan
+from chainshaper.planning.chain_plan import revised
 from chainshaper.robot.handover import MOVING, VERSION, Page, open_page
 from chainshaper.sources.gate_log import read_gate_log, releases_so_far
 from chainshaper.splicing.shaped_outputs import FollowedOutput, ask_phase, find_outputs, output_text
@@ -28,7 +28,7 @@ MS = 1_000_000
 
 
 def written(
-    plan: Plan, folder: Path, patience_ns: int = 20_000 * MS
+    plan: ChainPlan, folder: Path, patience_ns: int = 20_000 * MS
 ) -> tuple[ShapingProcess, ShapingProcess]:
     """A shaping node and its standby, for which a node on a busy machine is late only then."""
     process = write_shaping_process(
@@ -82,7 +82,7 @@ def diagnosed(standby: NodeRun) -> tuple[int, str]:
 
 
 def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
-    tmp_path: Path, plan: Plan
+    tmp_path: Path, plan: ChainPlan
 ) -> None:
     process, beside = written(plan, tmp_path)
     parameters_of(process, cycle_ns=1_000 * MS, slots_ns=[400 * MS, 401 * MS])
@@ -133,7 +133,7 @@ def test_what_a_killed_node_had_in_hand_goes_around_it_until_it_is_back(
     ids=["overflowed", "discarded"],
 )
 def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
-    tmp_path: Path, plan: Plan, changes: dict[str, Any], dropped: int
+    tmp_path: Path, plan: ChainPlan, changes: dict[str, Any], dropped: int
 ) -> None:
     process, beside = written(plan, tmp_path)
     slot = [59_000 * MS, 59_500 * MS]
@@ -161,7 +161,7 @@ def test_what_waits_in_a_killed_node_goes_around_it_but_not_what_it_has_dropped(
 
 
 def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counted_as_lost(
-    tmp_path: Path, plan: Plan
+    tmp_path: Path, plan: ChainPlan
 ) -> None:
     process, beside = written(plan, tmp_path, patience_ns=300 * MS)
     parameters_of(process, depth=3, cycle_ns=600 * MS, slots_ns=[300 * MS, 450 * MS])
@@ -183,7 +183,7 @@ def test_what_a_stopped_node_finds_when_it_goes_on_is_neither_doubled_nor_counte
 
 
 def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
-    tmp_path: Path, plan: Plan
+    tmp_path: Path, plan: ChainPlan
 ) -> None:
     _, beside = written(revised(plan, fallback="silence"), tmp_path)
     with running_node(beside, tmp_path) as standby:
@@ -206,7 +206,9 @@ def test_with_the_fallback_silence_nothing_is_published_and_all_is_counted(
     assert log["release"].null_count() == 3
 
 
-def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(tmp_path: Path, plan: Plan) -> None:
+def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(
+    tmp_path: Path, plan: ChainPlan
+) -> None:
     process, _ = written(banded(revised(plan, anchor="cycle")), tmp_path)
     for run_number in (1, 2):
         with running_node(process, tmp_path) as run:
@@ -225,7 +227,7 @@ def test_a_node_that_starts_again_goes_on_in_its_cycle_and_mode(tmp_path: Path, 
 
 
 def test_a_node_that_fails_at_once_waits_longer_each_time_and_says_so(
-    tmp_path: Path, plan: Plan
+    tmp_path: Path, plan: ChainPlan
 ) -> None:
     process, _ = written(plan, tmp_path)
     for failed in range(4):
@@ -240,7 +242,7 @@ def test_a_node_that_fails_at_once_waits_longer_each_time_and_says_so(
 
 
 def test_without_a_folder_the_node_works_alone_and_the_standby_says_that_it_cannot(
-    tmp_path: Path, plan: Plan
+    tmp_path: Path, plan: ChainPlan
 ) -> None:
     process, beside = written(plan, tmp_path)
     for one in (process, beside):
@@ -263,7 +265,7 @@ def test_pages_of_others_are_looked_at_without_trust(
 ) -> None:
     """Another robot, in another domain, has an output of the same name."""
     folder, topic = tmp_path / "outputs", f"/of_{os.getpid()}"
-    for module in ("gate.handover", "splicing.shaped_outputs"):
+    for module in ("robot.handover", "splicing.shaped_outputs"):
         name = f"chainshaper.{module}.page_folders"
         monkeypatch.setattr(name, lambda: iter([str(folder), str(tmp_path / "missing")]))
     good, bad = open_page("good", topic), open_page("bad", f"{topic}\x1b[31m")
@@ -313,7 +315,7 @@ def test_a_stranger_s_page_says_nothing_of_our_outputs() -> None:
             file.unlink()
 
 
-def test_a_program_is_started_again_until_it_is_to_end(tmp_path: Path, plan: Plan) -> None:
+def test_a_program_is_started_again_until_it_is_to_end(tmp_path: Path, plan: ChainPlan) -> None:
     written(plan, tmp_path)
     (tmp_path / "child.py").write_text(
         "import os, signal, sys\nprint(os.getpid(), *sys.argv[1:], flush=True)\nsignal.pause()\n"

@@ -24,7 +24,7 @@ from processes import wait_for
 from ros2 import ros2_environment
 
 from chainshaper import measure_latency, splice_launch_files
-from chainshaper.planning import Plan, plan_shaping
+from chainshaper.planning import ChainPlan, Plan, plan_shaping
 from chainshaper.splicing.node_packages import build_package
 from chainshaper.splicing.shaped_outputs import ShapedOutput, find_outputs
 from chainshaper.splicing.spliced_launch import NODES
@@ -55,7 +55,7 @@ class Launched:
         return [(int(number), int(at)) for number, at in map(str.split, lines)]
 
 
-def plan() -> Plan:
+def plan() -> ChainPlan:
     return plan_shaping(
         np.array([5_000_000, 49_000_000]),
         100_000_000,
@@ -97,7 +97,7 @@ def launching(kind: NodeLanguage, tmp_path: Path, *recorder: str) -> Iterator[La
         "from launch import LaunchDescription\nfrom launch_ros.actions import Node\n"
         f"def generate_launch_description():\n    return LaunchDescription([\n{nodes}    ])\n"
     )
-    splicing = splice_launch_files(plan(), [robot], tmp_path / "spliced", node=kind)
+    splicing = splice_launch_files(Plan.of(plan()), [robot], tmp_path / "spliced", node=kind)
     command = [*recorder, "ros2", "launch", str(splicing.launch[robot])]
     if kind == "cpp":
         with pytest.MonkeyPatch.context() as monkeypatch:

@@ -41,7 +41,7 @@ FUNCTIONS = """\
 import itertools, threading, time
 import numpy as np
 from chainshaper.workload.dds import data_message, data_of, number_in
-from chainshaper.robot.decision import origin_of
+from chainshaper import origin_of
 
 COUNT = itertools.count()
 threading.Thread(target=threading.Event().wait, daemon=True).start()

@@ -24,8 +24,8 @@ from small_chain import EXECUTOR_CORE, PERIOD_NS, small_chain, small_chain_plan,
 
 from chainshaper import LatencyAnalysis, measure_latency, save_plan, shape_application, simulate
 from chainshaper.flow.apply import apply_plan
-from chainshaper.planning import Plan, plan_shaping, publish_slots
-from chainshaper.planning.plan import revised
+from chainshaper.planning import ChainPlan, Plan, plan_shaping, publish_slots
+from chainshaper.planning.chain_plan import revised
 from chainshaper.planning.shaping import let_per_chain
 from chainshaper.reporting.latency import doubts_text, latency_json
 from chainshaper.robot.clocks import sleep_until
@@ -47,7 +47,7 @@ pytestmark = pytest.mark.timed
 MS = 1_000_000
 
 
-def _too_early(overrun: str = "wait", until_ns: int | None = None, **changes: Any) -> Plan:
+def _too_early(overrun: str = "wait", until_ns: int | None = None, **changes: Any) -> ChainPlan:
     """A publish slot in the midst of the small chain's latencies; the chain itself may run on.
 
     Until ``until_ns``: 1 ms later.
@@ -65,7 +65,7 @@ def _too_early(overrun: str = "wait", until_ns: int | None = None, **changes: An
 
 def test_discarded_outputs_are_not_published_and_not_lost(tmp_path: Path) -> None:
     plan = _too_early("discard")
-    recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
+    recording = simulate(small_chain(tmp_path), tmp_path / "rec", Plan.of(plan), cycles=24)
     measured, releases = measure_latency(recording), recording.events["gate_release"]
     discarded = releases.filter(pl.col("overrun") == "discard")
     count = discarded.height
@@ -107,7 +107,7 @@ def _with_long_executions(folder: Path) -> Application:
     return with_times(small_chain(folder), {"second": second, **others})
 
 
-def _frozen_outside_slots(plan: Plan) -> Enforcement:
+def _frozen_outside_slots(plan: ChainPlan) -> Enforcement:
     """The chain's executors run in the slots of their server, by the freezer."""
 
     @contextmanager
@@ -116,7 +116,7 @@ def _frozen_outside_slots(plan: Plan) -> Enforcement:
         how: dict[str, Any] = {"back_end": "freezer", "phase_ns": nodes.anchor_ns, "stop": stop}
         how |= {"wait_ns": 1000 * MS, "watch": lambda _: in_force.set()}
         with ThreadPoolExecutor(1) as pool:
-            run = pool.submit(apply_plan, plan, **how)
+            run = pool.submit(apply_plan, Plan.of(plan), **how)
             while not in_force.wait(0.05) and not run.done():
                 pass
             try:
@@ -137,10 +137,12 @@ def test_whatever_becomes_of_an_overrun_the_next_output_is_in_its_slot(
     """Stopped at the end of its slot, the chain would take 24 of the next slot's 18 ms."""
     application, wishes = _with_long_executions(tmp_path), {"epsilon_ns": 9 * MS, "overrun": policy}
     plan = small_chain_plan(6 * MS, 9 * MS, core=EXECUTOR_CORE, publish_slot_ns=4 * MS, **wishes)
-    simulated = simulate(application, tmp_path / "simulated", plan, cycles=40)
+    simulated = simulate(application, tmp_path / "simulated", Plan.of(plan), cycles=40)
     for attempt in range(3):  # unless the machine stands still for long
         place, enforcement = tmp_path / f"live{attempt}", _frozen_outside_slots(plan)
-        live = shape_application(application, plan, place, cycles=40, enforcement=enforcement)
+        live = shape_application(
+            application, Plan.of(plan), place, cycles=40, enforcement=enforcement
+        )
         found = measure_latency(live).outcomes
         if [one.next_hit for one in found.values()] == [0]:
             break
@@ -160,14 +162,14 @@ def test_of_a_gated_publisher_too_what_missed_its_slot_is_counted(
     application = application.model_copy(update={"topics": {"/t3": topic}})
     wishes: dict[str, Any] = {"publication": "asynchronous", "publish_slot_ns": 10 * MS}
     plan = small_chain_plan(6 * MS, 9 * MS, core=EXECUTOR_CORE, overrun=policy, **wishes)
-    measured = measure_latency(simulate(application, tmp_path / "rec", plan, cycles=40))
+    measured = measure_latency(simulate(application, tmp_path / "rec", Plan.of(plan), cycles=40))
     assert measured.outcomes == {policy: Outcome(late=3, discarded=0, followed=3, next_hit=0)}
     assert measured.overruns == {policy: 3}
 
 
 def test_outputs_published_at_once_wait_for_nothing(tmp_path: Path) -> None:
     plan = _too_early("publish")
-    recording = simulate(small_chain(tmp_path), tmp_path / "rec", plan, cycles=24)
+    recording = simulate(small_chain(tmp_path), tmp_path / "rec", Plan.of(plan), cycles=24)
     measured = measure_latency(recording)
     late = recording.events["gate_release"].drop_nulls("overrun")
     assert measured.overruns == {"publish": late.height}
@@ -181,8 +183,8 @@ def test_what_comes_into_an_open_slot_leaves_at_once_and_is_counted(tmp_path: Pa
     plan, application = _too_early(until_ns=PERIOD_NS), small_chain(tmp_path)
     ((start, _),) = publish_slots(plan)
 
-    def shaped(plan: Plan, name: str) -> tuple[Recording, pl.DataFrame, pl.Series]:
-        recording = simulate(application, tmp_path / name, plan, cycles=24)
+    def shaped(plan: ChainPlan, name: str) -> tuple[Recording, pl.DataFrame, pl.Series]:
+        recording = simulate(application, tmp_path / name, Plan.of(plan), cycles=24)
         releases = recording.events["gate_release"]
         behind = releases["arrival"] - releases["origin"] > start
         assert 0 < behind.sum() < releases.height
@@ -212,7 +214,7 @@ def test_the_plan_says_what_is_done_about_overruns_and_the_live_run_reports_it(
     wishes = ("plan", "--latencies", latencies, "--period", "50ms", "--into-open-slot", "next-slot")
     made = json_of(*wishes)
     assert (made["into_open_slot"], made["predicted"]["jitter_ns"]) == ("next-slot", 0)
-    save_plan(_too_early("discard"), plan_file)
+    save_plan(Plan.of(_too_early("discard")), plan_file)
     small_chain(tmp_path)
     output, described = tmp_path / "rec", tmp_path / "small_chain.yaml"
     shaped = called("shape", described, plan_file, "-o", output, "--cycles", "12")
@@ -225,7 +227,7 @@ def test_what_a_gate_lost_is_shown_wherever_recordings_are_compared(tmp_path: Pa
     application = small_chain(tmp_path)
     profile = simulate(application, tmp_path / "profile", cycles=24)
     plan = _too_early(messages="newest")
-    shaped = simulate(application, tmp_path / "shaped", plan, cycles=24)
+    shaped = simulate(application, tmp_path / "shaped", Plan.of(plan), cycles=24)
     dropped = known(measure_latency(shaped).dropped)
     count = dropped["replaced"]
     assert dropped == {"replaced": count}
@@ -267,7 +269,7 @@ def test_an_unshaped_recording_has_no_overruns(unshaped: Recording) -> None:
 
 
 def _overran(
-    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis
+    recording: Recording, plan: ChainPlan | None, analysis: LatencyAnalysis
 ) -> dict[str, int] | None:
     return overruns_in(recording, plan, analysis, gate_releases(recording, plan, analysis))
 
@@ -282,7 +284,7 @@ def _without_column(recording: Recording, cycles_waited: list[int]) -> Recording
 
 
 def test_older_recordings_are_read_by_the_cycles_their_outputs_waited(
-    shaped: Recording, plan: Plan
+    shaped: Recording, plan: ChainPlan
 ) -> None:
     old = _without_column(shaped, [0, 1, 2, 0])
     analysis = measure_latency(old).analysis
@@ -326,7 +328,7 @@ def _stopped_once(nodes: StartedNodes) -> Iterator[None]:
 
 
 def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
-    tmp_path: Path, plan: Plan, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, plan: ChainPlan, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A node is stopped; the machine is said to stall while its output waits."""
     monkeypatch.setattr(live, "ENFORCING_NS", 0)  # so that cycles count from the given anchor
@@ -334,7 +336,9 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
 
     def shape(place: Path) -> Recording:
         output = place / "rec"
-        return shape_application(application, plan, output, cycles=24, enforcement=_stopped_once)
+        return shape_application(
+            application, Plan.of(plan), output, cycles=24, enforcement=_stopped_once
+        )
 
     recording = calm_run(shape, tmp_path)
     stopped = measure_latency(recording).analysis.traversals.filter("late").row(0, named=True)
@@ -358,7 +362,9 @@ def test_a_late_output_is_not_hidden_by_a_stall_after_it_was_due(
     assert (judged.outputs.late, judged.outputs.due) == (late, values["count"])
 
 
-def test_of_gates_in_one_process_each_chain_has_its_own_rows(shaped: Recording, plan: Plan) -> None:
+def test_of_gates_in_one_process_each_chain_has_its_own_rows(
+    shaped: Recording, plan: ChainPlan
+) -> None:
     rows = shaped.events["gate_release"]
     own, others = (rows.with_columns(gate=pl.lit(name)) for name in ("chainshaper_t3", "another"))
     both = replace(shaped, events={**shaped.events, "gate_release": pl.concat([own, others])})

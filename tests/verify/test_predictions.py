@@ -12,9 +12,17 @@ from rich.console import Console
 
 from chainshaper import compare_recordings, measure_latency
 from chainshaper.analysis import LatencyAnalysis, latency_statistics
-from chainshaper.planning import Modes, Plan, PlanRequest, Profile, plan_chain, publish_slots
+from chainshaper.planning import (
+    ChainPlan,
+    Modes,
+    Plan,
+    PlanRequest,
+    Profile,
+    plan_chain,
+    publish_slots,
+)
+from chainshaper.planning.chain_plan import Margin, revised
 from chainshaper.planning.overruns import GATE_NS, cycles_until_output, expected
-from chainshaper.planning.plan import Margin, revised
 from chainshaper.reporting.latency import late_text, prediction_json, prediction_table
 from chainshaper.values.recording import Recording
 from chainshaper.verify.predictions import JudgedPrediction, judge_prediction
@@ -50,7 +58,7 @@ def like(simulated: Recording) -> LatencyAnalysis:
     return measure_latency(simulated).analysis
 
 
-def _bands(bands: int = 3) -> Plan:
+def _bands(bands: int = 3) -> ChainPlan:
     return plan_chain(PROFILE, PlanRequest(bands=bands, publish_slot_ns=MS))
 
 
@@ -149,9 +157,9 @@ def test_each_mode_is_held_by_its_own_band(like: LatencyAnalysis) -> None:
 
 
 def test_the_plan_may_be_named_where_the_recording_does_not(
-    simulated: Recording, plan: Plan
+    simulated: Recording, plan: ChainPlan
 ) -> None:
-    first, second = compare_recordings([simulated, simulated], plan=plan).measurements
+    first, second = compare_recordings([simulated, simulated], plan=Plan.of(plan)).measurements
     assert first.prediction is None
     assert second.prediction is not None
     assert second.prediction.mean.holds is False

@@ -20,8 +20,8 @@ from chainshaper import (
     simulate,
     sweep,
 )
-from chainshaper.planning import PlanRequest
-from chainshaper.planning.plan import Margin, revised
+from chainshaper.planning import Plan, PlanRequest
+from chainshaper.planning.chain_plan import Margin, revised
 from chainshaper.reporting.latency import comparison_table, verdict
 from chainshaper.values import events
 from chainshaper.values.errors import InputError
@@ -52,8 +52,8 @@ def test_discarded_outputs_break_the_promise(tmp_path: Path) -> None:
     plan = plan_recording(
         simulate(application, tmp_path / "profile", cycles=400),
         request=PlanRequest(overrun="discard"),
-    )
-    recording = simulate(_slower(application), tmp_path / "shaped", plan, cycles=400)
+    ).chains[0]
+    recording = simulate(_slower(application), tmp_path / "shaped", Plan.of(plan), cycles=400)
     gone = recording.events["gate_release"]["release"].null_count()
     assert 200 < gone < 400
     measured = measure_latency(recording)
@@ -69,7 +69,7 @@ def test_discarded_outputs_break_the_promise(tmp_path: Path) -> None:
     assert f"promise broken: {gone} of 400 outputs missed" in compared.out
     said = json_of("compare", before, after)["recordings"][1]["prediction"]
     assert (said["missed"], said["due"], said["kept"]) == (gone, 400, False)
-    save_plan(plan, tmp_path / "plan.yaml")
+    save_plan(Plan.of(plan), tmp_path / "plan.yaml")
     simulated = called(
         "simulate", tmp_path / "small_chain.yaml", tmp_path / "plan.yaml", "-o", tmp_path / "again"
     )
@@ -80,10 +80,10 @@ def test_discarded_outputs_break_the_promise(tmp_path: Path) -> None:
 def test_a_sweep_judges_what_did_not_come_as_well(tmp_path: Path) -> None:
     application = small_chain(tmp_path)
     recording = simulate(application, tmp_path / "profile", cycles=400)
-    plan = plan_recording(recording, request=PlanRequest(overrun="discard"))
+    plan = plan_recording(recording, request=PlanRequest(overrun="discard")).chains[0]
     axes = {"seed": (1,)}
     frames = [
-        sweep(one, axes, tmp_path / f"{name}.parquet", plan, cycles=400)
+        sweep(one, axes, tmp_path / f"{name}.parquet", Plan.of(plan), cycles=400)
         for name, one in (("kept", application), ("broken", _slower(application)))
     ]
     kept, broken = (frame.row(0, named=True) for frame in frames)
@@ -148,17 +148,21 @@ def test_recordings_of_other_periods_are_said_to_be_of_other_applications(tmp_pa
     assert "every 125 ms in two: these are different applications" in known(compared.remark)
     assert known(compared.remark) in known(comparison_table(compared).caption)
     assert compare_recordings([one, one]).remark is None
-    plan = plan_recording(one)
+    plan = plan_recording(one).chains[0]
     with pytest.raises(InputError, match=r"starts every 125 ms there, and the plan's cycle is"):
-        compare_recordings([one, two], plan=plan)
+        compare_recordings([one, two], plan=Plan.of(plan))
 
 
 def test_the_verdict_has_the_bound_that_it_judges_by(tmp_path: Path) -> None:
     recording = simulate(small_chain(tmp_path), tmp_path / "profile", cycles=400)
-    plans = [plan_recording(recording, request=PlanRequest(bands=bands)) for bands in (1, 3)]
+    plans = [
+        plan_recording(recording, request=PlanRequest(bands=bands)).chains[0] for bands in (1, 3)
+    ]
     said = []
     for number, plan in enumerate(plans):
-        shaped = simulate(small_chain(tmp_path), tmp_path / f"shaped{number}", plan, cycles=400)
+        shaped = simulate(
+            small_chain(tmp_path), tmp_path / f"shaped{number}", Plan.of(plan), cycles=400
+        )
         said.append(_text(measure_latency(shaped)))
     assert "promise met: jitter 0.000 ms, at most 1.000 ms; 0 of 400 outputs late" in said[0]
     assert re.search(

@@ -9,9 +9,9 @@ from command_line import called, json_of, refused
 from chainshaper import compare_chains, load_application, measure_latency, simulate
 from chainshaper.flow.plan import profile_chains
 from chainshaper.planning import PlanRequest, plan_application, publish_slots
-from chainshaper.planning.application_plan import ApplicationPlan, combined
-from chainshaper.planning.plan import publishing_servers, revised, with_slots
-from chainshaper.planning.plan_file import save_application_plan
+from chainshaper.planning.chain_plan import publishing_servers, revised, with_slots
+from chainshaper.planning.plan import Plan
+from chainshaper.planning.plan_file import save_plan
 from chainshaper.verify.predictions import due_of
 from chainshaper.workload.description import Application
 
@@ -41,7 +41,7 @@ def _application(folder: Path, count: int) -> Application:
     return load_application(path)
 
 
-def _planned(folder: Path, count: int, **wishes: Any) -> tuple[Application, ApplicationPlan]:
+def _planned(folder: Path, count: int, **wishes: Any) -> tuple[Application, Plan]:
     application = _application(folder, count)
     recording = simulate(application, folder / "before", cycles=60)
     chains = [f"/a{k}../b{k}" for k in range(count)]
@@ -59,7 +59,7 @@ def test_twenty_chains_on_eight_cores(tmp_path: Path) -> None:
     application, plan = _planned(tmp_path, CHAINS)
     assert len({server.core for server in plan.servers}) == CORES
     after = simulate(application, tmp_path / "after", plan, cycles=40, switches=True)
-    alone = simulate(application, tmp_path / "alone", plan.chains[0], cycles=40)
+    alone = simulate(application, tmp_path / "alone", Plan.of(plan.chains[0]), cycles=40)
     comparisons = compare_chains([tmp_path / "before", after])
     assert [one.chain for one in comparisons] == [chain.chain.spec for chain in plan.chains]
     for chain, comparison in zip(plan.chains, comparisons, strict=True):
@@ -93,8 +93,8 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     early, other = plan.chains[8], plan.chains[0]
     (server,) = publishing_servers(early)
     slots = {server.name: [(2 * MS, 3 * MS)]}
-    both = combined([other, revised(early, servers=with_slots(early.servers, slots))])
-    save_application_plan(both, folder / "plan.yaml")
+    both = Plan.of(other, revised(early, servers=with_slots(early.servers, slots)))
+    save_plan(both, folder / "plan.yaml")
     simulate(application, folder / "after", both, cycles=60)
     return folder
 

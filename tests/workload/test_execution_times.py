@@ -2,18 +2,18 @@
 
 import threading
 import time
-from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from chainshaper.workload.description import ExecutionTime
 from chainshaper.workload.execution import BLOCK, ExecutionTimes, draw, spend
 
-UNIFORM = {"uniform_ns": (5_000_000, 15_000_000)}
-NORMAL = {"normal_ns": (8_000_000, 2_000_000), "within_ns": (7_000_000, 14_000_000)}
-CONSTANT = {"constant_ns": 100_000}
+UNIFORM = ExecutionTime(uniform_ns=(5_000_000, 15_000_000))
+NORMAL = ExecutionTime(normal_ns=(8_000_000, 2_000_000), within_ns=(7_000_000, 14_000_000))
+CONSTANT = ExecutionTime(constant_ns=100_000)
 
 
 def _first(count: int, times: ExecutionTimes) -> list[int]:
@@ -30,7 +30,7 @@ def test_seed_node_and_index_determine_the_sequence() -> None:
 @pytest.mark.parametrize("execution", [UNIFORM, NORMAL])
 @given(refills=st.lists(st.integers(1, 3 * BLOCK), min_size=1, max_size=3))
 def test_drawing_ahead_does_not_change_the_sequence(
-    execution: dict[str, Any], refills: list[int]
+    execution: ExecutionTime, refills: list[int]
 ) -> None:
     """A long run and a short one spend the same time in the same instance."""
     one_by_one = _first(3 * BLOCK, ExecutionTimes(execution, 1, "/node1", 0))
@@ -45,7 +45,7 @@ def test_drawing_ahead_does_not_change_the_sequence(
 
 def test_values_stay_within_their_limits_and_fill_them() -> None:
     random = np.random.default_rng(3)
-    uniform = draw({"uniform_ns": (10, 12)}, 2000, random)
+    uniform = draw(ExecutionTime(uniform_ns=(10, 12)), 2000, random)
     assert set(uniform.tolist()) == {10, 11, 12}, "both ends belong to it"
     normal = draw(NORMAL, 20_000, random)
     assert normal.min() >= 7_000_000

@@ -28,7 +28,7 @@ from chainshaper.workload.description import Application
 from chainshaper.workload.event_log import LAYOUT, WIDTH, EventLog
 from chainshaper.workload.executor import (
     AsynchronousWriter,
-    Executor,
+    NodeExecutor,
     SubscriptionEntity,
     Synchroniser,
     Timer,
@@ -59,7 +59,7 @@ class Bench:
 
     participant: Any
     log: EventLog
-    executor: Executor
+    executor: NodeExecutor
     diary: list[str] = field(default_factory=list)
     handles: int = 0
 
@@ -121,7 +121,7 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
     monkeypatch.setenv("CYCLONEDDS_URI", dds.closed_domain_configuration())
     log = EventLog()
     participant = dds.Participant(dds.free_domain())
-    return Bench(participant, log, Executor(participant, log))
+    return Bench(participant, log, NodeExecutor(participant, log))
 
 
 def _send(*publishers: dds.Publisher) -> None:
@@ -138,7 +138,7 @@ def test_threads_run_callbacks_beside_each_other_unless_they_are_in_one_group(
     bench: Bench, groups: tuple[str | None, str | None], beside: bool
 ) -> None:
     """Both wait for each other, in vain if one begins when the other has ended."""
-    bench.executor = Executor(bench.participant, bench.log, threads=2)
+    bench.executor = NodeExecutor(bench.participant, bench.log, threads=2)
     meeting = threading.Barrier(2)
     met, running, most = [], [0], [0]
 
@@ -361,10 +361,12 @@ def test_the_publication_is_when_the_message_was_sent_not_handed_over(tmp_path: 
     assert (handed_over["time"] <= handed_over["time_sent"]).all()
 
     request = PlanRequest(publication="asynchronous", publish_slot_ns=10 * MS)
-    plan = plan_recording(recording, request=request)
+    plan = plan_recording(recording, request=request).chains[0]
     assert plan.chain.output_depth == 10
     assert plan.evidence.longest_send_ns in sends["duration"].to_list()
-    assert plan_recording(recording).evidence.longest_send_ns is None, "nobody's thread is gated"
+    assert plan_recording(recording).chains[0].evidence.longest_send_ns is None, (
+        "nobody's thread is gated"
+    )
 
 
 @pytest.mark.parametrize(

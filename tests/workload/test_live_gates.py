@@ -16,8 +16,8 @@ from chainshaper import (
     shape_application,
     simulate,
 )
-from chainshaper.planning import Modes, Plan, PlanRequest
-from chainshaper.planning.plan import revised
+from chainshaper.planning import ChainPlan, Modes, Plan, PlanRequest
+from chainshaper.planning.chain_plan import revised
 from chainshaper.splicing.application import splice_application
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import Recording
@@ -30,8 +30,8 @@ pytestmark = pytest.mark.timed
 def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path, unshaped: Recording) -> None:
     """The slot of /t1 comes behind the end of fast callbacks, in the same cycle."""
     application = small_chain(tmp_path)
-    plan = plan_recording(unshaped, request=PlanRequest(policy="let-per-callback"))
-    shaped = shape_application(application, plan, tmp_path / "shaped", cycles=20)
+    plan = plan_recording(unshaped, request=PlanRequest(policy="let-per-callback")).chains[0]
+    shaped = shape_application(application, Plan.of(plan), tmp_path / "shaped", cycles=20)
 
     releases = shaped.events["gate_release"].filter(pl.col("overrun").is_null())
     held = releases.select("pid", "cycles_waited", since=pl.col("release") - pl.col("origin"))
@@ -41,7 +41,7 @@ def test_let_per_callback_has_no_jitter_of_a_period(tmp_path: Path, unshaped: Re
     # A thread that woke behind its slot is an overrun, and later by whole cycles.
     assert latencies.min() >= 3 * PERIOD_NS  # type: ignore[operator]
     assert (latencies < 3.5 * PERIOD_NS).sum() >= 0.8 * latencies.len()
-    simulated = simulate(application, tmp_path / "simulated", plan, cycles=20)
+    simulated = simulate(application, tmp_path / "simulated", Plan.of(plan), cycles=20)
     assert measure_latency(simulated).analysis.statistics.jitter_ns == 0
 
 
@@ -126,7 +126,7 @@ def with_driver(folder: Path, driver: str = DRIVER) -> Application:
     return load_application(path)
 
 
-def with_modes(plan: Plan) -> Plan:
+def with_modes(plan: ChainPlan) -> ChainPlan:
     """The plan of the small chain, with a second slot before its own."""
     servers = tuple(
         server.model_copy(update={"slots": SLOTS}) if server.name == "output" else server
@@ -136,11 +136,13 @@ def with_modes(plan: Plan) -> Plan:
 
 
 @pytest.fixture(scope="module")
-def recording(tmp_path_factory: pytest.TempPathFactory, plan: Plan) -> Recording:
+def recording(tmp_path_factory: pytest.TempPathFactory, plan: ChainPlan) -> Recording:
     folder = tmp_path_factory.mktemp("modes")
     application = with_driver(folder)
     return calm_run(
-        lambda place: shape_application(application, with_modes(plan), place / "rec", cycles=24),
+        lambda place: shape_application(
+            application, Plan.of(with_modes(plan)), place / "rec", cycles=24
+        ),
         folder,
     )
 
@@ -184,7 +186,7 @@ def test_the_gate_and_the_profile_take_each_cycle_for_one_of_the_same_mode(
         assert profile.of_modes[mode].every.size == decided.filter(mode=mode).height > 0
 
 
-def test_modes_that_nobody_announces_are_refused(tmp_path: Path, plan: Plan) -> None:
+def test_modes_that_nobody_announces_are_refused(tmp_path: Path, plan: ChainPlan) -> None:
     silent = with_driver(tmp_path, DRIVER.replace(f"announces: [{', '.join(ANNOUNCED)}], ", ""))
     with pytest.raises(InputError, match=r"named on /mode, but no callback .*`announces`"):
-        splice_application(silent, with_modes(plan))
+        splice_application(silent, Plan.of(with_modes(plan)))

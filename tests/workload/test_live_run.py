@@ -16,12 +16,12 @@ import chainshaper as cs
 from chainshaper import measure_latency, run_application
 from chainshaper.analysis import data_flow
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
-from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.values.errors import InputError, OperationError, PlatformError
 from chainshaper.values.recording import Recording, ThreadInfo
-from chainshaper.workload import live
-from chainshaper.workload.description import load_application
+from chainshaper.workload.description import ExecutionTime, load_application
 from chainshaper.workload.execution import ExecutionTimes
+from chainshaper.workload.timing import WARM_UP_CYCLES
 
 pytestmark = pytest.mark.timed
 
@@ -140,20 +140,22 @@ def test_without_privileges_threads_have_their_cores_and_the_recording_says_so(
 def test_the_seed_determines_the_execution_times(privileged: Recording, shaped: Recording) -> None:
     """Each instance spends what its place in the sequence says, and little more, shaped or not."""
     for node in ("/first", "/second", "/third"):
-        drawn = ExecutionTimes({"uniform_ns": (1_000_000, 4_000_000)}, 7, node, 0)
-        expected = np.array([drawn.next() for _ in range(live.WARM_UP_CYCLES + CYCLES)])
+        drawn = ExecutionTimes(ExecutionTime(uniform_ns=(1_000_000, 4_000_000)), 7, node, 0)
+        expected = np.array([drawn.next() for _ in range(WARM_UP_CYCLES + CYCLES)])
         for recording in (privileged, shaped):
             (pid,) = (pid for pid, name in recording.info.processes.items() if name == node)
             start, end = (
                 recording.events[name].filter(pid=pid)["thread_time"].to_numpy()
                 for name in ("callback_start", "callback_end")
             )
-            excess = (end - start) - expected[live.WARM_UP_CYCLES :]
+            excess = (end - start) - expected[WARM_UP_CYCLES:]
             assert (excess >= 0).all(), f"{node} computed for less than was drawn"
             assert np.median(excess) < 500_000, "that is not the drawn sequence"
 
 
-def test_shaped_outputs_leave_in_their_slot_or_are_counted(shaped: Recording, plan: Plan) -> None:
+def test_shaped_outputs_leave_in_their_slot_or_are_counted(
+    shaped: Recording, plan: ChainPlan
+) -> None:
     """Every message left inside a slot, or overran it and left at once, as the plan has it."""
     releases = shaped.events["gate_release"]
     assert set(releases["anchor"]) == {"stamp"}

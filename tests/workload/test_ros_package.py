@@ -18,6 +18,7 @@ from ros2 import ros2_environment
 import chainshaper as cs
 from chainshaper.analysis import data_flow
 from chainshaper.linux.scheduling import may_use_fifo
+from chainshaper.workload.description import ExecutionTime
 from chainshaper.workload.execution import draw
 
 ROOT = Path(__file__).parents[2]
@@ -219,7 +220,7 @@ def test_times_are_drawn_and_spent_as_the_live_workload_does(tmp_path: Path) -> 
     drawn = [np.array(line.split(), dtype=np.int64) for line in lines]
     for number, (name, described) in enumerate(DISTRIBUTIONS.items()):
         first, again, other = drawn[3 * number : 3 * number + 3]
-        expected = draw(described, 20_000, np.random.default_rng(1))
+        expected = draw(ExecutionTime(**described), 20_000, np.random.default_rng(1))
         assert (first == again).all(), "the same seed"
         assert (first == other).all() == (name in ("constant", "stretches")), name
         assert (first.min(), first.max()) == pytest.approx(

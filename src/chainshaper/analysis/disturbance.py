@@ -85,7 +85,11 @@ def with_punctuality(
     decided = releases.filter(pl.col("hop") == len(chain.callbacks) - 1).drop("hop")
     # A standby publishes at once what went around the gate: no slot was chosen for it.
     decided = decided.filter(pl.col("overrun").ne_missing("bypass"))
-    frame = traversals.frame.join(decided, on="traversal", how="left", maintain_order="left")
+    if decided.is_empty():  # nulls as the join would give them, which take no memory like this
+        columns = decided.drop("traversal").schema.items()
+        frame = traversals.frame.with_columns(pl.lit(None, kind).alias(n) for n, kind in columns)
+    else:
+        frame = traversals.frame.join(decided, on="traversal", how="left", maintain_order="left")
     start, end, counted_from = pl.col("start"), pl.col("end"), pl.col("origin")
     within = due_within(flow, chain, due)
     cycle_ns = within if due is None else due.cycle_ns
@@ -123,11 +127,12 @@ def _expected(flow: DataFlow, traversals: Traversals, period_ns: int | None) -> 
     due = [own.select("start", expected=timer_due(own["start"], period_ns)) for own in processes]
     if not due:
         return pl.col("start")
-    known = pl.concat(due).unique("start", keep="first")
-    rows = traversals.frame.select("start").join(
-        known, on="start", how="left", maintain_order="left"
-    )
-    return pl.lit(rows.select(pl.coalesce("expected", "start")).to_series())
+    known = pl.concat(due)
+    if not known["start"].is_sorted():
+        known = known.sort("start", maintain_order=True)
+    # Every traversal's start is one of them; of equal ones the first counts.
+    place = known["start"].search_sorted(traversals.frame["start"])
+    return pl.lit(known.select(pl.coalesce("expected", "start")).to_series().gather(place))
 
 
 def timer_due(starts: pl.Series, period_ns: int) -> pl.Series:
@@ -212,6 +217,8 @@ def disturbed(flow: DataFlow, frame: pl.DataFrame, margin_ns: int = 0) -> Mask:
     ``frame`` is that of :func:`with_punctuality`, ``margin_ns`` the margin of the plan in force.
     """
     began, ended, core = _stalls(flow)
+    if not len(began):
+        return np.zeros(frame.height, dtype=np.bool_)
     complete, gated = frame["complete"].to_numpy(), frame["origin"].is_not_null().to_numpy()
     start, due, origin, computed, expected = (
         frame[name].fill_null(frame["start"]).to_numpy()

@@ -48,6 +48,10 @@ from chainshaper.values.application import INTERNAL_TOPICS, REQUEST, RESPONSE
 from chainshaper.values.recording import Recording
 
 _ACTION = "/_action/"
+_SPENT = ("callback_start", "callback_end", "rmw_publish", "rmw_take")
+"""The largest tables; the data flow has what hardly anybody looks up in them later."""
+MANY_ROWS = 1_000_000
+"""Tables that are larger are not kept beside the data flow: tens of MB each."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +91,15 @@ class DataFlow:
 def recorded_flow(recording: Recording) -> DataFlow:
     """Resolve a recording's events, with what it knows of the clocks and of lost events."""
     info = recording.info
-    return data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
+    flow = data_flow(recording.events, info.clock_offset_ns, complete=not any(info.lost.values()))
+    if isinstance(recording.events, events.ReadAgain):
+        recording.events.let_go([name for name in _SPENT if _many_rows(recording.events, name)])
+    return flow
+
+
+def _many_rows(tables: events.EventTables, name: str) -> bool:
+    """Whether a table takes more memory than reading it again takes time."""
+    return events.table(tables, name).height > MANY_ROWS
 
 
 def data_flow(
@@ -321,9 +333,11 @@ def _with_assumed_readers(
         assumed = first_after(assumed, looks.sort("end"), ["pid", "tid"], "start", "end")
         end = pl.when("by_executor").then("end")
         assumed = assumed.with_columns(end=end, assumed=end.is_null())
+    assumed = assumed.drop("by_executor")
     every = pl.concat([instances.drop("instance"), assumed], how="diagonal_relaxed")
     every = every.sort("start", maintain_order=True).with_row_index("instance")
-    of_take = by_number(every.drop_nulls("take"), "take", "instance", taken.height)
+    reading = every.select("take", "instance").drop_nulls("take")
+    of_take = by_number(reading, "take", "instance", taken.height)
     return every.select(instances.columns), taken.with_columns(assumed_instance=of_take)
 
 

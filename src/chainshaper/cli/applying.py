@@ -38,7 +38,7 @@ def threads(
     from chainshaper.reporting.overviews import threads_json, threads_table
 
     pid = int(where) if where is not None and where.isdecimal() else None
-    plan = None if where is None or pid is not None else cs.load_application_plan(where)
+    plan = None if where is None or pid is not None else cs.load_plan(where)
     known = opt.recording_of(recording)
     found = cs.find_threads(plan if pid is None else pid, known, users=user or ())
     if out.present(json, threads_json(found), threads_table(found)):
@@ -85,7 +85,7 @@ def apply(
     from chainshaper.linux.own_processes import end_in_words
     from chainshaper.reporting.overviews import changes_table, servers_table
 
-    planned = cs.load_application_plan(plan)
+    planned = cs.load_plan(plan)
     opt.refuse_bound_alone(max_latency, adapt)
     how: dict[str, Any] = {"recording": opt.recording_of(recording), "phase_ns": phase}
     how["users"] = user or ()

@@ -167,9 +167,9 @@ NODE: NodeChoice = option(
 )
 
 
-def plan_in_force(path: Path | None) -> "cs.ApplicationPlan | None":
+def plan_in_force(path: Path | None) -> "cs.Plan | None":
     """The plan of a file, if one is named."""
-    return None if path is None else cs.load_application_plan(path)
+    return None if path is None else cs.load_plan(path)
 
 
 _WISHES = {field.name: field for field in fields(Wishes)}
@@ -283,9 +283,7 @@ def modes_of(text: str | None, late: Late | None) -> "Modes | None":
         return Modes(topic=topic, default=pairs[0][0], bands=bands, late=late or "publish")
 
 
-def recording_of(
-    named: Path | None, plan: "cs.ApplicationPlan | None" = None
-) -> "cs.Recording | None":
+def recording_of(named: Path | None, plan: "cs.Plan | None" = None) -> "cs.Recording | None":
     """The recording that an option names, or else the first of the plan's own that is still there,
     whichever chain it was made for.
     """

@@ -80,12 +80,11 @@ def notes(lines: Iterable[str]) -> None:
         say(f"note: {line}")
 
 
-def warn(plan: "cs.Plan | cs.ApplicationPlan") -> None:
+def warn(plan: "cs.Plan") -> None:
     """Say what is doubtful about a plan, before it is used."""
     from chainshaper.planning import plan_warnings
-    from chainshaper.planning.application_plan import whole
 
-    notes(plan_warnings(*whole(plan).chains))
+    notes(plan_warnings(*plan.chains))
 
 
 @contextmanager

@@ -42,6 +42,10 @@ def plan(
     ),
     mode_profile: list[str] | None = opt.MODE_PROFILE,
     sink: list[str] | None = opt.SINK,
+    convert: Path | None = opt.option(
+        "--convert OLD.yaml",
+        "Plan nothing: write the plan of an earlier version anew, to --output.",
+    ),
     json: bool = opt.JSON,
 ) -> None:
     """Plan the reservation servers of a chain: by default one publish slot behind its longest
@@ -57,6 +61,11 @@ def plan(
     from chainshaper.values.files import new_file
     from chainshaper.verify.measure import taken_chain
 
+    if convert is not None:
+        if recording is not None or latencies is not None or output is None:
+            raise InputError("--convert OLD.yaml goes with --output NEW.yaml, and nothing else")
+        _convert(convert, output, json)
+        return
     if (recording is None) == (latencies is None):
         raise InputError("give either a recording or --latencies FILE --period DURATION")
     if curve is not None and request.bands != "auto":
@@ -89,7 +98,7 @@ def plan(
     of_auto = request.bands == "auto"
     choice = planning.band_choice(made, planned[0], request, sinks) if of_auto else None
     if output is not None:
-        cs.save_plan(made, output)
+        cs.save_plan(cs.Plan.of(made), output)
     warnings = [*on_cores(profiles, request)[1], *doubts, *planning.plan_warnings(made)]
     values: dict[str, Any] = {**planning.plan_json(made), "warnings": warnings}
     tables = [overviews.plan_table(made)]
@@ -104,6 +113,13 @@ def plan(
         out.notes(warnings)
         for path in filter(None, (curve, output)):
             out.show_line(path)
+
+
+def _convert(earlier: Path, output: Path, json: bool) -> None:
+    """Write the plan of an earlier version as plans are written now."""
+    cs.save_plan(cs.convert_plan(earlier), output)
+    if out.present(json, {"files": [str(output)]}):
+        out.show_line(output)
 
 
 def _profiles(
@@ -143,18 +159,18 @@ def offsets(
     `plan` with a `--chain` for each measures that.
     """
     placed, remarks = cs.place_chains(
-        [chain for path in plans for chain in cs.load_application_plan(path).chains],
+        [chain for path in plans for chain in cs.load_plan(path).chains],
         time_limit_s=time_limit,
     )
     _print_several(placed, remarks, output, json)
 
 
 def _print_several(
-    placed: "Sequence[cs.Plan]", remarks: Sequence[str], output: Path | None, json: bool
+    placed: "Sequence[cs.ChainPlan]", remarks: Sequence[str], output: Path | None, json: bool
 ) -> None:
     """Plans of several chains, written as one plan of all, or into a folder with a plan each."""
     from chainshaper import planning
-    from chainshaper.planning.application_plan import combined
+    from chainshaper.planning.plan import Plan
     from chainshaper.planning.several_chains import with_own_names
     from chainshaper.reporting.overviews import plan_table
 
@@ -162,10 +178,10 @@ def _print_several(
     if output is not None and output.suffix not in opt.DESCRIPTIONS:
         written = planning.save_plans(placed, output)
     else:
-        joint = combined(with_own_names(placed))
+        joint = Plan.of(*with_own_names(placed))
         placed = joint.chains
         if output is not None:
-            cs.save_application_plan(joint, output)
+            cs.save_plan(joint, output)
     warnings = [*remarks, *planning.plan_warnings(*placed)]
     values = {"plans": [*map(planning.plan_json, placed)], "files": [*map(str, written)]}
     if out.present(json, values | {"warnings": warnings}, *map(plan_table, placed)):
@@ -317,7 +333,7 @@ def splice(
     elif plan is None or not files:
         raise InputError("give a plan and the launch files: `splice plan.yaml LAUNCH... -o DIR`")
     else:
-        planned = cs.load_application_plan(plan)
+        planned = cs.load_plan(plan)
         out.warn(planned)
         common |= {"message_type": message_type, "fallback": fallback}
         known = opt.recording_of(recording, planned)

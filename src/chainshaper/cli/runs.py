@@ -84,7 +84,10 @@ def demo(
     before, after = (one.recording for one in compared.measurements)
     flow = cs.data_flow(before.events, before.info.clock_offset_ns)
     tables = [callback_table(cs.callback_statistics(flow))]
-    tables += [plan_table(cs.load_plan(folder / "plan.yaml")), comparison_tables(compared)[0]]
+    tables += [
+        plan_table(cs.load_plan(folder / "plan.yaml").chains[0]),
+        comparison_tables(compared)[0],
+    ]
     if out.present(json, comparison_json(compared) | {"folder": str(folder)}, *tables):
         out.notes(dict.fromkeys((*before.info.notes, *after.info.notes)))
         out.show_line(folder.absolute())
@@ -118,7 +121,7 @@ def run(
     Every node is a process of its own, scheduled as the description says (SCHED_FIFO where it is
     permitted). The recording is a folder of Parquet tables.
     """
-    from chainshaper.workload.live import WARM_UP_CYCLES
+    from chainshaper.workload.timing import WARM_UP_CYCLES
 
     described = cs.load_application(application)
     with out.progress(f"running {described.name}") as report:
@@ -219,27 +222,27 @@ def record(
         raise InputError("a COMMAND is started, --pid attaches to what runs: give one of them")
     if not command and source not in ("ebpf", "preload"):
         raise InputError("no command given: add `-- ros2 launch …`, or to attach --source ebpf")
-    how: dict[str, Any] = {"pids": pid or [], "users": user or [], "watch_stalls": watch_stalls}
-    how |= {"source": source, "duration_ns": duration}
-    _record_and_show(output, command or [], json, buffer, **how)
-
-
-def _record_and_show(
-    output: Path, command: list[str], json: bool, buffer: int | None, **how: Any
-) -> None:
-    """Record, and say what came of it; ``how`` goes to :func:`chainshaper.record_command`."""
-    from chainshaper.linux.own_processes import end_in_words
-
     with out.stop_on_signals() as stop:
         recorded = cs.record_command(
             output,
-            command,
-            command_stdout=STDERR if json else None,  # standard output is ours
+            command or [],
+            source=source,
+            duration_ns=duration,
+            pids=pid or [],
+            users=user or [],
             buffer=buffer and buffer << 20,
+            watch_stalls=watch_stalls,
+            command_stdout=STDERR if json else None,  # standard output is ours
             stop=stop,
             progress=out.stage_lines("record"),
-            **how,
         )
+    _show_recorded(recorded, json=json)
+
+
+def _show_recorded(recorded: "cs.Recorded", *, json: bool) -> None:
+    """Show what was recorded. Raises OperationError: the command ended with an error."""
+    from chainshaper.linux.own_processes import end_in_words
+
     recording = recorded.recording
     events = int(cs.event_counts(recording)["count"].sum())
     values = {
@@ -503,19 +506,27 @@ def profile(
             out.notes(["chains that share a core delay each other here: profile them one by one"])
     if request.best_effort and not core_of:
         raise InputError("--best-effort is beside a chain: add --chain and --like, or --node")
-    _record_and_show(
-        *(output, command, json, buffer),
-        source=source,
-        duration_ns=duration,
-        chain=chains[0] if chains else None,
-        scheduling=cs.profiling_condition(
-            *(core_of, core_of or cores[0]),
-            like=earlier,
-            best_effort=best_effort_cores(seen, request, core_of),
-            policy=request.policy,
-        ),
-        watch_stalls=True,
-    )
+    with out.stop_on_signals() as stop:
+        recorded = cs.record_command(
+            output,
+            command,
+            source=source,
+            duration_ns=duration,
+            buffer=buffer and buffer << 20,
+            chain=chains[0] if chains else None,
+            scheduling=cs.profiling_condition(
+                core_of,
+                core_of or cores[0],
+                like=earlier,
+                best_effort=best_effort_cores(seen, request, core_of),
+                policy=request.policy,
+            ),
+            watch_stalls=True,
+            command_stdout=STDERR if json else None,  # standard output is ours
+            stop=stop,
+            progress=out.stage_lines("record"),
+        )
+    _show_recorded(recorded, json=json)
 
 
 @opt.takes_wishes(*opt.PLAN_WISHES)
@@ -574,48 +585,62 @@ def shape(
     and --adapt are for this, and mean what they mean for `chainshaper plan` and `apply`.
     """
     opt.refuse_bound_alone(max_latency, adapt)
-    following: dict[str, Any] = {"adapt": adapt, "max_latency_ns": max_latency}
     if len(words) == 2 and words[0].endswith(opt.DESCRIPTIONS):
         if chain or sink or throttle or mode_profile or request != cs.PlanRequest():
             raise InputError("a described application is shaped as plan.yaml says: plan it so")
-        how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, **following}
-        _shape_described(Path(words[0]), Path(words[1]), output, strict, how)
+        application, planned = cs.load_application(words[0]), cs.load_application_plan(words[1])
+        out.warn(planned)
+        with out.progress(f"shaping {application.name}") as report:
+            recording = cs.shape_application(
+                application,
+                planned,
+                output,
+                cycles=cycles,
+                realtime=realtime,
+                adapt=adapt,
+                max_latency_ns=max_latency,
+                command=sys.argv,
+                progress=report,
+            )
+        _show_shaped_recording(recording, strict=strict)
         return
     if Path(words[0]).suffix in opt.DESCRIPTIONS:
         raise InputError("a described application has its plan: `shape APP.yaml plan.yaml -o REC`")
-    _shape_launched(
-        *(words, output, json, strict),
-        chain=chain,
-        sinks=sink or (),
-        throttled=throttled_inputs(throttle or []),
-        period_ns=period,
-        mode_recordings=opt.mode_profiles(mode_profile, request),
-        since_ns=since,
-        until_ns=until,
-        duration_ns=duration,
-        source=source,
-        node=node,
-        back_end=backend,
-        request=request,
-        users=user or (),
-        **following,
-    )
+    with out.stop_on_signals() as stop:
+        shaped = cs.shape_launch(
+            words,
+            output,
+            chain=chain,
+            sinks=sink or (),
+            throttled=throttled_inputs(throttle or []),
+            choose=_ask if sys.stdin.isatty() and not json else None,
+            request=request,
+            period_ns=period,
+            mode_recordings=opt.mode_profiles(mode_profile, request),
+            since_ns=since,
+            until_ns=until,
+            duration_ns=duration,
+            source=source,
+            node=node,
+            back_end=backend,
+            adapt=adapt,
+            max_latency_ns=max_latency,
+            users=user or (),
+            stop=stop,
+            planned=out.warn,
+            progress=out.stage_lines("shape"),
+        )
+    _show_shaped_launch(shaped, strict=strict, json=json)
 
 
-def _shape_described(
-    application: Path, plan: Path, output: Path, strict: bool, how: dict[str, Any]
-) -> None:
+def _show_shaped_recording(recording: "cs.Recording", *, strict: bool) -> None:
+    """Show what a recording of a described application shows of its gates, and judge it."""
     from chainshaper.verify.overruns import dropped_text, overruns_text
 
-    described, planned = cs.load_application(application), cs.load_application_plan(plan)
-    out.warn(planned)
-    with out.progress(f"shaping {described.name}") as report:
-        how |= {"command": sys.argv, "progress": report}
-        recording = cs.shape_application(described, planned, output, **how)
     comparisons = cs.compare_chains([recording], least=1)
-    for one in comparisons:
-        about = f"{one.chain}: " if len(comparisons) > 1 else ""
-        (measured,) = one.measurements
+    for comparison in comparisons:
+        about = f"{comparison.chain}: " if len(comparisons) > 1 else ""
+        (measured,) = comparison.measurements
         if measured.overruns:
             out.notes([about + overruns_text(measured.overruns)])
         if measured.dropped:
@@ -625,26 +650,16 @@ def _shape_described(
     judge(comparisons, strict=strict, json=False)
 
 
-def _shape_launched(command: list[str], folder: Path, json: bool, strict: bool, **how: Any) -> None:
-    """Do the whole flow; ``how`` goes to :func:`chainshaper.shape_launch`."""
+def _show_shaped_launch(shaped: "cs.ShapedLaunch", *, strict: bool, json: bool) -> None:
+    """Show the comparison of a launched application's chains, and judge it."""
     from chainshaper.reporting.latency import comparison_json
 
-    with out.stop_on_signals() as stop:
-        shaped = cs.shape_launch(
-            command,
-            folder,
-            choose=_ask if sys.stdin.isatty() and not json else None,
-            stop=stop,
-            planned=out.warn,
-            progress=out.stage_lines("shape"),
-            **how,
-        )
     values = comparison_json(shaped.comparison) | {
         "folder": str(shaped.folder),
-        "chains": [comparison_json(one) for one in shaped.comparisons],
+        "chains": [comparison_json(comparison) for comparison in shaped.comparisons],
         "cores": dict(shaped.cores),
     }
-    tables = [table for one in shaped.comparisons for table in comparison_tables(one)]
+    tables = [table for comparison in shaped.comparisons for table in comparison_tables(comparison)]
     if out.present(json, values, *tables):
         out.notes(shaped.notes)
         out.show_line(shaped.folder)

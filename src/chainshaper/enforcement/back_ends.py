@@ -87,8 +87,10 @@ def make_back_end(
 
 
 class Fifo(BackEnd):
-    """Servers as SCHED_FIFO priorities, without slots; see :class:`BackEnd`. Threads have core and
-    priority already (:func:`.threads.plan_scheduling`); a shaping node's gate has to do the rest.
+    """Servers as SCHED_FIFO priorities, without slots; see :class:`BackEnd`.
+
+    Threads have core and priority already (:func:`.thread_scheduling.plan_scheduling`); a shaping
+    node's gate does the rest.
     """
 
     def __init__(self, table: ServerTable, journal: Journal) -> None:

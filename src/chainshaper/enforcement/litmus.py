@@ -154,9 +154,14 @@ def _active_plugin(proc: Path) -> str:
 def _run(command: Command) -> None:
     """Run a command of LITMUS^RT's; its complaint becomes ours."""
     text = f"`{' '.join(command)}`"
-    how: dict[str, Any] = {"env": tool_environment(), "timeout": _COMMAND_S}
     try:
-        done = subprocess.run(command, capture_output=True, check=False, **how)
+        done = subprocess.run(
+            command,
+            capture_output=True,
+            check=False,
+            env=tool_environment(),
+            timeout=_COMMAND_S,
+        )
     except (OSError, subprocess.TimeoutExpired) as error:
         raise OperationError(f"{text} cannot be run: {error}") from error
     if done.returncode:

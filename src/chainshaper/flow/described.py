@@ -6,16 +6,15 @@ from contextlib import ExitStack, contextmanager
 from functools import partial
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from chainshaper.enforcement.back_ends import choose_back_end, make_back_end
 from chainshaper.enforcement.guardian import run_claimed
 from chainshaper.flow.drift import SlotFollower
 from chainshaper.flow.plan import plan_recording
 from chainshaper.flow.threads import followed_chains, table_of
-from chainshaper.planning import Plan, PlanRequest, save_plan
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
-from chainshaper.planning.plan import Server, Thread
+from chainshaper.planning import ChainPlan, PlanRequest, save_plan
+from chainshaper.planning.chain_plan import Server, Thread
+from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.application import splice_application
@@ -37,7 +36,7 @@ _STANDARD = PlanRequest()
 
 def shape_application(
     application: Application,
-    plan: Plan | ApplicationPlan,
+    plan: Plan,
     output: str | Path,
     *,
     cycles: int = 320,
@@ -57,25 +56,24 @@ def shape_application(
     Raises InputError: the plan does not fit the application, or no slot can follow; PlatformError:
     threads cannot be frozen here; and as :func:`~chainshaper.workload.live.run_application`.
     """
-    joint = whole(plan)
-    if enforcement is None and gated_threads(joint):
-        enforcement = partial(threads_gated, joint)
+    if enforcement is None and gated_threads(plan):
+        enforcement = partial(threads_gated, plan)
     if adapt:
-        joint, reaches_ns, _ = followed_chains(joint, "fifo", max_latency_ns)
-        enforcement = partial(slots_followed, joint, reaches_ns, enforcement)
+        plan, reaches_ns, _ = followed_chains(plan, "fifo", max_latency_ns)
+        enforcement = partial(slots_followed, plan, reaches_ns, enforcement)
     return run_application(
-        splice_application(application, joint),
+        splice_application(application, plan),
         output,
         cycles=cycles,
         realtime=realtime,
-        plan=plan_values(joint),
+        plan=plan_values(plan),
         enforcement=enforcement,
         command=command,
         progress=progress,
     )
 
 
-def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
+def gated_threads(plan: Plan) -> list[tuple[Server, list[Thread]]]:
     """The servers without which a plan does not do what it says, and whom they gate: publishers,
     stages of pipelines, and where servers close at their slots' ends all that is in them, but for
     shaping nodes that see to their slots themselves.
@@ -102,7 +100,7 @@ def gated_threads(plan: ApplicationPlan) -> list[tuple[Server, list[Thread]]]:
 
 
 @contextmanager
-def threads_gated(plan: ApplicationPlan, nodes: StartedNodes) -> Iterator[None]:
+def threads_gated(plan: Plan, nodes: StartedNodes) -> Iterator[None]:
     """Inside, the :func:`gated_threads` of a plan run in the slots of their servers only (paper,
     section 3.2.1, design 1).
 
@@ -130,7 +128,7 @@ def threads_gated(plan: ApplicationPlan, nodes: StartedNodes) -> Iterator[None]:
 
 @contextmanager
 def slots_followed(
-    plan: ApplicationPlan,
+    plan: Plan,
     reaches_ns: Mapping[int, tuple[int, int]],
     enforcement: Enforcement | None,
     nodes: StartedNodes,
@@ -138,7 +136,7 @@ def slots_followed(
     """Inside, slots of gates follow latencies within their reach. Raises as ``enforcement``."""
     anchor_ns = nodes.start_ns if plan.moves_timers else nodes.anchor_ns
 
-    def from_when(chain: Plan, _: int) -> int:
+    def from_when(chain: ChainPlan, _: int) -> int:
         since = time.monotonic_ns() + 2 * chain.cycle_ns
         return since + (anchor_ns + chain.offset_ns + chain.cycle_ns // 2 - since) % chain.cycle_ns
 
@@ -194,7 +192,6 @@ def run_demo(
     folder = refuse_existing(folder)
     path = synthetic_chain() if application is None else Path(application)
     description = load_application(path)
-    how: dict[str, Any] = {"cycles": cycles, "realtime": realtime, "command": command}
 
     def part(start: float, title: str) -> Progress:
         return lambda done, what: progress(start + 0.48 * done, f"{title}, {what}")
@@ -204,7 +201,14 @@ def run_demo(
     try:
         folder.mkdir(exist_ok=True)
         write_whole(copy, [path.read_bytes()])
-        before = run_application(description, folder / "before", progress=report, **how)
+        before = run_application(
+            description,
+            folder / "before",
+            cycles=cycles,
+            realtime=realtime,
+            command=command,
+            progress=report,
+        )
     except OSError as error:
         raise OperationError(f"{folder}: cannot be written: {error}") from error
     finally:
@@ -217,7 +221,15 @@ def run_demo(
     save_plan(plan, folder / "plan.yaml")
     planned(plan)
     report = part(0.5, "shaped run")
-    after = shape_application(description, plan, folder / "after", progress=report, **how)
+    after = shape_application(
+        description,
+        plan,
+        folder / "after",
+        cycles=cycles,
+        realtime=realtime,
+        command=command,
+        progress=report,
+    )
     progress(0.98, "comparing")
     comparison = compare_recordings([before, after])
     write_comparison(comparison, folder)

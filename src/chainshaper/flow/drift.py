@@ -22,9 +22,9 @@ from itertools import pairwise
 from statistics import mean, median
 
 from chainshaper.enforcement.undoing import SlotMove
+from chainshaper.planning.chain_plan import Adaptation, ChainPlan, publish_slots
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, Tail
 from chainshaper.planning.offsets import chain_name
-from chainshaper.planning.plan import Adaptation, Plan, publish_slots
 from chainshaper.splicing.shaped_outputs import FollowedOutput
 from chainshaper.values.errors import ChainshaperError, OperationError
 
@@ -145,7 +145,7 @@ class SlotFollower:
 
     def __init__(
         self,
-        chain: Plan,
+        chain: ChainPlan,
         pids: Collection[int],
         reach_ns: tuple[int, int],
         put_in_force: Callable[[int], int],

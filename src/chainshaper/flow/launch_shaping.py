@@ -16,8 +16,9 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal, TypeAlias
+from typing import Literal, TypeAlias
 
 from chainshaper import planning
 from chainshaper.analysis import ChainEnumeration, graph_of, recorded_flow
@@ -28,12 +29,11 @@ from chainshaper.flow.exploration import list_chains
 from chainshaper.flow.launch_splicing import Splicing, ThrottledInput
 from chainshaper.flow.plan import profile_chains
 from chainshaper.flow.profiling import chain_nodes, profiled_cores, profiling_condition, undelayed
-from chainshaper.flow.record import record_command
+from chainshaper.flow.record import Scheduling, record_command
 from chainshaper.linux.processes import RunningProcess, run_users
 from chainshaper.linux.scheduling import check_cores, may_use_fifo
-from chainshaper.planning import ApplicationPlan, Plan, PlanRequest, Profile
+from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile
 from chainshaper.planning import request as requests
-from chainshaper.planning.application_plan import whole
 from chainshaper.planning.profile import doubts_about
 from chainshaper.reporting.figures import write_comparison
 from chainshaper.splicing.node_kinds import language_of
@@ -55,11 +55,11 @@ class ShapedLaunch:
 
     folder: Path
     chain: str  # the first
-    plan: Plan  # of the first chain
+    plan: ChainPlan  # of the first chain
     splicing: Splicing | None  # None: no output has a shaping node
     comparison: Comparison  # of the first chain
     notes: tuple[str, ...]
-    application: ApplicationPlan
+    application: Plan
     comparisons: tuple[Comparison, ...]  # of every chain and sink
     cores: Mapping[str, int]  # where each node's executor ran
 
@@ -88,7 +88,7 @@ def shape_launch(
     max_latency_ns: int | None = None,
     users: Collection[str | int] = (),
     stop: threading.Event | None = None,
-    planned: Callable[[Plan | ApplicationPlan], None] = lambda _: None,
+    planned: Callable[[Plan], None] = lambda _: None,
     progress: Callable[[float, str], None] = lambda *_: None,
 ) -> ShapedLaunch:
     """Measure chains of a launched application, plan, splice, apply, and measure again.
@@ -106,36 +106,12 @@ def shape_launch(
     """
     launch, request = parse_launch_command(command), request or PlanRequest()
     chains = [chain] if isinstance(chain, str) else [*(chain or ())]
-    known: Any = {
-        **{"period_ns": period_ns, "since_ns": since_ns, "until_ns": until_ns},
-        **{"modes": request.modes, "mode_recordings": mode_recordings or {}},
-    }
     _refuse_early(request, chains, sinks, throttled, bool(mode_recordings))
     if language_of(node, builds=True)[0] == "cpp":
         check_build_tools()
-    folder, stop, taken = refuse_existing(folder), stop or threading.Event(), run_users(users)
+    folder, user_ids = refuse_existing(folder), run_users(users)
     folder.mkdir(exist_ok=True)
-
-    def record(name: str, words: Sequence[str], lasting_ns: int, **how: Any) -> Recording:
-        done = record_command(
-            folder / name,
-            words,
-            source=source,
-            duration_ns=lasting_ns,
-            command_stdout=sys.stderr.fileno(),
-            watch_stalls=name != "first",
-            stop=stop,
-            progress=lambda share, what: progress(share, f"{name}: {what}"),
-            **how,
-        )
-        if stop.is_set() or done.exit_code is not None:
-            ended = "was stopped" if done.exit_code is None else "ended by itself"
-            raise OperationError(
-                f"the application {ended} during the recording {done.recording.path}, which stays;"
-                " nothing was shaped"
-            )
-        return done.recording
-
+    recorder = _Recorder(folder, source, stop or threading.Event(), progress)
     shaped, setup = list(command), list[str]()
     if throttled:
         request = replace(request, anchor="cycle")  # messages have the stamps of their sensors
@@ -144,71 +120,186 @@ def shape_launch(
         )
         launch, setup = replace(launch, file=next(iter(inputs.launch.values()))), _sourced(inputs)
         shaped = [*setup, *launch.with_file(launch.file)]
-    first = record("first", shaped, FIRST_LOOK_NS)
+    first = recorder.record("first", shaped, FIRST_LOOK_NS)
     chains = chains or [_chosen(first, choose)]
     wanted = (*chains, *sinks)
     seen, core_of = profiled_cores(first, wanted, request, period_ns)
     _refuse_at_first_look(seen, len(chains), request)
-    permitted = may_use_fifo()
-    found, measured = ([] if permitted else [NOT_PERMITTED]), dict[int, tuple[Recording, Profile]]()
-    for number, places in enumerate(undelayed(seen, core_of), start=1):
-        own = [wanted[place] for place in places]
-        cores = {node: core_of[node] for node in chain_nodes(first, *own)}
-        condition = profiling_condition(
-            *(cores, cores),
-            like=first,
-            before=requests.stages_before(seen, request),
-            best_effort=requests.best_effort_cores(seen, request, core_of),
-            policy=request.policy,
-        )
-        before = record(
-            *("before" if number == 1 else f"before_{number}", shaped, duration_ns),
-            scheduling=condition if permitted else None,
-            chain=own[0],
-        )
-        found += before.info.notes
-        profiles = profile_chains(before, own, **known)
-        measured |= {k: (before, one) for k, one in zip(places, profiles, strict=True)}
+    look = _FirstLook(first, wanted, seen, core_of)
+    profile = partial(
+        profile_chains,
+        period_ns=period_ns,
+        since_ns=since_ns,
+        until_ns=until_ns,
+        modes=request.modes,
+        mode_recordings=mode_recordings or {},
+    )
+    notes = [] if may_use_fifo() else [NOT_PERMITTED]
+    measured = _measured(
+        recorder,
+        shaped,
+        duration_ns=duration_ns,
+        look=look,
+        request=request,
+        profile=profile,
+        notes=notes,
+    )
     progress(0.0, "planning")
-    plan, remarks = _planned([measured[k][1] for k in range(len(wanted))], len(chains), request)
-    planning.save_application_plan(plan, folder / "plan.yaml")
-    planned(plan if len(plan.chains) > 1 else plan.chains[0])
-    found += remarks
+    profiles = [measured[place].profile for place in range(len(wanted))]
+    plan, remarks = _planned(profiles, len(chains), request)
+    planning.save_plan(plan, folder / "plan.yaml")
+    planned(plan)
+    notes += remarks
     splicing = None
     if plan.shaping_nodes:
+        recordings = [first, *(chain.recording for chain in measured.values())]
         splicing = launch_splicing.splice_launch_files(
-            *(plan, [launch.file], folder / "launch"),
+            plan,
+            [launch.file],
+            folder / "launch",
             node=node,
             builds=True,
-            recording=_with_types([first, *(before for before, _ in measured.values())], plan),
+            recording=_with_types(recordings, plan),
         )
-        found += splicing.notes
+        notes += splicing.notes
         shaped = [*setup, *_sourced(splicing), *launch.with_file(*set(splicing.launch.values()))]
-    after = record(
-        *("after", shaped, duration_ns),
-        scheduling=plan_in_force(
-            *(plan, back_end, first, taken, found), adapt=adapt, max_latency_ns=max_latency_ns
-        ),
+    in_force = plan_in_force(
+        plan, back_end, first, user_ids, notes, adapt=adapt, max_latency_ns=max_latency_ns
+    )
+    after = recorder.record(
+        "after",
+        shaped,
+        duration_ns,
+        scheduling=in_force,
         plan=plan,
         gate_logs=() if splicing is None else splicing.logs,
         chain=chains[0],
     )
     progress(0.0, "comparing")
-    comparisons = [compare_recordings([measured[k][0], after], one) for k, one in enumerate(wanted)]
-    for k, comparison in enumerate(comparisons):
-        write_comparison(comparison, folder / f"chain_{k + 1}" if k else folder)
-    found += after.info.notes
+    comparisons = [
+        compare_recordings([measured[place].recording, after], chain_or_sink)
+        for place, chain_or_sink in enumerate(wanted)
+    ]
+    for place, comparison in enumerate(comparisons):
+        write_comparison(comparison, folder / f"chain_{place + 1}" if place else folder)
+    notes += after.info.notes
     return ShapedLaunch(
         folder=folder,
         chain=chains[0],
         plan=plan.chains[0],
         splicing=splicing,
         comparison=comparisons[0],
-        notes=tuple(dict.fromkeys(found)),
+        notes=tuple(dict.fromkeys(notes)),
         application=plan,
         comparisons=tuple(comparisons),
         cores=core_of,
     )
+
+
+@dataclass(frozen=True)
+class _FirstLook:
+    """What the first, short recording shows of the chains and sinks that are wanted."""
+
+    recording: Recording
+    wanted: tuple[str, ...]
+    profiles: Sequence[Profile]
+    core_of: Mapping[str, int]  # where each node's executor runs
+
+
+@dataclass(frozen=True)
+class _MeasuredChain:
+    """A chain's profile, and the recording that it is of."""
+
+    recording: Recording
+    profile: Profile
+
+
+def _measured(
+    recorder: "_Recorder",
+    command: Sequence[str],
+    *,
+    duration_ns: int,
+    look: _FirstLook,
+    request: PlanRequest,
+    profile: Callable[[Recording, Sequence[str]], tuple[Profile, ...]],
+    notes: list[str],
+) -> dict[int, _MeasuredChain]:
+    """Record the chains under the profiling condition; what was measured, by place in ``wanted``.
+
+    Chains that would delay each other are recorded one after the other. Notes of the recordings
+    are added to ``notes``.
+    """
+    measured: dict[int, _MeasuredChain] = {}
+    for number, places in enumerate(undelayed(look.profiles, look.core_of), start=1):
+        chains = [look.wanted[place] for place in places]
+        cores = {node: look.core_of[node] for node in chain_nodes(look.recording, *chains)}
+        condition = profiling_condition(
+            cores,
+            cores,
+            like=look.recording,
+            before=requests.stages_before(look.profiles, request),
+            best_effort=requests.best_effort_cores(look.profiles, request, look.core_of),
+            policy=request.policy,
+        )
+        before = recorder.record(
+            "before" if number == 1 else f"before_{number}",
+            command,
+            duration_ns,
+            scheduling=condition if may_use_fifo() else None,
+            chain=chains[0],
+        )
+        notes += before.info.notes
+        for place, of_chain in zip(places, profile(before, chains), strict=True):
+            measured[place] = _MeasuredChain(before, of_chain)
+    return measured
+
+
+@dataclass(frozen=True)
+class _Recorder:
+    """Records the launched application again and again, into folders of one folder."""
+
+    folder: Path
+    source: Literal["lttng", "preload", "ebpf"] | None
+    stop: threading.Event
+    progress: Callable[[float, str], None]
+
+    def record(
+        self,
+        name: str,
+        command: Sequence[str],
+        duration_ns: int,
+        *,
+        scheduling: Scheduling | None = None,
+        plan: Plan | None = None,
+        gate_logs: Sequence[Path] = (),
+        chain: str | None = None,
+    ) -> Recording:
+        """Record for ``duration_ns``; the rest is as for :func:`.record_command`.
+
+        Raises OperationError: it was stopped, or the application ended by itself.
+        """
+        recorded = record_command(
+            self.folder / name,
+            command,
+            source=self.source,
+            duration_ns=duration_ns,
+            chain=chain,
+            scheduling=scheduling,
+            plan=plan,
+            gate_logs=gate_logs,
+            command_stdout=sys.stderr.fileno(),
+            watch_stalls=name != "first",
+            stop=self.stop,
+            progress=lambda share, doing: self.progress(share, f"{name}: {doing}"),
+        )
+        if self.stop.is_set() or recorded.exit_code is not None:
+            ended = "was stopped" if recorded.exit_code is None else "ended by itself"
+            path = recorded.recording.path
+            raise OperationError(
+                f"the application {ended} during the recording {path}, which stays;"
+                " nothing was shaped"
+            )
+        return recorded.recording
 
 
 def _refuse_early(
@@ -241,7 +332,7 @@ def _refuse_at_first_look(seen: Sequence[Profile], chains: int, request: PlanReq
 
 def _planned(
     profiles: Sequence[Profile], chains: int, request: PlanRequest
-) -> tuple[ApplicationPlan, list[str]]:
+) -> tuple[Plan, list[str]]:
     """The plan for the first of the profiles and its sinks, or for all; cores as measured."""
     if request.policy != "pipelined":  # whose stages may have a core twice
         request = replace(request, cores=None)
@@ -249,10 +340,10 @@ def _planned(
     if chains > 1:
         plan, remarks = planning.plan_application(profiles, request)
         return plan, remarks + doubts
-    return whole(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
+    return Plan.of(planning.plan_chain(profiles[0], request, profiles[1:])), doubts
 
 
-def _with_types(recordings: Sequence[Recording], plan: ApplicationPlan) -> Recording:
+def _with_types(recordings: Sequence[Recording], plan: Plan) -> Recording:
     """The first recording by whose end discovery had shown the types of all outputs, if any."""
     outputs = {node.output for node in plan.shaping_nodes}
 
@@ -285,20 +376,35 @@ def _sourced(splicing: Splicing) -> list[str]:
 
 @contextmanager
 def plan_in_force(
-    plan: ApplicationPlan,
+    plan: Plan,
     back_end: str,
     recording: Recording,
     users: frozenset[int],
     notes: list[str],
-    **how: Any,
+    *,
+    adapt: bool = False,
+    max_latency_ns: int | None = None,
 ) -> Iterator[Callable[[Sequence[RunningProcess]], bool]]:
-    """The plan in force on what runs, by a thread that does what `chainshaper apply` does (``how``)
-    until the context ends, which adds its ``notes``; it gives whether all servers have opened.
+    """Have a thread apply the plan to what runs, as `chainshaper apply` does, until the context
+    ends.
+
+    Yields a function that says whether all servers have opened. At the end the notes of the run
+    are added to ``notes``.
     """
     stop, states = threading.Event(), list[RunState]()
-    how |= {"back_end": back_end, "recording": recording, "users": users, "wait_ns": START_NS}
     with ThreadPoolExecutor(1, "apply") as beside:
-        applied = beside.submit(apply_plan, plan, **how, stop=stop, watch=states.append)
+        applied = beside.submit(
+            apply_plan,
+            plan,
+            back_end=back_end,
+            recording=recording,
+            adapt=adapt,
+            max_latency_ns=max_latency_ns,
+            wait_ns=START_NS,
+            users=users,
+            stop=stop,
+            watch=states.append,
+        )
 
         def opened(_: Sequence[RunningProcess]) -> bool:
             if applied.done():
@@ -306,7 +412,8 @@ def plan_in_force(
                 raise OperationError("the plan was released meanwhile")
             if not states:
                 return False
-            ours = [one for one in states[-1].servers if one.kept_by == states[-1].back_end]
+            state = states[-1]
+            ours = [server for server in state.servers if server.kept_by == state.back_end]
             return all(server.counters.slots for server in ours)
 
         try:

@@ -14,8 +14,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from chainshaper.planning.application_plan import ApplicationPlan, combined, whole
-from chainshaper.planning.plan import Plan, ShapingNode, revised, shaping_nodes
+from chainshaper.planning.chain_plan import ChainPlan, ShapingNode, revised, shaping_nodes
+from chainshaper.planning.plan import Plan
 from chainshaper.robot.throttling import Rule
 from chainshaper.sources.preload import ANY_ORDER, SANITIZER
 from chainshaper.sources.ros import own_environment, run_with_rclpy
@@ -77,7 +77,7 @@ class ThrottledInput(Part):
 
 
 def splice_launch_files(
-    plan: Plan | ApplicationPlan,
+    plan: Plan,
     launch_files: Sequence[str | Path],
     output: str | Path,
     *,
@@ -102,10 +102,9 @@ def splice_launch_files(
     folder is not ours. OperationError: the folder cannot be written, or a dry run finds too few or
     too many redirections. PlatformError: there is no ROS 2 environment for a dry run.
     """
-    joint = whole(plan)
     if fallback is not None:
-        joint = combined([revised(chain, fallback=fallback) for chain in joint.chains])
-    if without := [chain for chain in joint.chains if chain.shaping_node is None]:
+        plan = Plan.of(*[revised(chain, fallback=fallback) for chain in plan.chains])
+    if without := [chain for chain in plan.chains if chain.shaping_node is None]:
         raise nothing_to_splice(without[0])
     folder = launching.usable(Path(output))
     for path in (folder, *launch_files):
@@ -117,7 +116,7 @@ def splice_launch_files(
     known = _endpoints(recording, "publisher")
     every = [
         (chain, one, _publisher(chain, one, known))
-        for chain in joint.chains
+        for chain in plan.chains
         for one in shaping_nodes(chain)
     ]
     redirects = []
@@ -136,7 +135,7 @@ def splice_launch_files(
     if recording is not None:
         serialized = [one.output for _, one, _ in every if kinds.get(one.name) in _SERIALIZED]
         _refuse_undelivered(recording, {output: types.get(output, "") for output in serialized})
-    logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in joint.shaping_nodes}
+    logs = {one.name: folder / launching.LOGS / f"{one.name}.csv" for one in plan.shaping_nodes}
 
     def written(into: Path) -> _Written:
         made, blocks = list[ShapingProcess](), list[str]()
@@ -171,7 +170,7 @@ def splice_launch_files(
 
 
 def _kinds_of(
-    every: Sequence[tuple[Plan, ShapingNode, str]],
+    every: Sequence[tuple[ChainPlan, ShapingNode, str]],
     chosen: tuple[NodeLanguage, str],
     types: Mapping[str, str],
     recording: "Recording | None",
@@ -376,7 +375,7 @@ def _subscribers(one: ThrottledInput, known: _Names | None) -> Sequence[str]:
     return sorted(known[one.topic])
 
 
-def _publisher(plan: Plan, node: ShapingNode, known: _Names | None) -> str:
+def _publisher(plan: ChainPlan, node: ShapingNode, known: _Names | None) -> str:
     standby = f"/{node.name}{STANDBY}"
     names = sorted(name for name in (known or {}).get(node.output, ()) if name != standby)
     if len(names) > 1:

@@ -23,10 +23,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from chainshaper.enforcement.threads import Allocation
+from chainshaper.enforcement.node_threads import Allocation
 from chainshaper.linux.scheduling import become_fifo, set_state, state_of
 from chainshaper.linux.threads import has_ended, start_of
-from chainshaper.planning.plan import ShapingNode
+from chainshaper.planning.chain_plan import ShapingNode
 from chainshaper.splicing.shaped_outputs import ask_phase
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import OperationError

@@ -44,7 +44,7 @@ from chainshaper.values.yaml_file import wrong_values_refused
 from chainshaper.verify.measure import PARTS, chain_of, longest_stall, opened
 from chainshaper.verify.promises import NOT_PUBLISHED
 from chainshaper.workload.description import Application, node_name
-from chainshaper.workload.live import timing_of
+from chainshaper.workload.timing import timing_of
 
 DEFAULT_PRIORITY = 80
 _STANDARD = PlanRequest()
@@ -707,4 +707,4 @@ def plan_recording(
         raise InputError("one chain goes here: profile several, and plan with `plan_application`")
     wanted = (chain, *sinks)
     profile, *further = profile_chains(recording, wanted, period_ns=period_ns, modes=request.modes)
-    return plan_chain(profile, request, further)
+    return Plan.of(plan_chain(profile, request, further))

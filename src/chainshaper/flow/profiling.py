@@ -13,9 +13,10 @@ from types import MappingProxyType
 
 from chainshaper.analysis import find_chain, graph_of, recorded_flow
 from chainshaper.enforcement.guardian import run_claimed
+from chainshaper.enforcement.node_threads import Allocation, NodeThread, allocate
 from chainshaper.enforcement.scheduling_memory import change_all
 from chainshaper.enforcement.servers import ReservationServer
-from chainshaper.enforcement.threads import Allocation, NodeThread, allocate, scheduling_around
+from chainshaper.enforcement.thread_scheduling import scheduling_around
 from chainshaper.flow.plan import graph_stages, profile_chains, taking_part
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux.processes import RunningProcess
@@ -25,7 +26,7 @@ from chainshaper.linux.scheduling import (
     check_cores,
     may_use_fifo,
 )
-from chainshaper.planning.plan import PER_CALLBACK
+from chainshaper.planning.chain_plan import PER_CALLBACK
 from chainshaper.planning.profile import Profile
 from chainshaper.planning.request import PlanRequest, cores_for
 from chainshaper.planning.several_chains import beginning_together
@@ -96,7 +97,7 @@ def profiling_condition(
         around = scheduling_around(
             *(at_home, servers.values(), found, available_cores()), order=order, clear=clear
         )
-        wishes = [(one.thread.thread, one.wanted) for one in around]
+        wishes = [(one.node_thread.thread, one.scheduling) for one in around]
         wishes += [
             (one.thread, SchedulingRequest(0, (best_effort[node],)))
             for one in found.threads

@@ -22,7 +22,7 @@ from typing import TypeAlias, TypeVar
 
 from chainshaper.analysis.objects import resolve_objects
 from chainshaper.enforcement.journal import Governed, governing, in_force_throughout
-from chainshaper.enforcement.threads import allocate, strangers_text
+from chainshaper.enforcement.node_threads import allocate, strangers_text
 from chainshaper.flow.exploration import with_trace_events
 from chainshaper.flow.threads import recorded_processes
 from chainshaper.linux import processes as running
@@ -30,8 +30,7 @@ from chainshaper.linux.own_processes import check_command, end_command, end_in_w
 from chainshaper.linux.processes import RunningProcess, find_applications
 from chainshaper.linux.scheduling import available_cores, may_use_fifo
 from chainshaper.linux.threads import parents
-from chainshaper.planning import ApplicationPlan, Plan
-from chainshaper.planning.application_plan import whole
+from chainshaper.planning import Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.sources import Tracer, ebpf, lttng, preload
 from chainshaper.sources.ebpf.late_attachment import with_found_nodes
@@ -70,7 +69,7 @@ class Recorded:
 
 
 @dataclass
-class _Run:
+class _RecordedRun:
     """An application that is recorded, and what was seen of it."""
 
     tracer: Tracer
@@ -109,7 +108,7 @@ def record_command(
     buffer: int | None = None,
     chain: str | None = None,
     scheduling: Scheduling | None = None,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     gate_logs: Sequence[Path] = (),
     watch_stalls: bool = False,
     command_stdout: int | None = None,
@@ -144,7 +143,7 @@ def record_command(
     try:
         tracer = _tracer(source, folder, command, pids, buffer, users=taken)
         how = (command, duration_ns, stop or threading.Event(), progress, taken, pids)
-        run = _Run(tracer, folder, *how, gate_logs)
+        run = _RecordedRun(tracer, folder, *how, gate_logs)
         try:
             _trace(run, scheduling, command_stdout, stalls=watch_stalls)
             progress(1.0, "reading the events")
@@ -195,7 +194,9 @@ def _tracer(
     return ebpf.EbpfTracer(folder, command, pids, users)
 
 
-def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool) -> None:
+def _trace(
+    run: _RecordedRun, scheduling: Scheduling | None, stdout: int | None, *, stalls: bool
+) -> None:
     with ExitStack() as undo:
         if stalls:
             run.stalls = undo.enter_context(stalls_watched(available_cores(), may_use_fifo()))
@@ -224,7 +225,7 @@ def _trace(run: _Run, scheduling: Scheduling | None, stdout: int | None, *, stal
             run.endpoints, run.no_qos_because = ask_graph(run.environment)
 
 
-def _watch(run: _Run) -> None:
+def _watch(run: _RecordedRun) -> None:
     """Look at the application until it, its time (in force) or the tracer ends."""
     next_look = _FIRST_LOOK_NS
     while True:
@@ -259,7 +260,7 @@ def _watch(run: _Run) -> None:
         run.stop.wait(_STEP_S)
 
 
-def _look(run: _Run) -> None:
+def _look(run: _RecordedRun) -> None:
     """Which processes and threads there are, and a node's environment."""
     if run.pids:
         parent_of = parents()
@@ -283,9 +284,7 @@ def _look(run: _Run) -> None:
         run.in_force_ns = run.stalls.begin(far_from(releases_so_far(run.gate_logs)))
 
 
-def _written(
-    output: Path, run: _Run, chain: str | None, plan: Plan | ApplicationPlan | None
-) -> Recording:
+def _written(output: Path, run: _RecordedRun, chain: str | None, plan: Plan | None) -> Recording:
     tables, info = run.tracer.recording()
     if run.stalls.table is not None:
         tables = {**tables, "machine_stall": run.stalls.table}
@@ -326,7 +325,7 @@ def _written(
         "realtime": run.schedule is not None or in_real_time,
         "stall_meter": run.stalls.info,
         "chain": chain,
-        "plan": None if plan is None else plan_values(whole(plan)),
+        "plan": None if plan is None else plan_values(plan),
         "in_force": None if plan is None else recordings.InForceInfo(since_ns=since_ns),
         "notes": tuple(notes),
     }
@@ -337,7 +336,7 @@ def _written(
     return recordings.write_recording(output, tables, info)
 
 
-def _beside_events(run: _Run, what: str, ask: Callable[[], _T], otherwise: _T) -> _T:
+def _beside_events(run: _RecordedRun, what: str, ask: Callable[[], _T], otherwise: _T) -> _T:
     """What is known of an application beside its events, which are written whatever fails here."""
     try:
         return ask()

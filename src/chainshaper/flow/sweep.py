@@ -39,7 +39,7 @@ from chainshaper.analysis import latency_statistics
 from chainshaper.analysis.latency import PERCENTILES
 from chainshaper.flow.plan import profile_chains
 from chainshaper.linux.scheduling import available_cores
-from chainshaper.planning import Plan, PlanRequest, Profile, plan_chain
+from chainshaper.planning import ChainPlan, Plan, PlanRequest, Profile, plan_chain
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.simulation import simulate, simulate_latencies
 from chainshaper.simulation.system import build_system
@@ -106,7 +106,7 @@ class Grid:
     """What :func:`sweep` is asked for: every combination of the axes' values is a point."""
 
     application: Application
-    plan: Plan | None
+    plan: ChainPlan | None
     axes: Mapping[str, tuple[Any, ...]]
     cycles: int
 
@@ -138,8 +138,11 @@ def sweep(
     of another sweep. OperationError: the cluster failed, or the disk is full. PlatformError:
     `distributed` is not installed.
     """
+    if plan is not None and len(plan.chains) > 1:
+        raise InputError("the plan is of several chains, and that of one is wanted here")
     output = new_file(output, (".parquet",))
-    grid = grid_of(application, vary, plan, cycles=cycles, seed=seed)
+    of_chain = None if plan is None else plan.chains[0]
+    grid = grid_of(application, vary, of_chain, cycles=cycles, seed=seed)
     if workers is not None and workers < 1:
         raise InputError(f"{workers} workers compute nothing: ask for at least 1")
     points = points_of(grid)
@@ -223,7 +226,7 @@ def _expanded(written: Any) -> Iterator[Any]:
 def grid_of(
     application: Application,
     axes: Mapping[str, Sequence[Any]],
-    plan: Plan | None = None,
+    plan: ChainPlan | None = None,
     *,
     cycles: int,
     seed: int | None = None,
@@ -264,7 +267,7 @@ def _changes_application(name: str) -> bool:
     return name not in _WISHES and not name.startswith(PLAN)
 
 
-def _refuse_unknown(name: str, plan: Plan | None) -> None:
+def _refuse_unknown(name: str, plan: ChainPlan | None) -> None:
     if plan is not None and name in _WISHES:
         raise InputError(
             f"axis {name} is a wish for a plan, but a plan is given: leave it out, or vary a value"
@@ -306,13 +309,13 @@ def application_at(grid: Grid, values: Values) -> Application:
     return _changed(Application, described, changes, without=INTERFERENCE)
 
 
-def plan_at(grid: Grid, values: Values) -> Plan | None:
+def plan_at(grid: Grid, values: Values) -> ChainPlan | None:
     """The given plan with the point's values in it, if any. Raises InputError: that is no plan."""
     changes = {name: value for name, value in values.items() if name.startswith(PLAN)}
     if grid.plan is None or not changes:
         return grid.plan
     written = grid.plan.model_dump(mode="json", by_alias=True, context=AS_YAML)
-    return _changed(Plan, written, changes)
+    return _changed(ChainPlan, written, changes)
 
 
 def request_at(grid: Grid, values: Values) -> PlanRequest | None:
@@ -436,7 +439,7 @@ def row_at(
             plan = plan_chain(profile, request)
         latencies = simulate_latencies(
             application,
-            plan,
+            None if plan is None else Plan.of(plan),
             cycles=grid.cycles,
             seed=application.seed + OTHER_RUN,
             progress=progress,
@@ -451,7 +454,7 @@ def row_at(
     return {**figures, "seconds": round(time.perf_counter() - began, 6)}
 
 
-def _beside(plan: Plan, latencies: Any, incomplete: int) -> dict[str, Any]:
+def _beside(plan: ChainPlan, latencies: Any, incomplete: int) -> dict[str, Any]:
     """What the plan says, what became of its bands, and whether its promise was kept."""
     slots = slots_of_latency(plan)
     shares: Sequence[float | None] = plan.predicted.shares

@@ -20,28 +20,46 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, TypeAlias, cast
 from xml.etree import ElementTree
 
-from chainshaper.enforcement import threads as allocation
 from chainshaper.enforcement.back_ends import choose_back_end, gates
 from chainshaper.enforcement.litmus import litmus_commands
+from chainshaper.enforcement.node_threads import (
+    Allocation,
+    RecordedProcess,
+    RecordedThread,
+    allocate,
+    strangers_text,
+    with_gates,
+)
+from chainshaper.enforcement.planned_threads import (
+    absent_receivers,
+    closed_before,
+    first_planned,
+    server_members,
+    threads_for,
+)
 from chainshaper.enforcement.servers import ReservationServer, ServerTable
-from chainshaper.enforcement.threads import Allocation, RecordedProcess, RecordedThread, allocate
+from chainshaper.enforcement.thread_scheduling import (
+    WantedScheduling,
+    left_by_back_end,
+    plan_scheduling,
+    waiting_receivers,
+)
 from chainshaper.flow.phase import Phase, measure_phase
 from chainshaper.linux import processes as running
 from chainshaper.linux.processes import list_processes
 from chainshaper.linux.scheduling import available_cores
 from chainshaper.linux.threads import RunningThread, ThreadRole, of_another_clock, read_proc
-from chainshaper.planning import application_plan as joint
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
-from chainshaper.planning.offsets import LEAD_NS, chain_name, linked, with_windows
-from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
-from chainshaper.planning.plan import (
+from chainshaper.planning.chain_plan import (
     Adaptation,
-    Plan,
+    ChainPlan,
     Server,
     publisher_servers,
     revised,
     shaping_nodes,
 )
+from chainshaper.planning.offsets import LEAD_NS, chain_name, linked, with_windows
+from chainshaper.planning.overruns import Writer, check_publication, why_not_followed
+from chainshaper.planning.plan import Plan, open_until_done, reach, with_slots_moved
 from chainshaper.planning.request import simulated_stamps
 from chainshaper.values.errors import (
     ChainshaperError,
@@ -62,7 +80,7 @@ _LONGEST_SETTINGS = 1 << 20  # of a file of a node's parameters or profiles (byt
 
 
 def find_threads(
-    where: int | Plan | ApplicationPlan | None = None,
+    where: int | Plan | None = None,
     recording: "Recording | None" = None,
     *,
     recorded: Sequence[RecordedProcess] | None = None,
@@ -80,7 +98,7 @@ def find_threads(
     Raises InputError: there is no such process, or no such user.
     """
     processes, taken = list_processes(), running.run_users(users)
-    plan = None if where is None or isinstance(where, int) else whole(where)
+    plan = None if where is None or isinstance(where, int) else where
     shaping, servers = ((), ()) if plan is None else (plan.shaping_nodes, plan.servers)
     notes, strangers = tuple[str, ...](), None
     if recorded is None:
@@ -95,7 +113,7 @@ def find_threads(
     else:
         found = allocate(running.find_applications(processes), recorded, processes, taken)
         nodes = defaultdict[int, set[str]](set)
-        for one in allocation.with_gates(found, shaping).threads:
+        for one in with_gates(found, shaping).threads:
             nodes[one.thread.pid].update(one.nodes)
         planned = {thread.node: server.name for server in servers for thread in server.threads}
         hosted, chosen = None, [p for p in processes if nodes[p.pid] or p.participates]
@@ -103,15 +121,15 @@ def find_threads(
             hosted = ROUTERS.union(planned, *(node.receivers for node in shaping))
             chosen = [process for process in processes if nodes[process.pid] & hosted]
         chosen = [process for process in chosen if process.user in taken]
-        strangers = allocation.strangers_text(processes, taken, hosted)
+        strangers = strangers_text(processes, taken, hosted)
         there = sorted(set().union(*nodes.values()))
         seen = f"is not running, or cannot be recognised; running: {', '.join(there) or 'no node'}"
         missing = [(node, server) for node, server in planned.items() if node not in there]
         notes += tuple(f"node {node} of server {server} {seen}" for node, server in missing)
-        notes += tuple(filter(None, [allocation.absent_receivers(shaping, there)]))
+        notes += tuple(filter(None, [absent_receivers(shaping, there)]))
         if plan is None and not chosen:
             notes += ("no process looks like an application of ROS 2 or DDS",)
-    found = allocation.with_gates(allocate(chosen, recorded, processes, taken), shaping)
+    found = with_gates(allocate(chosen, recorded, processes, taken), shaping)
     if recorded and not any(one.nodes_known_by == "recording" for one in found.threads):
         notes += ("none of these processes is in the recording: they were started after it",)
     notes += found.notes + (() if strangers is None else (strangers,))
@@ -119,7 +137,7 @@ def find_threads(
 
 
 def evidence_of(
-    plan: ApplicationPlan | None, recording: "Recording | None" = None
+    plan: Plan | None, recording: "Recording | None" = None
 ) -> tuple[tuple["Recording", ...], tuple[str, ...]]:
     """The recordings that say which thread of an application does what: ``recording``, or else
     those that the plan names; and which of these cannot be read, in sentences.
@@ -199,7 +217,7 @@ def recorded_processes(
     return tuple(found), ()
 
 
-def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
+def refuse_simulated(plan: Plan, found: Allocation) -> None:
     """Raises InputError: slots count from stamps of nodes that, by commands, follow `/clock`."""
     stamped = [one for one in plan.chains if one.anchor == "stamp" and shaping_nodes(one)]
     servers = [server for one in stamped for server in one.servers]
@@ -209,7 +227,7 @@ def refuse_simulated(plan: ApplicationPlan, found: Allocation) -> None:
             raise InputError(simulated_stamps(node))
 
 
-def refuse_other_clocks(plan: ApplicationPlan, found: Allocation) -> None:
+def refuse_other_clocks(plan: Plan, found: Allocation) -> None:
     """Raises PlatformError: a shaping node, which gets its slots in our clock, has another."""
     shaping = {node.thread.node for node in plan.shaping_nodes}
     for node, pid in _processes_of(shaping, found):
@@ -240,7 +258,7 @@ def _follows_clock(pid: int) -> bool:
 
 
 def check_publishers(
-    plan: ApplicationPlan, found: Allocation, recordings: Iterable["Recording"] = ()
+    plan: Plan, found: Allocation, recordings: Iterable["Recording"] = ()
 ) -> list[str]:
     """What a person must know where a plan gates publishers' threads (design 1): whether processes
     publish so. Recordings know their writers. Raises InputError: as :func:`.check_publication`.
@@ -296,13 +314,13 @@ class Changes:
 
     back_end: str
     reason: str
-    threads: tuple[allocation.WantedScheduling, ...]
+    threads: tuple[WantedScheduling, ...]
     commands: tuple[tuple[str, ...], ...]
     notes: tuple[str, ...]
 
 
 def planned_changes(
-    plan: Plan | ApplicationPlan,
+    plan: Plan,
     back_end: str = "auto",
     *,
     recording: "Recording | None" = None,
@@ -310,7 +328,7 @@ def planned_changes(
     users: Collection[str | int] = (),
 ) -> Changes:
     """What :func:`.apply_plan` would do, with the same errors; of LITMUS^RT on any kernel."""
-    given, plan = whole(plan), open_until_done(whole(plan))
+    given, plan = plan, open_until_done(plan)
     table = server_table(plan)
     found = find_threads(plan, recording, users=users)
     if back_end != "litmus":
@@ -318,15 +336,15 @@ def planned_changes(
         refuse_unfit(plan, choice.name)
         refuse_simulated(plan, found)
         refuse_other_clocks(plan, found)
-        wanted = allocation.plan_scheduling(plan, found, available_cores())
-        threads = allocation.left_by_back_end(choice.name, wanted, plan.free_threads)
-        notes = (*found.notes, *allocation.waiting_receivers(plan, threads))
+        wanted = plan_scheduling(plan, found, available_cores())
+        threads = left_by_back_end(choice.name, wanted, plan.free_threads)
+        notes = (*found.notes, *waiting_receivers(plan, threads))
         return Changes(choice.name, choice.reason, threads, (), notes)
     notes, anchor_ns, members = found.notes, 0, dict[str, list[int | str]]()
     try:
         given, anchor_ns, waits_ns, _ = carried_out(given, found, phase_ns)
         table = server_table(open_until_done(given, waits_ns))
-        for name, group in allocation.server_members(plan, found).items():
+        for name, group in server_members(plan, found).items():
             members[name] = [member.thread.tid for member in group]
     except OperationError:
         members = {s.name: [f"TID:{t.node}" for t in s.threads] for s in plan.servers}
@@ -334,7 +352,7 @@ def planned_changes(
     return Changes("litmus", "asked for", (), litmus_commands(table, members, anchor_ns), notes)
 
 
-def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
+def refuse_unfit(plan: Plan, back_end: str) -> None:
     """Raises InputError: this back end cannot carry out all of the plan."""
     if not gates(back_end) and any(chain.offset_ns for chain in plan.chains):
         raise InputError(
@@ -354,8 +372,8 @@ def refuse_unfit(plan: ApplicationPlan, back_end: str) -> None:
 
 
 def followed_chains(
-    plan: ApplicationPlan, back_end: str, max_latency_ns: int | None = None
-) -> tuple[ApplicationPlan, dict[int, tuple[int, int]], list[str]]:
+    plan: Plan, back_end: str, max_latency_ns: int | None = None
+) -> tuple[Plan, dict[int, tuple[int, int]], list[str]]:
     """The plan, with ``max_latency_ns`` in it; how far slots that can follow their latencies may
     be moved (ns), by their chains' places; why others stay. Raises InputError: none can.
     """
@@ -372,8 +390,8 @@ def followed_chains(
                 other = chain_name(followed[server.name])
                 raise InputError(f"its server {server.name} is also that of {other}, which follows")
             chains[place] = revised(chain, adaptation=rules)
-            found = joint.reach(plan, place, rules.max_latency_ns)
-            furthest = (joint.with_slots_moved(plan, {place: by}) for by in found)
+            found = reach(plan, place, rules.max_latency_ns)
+            furthest = (with_slots_moved(plan, {place: by}) for by in found)
             tables = {server_table(open_until_done(one)) for one in (plan, *furthest)}
             if len(tables) > 1 and back_end not in ("freezer", "fifo"):
                 remedy = "choose freezer, or `shaping_thread: free`"
@@ -384,10 +402,10 @@ def followed_chains(
             reaches[place] = found
     if not reaches:
         raise InputError("; ".join(why_not))
-    return joint.combined(chains), reaches, why_not
+    return Plan.of(*chains), reaches, why_not
 
 
-def server_table(plan: ApplicationPlan) -> ServerTable:
+def server_table(plan: Plan) -> ServerTable:
     """The servers of a plan whose threads a back end has to keep inside their slots."""
     servers = [s for s in plan.servers if set(s.threads) - plan.free_threads]
     if not servers:
@@ -420,23 +438,23 @@ def places_in(server: Server, order: Sequence[str]) -> int:
     return max(1, len(ordered) + (len(ordered) < len(nodes)))
 
 
-def first_threads(plan: ApplicationPlan, found: Allocation) -> list[tuple[RunningThread, ...]]:
+def first_threads(plan: Plan, found: Allocation) -> list[tuple[RunningThread, ...]]:
     """The running threads that begin each chain: any of an executor's may, where it has several."""
-    allocation.server_members(plan, found)  # none is in two servers
+    server_members(plan, found)  # none is in two servers
     begin: list[tuple[RunningThread, ...]] = []
     for chain in plan.chains:
-        planned = allocation.first_planned(chain)
+        planned = first_planned(chain)
         if planned is None:
             raise OperationError(
                 f"no server of {chain_name(chain)} holds an executor, so nothing says where in a"
                 " cycle the chain begins: give its phase (--phase)"
             )
-        begin.append(tuple(one.thread for one in allocation.threads_for(planned, found)))
+        begin.append(tuple(one.thread for one in threads_for(planned, found)))
     return begin
 
 
 def chain_phases(
-    plan: ApplicationPlan,
+    plan: Plan,
     found: Allocation,
     progress: Callable[[float], None] = lambda _: None,
     known: Mapping[int, Phase] = MappingProxyType({}),
@@ -455,14 +473,14 @@ def chain_phases(
     return [known[k] if k in known else phases[one] for k, one in enumerate(wanted)]
 
 
-CarriedOut: TypeAlias = tuple[ApplicationPlan, int, list[int], list[Phase]]
+CarriedOut: TypeAlias = tuple[Plan, int, list[int], list[Phase]]
 """A plan as it is carried out, and from when on its cycles count (CLOCK_MONOTONIC, modulo the
 hyper-period). Where timers were measured: how long before slots they expire, and where.
 """
 
 
 def carried_out(
-    plan: ApplicationPlan,
+    plan: Plan,
     found: Allocation,
     phase_ns: int | None,
     *,
@@ -486,9 +504,7 @@ def carried_out(
     return plan, anchor_ns, waits_ns, phases
 
 
-def placed(
-    plan: ApplicationPlan, phases: Sequence[Phase], *, gated: bool = True
-) -> tuple[ApplicationPlan, int]:
+def placed(plan: Plan, phases: Sequence[Phase], *, gated: bool = True) -> tuple[Plan, int]:
     """The plan, and the instant of CLOCK_MONOTONIC, modulo the hyper-period, from which its cycles
     count, so that every slot opens :data:`LEAD_NS` after its chain's timer at least.
 
@@ -509,19 +525,19 @@ def placed(
         for k, chain in zip(group, own, strict=True):
             offset_ns = (chain.offset_ns + anchor_ns - first_ns) % chain.cycle_ns
             chains[k] = revised(chain, offset_ns=offset_ns)
-    return joint.combined(chains), first_ns or 0
+    return Plan.of(*chains), first_ns or 0
 
 
 def _around(
-    chains: Sequence[Plan], phases: Sequence[Phase], gated: bool
-) -> tuple[Sequence[Plan], int]:
+    chains: Sequence[ChainPlan], phases: Sequence[Phase], gated: bool
+) -> tuple[Sequence[ChainPlan], int]:
     """Chains that share cores, and from when on their cycles count."""
     # Waits only grow with the anchor, but where one starts again: the best is at such a place.
     hyper = math.lcm(*(chain.cycle_ns for chain in chains))
     ready = [phase.at_ns + LEAD_NS for phase in phases]
     begin = [(at - one.offset_ns, one.cycle_ns) for at, one in zip(ready, chains, strict=True)]
     candidates = {(at + n * cycle) % hyper for at, cycle in begin for n in range(hyper // cycle)}
-    most = [allocation.closed_before(chain) if gated else None for chain in chains]
+    most = [closed_before(chain) if gated else None for chain in chains]
 
     def cost(at: int) -> tuple[int, int]:
         waits = [LEAD_NS + (at - one) % cycle for one, cycle in begin]

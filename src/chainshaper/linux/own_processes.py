@@ -20,7 +20,7 @@ import site
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -72,11 +72,26 @@ def module_command(module: str, libraries: Sequence[str] = ()) -> list[str]:
     return [sys.executable, "-I", "-c", _START, package, ":".join(dict.fromkeys(folders)), module]
 
 
-def start_module(module: str, *arguments: str, **options: Any) -> "subprocess.Popen[bytes]":
-    """Start a module as a process of ours; we read its output, unless ``options`` say otherwise."""
-    pipes = {"stdin": subprocess.DEVNULL, "stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    command = [*module_command(module), *arguments]
-    return subprocess.Popen(command, start_new_session=True, **{**pipes, **options})
+def start_module(
+    module: str,
+    *arguments: str,
+    stdin: int = subprocess.DEVNULL,
+    stdout: int = subprocess.PIPE,
+    stderr: int = subprocess.PIPE,
+    pass_fds: Collection[int] = (),
+) -> "subprocess.Popen[bytes]":
+    """Start a module as a process of ours; we read its output and errors by default.
+
+    ``stdin``, ``stdout`` and ``stderr`` are as for Popen; it gets the descriptors ``pass_fds`` too.
+    """
+    return subprocess.Popen(
+        [*module_command(module), *arguments],
+        start_new_session=True,
+        stdin=stdin,
+        stdout=stdout,
+        stderr=stderr,
+        pass_fds=tuple(pass_fds),
+    )
 
 
 def named_folders() -> list[str]:

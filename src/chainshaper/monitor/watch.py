@@ -47,7 +47,7 @@ from chainshaper.monitor.metrics import (
     serving,
     tell_delivery,
 )
-from chainshaper.planning import ApplicationPlan, Plan
+from chainshaper.planning import ChainPlan, Plan
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.robot.clocks import clock_offset
 from chainshaper.sources.preload import (
@@ -272,7 +272,7 @@ class Watch:
         chains: Sequence[str],
         *,
         users: Collection[int],
-        plan: ApplicationPlan | None = None,
+        plan: Plan | None = None,
         longest_ns: int = 2 * SECOND,
         callbacks: bool = False,
     ) -> None:
@@ -300,7 +300,7 @@ class Watch:
     def _due(self, output: str) -> Due | None:
         return next((due for due in self.due if due.output in (None, output)), None)
 
-    def _plan_of(self, output: str) -> Plan | None:
+    def _plan_of(self, output: str) -> ChainPlan | None:
         """The plan whose promise is about a chain with this output."""
         plans = () if self.plan is None else self.plan.chains
         return next((one for one in plans if one.chain.output in (None, output)), None)

@@ -4,20 +4,19 @@ Everything starts with :func:`plan_shaping`; each further step takes a plan and 
 :func:`plan_chain` takes all of them that a :class:`PlanRequest` asks for.
 """
 
-from chainshaper.planning.application_plan import ApplicationPlan as ApplicationPlan
 from chainshaper.planning.bands import BandChoice as BandChoice
+from chainshaper.planning.chain_plan import ChainPlan as ChainPlan
+from chainshaper.planning.chain_plan import Modes as Modes
+from chainshaper.planning.chain_plan import band_predictions as band_predictions
+from chainshaper.planning.chain_plan import publish_slots as publish_slots
 from chainshaper.planning.margins import read_latencies as read_latencies
 from chainshaper.planning.offsets import place_chains as place_chains
 from chainshaper.planning.overruns import plan_warnings as plan_warnings
-from chainshaper.planning.plan import Modes as Modes
 from chainshaper.planning.plan import Plan as Plan
-from chainshaper.planning.plan import band_predictions as band_predictions
-from chainshaper.planning.plan import publish_slots as publish_slots
+from chainshaper.planning.plan_file import convert_plan as convert_plan
 from chainshaper.planning.plan_file import dump_plan as dump_plan
-from chainshaper.planning.plan_file import load_application_plan as load_application_plan
 from chainshaper.planning.plan_file import load_plan as load_plan
 from chainshaper.planning.plan_file import plan_json as plan_json
-from chainshaper.planning.plan_file import save_application_plan as save_application_plan
 from chainshaper.planning.plan_file import save_plan as save_plan
 from chainshaper.planning.plan_file import save_plans as save_plans
 from chainshaper.planning.profile import Profile as Profile

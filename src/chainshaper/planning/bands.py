@@ -32,9 +32,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from chainshaper import _core
-from chainshaper.planning import plan as plans
+from chainshaper.planning import chain_plan as plans
+from chainshaper.planning.chain_plan import ChainPlan, Prediction, Slot, publish_slots
 from chainshaper.planning.margins import check_latencies
-from chainshaper.planning.plan import Plan, Prediction, Slot, publish_slots
 from chainshaper.robot.gate import IntoOpenSlot
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError, extra_library
@@ -168,7 +168,7 @@ class BandChoice(NamedTuple):
 
 
 def with_bands(
-    plan: Plan,
+    plan: ChainPlan,
     latencies_ns: NDArray[np.int64],
     bands: int | Literal["auto"],
     *,
@@ -179,7 +179,7 @@ def with_bands(
     least_gain: float = 0.02,
     seed: int | None = None,
     **limits: Any,
-) -> Plan:
+) -> ChainPlan:
     """A shaped plan with ``bands`` publish slots of the plan's length (Δ); the last one stays.
 
     ``most_ns`` are the latencies where others delay all executions, behind which the average is
@@ -209,7 +209,7 @@ def with_bands(
 
 
 def choose_bands(
-    plan: Plan, latencies_ns: NDArray[np.int64], *, least_gain: float = 0.02, **limits: Any
+    plan: ChainPlan, latencies_ns: NDArray[np.int64], *, least_gain: float = 0.02, **limits: Any
 ) -> BandChoice:
     """What :func:`with_bands` takes for ``auto``: the first number of bands behind which another
     one gains less than ``least_gain`` of the average.
@@ -226,7 +226,9 @@ def choose_bands(
     return BandChoice(tuple(curve), chosen, f"stopped at {len(chosen.slot_ends_ns)}: {why}")
 
 
-def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: int) -> Plan:
+def with_long_slot(
+    plan: ChainPlan, latencies_ns: NDArray[np.int64], slot_start_ns: int
+) -> ChainPlan:
     """A shaped plan with one long publish slot, from ``slot_start_ns`` to where it ended before:
     the average falls and the jitter grows as it starts earlier (end of section 4.1).
     """
@@ -241,19 +243,21 @@ def with_long_slot(plan: Plan, latencies_ns: NDArray[np.int64], slot_start_ns: i
     return with_publish_slots(plan, slots, predicted=predicted, policy="one-long-slot")
 
 
-def _problem(plan: Plan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]) -> BandProblem:
+def _problem(
+    plan: ChainPlan, latencies_ns: NDArray[np.int64], limits: dict[str, Any]
+) -> BandProblem:
     start, end = _last_publish_slot(plan)
     limits = {**limits, "into_open_slot": plan.into_open_slot}
     return BandProblem(latencies_ns, end, publish_slot_ns=end - start, **limits)
 
 
-def _last_publish_slot(plan: Plan) -> Slot:
+def _last_publish_slot(plan: ChainPlan) -> Slot:
     if slots := publish_slots(plan):
         return slots[-1]
     raise InputError(f"a plan of policy {plan.policy} has no publish slot: plan shaping first")
 
 
-def with_publish_slots(plan: Plan, slots: Sequence[Slot], **changes: object) -> Plan:
+def with_publish_slots(plan: ChainPlan, slots: Sequence[Slot], **changes: object) -> ChainPlan:
     """The plan with other slots for its output, and other fields."""
     publishing = plans.output_server(plan)
     others = {} if publishing is None else {publishing.name: slots}

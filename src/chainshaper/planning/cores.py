@@ -4,8 +4,8 @@ The paper takes the assignment as given (sections 5.1 and 5.4). Executors gain f
 own where branches run at the same time, or slots of different chains would collide. An assignment
 is judged by playing out one cycle of each graph: of the callbacks for which all is done that they
 wait for, the most urgent executor's runs on each core, in the order of
-:mod:`chainshaper.enforcement.threads`: chains first, then the branches that they wait for. What
-counts, in this order:
+:mod:`chainshaper.enforcement.thread_scheduling`: chains first, then the branches that they wait
+for. What counts, in this order:
 
 1. by how much chains that share a core do not fit: slots as long as the longest execution must
    both fit into the greatest common divisor of their periods

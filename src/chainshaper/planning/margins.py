@@ -43,7 +43,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.plan import Adaptation, Margin
+from chainshaper.planning.chain_plan import Adaptation, Margin
 from chainshaper.values.durations import duration_text, parse_duration
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import Publication

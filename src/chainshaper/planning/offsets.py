@@ -5,12 +5,14 @@ and U collide in some cycle unless the distance of their starts, modulo g = gcd(
 e]: the distances that occur are all numbers congruent to it. So each pair of chains allows a set of
 differences of offsets modulo g, and nothing else matters.
 
-**Few chains are searched exhaustively.** From any solution, take the chains that are not linked to
-the first by a chain of tight pairs (pairs whose difference is at an end of an allowed interval),
-and start all of them earlier until some pair becomes tight. Repeated, that links every chain to the
-first without breaking a constraint: it is enough to try the ends of allowed intervals. Many chains
-are first fitted in one after the other, which is quick and mostly enough; where it is not, the
-CP-SAT solver of OR-tools decides, which is exact as well but may run out of time.
+**Candidates.** From any solution, take the chains that are not linked to the first by a chain of
+tight pairs (pairs whose difference is at an end of an allowed interval), and start all of them
+earlier until some pair becomes tight. Repeated, that links every chain to the first without
+breaking a constraint: it is enough to try the ends of allowed intervals.
+
+Chains are fitted in one after the other, which is quick and mostly enough, but proves nothing.
+Where it finds nothing, the CP-SAT solver of OR-tools decides, which is exact but may run out of
+time; with 30 chains that nearly fill a core it does, where the fitting takes two seconds.
 """
 
 import math
@@ -26,10 +28,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning.overruns import in_cycle, slots_without
-from chainshaper.planning.plan import (
+from chainshaper.planning.chain_plan import (
     PER_CALLBACK,
-    Plan,
+    ChainPlan,
     Server,
     Slot,
     below_executors,
@@ -41,11 +42,11 @@ from chainshaper.planning.plan import (
     server_of,
     shaping_nodes,
 )
+from chainshaper.planning.overruns import in_cycle, slots_without
 from chainshaper.planning.shaping import BOUNDARY_NS, OUTPUT_PRIORITY, with_gates_level
 from chainshaper.values.durations import duration_text
-from chainshaper.values.errors import InputError, OperationError, extra_library
+from chainshaper.values.errors import InputError, OperationError, PlatformError, extra_library
 
-MOST_SEARCHED = 4  # chains; beyond, CP-SAT is faster
 TIME_LIMIT_SECONDS = 60.0
 MOST_CYCLES = 2_000  # of all chains in a hyper-period that is played out for the solver
 SHARES = (0.9, 0.75, 0.5, 0.25, 0.1, 0.0)  # of a slot that begins while no better one is open
@@ -56,7 +57,8 @@ LEAD_NS = 2_000_000  # a cycle starts so long after the chain's timer expires (D
 # (:data:`LEAD_NS`); and behind its pause, for its notes.
 BEFORE_NS, BEHIND_NS = 4_000_000, 2_000_000
 WAKE_UP_NS = 150_000  # of a gate that waits for the others
-MOST_FITTINGS = 10_000  # of one chain, before the solver is asked; some seconds for 30 chains
+SURELY_FITTED = 4  # chains: in tests these were fitted wherever they have offsets
+MOST_FITTINGS = 300  # of each chain, before the solver is asked; some seconds for 30 chains
 
 
 _Slots: TypeAlias = Mapping[tuple[int, int], Sequence[Slot]]
@@ -76,7 +78,9 @@ class Timetable(NamedTuple):
     busy: _Slots = MappingProxyType({})
 
 
-def _timetable(own: Sequence[Plan], plans: Sequence[Plan], alone: float | None) -> Timetable:
+def _timetable(
+    own: Sequence[ChainPlan], plans: Sequence[ChainPlan], alone: float | None
+) -> Timetable:
     """The slots of a chain, or of several that share servers, of which each counts once; and the
     share of the slot that it begins with in which no better server of the plans may run.
     """
@@ -100,7 +104,7 @@ def _timetable(own: Sequence[Plan], plans: Sequence[Plan], alone: float | None) 
     return Timetable(name, own[0].cycle_ns, slots, begins, busy)
 
 
-def _watching(plan: Plan) -> Iterator[tuple[Server, int]]:
+def _watching(plan: ChainPlan) -> Iterator[tuple[Server, int]]:
     """The servers of shaping nodes, and for how long these watch the clock before a slot."""
     for node in shaping_nodes(plan):
         if (server := server_of(plan, node.thread)) is not None:
@@ -108,12 +112,12 @@ def _watching(plan: Plan) -> Iterator[tuple[Server, int]]:
 
 
 def place_chains(
-    plans: Sequence[Plan],
+    plans: Sequence[ChainPlan],
     *,
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
-    at_once: Callable[[bool], Sequence[Plan]] | None = None,
-) -> tuple[tuple[Plan, ...], list[str]]:
+    at_once: Callable[[bool], Sequence[ChainPlan]] | None = None,
+) -> tuple[tuple[ChainPlan, ...], list[str]]:
     """Offsets for chains that share cores, and what is to be known about them.
 
     The chains take turns where they can (:func:`with_offsets`). Where they cannot, ``at_once``
@@ -149,7 +153,7 @@ def place_chains(
     return with_gates_level(turns), remarks
 
 
-def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...] | None:
+def _longest_alone(apart: Callable[..., tuple[ChainPlan, ...]]) -> tuple[ChainPlan, ...] | None:
     """The offsets with which no better chain has the core for the largest of the shares, if any."""
     for share in SHARES:
         with suppress(OperationError):
@@ -157,7 +161,7 @@ def _longest_alone(apart: Callable[..., tuple[Plan, ...]]) -> tuple[Plan, ...] |
     return None
 
 
-def stamp_shift_ns(plan: Plan, plans: Sequence[Plan]) -> int:
+def stamp_shift_ns(plan: ChainPlan, plans: Sequence[ChainPlan]) -> int:
     """How much later than its cycle begins a chain may take the stamp from which its slots count:
     0 where no better server, of any of the plans, has the core then.
     """
@@ -177,7 +181,7 @@ def stamp_shift_ns(plan: Plan, plans: Sequence[Plan]) -> int:
     return 0
 
 
-def _refuse_outputs_behind_others(plans: Sequence[Plan]) -> None:
+def _refuse_outputs_behind_others(plans: Sequence[ChainPlan]) -> None:
     """Refuse outputs that have to wait for those of others beyond their slot when stamps shift.
 
     The gate that wakes up first publishes first, so an output waits for publications that are due
@@ -222,7 +226,7 @@ def _refuse_outputs_behind_others(plans: Sequence[Plan]) -> None:
             raise OperationError(f"{said} (--publish-slot)")
 
 
-def _shared_threads(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> set[str]:
+def _shared_threads(plans: Sequence[ChainPlan], together: Sequence[Sequence[int]]) -> set[str]:
     """The threads that several groups of chains have in their servers: each has one priority."""
     threads = [
         {thread.text for k in group for server in plans[k].servers for thread in server.threads}
@@ -231,7 +235,7 @@ def _shared_threads(plans: Sequence[Plan], together: Sequence[Sequence[int]]) ->
     return {thread for one, two in combinations(threads, 2) for thread in one & two}
 
 
-def _refuse_too_full(plans: Sequence[Plan]) -> None:
+def _refuse_too_full(plans: Sequence[ChainPlan]) -> None:
     """Refuse chains that take more than all of a core, whatever their priorities are."""
     shares: dict[int, dict[str, float]] = {}
     for plan in plans:
@@ -247,7 +251,7 @@ def _refuse_too_full(plans: Sequence[Plan]) -> None:
             raise OperationError(f"{reason} {core}: {remedy}")
 
 
-def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
+def _turns_only(plans: Sequence[ChainPlan], shared: set[str]) -> str:
     """Why chains that cannot take turns are not planned at the same time, and what helps."""
     helps = "periods with a larger common divisor, a smaller margin, or shorter chains"
     if shared:
@@ -264,7 +268,7 @@ def _turns_only(plans: Sequence[Plan], shared: set[str]) -> str:
     return f"{said} all were measured at priorities of their own, write these into the plans"
 
 
-def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Plan]:
+def _ranked(plans: Sequence[ChainPlan], together: Sequence[Sequence[int]]) -> list[ChainPlan]:
     """The plans with a priority for each group of chains, and one behind it where the threads of
     asynchronous publishers may have to run below their executors.
     """
@@ -284,13 +288,13 @@ def _ranked(plans: Sequence[Plan], together: Sequence[Sequence[int]]) -> list[Pl
 
 
 def with_offsets(
-    plans: Sequence[Plan],
+    plans: Sequence[ChainPlan],
     *,
     together: Sequence[Sequence[int]] | None = None,
     time_limit_s: float = TIME_LIMIT_SECONDS,
     alone: float | None = None,
     windows: Mapping[int, tuple[int, int]] = MappingProxyType({}),
-) -> tuple[Plan, ...]:
+) -> tuple[ChainPlan, ...]:
     """The plans of several chains with offsets that keep their slots apart.
 
     ``together`` are groups of chains (places in ``plans``) that begin at the same callback: they
@@ -318,8 +322,10 @@ def with_offsets(
 
 
 def with_windows(
-    plans: Sequence[Plan], windows_ns: Sequence[tuple[int, int] | None], time_limit_s: float = 5.0
-) -> tuple[Plan, ...]:
+    plans: Sequence[ChainPlan],
+    windows_ns: Sequence[tuple[int, int] | None],
+    time_limit_s: float = 5.0,
+) -> tuple[ChainPlan, ...]:
     """The plans with offsets at which each cycle begins inside its chain's window: from and to, on
     a common clock (None: anywhere). So chains are placed around timers that cannot be moved.
 
@@ -352,13 +358,10 @@ def _find_offsets(
     for group in linked(len(tables), puzzle.free):
         if len(group) == 1:
             continue
-        if len(group) <= MOST_SEARCHED:
-            solution = puzzle.searched(group, {group[0]: 0})
-        else:
-            deadline = time.monotonic() + time_limit_s
-            solution = puzzle.fitted(group, deadline)
-            if solution is None:
-                solution = puzzle.solved(group, max(0.0, deadline - time.monotonic()))
+        deadline = time.monotonic() + time_limit_s
+        solution = puzzle.fitted(group, deadline)
+        if solution is None:
+            solution = puzzle.solved(group, max(0.0, deadline - time.monotonic()))
         if solution is None:
             names = ", ".join(tables[k].name for k in group)
             reason = f"no offsets at which {names} keep their slots apart, although any two"
@@ -403,19 +406,6 @@ class _Puzzle:
                 if not self.free[j, k][1]:
                     raise OperationError(_pair_too_long(one, two, common))
 
-    def searched(self, group: list[int], placed: dict[int, int]) -> dict[int, int] | None:
-        """Offsets of a group, of which some are placed; None: there are none."""
-        if len(placed) == len(group):
-            return placed
-        for k in (k for k in group if k not in placed):
-            candidates = self._candidates(k, placed)
-            apart = [self._apart(j, k, candidates - base) for j, base in placed.items()]
-            for offset in candidates[np.all(apart, axis=0)].tolist():
-                found = self.searched(group, {**placed, k: offset})
-                if found is not None:
-                    return found
-        return None
-
     def _candidates(self, k: int, placed: dict[int, int]) -> NDArray[np.int64]:
         """Offsets of k, ascending, at which it is tight with one of what is placed; or 0."""
         found = [np.zeros(1, dtype=np.int64)]
@@ -449,7 +439,7 @@ class _Puzzle:
         weight = dict.fromkeys(group, 1)
         placed: dict[int, int] = {}
         generator = random.Random(0)  # noqa: S311 - no secrets; the same plans, the same offsets
-        for _ in range(MOST_FITTINGS):
+        for _ in range(MOST_FITTINGS * len(group)):
             if not waiting:
                 first = placed[group[0]]
                 return {k: (offset - first) % tables[k].cycle_ns for k, offset in placed.items()}
@@ -474,7 +464,12 @@ class _Puzzle:
 
     def solved(self, group: list[int], time_limit_s: float) -> dict[int, int] | None:
         """The same by CP-SAT; None: there are none."""
-        cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
+        try:
+            cp_model = extra_library("ortools.sat.python.cp_model", "offsets for this many chains")
+        except PlatformError:
+            if len(group) <= SURELY_FITTED:
+                return None
+            raise
         model, cycles = cp_model.CpModel(), {k: self.tables[k].cycle_ns for k in group}
         offsets = {k: model.new_int_var(0, cycles[k] - 1, f"offset{k}") for k in group}
         model.add(offsets[group[0]] == 0)
@@ -542,7 +537,7 @@ def _pair_too_long(one: Timetable, two: Timetable, common: int) -> str:
     return f"{said} their longest take {duration_text(needed)}{excess}"
 
 
-def chain_name(plan: Plan) -> str:
+def chain_name(plan: ChainPlan) -> str:
     """What a plan's chain is called in messages."""
     return plan.chain.spec or plan.chain.output or "a chain without a name"
 

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from itertools import chain, combinations, pairwise, product
 from typing import NamedTuple
 
-from chainshaper.planning import plan as plans
+from chainshaper.planning import chain_plan as plans
+from chainshaper.planning.chain_plan import PER_CALLBACK, ChainPlan, ShapingNode, Slot, Thread
 from chainshaper.planning.margins import OVERRUN_PROBABILITY, cycles_needed
-from chainshaper.planning.plan import PER_CALLBACK, Plan, ShapingNode, Slot, Thread
 from chainshaper.values.durations import duration_text, milliseconds
 from chainshaper.values.errors import InputError
 
@@ -26,7 +26,7 @@ GATE_NS, STOPPED_THREAD_NS = 100_000, 500_000
 ROOMY_SLOT_NS = 10_000_000  # suffices for many sends where the machine stalls for 1 to 8 ms
 
 
-def cycles_until_output(plan: Plan, node: ShapingNode | None = None) -> int:
+def cycles_until_output(plan: ChainPlan, node: ShapingNode | None = None) -> int:
     """How many cycles after its own the chain's output, or what ``node`` republishes, is due: under
     LET per callback, each topic a cycle after the one before it.
     """
@@ -50,7 +50,7 @@ class Expected(NamedTuple):
     jitter_ns: int
 
 
-def expected(plan: Plan) -> Expected | None:
+def expected(plan: ChainPlan) -> Expected | None:
     """What a plan's outputs will look like; None where no slots give them their places."""
     leave, shares = tuple(start for start, _ in slots_of_latency(plan)), plan.predicted.shares
     if plan.policy == "one-long-slot" or not 0 < len(leave) == len(shares):
@@ -60,7 +60,7 @@ def expected(plan: Plan) -> Expected | None:
     return Expected(leave, mean, leave[-1] + apart, leave[-1] - leave[0] + apart)
 
 
-def output_lifespan(plan: Plan) -> int | None:
+def output_lifespan(plan: ChainPlan) -> int | None:
     """The lifespan (ns) by which DDS discards what overruns; None where it is not needed.
 
     An output in time waits at most until the end of the first slot, or of the next slot when it
@@ -76,7 +76,7 @@ def output_lifespan(plan: Plan) -> int | None:
     return max([slots[0][1], *(after[1] - before[1] for before, after in pairwise(slots))])
 
 
-def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
+def open_until_done(plan: ChainPlan, closed_ns: int = 0) -> ChainPlan:
     """The plan as back ends and the simulator carry it out: what overruns may finish.
 
     The servers that run the chain to its end stay open until the cycle's end (section 6): stopped
@@ -136,7 +136,7 @@ def open_until_done(plan: Plan, closed_ns: int = 0) -> Plan:
         return plan
 
 
-def with_output_moved(plan: Plan, by_ns: int) -> Plan:
+def with_output_moved(plan: ChainPlan, by_ns: int) -> ChainPlan:
     """The plan with the slots of its output moved by so much, and with them the ends of those that
     run the chain until then. Raises InputError: there they may not be.
     """
@@ -152,7 +152,7 @@ def with_output_moved(plan: Plan, by_ns: int) -> Plan:
     return plans.revised(plan, servers=plans.with_slots(plan.servers, slots))
 
 
-def why_not_followed(plan: Plan) -> str | None:
+def why_not_followed(plan: ChainPlan) -> str | None:
     """Why the slots of a plan cannot follow the latencies, None where they can."""
     if plan.policy != "shaped":
         return f"under {plan.policy} slots are where the policy has them"
@@ -206,7 +206,7 @@ class Writer:
     process: int | None = None
 
 
-def check_publication(plan: Plan, writers: Sequence[Writer]) -> list[str]:
+def check_publication(plan: ChainPlan, writers: Sequence[Writer]) -> list[str]:
     """What a person must know of a plan that gates the publishers' threads of these writers.
 
     Raises InputError: the output is published by another node, or synchronously, or its history is
@@ -250,7 +250,7 @@ def _check_output(topic: str, node: str, writer: Writer | None, waiting: int) ->
         raise InputError(f"{reason} thread of {node} may not run: give it a depth of {waiting + 1}")
 
 
-def publication_warnings(plan: Plan) -> list[str]:
+def publication_warnings(plan: ChainPlan) -> list[str]:
     """What a plan for asynchronous publication asks of the application; one sentence each."""
     warnings = []
     for _, server, nodes in plans.publisher_servers(open_until_done(plan)):
@@ -280,7 +280,7 @@ def publication_warnings(plan: Plan) -> list[str]:
     return warnings
 
 
-def plan_warnings(*chains: Plan) -> list[str]:
+def plan_warnings(*chains: ChainPlan) -> list[str]:
     """What a person must know before relying on plans; one sentence each, none if all is well."""
     found = []
     for plan in chains:
@@ -293,7 +293,7 @@ def plan_warnings(*chains: Plan) -> list[str]:
     return found
 
 
-def _about_stages(plan: Plan) -> Iterator[str]:
+def _about_stages(plan: ChainPlan) -> Iterator[str]:
     """Where a pipeline is cut, what it costs, and what has to be right for it."""
     if plan.policy != "pipelined":
         return
@@ -312,13 +312,13 @@ def _about_stages(plan: Plan) -> Iterator[str]:
             yield f"{said}: right only where their callbacks wait rather than compute."
 
 
-def _leaves_at(plan: Plan) -> int:
+def _leaves_at(plan: ChainPlan) -> int:
     """When outputs leave, from the start of their chain on, if they come in time."""
     slots = slots_of_latency(plan)
     return slots[-1][0] if slots else plan.evidence.max_latency_ns + plan.margin.epsilon_ns
 
 
-def evidence_cycles(plan: Plan) -> int:
+def evidence_cycles(plan: ChainPlan) -> int:
     """How many cycles a plan rests on, disturbed ones included."""
     evidence = plan.evidence
     if evidence.all_disturbed:
@@ -326,7 +326,7 @@ def evidence_cycles(plan: Plan) -> int:
     return evidence.samples + evidence.disturbed
 
 
-def _about_late_outputs(plan: Plan) -> Iterator[str]:
+def _about_late_outputs(plan: ChainPlan) -> Iterator[str]:
     """Which bands hardly any cycle takes, how many outputs will be late, if the sample tells, and
     what the machine's stalls cost.
     """
@@ -366,7 +366,7 @@ def _about_late_outputs(plan: Plan) -> Iterator[str]:
         yield f"{said} slot ({plan.overrun}): a larger margin (--epsilon) or calmer machine helps."
 
 
-def _about_receivers(plan: Plan) -> Iterator[str]:
+def _about_receivers(plan: ChainPlan) -> Iterator[str]:
     """Who receives an output without a place in the plan, or a promise."""
     node = plan.shaping_node
     if node is not None and node.receivers and node.receivers_at is None:
@@ -392,7 +392,7 @@ def _about_receivers(plan: Plan) -> Iterator[str]:
         yield f"{said} is not promised. With --publication synchronous they have a place."
 
 
-def modes_with_one_slot(plan: Plan) -> Iterator[tuple[tuple[str, ...], Slot]]:
+def modes_with_one_slot(plan: ChainPlan) -> Iterator[tuple[tuple[str, ...], Slot]]:
     """Modes that the announcement of another does not change anything for, and their slot."""
     slots = plans.publish_slots(plan)
     bands = {} if plan.modes is None else plan.modes.bands
@@ -402,7 +402,7 @@ def modes_with_one_slot(plan: Plan) -> Iterator[tuple[tuple[str, ...], Slot]]:
             yield modes, slot
 
 
-def _about_evidence(plan: Plan) -> Iterator[str]:
+def _about_evidence(plan: ChainPlan) -> Iterator[str]:
     """What is doubtful about the measurements, or about how much of the cycle is used."""
     for modes, slot in modes_with_one_slot(plan):
         opens, closes = map(milliseconds, slot)
@@ -445,7 +445,7 @@ def _about_evidence(plan: Plan) -> Iterator[str]:
         yield f"the chain takes {used:.1%} of its core: latencies will pile up, whatever the slots."
 
 
-def slots_of_latency(plan: Plan) -> tuple[Slot, ...]:
+def slots_of_latency(plan: ChainPlan) -> tuple[Slot, ...]:
     """The publish slots as latencies: under LET, and in a pipeline, they are of a later cycle."""
     delay = cycles_until_output(plan) * plan.cycle_ns
     return tuple((start + delay, end + delay) for start, end in plans.publish_slots(plan))

@@ -37,8 +37,8 @@ from itertools import combinations, count
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.planning.chain_plan import ChainPlan, in_one_slot, publish_slots, revised
 from chainshaper.planning.overruns import in_cycle
-from chainshaper.planning.plan import Plan, in_one_slot, publish_slots, revised
 from chainshaper.planning.shaping import CHAIN_PRIORITY, OUTPUT_PRIORITY, server_for
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
@@ -381,15 +381,15 @@ def _in_order(stages: Sequence[Stage], work: Work) -> Iterator[int]:
         yield number
 
 
-@wrong_values_refused(Plan)
+@wrong_values_refused(ChainPlan)
 def pipelined(
-    plan: Plan,
+    plan: ChainPlan,
     work: Work,
     core_of: Mapping[str, int],
     cores: Sequence[int] | None = None,
     *,
     room_ns: int = 0,
-) -> Plan:
+) -> ChainPlan:
     """A shaped plan's chain in stages, on these cores (default: those of ``core_of``).
 
     Each slot has ``room_ns`` more, for what may have the core meanwhile: who receives the output.

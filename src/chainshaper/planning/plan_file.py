@@ -1,22 +1,23 @@
 """The file of a plan: YAML that a person reads, edits, and gets back as it was written.
 
-Format 1 has one chain's plan. Format 2 has a list of chains, each of which is written as it stands
-alone, with two differences: a server is written out where it comes first, and further chains have
-its name in its place.
+A file has a list of chains. Each server is written out in the first chain that has it; further
+chains have its name in its place.
+
+Files of earlier versions have one chain and no list; :func:`convert_plan` reads these.
 """
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from shutil import rmtree
 from textwrap import indent
-from typing import Any
+from typing import Any, Literal
 
 import yaml
 
-from chainshaper.planning.application_plan import ApplicationPlan, whole
+from chainshaper.planning.chain_plan import ChainPlan, band_predictions, publish_slots
 from chainshaper.planning.overruns import expected
-from chainshaper.planning.plan import Plan, band_predictions, publish_slots
-from chainshaper.values.errors import InputError, OperationError
+from chainshaper.planning.plan import Plan
+from chainshaper.values.errors import OperationError
 from chainshaper.values.files import new_file, write_whole
 from chainshaper.values.yaml_file import AS_YAML, read_model, wrong_values_refused
 
@@ -56,25 +57,30 @@ _SECTION_COMMENTS = {
 
 def load_plan(path: str | Path) -> Plan:
     """Read a plan, however a person has laid it out. Raises: as :func:`.read_model`."""
-    chain, *others = load_application_plan(path).chains
-    if others:
-        raise InputError(f"{path}: the plan is of several chains, and that of one is wanted here")
-    return chain
+    return read_model(path, Plan, made_by="written by `chainshaper plan`")
+
+
+class _EarlierPlan(ChainPlan):
+    """A plan as files of earlier versions have it: that of one chain."""
+
+    format: Literal[1] = 1
+
+
+def convert_plan(path: str | Path) -> Plan:
+    """Read the plan of an earlier version. Raises: as :func:`.read_model`."""
+    made_by = "that `chainshaper plan` of an earlier version wrote"
+    return _of_earlier(read_model(path, _EarlierPlan, made_by=made_by))
+
+
+def _of_earlier(plan: _EarlierPlan) -> Plan:
+    return Plan.of(ChainPlan(**{name: getattr(plan, name) for name in ChainPlan.model_fields}))
 
 
 def dump_plan(plan: Plan) -> str:
-    """The YAML text of a plan; reading it gives an equal plan."""
-    return plans_as_text([plan])
-
-
-def plans_as_text(plans: Sequence[Plan]) -> str:
-    """The YAML text of a chain's plan, or of several in one file, each server written once."""
-    if len(plans) == 1:
-        return _HEADER + _sections(_yaml_values(plans[0]))
+    """The YAML text of a plan, each server written once; reading it gives an equal plan."""
     text, known = f"{_HEADER}format: 2\nchains:\n", set[str]()
-    for plan in plans:
-        values = _yaml_values(plan)
-        del values["format"]
+    for chain in plan.chains:
+        values = _yaml_values(chain)
         names = [server["name"] for server in values["servers"]]
         pairs = zip(names, values["servers"], strict=True)
         values["servers"] = [name if name in known else server for name, server in pairs]
@@ -83,9 +89,9 @@ def plans_as_text(plans: Sequence[Plan]) -> str:
     return text
 
 
-def _yaml_values(plan: Plan) -> dict[str, Any]:
+def _yaml_values(plan: ChainPlan) -> dict[str, Any]:
     names = _UNLESS_OTHERWISE if plan.shaping_node else {*_UNLESS_OTHERWISE, "fallback"}
-    usual = {name for name in names if getattr(plan, name) == Plan.model_fields[name].default}
+    usual = {name for name in names if getattr(plan, name) == ChainPlan.model_fields[name].default}
     how: dict[str, Any] = {"mode": "json", "by_alias": True, "context": AS_YAML}
     values = plan.model_dump(exclude_none=True, exclude=usual, **how)
     for server in values["servers"]:
@@ -126,8 +132,8 @@ _Dumper.add_representer(
 )
 
 
-def save_plan(plan: Plan | ApplicationPlan, path: str | Path, *, overwrite: bool = False) -> None:
-    """Write a plan, whole or not at all; an application's of one chain as that chain's.
+def save_plan(plan: Plan, path: str | Path, *, overwrite: bool = False) -> None:
+    """Write a plan, whole or not at all.
 
     Raises InputError: ``path`` exists (and ``overwrite`` is not set), or its folder does not.
     OperationError: it cannot be written; nothing is left behind, an existing file stays.
@@ -135,15 +141,11 @@ def save_plan(plan: Plan | ApplicationPlan, path: str | Path, *, overwrite: bool
     path = Path(path)
     if not (overwrite and path.is_file()):
         new_file(path)
-    plans = [plan] if isinstance(plan, Plan) else plan.chains
-    write_whole(path, [plans_as_text(plans).encode()])
+    write_whole(path, [dump_plan(plan).encode()])
 
 
-save_application_plan = save_plan
-
-
-def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
-    """Write the plans of several chains into a new folder, each named after its output, or none.
+def save_plans(chains: Sequence[ChainPlan], folder: str | Path) -> list[Path]:
+    """Write a plan of each chain into a new folder, named after the chain's output; all or none.
 
     Raises: as :func:`save_plan`.
     """
@@ -154,17 +156,17 @@ def save_plans(plans: Sequence[Plan], folder: str | Path) -> list[Path]:
         raise OperationError(f"{folder}: the folder cannot be made: {error}") from error
     written: list[Path] = []
     try:
-        for number, plan in enumerate(plans, start=1):
-            name = (plan.chain.output or "plan").strip("/").replace("/", "_")
+        for number, chain in enumerate(chains, start=1):
+            name = (chain.chain.output or "plan").strip("/").replace("/", "_")
             written.append(folder / f"{number}_{name}.yaml")
-            save_plan(plan, written[-1])
+            save_plan(Plan.of(chain), written[-1])
     except OperationError:
         rmtree(folder)
         raise
     return written
 
 
-def plan_json(plan: Plan) -> dict[str, Any]:
+def plan_json(plan: ChainPlan) -> dict[str, Any]:
     """The plan as plain data for ``--json``: integer nanoseconds, keys ending in ``_ns``, with the
     ends of the publish slots (``bands_ns``), :func:`band_predictions`, and what will be seen
     (``expected``: :class:`~chainshaper.planning.overruns.Expected`).
@@ -178,23 +180,17 @@ def plan_json(plan: Plan) -> dict[str, Any]:
     }
 
 
-def load_application_plan(path: str | Path) -> ApplicationPlan:
-    """Read a plan for an application, or for one chain. Raises: as :func:`.read_model`."""
-    made_by = "written by `chainshaper plan`"
-    return whole(read_model(path, Plan, made_by=made_by, otherwise=("chains", ApplicationPlan)))
+def plan_in(values: Mapping[str, Any], where: object = "the plan") -> Plan:
+    """The plan in the plain data of a recording or a run, which may be of an earlier version.
 
-
-def plan_in(values: Mapping[str, Any], where: object = "the plan") -> ApplicationPlan:
-    """A plan from what a recording or a run has of it, of either format.
-
-    Raises InputError: it is none, which begins with ``where`` it stands.
+    Raises InputError, which begins with ``where``: the values are no plan.
     """
-    model: type[Plan | ApplicationPlan] = ApplicationPlan if "chains" in values else Plan
+    model: type[Plan | _EarlierPlan] = Plan if "chains" in values else _EarlierPlan
     with wrong_values_refused(model, f"{where}: "):
-        found = model.model_validate(values, strict=False)
-    return whole(found)
+        plan = model.model_validate(values, strict=False)
+    return _of_earlier(plan) if isinstance(plan, _EarlierPlan) else plan
 
 
-def plan_values(plan: ApplicationPlan) -> dict[str, Any]:
-    """What a recording or a run has of a plan: plain data, as :func:`plan_in` reads it."""
-    return (plan.chains[0] if len(plan.chains) == 1 else plan).model_dump(mode="json")
+def plan_values(plan: Plan) -> dict[str, Any]:
+    """A plan as plain data for a recording or a run, as :func:`plan_in` reads it."""
+    return plan.model_dump(mode="json")

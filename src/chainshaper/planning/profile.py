@@ -26,9 +26,9 @@ from typing import Literal, NamedTuple, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.planning.chain_plan import PER_CALLBACK, SHORTEST_SLOT_NS, UNSHAPED
 from chainshaper.planning.margins import check_latencies
 from chainshaper.planning.pipeline import finished
-from chainshaper.planning.plan import PER_CALLBACK, SHORTEST_SLOT_NS, UNSHAPED
 from chainshaper.planning.shaping import CallbackTimes
 from chainshaper.values.durations import format_duration, milliseconds
 from chainshaper.values.errors import InputError
@@ -100,8 +100,8 @@ class Profile:
     ``others_ns`` is for how long gates of other chains may have its cores in a cycle,
     ``interfering`` what else the chain's threads run, ``contradictions`` what in the recording's
     events contradicts itself about its callbacks, in words; ``reception`` is None where nothing
-    says how the output is received. The rest is :class:`~chainshaper.planning.plan.Evidence`, and
-    :class:`~.plan.ChainOfPlan`.
+    says how the output is received. The rest is
+    :class:`~chainshaper.planning.chain_plan.Evidence`, and :class:`~.chain_plan.ChainOfPlan`.
     """
 
     latencies_ns: NDArray[np.int64]

@@ -18,9 +18,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from chainshaper.planning import margins
-from chainshaper.planning.plan import (
+from chainshaper.planning.chain_plan import (
     PER_CALLBACK,
-    Plan,
+    ChainPlan,
     Prediction,
     ReceiverPlace,
     ShapingNode,
@@ -36,7 +36,7 @@ def without_reception(profile: Profile) -> Profile:
     return replace(profile, reception=None)
 
 
-def without_places(plan: Plan) -> Plan:
+def without_places(plan: ChainPlan) -> ChainPlan:
     """The plan with no place for those that receive its output."""
     node = plan.shaping_node
     if node is None or node.receivers_at is None:
@@ -48,12 +48,14 @@ def without_places(plan: Plan) -> Plan:
     )
 
 
-def has_places(plan: Plan) -> bool:
+def has_places(plan: ChainPlan) -> bool:
     """Whether a plan has a place for those that receive its output."""
     return plan.shaping_node is not None and plan.shaping_node.receivers_at is not None
 
 
-def with_receivers_placed(plans: Sequence[Plan], profiles: Sequence[Profile]) -> list[Plan]:
+def with_receivers_placed(
+    plans: Sequence[ChainPlan], profiles: Sequence[Profile]
+) -> list[ChainPlan]:
     """The plans with a place for those that receive their outputs, where there is room for it."""
     plans = list(map(without_places, plans))
     running = {thread.node for one in plans for server in one.servers for thread in server.threads}
@@ -75,8 +77,12 @@ def with_receivers_placed(plans: Sequence[Plan], profiles: Sequence[Profile]) ->
 
 
 def _placed(
-    plan: Plan, profile: Profile, running: set[str], busy: set[int], nodes: Sequence[ShapingNode]
-) -> Plan:
+    plan: ChainPlan,
+    profile: Profile,
+    running: set[str],
+    busy: set[int],
+    nodes: Sequence[ShapingNode],
+) -> ChainPlan:
     node, one = plan.shaping_node, profile.reception
     if node is None or one is None or running.issuperset(node.receivers):
         return plan
@@ -112,17 +118,17 @@ def _placed(
     )
 
 
-def node_work_ns(plan: Plan, node: ShapingNode) -> int:
+def node_work_ns(plan: ChainPlan, node: ShapingNode) -> int:
     """For how long a shaping node has its core for a message, watching the clock included."""
     return node.spin_ns + (plan.evidence.longest_publication_ns or 0) + GATE_TAKES_NS
 
 
-def _reaches_next_cycle(plan: Plan, after_ns: int) -> bool:
+def _reaches_next_cycle(plan: ChainPlan, after_ns: int) -> bool:
     """Whether what follows the last output for so long reaches the next instance of its chain."""
     return plan.predicted.max_ns % plan.cycle_ns + after_ns > plan.cycle_ns
 
 
-def _has_room(plan: Plan, profile: Profile, time_ns: int) -> bool:
+def _has_room(plan: ChainPlan, profile: Profile, time_ns: int) -> bool:
     """Whether a plan keeps what it promises while receivers run above its servers for so long."""
     node, period = plan.shaping_node, plan.chain.period_ns
     work_ns = time_ns + (0 if node is None else node_work_ns(plan, node))

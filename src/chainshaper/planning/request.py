@@ -16,8 +16,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from chainshaper.planning import chain_plan as plans
 from chainshaper.planning import margins, shaping
-from chainshaper.planning import plan as plans
 from chainshaper.planning.bands import (
     BandChoice,
     choose_bands,
@@ -25,10 +25,18 @@ from chainshaper.planning.bands import (
     with_long_slot,
     with_publish_slots,
 )
+from chainshaper.planning.chain_plan import (
+    UNSHAPED,
+    ChainPlan,
+    Evidence,
+    Margin,
+    Modes,
+    Prediction,
+    Slot,
+)
 from chainshaper.planning.cores import assign_cores
 from chainshaper.planning.offsets import refuse_common
 from chainshaper.planning.pipeline import Work, pipelined, stage_places, work_of
-from chainshaper.planning.plan import UNSHAPED, Evidence, Margin, Modes, Plan, Prediction, Slot
 from chainshaper.planning.profile import (
     UNKNOWN,
     Profile,
@@ -64,7 +72,7 @@ _STANDARD = PlanRequest()
 
 def plan_chain(
     profile: Profile, request: PlanRequest = _STANDARD, sinks: Sequence[Profile] = ()
-) -> Plan:
+) -> ChainPlan:
     """The plan of the requested policy for a measured chain.
 
     ``sinks`` are profiles of further outputs of the same graph, each of which is shaped too.
@@ -84,7 +92,7 @@ def plan_chain(
         raise OperationError(f"{str(error).rstrip('.')}. {remark}") from error
 
 
-def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]) -> Plan:
+def _plan_chain(profile: Profile, request: PlanRequest, sinks: Sequence[Profile]) -> ChainPlan:
     refuse_contradictions(request, sinks=bool(sinks), modes=bool(profile.of_modes))
     refuse_entangled((profile, *sinks), request.policy, sinks=True)
     refuse_simulated((profile, *sinks), request)
@@ -276,7 +284,7 @@ def moved_to(
 
 
 def band_choice(
-    plan: Plan, profile: Profile, request: PlanRequest, sinks: Sequence[Profile] = ()
+    plan: ChainPlan, profile: Profile, request: PlanRequest, sinks: Sequence[Profile] = ()
 ) -> BandChoice:
     """The curve of figure 7 for a plan that :func:`plan_chain` made of this, and what ``auto``
     takes from it.
@@ -352,8 +360,8 @@ def place_modes(
 
 
 def with_modes(
-    plan: Plan, modes: Modes, slots: tuple[Slot, ...], measured: Mapping[str, Evidence]
-) -> Plan:
+    plan: ChainPlan, modes: Modes, slots: tuple[Slot, ...], measured: Mapping[str, Evidence]
+) -> ChainPlan:
     """A shaped plan with slots for modes of which each was measured.
 
     The prediction of the whole is for modes in force as often as they were measured.
@@ -375,7 +383,7 @@ def with_modes(
 
 def _together(
     profile: Profile, request: PlanRequest, modes: Modes
-) -> tuple[Profile, Margin, Modes, Callable[[Plan], Plan]]:
+) -> tuple[Profile, Margin, Modes, Callable[[ChainPlan], ChainPlan]]:
     """The profile of all modes, the margin up to their last slot, the modes with bands, and what
     gives a plan the slots.
     """
@@ -406,7 +414,7 @@ def _together(
 
 def _shaped(
     profile: Profile, request: PlanRequest, margin: Margin, sinks: Sequence[Profile]
-) -> Plan:
+) -> ChainPlan:
     last = profile.last
     values = {n: getattr(profile, n) for n in Evidence.model_fields if hasattr(profile, n)}
     if request.publication == "asynchronous":
@@ -527,7 +535,7 @@ def _late_by_default(
     return margins.late_share(every, longest + stalls, independent)
 
 
-def _with_policy(plan: Plan, profile: Profile, request: PlanRequest) -> Plan:
+def _with_policy(plan: ChainPlan, profile: Profile, request: PlanRequest) -> ChainPlan:
     if request.policy == "shaped":
         names = ("solver", "minimise", "mean_at_most_ns", "least_gain", "seed")
         values = _of(request, *_LIMITS, *names)

@@ -14,11 +14,9 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-from chainshaper.planning.application_plan import ApplicationPlan, combined
-from chainshaper.planning.offsets import TIME_LIMIT_SECONDS, chain_name, place_chains
-from chainshaper.planning.plan import (
+from chainshaper.planning.chain_plan import (
     PER_CALLBACK,
-    Plan,
+    ChainPlan,
     Prediction,
     Server,
     publishing_servers,
@@ -26,6 +24,8 @@ from chainshaper.planning.plan import (
     running_servers,
     with_slots,
 )
+from chainshaper.planning.offsets import TIME_LIMIT_SECONDS, chain_name, place_chains
+from chainshaper.planning.plan import Plan
 from chainshaper.planning.profile import Profile, with_interference
 from chainshaper.planning.receivers import (
     has_places,
@@ -56,7 +56,7 @@ def plan_application(
     request: PlanRequest = _STANDARD,
     *,
     time_limit_s: float = TIME_LIMIT_SECONDS,
-) -> tuple[ApplicationPlan, list[str]]:
+) -> tuple[Plan, list[str]]:
     """One plan for several chains of an application, and what is to be known about it.
 
     A chain that is added to others moves their outputs by what it can delay them, once.
@@ -82,7 +82,9 @@ def plan_application(
         raise OperationError(f"{reason}. It fits with {', or with '.join(fits)}") from error
 
 
-def with_own_names(plans: Sequence[Plan], together: Sequence[Sequence[int]] = ()) -> list[Plan]:
+def with_own_names(
+    plans: Sequence[ChainPlan], together: Sequence[Sequence[int]] = ()
+) -> list[ChainPlan]:
     """The plans, whose servers have names of their own: each had a ``chain``, and an ``output``.
     Equal servers are one in chains of one group, or whose cycles start at the same instants.
     """
@@ -104,7 +106,7 @@ def with_own_names(plans: Sequence[Plan], together: Sequence[Sequence[int]] = ()
 
 def _on_wished_cores(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
-) -> tuple[ApplicationPlan, list[str]]:
+) -> tuple[Plan, list[str]]:
     """The plan on the wished cores. Where chains collide although one of these is idle, the first
     plan in which they do not, with one of them there.
     """
@@ -143,10 +145,10 @@ def _one_on(profiles: Sequence[Profile], core: int) -> Iterator[dict[str, int]]:
 
 def _planned(
     profiles: Sequence[Profile], request: PlanRequest, time_limit_s: float
-) -> tuple[ApplicationPlan, list[str]]:
+) -> tuple[Plan, list[str]]:
     own, groups = replace(request, best_effort=()), beginning_together(profiles)
 
-    def plans(shifting: bool = False, *, at_once: bool) -> list[Plan]:
+    def plans(shifting: bool = False, *, at_once: bool) -> list[ChainPlan]:
         delayed = with_interference(profiles, groups, request, at_once=at_once, shifting=shifting)
         found = [_beside_others(profile, delayed, own) for profile in delayed]
         for group in groups:
@@ -162,10 +164,10 @@ def _planned(
     pairs = zip(placed, profiles, strict=True)
     placed_for = [one if has_places(plan) else without_reception(one) for plan, one in pairs]
     placed = tuple(with_receivers_placed(placed, placed_for))
-    return combined(with_best_effort(placed, best_effort_cores(profiles, request))), remarks
+    return Plan.of(*with_best_effort(placed, best_effort_cores(profiles, request))), remarks
 
 
-def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequest) -> Plan:
+def _beside_others(profile: Profile, every: Sequence[Profile], request: PlanRequest) -> ChainPlan:
     """The plan of one of several chains; who takes the room that it lacks is named."""
     try:
         return plan_chain(profile, request)
@@ -188,7 +190,7 @@ def beginning_together(profiles: Sequence[Profile]) -> list[list[int]]:
     return list(groups.values())
 
 
-def _sharing_servers(plans: list[Plan]) -> list[Plan]:
+def _sharing_servers(plans: list[ChainPlan]) -> list[ChainPlan]:
     """Branches of one graph: the same servers run it, and their outputs have slots apart."""
     if len(plans) == 1:
         return plans

@@ -14,20 +14,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from chainshaper.planning import plan as plans
+from chainshaper.planning import chain_plan as plans
 from chainshaper.planning.bands import predict_bands
-from chainshaper.planning.margins import check_latencies, least_epsilon_ns
-from chainshaper.planning.overruns import united
-from chainshaper.planning.plan import (
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
     Evidence,
     Margin,
-    Plan,
     Prediction,
     Server,
     ShapingNode,
     Slot,
     Thread,
 )
+from chainshaper.planning.margins import check_latencies, least_epsilon_ns
+from chainshaper.planning.overruns import united
 from chainshaper.values.durations import duration_text
 from chainshaper.values.errors import InputError, OperationError
 from chainshaper.values.plan_choices import EqualPriorities, Wishes
@@ -42,7 +42,7 @@ _OF_PLAN = ("anchor", "into_open_slot", "messages", "fallback", "shaping_thread"
 _NO_NODES: dict[str, object] = {"shaping_node": None, "further_shaping_nodes": ()}
 
 
-@wrong_values_refused(Plan)
+@wrong_values_refused(ChainPlan)
 def plan_shaping(
     latencies_ns: NDArray[np.int64],
     period_ns: int,
@@ -54,7 +54,7 @@ def plan_shaping(
     fifo_priority: int = 84,
     receivers: Sequence[str] = (),
     **values: Any,
-) -> Plan:
+) -> ChainPlan:
     """Plan single-band shaping: one publish slot right behind the longest latency measured.
 
     With L̄ the longest latency, ε the margin, Δ the length of the publish slot and CT the period,
@@ -65,8 +65,8 @@ def plan_shaping(
     ε is the margin's or, without one, 1 ms (0.8 ms with a gate in the publisher's process), Δ is
     1 ms unless the wishes say otherwise. ``nodes`` are those whose executors run the chain,
     ``fifo_priority`` and ``receivers`` for the shaping node.
-    ``values`` are fields of :class:`~chainshaper.planning.plan.ChainOfPlan` and
-    :class:`~chainshaper.planning.plan.Evidence`, and single
+    ``values`` are fields of :class:`~chainshaper.planning.chain_plan.ChainOfPlan` and
+    :class:`~chainshaper.planning.chain_plan.Evidence`, and single
     :class:`~chainshaper.values.plan_choices.Wishes`. OperationError: L̄ + ε + Δ does not fit.
     """
     latencies = check_latencies(latencies_ns)
@@ -87,7 +87,7 @@ def plan_shaping(
     chain = plans.ChainOfPlan(period_ns=period_ns, **of_chain)
     node, gated = _gate(chain, wishes, core, fifo_priority, receivers)
     running = server_for(nodes, "chain", core, CHAIN_PRIORITY, [(0, start)])
-    return Plan(
+    return ChainPlan(
         chain=chain,
         evidence=evidence_of(latencies, **values),
         margin=margin or Margin(epsilon_ns=epsilon),
@@ -169,7 +169,7 @@ def _inside(node: ShapingNode) -> ShapingNode:
     return node.model_copy(update={"spin_ns": 0, "fifo_priority": behind})
 
 
-def with_gates_level(chains: Sequence[Plan]) -> tuple[Plan, ...]:
+def with_gates_level(chains: Sequence[ChainPlan]) -> tuple[ChainPlan, ...]:
     """The plans of several chains whose shaping nodes run above the executors of all: those of
     outputs at one priority, so that the one that wakes first publishes first.
     """
@@ -177,7 +177,7 @@ def with_gates_level(chains: Sequence[Plan]) -> tuple[Plan, ...]:
     return tuple(_with_gates_at(plan, max(every, default=0)) for plan in chains)
 
 
-def _with_gates_at(plan: Plan, priority: int) -> Plan:
+def _with_gates_at(plan: ChainPlan, priority: int) -> ChainPlan:
     node = plan.shaping_node
     if node is None or node.fifo_priority == priority:
         return plan
@@ -221,8 +221,8 @@ def _too_long(longest: int, epsilon: int, publish_slot: int, period: int, *, alo
     )
 
 
-@wrong_values_refused(Plan)
-def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
+@wrong_values_refused(ChainPlan)
+def over_cores(plan: ChainPlan, core_of: Mapping[str, int]) -> ChainPlan:
     """One server per core for the chain's threads, each with the chain's slot (section 5.4).
 
     ``core_of`` names the core of every node that takes part, also on branches that the chain waits
@@ -239,7 +239,9 @@ def over_cores(plan: Plan, core_of: Mapping[str, int]) -> Plan:
     return plans.revised(plan, servers=(*split, *others))
 
 
-def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | None = None) -> Plan:
+def with_first_node_apart(
+    plan: ChainPlan, node: str, slot_end_ns: int, core: int | None = None
+) -> ChainPlan:
     """The chain's first node in a server of its own, [0, ``slot_end_ns``), on a ``core`` (default:
     the chain's), the rest behind it. So a first callback that is no timer starts every execution at
     the beginning of a cycle (table 4, rows 2 to 5: [0, 2] and [2, 86] ms).
@@ -258,8 +260,8 @@ def with_first_node_apart(plan: Plan, node: str, slot_end_ns: int, core: int | N
     return plans.revised(plan, servers=(alone, behind, *others))
 
 
-@wrong_values_refused(Plan)
-def with_best_effort(chains: Sequence[Plan], core_of: Mapping[str, int]) -> list[Plan]:
+@wrong_values_refused(ChainPlan)
+def with_best_effort(chains: Sequence[ChainPlan], core_of: Mapping[str, int]) -> list[ChainPlan]:
     """Plans whose first has a server on each core for these nodes, which are in none of the chains:
     R_m' of section 3.1, R_int of section 5.1. Raises InputError: a node is in a server already.
     """
@@ -281,7 +283,7 @@ def with_best_effort(chains: Sequence[Plan], core_of: Mapping[str, int]) -> list
     return [plans.revised(first, servers=(*first.servers, *added)), *others]
 
 
-def with_turns(plan: Plan, equal_priorities: EqualPriorities) -> Plan:
+def with_turns(plan: ChainPlan, equal_priorities: EqualPriorities) -> ChainPlan:
     """A plan whose servers take turns at one priority (eq. 3), if that is wished."""
     if equal_priorities == "apart":
         return plan
@@ -290,7 +292,7 @@ def with_turns(plan: Plan, equal_priorities: EqualPriorities) -> Plan:
     return plans.revised(plan, servers=plans.below_executors(equal), equal_priorities="round-robin")
 
 
-def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
+def _chain_and_others(plan: ChainPlan) -> tuple[Server, list[Server]]:
     for server in plan.servers:
         if server.name == "chain":
             return server, [other for other in plan.servers if other is not server]
@@ -298,8 +300,8 @@ def _chain_and_others(plan: Plan) -> tuple[Server, list[Server]]:
 
 
 def with_executors(
-    plan: Plan, executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]]
-) -> Plan:
+    plan: ChainPlan, executors: Sequence[Mapping[str, Sequence[tuple[str, ...]]]]
+) -> ChainPlan:
     """The plan with those executors of nodes in its servers that run the given callbacks; others of
     a node whose callback groups have executors of their own run on (section 6).
     """
@@ -332,15 +334,15 @@ def behind_others(name: str, own: Sequence[Server], taken: Sequence[Server], cyc
     return later_ns
 
 
-@wrong_values_refused(Plan)
+@wrong_values_refused(ChainPlan)
 def with_sink(
-    plan: Plan,
+    plan: ChainPlan,
     latencies_ns: NDArray[np.int64],
     output: str,
     *,
     publisher: str | None = None,
     receivers: Sequence[str] = (),
-) -> Plan:
+) -> ChainPlan:
     """A shaped plan with one more shaped output: another sink of the same graph (end of 5.4).
 
     The sink gets a shaping node; where the plan's output is published asynchronously, the thread of
@@ -395,7 +397,7 @@ class CallbackTimes:
     publishes: str | None = None
 
 
-def server_per_chain(plan: Plan) -> Plan:
+def server_per_chain(plan: ChainPlan) -> ChainPlan:
     """One server for the chain, nothing shaped (section 3.1; table 4 row 2): what was measured."""
     publishing, evidence = plans.output_server(plan), plan.evidence
     longest, jitter = evidence.max_latency_ns, evidence.max_latency_ns - evidence.min_latency_ns
@@ -408,10 +410,10 @@ def server_per_chain(plan: Plan) -> Plan:
     )
 
 
-@wrong_values_refused(Plan)
+@wrong_values_refused(ChainPlan)
 def server_per_callback(
-    plan: Plan, callbacks: Sequence[CallbackTimes], *, margin_ns: int = 0
-) -> Plan:
+    plan: ChainPlan, callbacks: Sequence[CallbackTimes], *, margin_ns: int = 0
+) -> ChainPlan:
     """Time-triggered scheduling: each callback runs in a slot of its own (table 4 row 1).
 
     It starts when the slots of all callbacks that this one waits for have ended, and the slot
@@ -466,7 +468,7 @@ def _slots_in_sequence(callbacks: Sequence[CallbackTimes], margin_ns: int) -> li
     return slots
 
 
-def let_per_chain(plan: Plan) -> Plan:
+def let_per_chain(plan: ChainPlan) -> ChainPlan:
     """Logical execution time for the chain as one task: its output leaves at the start of the next
     cycle (section 5.3, table 5).
     """
@@ -481,8 +483,10 @@ def let_per_chain(plan: Plan) -> Plan:
     return plans.revised(plan, policy="let-per-chain", servers=servers, predicted=predicted)
 
 
-@wrong_values_refused(Plan)
-def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str] = ()) -> Plan:
+@wrong_values_refused(ChainPlan)
+def let_per_callback(
+    plan: ChainPlan, topics: Sequence[str], publishers: Sequence[str] = ()
+) -> ChainPlan:
     """Logical execution time for every callback: each one's output waits for the next cycle.
 
     ``topics`` are the outputs of the chain's callbacks in order, the chain's own last;
@@ -522,7 +526,7 @@ def let_per_callback(plan: Plan, topics: Sequence[str], publishers: Sequence[str
     )
 
 
-def _one_slot(plan: Plan) -> tuple[Server, int]:
+def _one_slot(plan: ChainPlan) -> tuple[Server, int]:
     """The server of the output, and how long its only slot is."""
     publishing, slots = plans.output_server(plan), plans.publish_slots(plan)
     if publishing is None or len(slots) != 1:
@@ -530,6 +534,6 @@ def _one_slot(plan: Plan) -> tuple[Server, int]:
     return publishing, slots[0][1] - slots[0][0]
 
 
-def _after_periods(plan: Plan, periods: int, slot_ns: int) -> Prediction:
+def _after_periods(plan: ChainPlan, periods: int, slot_ns: int) -> Prediction:
     start = periods * plan.chain.period_ns
     return plans.in_one_slot((start, start + slot_ns))

@@ -398,7 +398,7 @@ Beside: TypeAlias = dict[int, list[tuple[int, float, float]]]
 
 
 @dataclass
-class _Part:
+class _ConnectedPart:
     """A connected part in columns: vertices are its boxes and, behind them, edges' places."""
 
     layer: dict[int, int]
@@ -459,7 +459,7 @@ def lay_out(boxes: Sequence[Box], edges: Sequence[Edge]) -> Layout:
     return Layout(corners, routes, width, max(top - 2 * ROW_GAP, 0.0))
 
 
-def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge]) -> _Part:
+def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge]) -> _ConnectedPart:
     """Columns by the longest path from the sources, and places for edges that pass columns.
 
     Edges that close a cycle are those that lead back in the order of a depth-first search from the
@@ -486,7 +486,7 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
     for vertex in chosen:
         if onward[vertex] and not before[vertex]:
             layer[vertex] = min(layer[right] for right in onward[vertex]) - 1
-    part = _Part(dict(sorted(layer.items())), {v: boxes[v].height for v in chosen})
+    part = _ConnectedPart(dict(sorted(layer.items())), {v: boxes[v].height for v in chosen})
     fresh = len(boxes)
     for number, (left, right) in ends.items():
         passed = range(layer[left] + 1, layer[right])
@@ -506,7 +506,7 @@ def _layered(chosen: list[int], boxes: Sequence[Box], edges: Mapping[int, Edge])
     return part
 
 
-def _sort_columns(part: _Part) -> None:
+def _sort_columns(part: _ConnectedPart) -> None:
     """Order each column by the mean position of its neighbours; the best order seen stays."""
     before, after = part.beside()
     best, fewest = [list(column) for column in part.columns], _crossings(part)
@@ -526,7 +526,7 @@ def _sort_columns(part: _Part) -> None:
     part.columns = best
 
 
-def _crossings(part: _Part) -> int:
+def _crossings(part: _ConnectedPart) -> int:
     """How many pairs of segments cross: those whose ends are in another order than their begins."""
     place, by_column = part.place(), defaultdict[int, list[tuple[float, float]]](list)
     for left, right, leaves, enters in part.segments:
@@ -537,7 +537,7 @@ def _crossings(part: _Part) -> int:
     return sum(int(np.count_nonzero(np.triu(at[:, None] > at))) for at in ends_at)
 
 
-def _choose_heights(part: _Part) -> None:
+def _choose_heights(part: _ConnectedPart) -> None:
     """Heights that let edges run straight, column by column, back and forth."""
     before, after = part.beside()
     for column in part.columns:

@@ -8,7 +8,7 @@ from typing import Any
 import polars as pl
 
 from chainshaper.analysis import REASONS, LatencyAnalysis, LatencyStatistics
-from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning import ChainPlan, publish_slots
 from chainshaper.planning.overruns import expected
 from chainshaper.reporting.tables import (
     ABSENT,
@@ -227,7 +227,7 @@ def comparison_table(comparison: Comparison, names: Sequence[str] = ()) -> Resul
     return table
 
 
-def expected_text(plan: Plan) -> str:
+def expected_text(plan: ChainPlan) -> str:
     """What a plan's outputs will look like, in ms."""
     seen, predicted = expected(plan), plan.predicted
     if seen is None:
@@ -240,7 +240,7 @@ def expected_text(plan: Plan) -> str:
     return f"outputs leave at {places}{average}"
 
 
-def expected_jitter_text(plan: Plan) -> str:
+def expected_jitter_text(plan: ChainPlan) -> str:
     """What :func:`expected_text` says, and the jitter that is expected of it: within each band."""
     seen, slots = expected(plan), publish_slots(plan)
     if seen is None:

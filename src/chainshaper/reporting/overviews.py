@@ -11,11 +11,12 @@ import polars as pl
 from chainshaper.analysis import ChainEnumeration
 from chainshaper.analysis.contradictions import Contradiction
 from chainshaper.enforcement.journal import Journal
-from chainshaper.enforcement.threads import Allocation, NodeThread, WantedScheduling
+from chainshaper.enforcement.node_threads import Allocation, NodeThread
+from chainshaper.enforcement.thread_scheduling import WantedScheduling
 from chainshaper.enforcement.undoing import RunState, ServerState
 from chainshaper.linux.threads import POLICIES
-from chainshaper.planning import BandChoice, Plan, band_predictions, publish_slots
-from chainshaper.planning.plan import slot_text
+from chainshaper.planning import BandChoice, ChainPlan, band_predictions, publish_slots
+from chainshaper.planning.chain_plan import slot_text
 from chainshaper.reporting.graph_drawing import short_symbol
 from chainshaper.reporting.latency import expected_jitter_text
 from chainshaper.reporting.tables import (
@@ -321,7 +322,7 @@ def condition_table(
     return table
 
 
-def _in_force(plan: Plan) -> str:
+def _in_force(plan: ChainPlan) -> str:
     """A plan in one line, with what its servers do at their slots' ends."""
     closing = "servers closed behind their slots" if plan.slot_ends == "closed" else ""
     parts = [part for part in (plan.policy, closing) if part]
@@ -372,7 +373,7 @@ def recorded_thread_table(threads: Sequence[ThreadInfo]) -> ResultTable:
     return table
 
 
-def plan_table(plan: Plan) -> ResultTable:
+def plan_table(plan: ChainPlan) -> ResultTable:
     """Servers and slots of a plan."""
     columns = [*words("server"), *figures("core", "priority"), *words("slots", "threads")]
     table = ResultTable(f"Plan for {plan.chain.spec or 'a chain'} [ms]", columns)
@@ -390,7 +391,7 @@ def plan_table(plan: Plan) -> ResultTable:
     return table
 
 
-def receivers_text(plan: Plan) -> str | None:
+def receivers_text(plan: ChainPlan) -> str | None:
     """What a plan promises for those that receive its output, and where they run."""
     node, promised = plan.shaping_node, plan.predicted.receivers
     if node is None or node.receivers_at is None or promised is None:
@@ -400,7 +401,7 @@ def receivers_text(plan: Plan) -> str | None:
     return f"{said} {milliseconds(promised.jitter_ns)} at most"
 
 
-def bands_table(plan: Plan) -> ResultTable:
+def bands_table(plan: ChainPlan) -> ResultTable:
     """What a plan predicts of each latency band, or of each mode by what was measured in it."""
     if plan.modes is not None and plan.evidence.modes is not None:
         columns = [*words("mode"), *figures("cycles", "min", "mean", "max", "slot")]
@@ -569,12 +570,12 @@ def changes_table(changes: Iterable[WantedScheduling]) -> ResultTable:
     names = ("node", "pid", "tid", "name", "role", "server", "class", "core", "why")
     table = ResultTable("What threads would get", words(*names))
     for one in changes:
-        thread, wanted = one.thread.thread, one.wanted
+        thread, wanted = one.node_thread.thread, one.scheduling
         scheduling = "as it is"
         if wanted.priority is not None:
             scheduling = scheduling_text(POLICIES[wanted.policy], wanted.priority)
         cores = listed(wanted.cores) if wanted.cores else "as they are"
-        about = ", ".join(one.thread.nodes), thread.pid, thread.tid, thread.comm, thread.role
+        about = ", ".join(one.node_thread.nodes), thread.pid, thread.tid, thread.comm, thread.role
         table.add(*about, one.server or "", scheduling, cores, one.reason)
     return table
 

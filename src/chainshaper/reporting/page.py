@@ -26,7 +26,7 @@ import numpy as np
 import polars as pl
 
 from chainshaper.analysis import DataFlow, callback_statistics, recorded_flow
-from chainshaper.planning import Plan, dump_plan, publish_slots
+from chainshaper.planning import ChainPlan, Plan, dump_plan, publish_slots
 from chainshaper.planning.overruns import slots_of_latency
 from chainshaper.reporting import latency as of_chain
 from chainshaper.reporting import overviews
@@ -52,7 +52,7 @@ WAITING = '<p class="waiting">This chart is drawn by a script: allow scripts to 
 
 
 @dataclass(frozen=True)
-class _Part:
+class _NamedMeasurement:
     """A measurement under the ``name`` that tells it from the report's others."""
 
     name: str
@@ -108,7 +108,7 @@ def report_page(
         for name, one in zip(names, chain.measurements, strict=True):
             flow = flows[id(one.recording)]
             timeline = timeline_of(one.recording, flow, one.analysis, one.plan)
-            parts.append(_Part(name, one, flow, timeline))
+            parts.append(_NamedMeasurement(name, one, flow, timeline))
         data = _drawn(parts, cycles, number)
         places = _tables(parts, data["n"], several) | _beside_charts(parts, data["recordings"])
         blocks.append(Template(of_each).substitute(places, n=data["n"]))
@@ -133,16 +133,18 @@ def report_page(
     )
 
 
-def _plans_of(parts: Sequence[_Part]) -> dict[str, Plan]:
+def _plans_of(parts: Sequence[_NamedMeasurement]) -> dict[str, ChainPlan]:
     """The plans that were in force, by the names of their recordings; equal ones stand once."""
-    plans: dict[str, tuple[list[str], Plan]] = {}
+    plans: dict[str, tuple[list[str], ChainPlan]] = {}
     for part in parts:
         if (plan := part.measurement.plan) is not None:
-            plans.setdefault(dump_plan(plan), ([], plan))[0].append(part.name)
+            plans.setdefault(dump_plan(Plan.of(plan)), ([], plan))[0].append(part.name)
     return {", ".join(users): plan for users, plan in plans.values()}
 
 
-def _drawn(parts: Sequence[_Part], cycles: Sequence[int], number: int) -> dict[str, Any]:
+def _drawn(
+    parts: Sequence[_NamedMeasurement], cycles: Sequence[int], number: int
+) -> dict[str, Any]:
     """Everything that is drawn of a chain; ``n`` is what ids end in, nothing for the first."""
     suffix = f"-{number + 1}" if number else ""
     recordings = [_recording_data(part, cycles) for part in parts]
@@ -179,7 +181,7 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     return [f"{path} ({number})" for number, path in enumerate(paths, start=1)]
 
 
-def _tables(parts: Sequence[_Part], suffix: str, several: bool) -> dict[str, str]:
+def _tables(parts: Sequence[_NamedMeasurement], suffix: str, several: bool) -> dict[str, str]:
     """What a chain's tables say, by the places that the template has for them. Of ``several``
     chains each has a heading, and the first has the callbacks of all."""
     names = [one.name for one in parts]
@@ -221,7 +223,9 @@ def _conditions(names: Sequence[str], chains: Sequence[Comparison]) -> str:
     return "\n".join([*parts, f'<ul class="notes">{items}</ul>'])
 
 
-def _beside_charts(parts: Sequence[_Part], data: Sequence[dict[str, Any]]) -> dict[str, str]:
+def _beside_charts(
+    parts: Sequence[_NamedMeasurement], data: Sequence[dict[str, Any]]
+) -> dict[str, str]:
     """Legends, choices, and what charts leave out."""
     every, sample, points, cycles = [], [], "", ""
     for part, one in zip(parts, data, strict=True):
@@ -258,7 +262,7 @@ def _legend(names: Sequence[str]) -> str:
     return f'<div class="legend">{"".join(items)}</div>'
 
 
-def _prediction(part: _Part) -> str:
+def _prediction(part: _NamedMeasurement) -> str:
     """Predicted beside measured, where a plan was in force."""
     judged = part.measurement.prediction
     if judged is None:
@@ -270,13 +274,13 @@ def _prediction(part: _Part) -> str:
     return _paragraph(about) + table.html()
 
 
-def _callbacks(part: _Part) -> str:
+def _callbacks(part: _NamedMeasurement) -> str:
     table = overviews.callback_table(callback_statistics(part.flow))
     title = f"Callbacks of {part.name} ({len(table.rows)}) [ms]"
     return _details(title, table.html(), unfolded=len(table.rows) <= LISTED)
 
 
-def _moves(part: _Part) -> str:
+def _moves(part: _NamedMeasurement) -> str:
     """Slots that followed the latencies, move by move."""
     moves = moves_in(part.measurement.analysis)
     if not moves:
@@ -289,7 +293,7 @@ def _moves(part: _Part) -> str:
     return _details(title, table.html(), unfolded=len(moves) <= LISTED)
 
 
-def _overruns(part: _Part) -> str:
+def _overruns(part: _NamedMeasurement) -> str:
     """Outputs that came behind their slot, one by one."""
     measurement = part.measurement
     if measurement.overruns is None:
@@ -317,7 +321,7 @@ def _overruns(part: _Part) -> str:
     return about + table.html() + _paragraph(rest)
 
 
-def _stalls(part: _Part) -> str:
+def _stalls(part: _NamedMeasurement) -> str:
     meter = part.measurement.recording.info.stall_meter
     if meter is None:
         return _paragraph(f"{part.name}: no meter watched, so its stalls are unknown.")
@@ -331,7 +335,7 @@ def _stalls(part: _Part) -> str:
     return _paragraph(about) + overviews.stall_table(meter, stalls).html()
 
 
-def _plan(number: str, users: str, plan: Plan) -> str:
+def _plan(number: str, users: str, plan: ChainPlan) -> str:
     title = "The servers' slots over one cycle"
     return (
         f'<section id="plan-{number}">\n<h2>{escape(f"The plan of {users}")}</h2>\n'
@@ -340,7 +344,7 @@ def _plan(number: str, users: str, plan: Plan) -> str:
         "<figcaption>Blue: the server in whose slots the output is published. Slots are half-open"
         " and drawn at least 1.5 pixels wide; drag to zoom.</figcaption></figure>\n"
         + overviews.plan_table(plan).html()
-        + _details("The plan as YAML", f"<pre>{escape(dump_plan(plan))}</pre>")
+        + _details("The plan as YAML", f"<pre>{escape(dump_plan(Plan.of(plan)))}</pre>")
         + "</section>"
     )
 
@@ -360,7 +364,7 @@ def _details(summary: str, content: str, *, unfolded: bool = False) -> str:
     return f"<details{state}><summary>{escape(summary)}</summary>\n{content}\n</details>"
 
 
-def _recording_data(part: _Part, cycles: Sequence[int]) -> dict[str, Any]:
+def _recording_data(part: _NamedMeasurement, cycles: Sequence[int]) -> dict[str, Any]:
     """Everything that is drawn of one recording; its timeline has ``cycles`` in any case."""
     measurement, plan = part.measurement, part.measurement.plan
     traversals = measurement.analysis.traversals
@@ -390,7 +394,7 @@ def latency_range(recordings: Sequence[dict[str, Any]]) -> tuple[float, float]:
 _OPACITY = {"communication": 0.35, "waiting": 0.15}
 
 
-def _hop_bars(parts: Sequence[_Part]) -> dict[str, Any]:
+def _hop_bars(parts: Sequence[_NamedMeasurement]) -> dict[str, Any]:
     """Mean communication (pale), computation (full) and waiting (palest) of every hop, a row per
     recording."""
     rows, longest = [], 1.0
@@ -412,7 +416,7 @@ def _hop_bars(parts: Sequence[_Part]) -> dict[str, Any]:
     return {"label": label, "length": longest * 1.01, "rows": rows}
 
 
-def _slot_bars(plan: Plan) -> dict[str, Any]:
+def _slot_bars(plan: ChainPlan) -> dict[str, Any]:
     """The servers' slots over one cycle, a row per server."""
     rows = []
     for one in plan.servers:

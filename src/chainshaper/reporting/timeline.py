@@ -18,7 +18,7 @@ import polars as pl
 
 from chainshaper.analysis import DataFlow, LatencyAnalysis
 from chainshaper.analysis.disturbance import lateness_in_cycle, overlapping
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan
 from chainshaper.reporting.overviews import cores_text
 from chainshaper.reporting.tables import ms, slots_ms
 from chainshaper.values import events
@@ -84,7 +84,7 @@ def timeline_of(
     recording: Recording,
     flow: DataFlow,
     analysis: LatencyAnalysis | None = None,
-    plan: Plan | None = None,
+    plan: ChainPlan | None = None,
 ) -> Timeline:
     """The timeline of a recording; cycles and slots are those of ``analysis`` and ``plan``."""
     times = flow.instances["start"], flow.instances["end"], flow.publications["time"]
@@ -137,7 +137,7 @@ def _threads(
     return rows.drop("place").with_columns(pl.Series("about", texts, dtype=pl.String))
 
 
-def _origins(analysis: LatencyAnalysis | None, plan: Plan | None) -> pl.DataFrame:
+def _origins(analysis: LatencyAnalysis | None, plan: ChainPlan | None) -> pl.DataFrame:
     """The gate says from when it counted; else the chain's stamp, or where cycles seem to start
     (:mod:`chainshaper.analysis.disturbance`)."""
     if analysis is None or plan is None:

@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 
 from chainshaper import _core
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import ReceiverPlace, Server
+from chainshaper.planning.chain_plan import ReceiverPlace, Server
+from chainshaper.planning.plan import Plan
 from chainshaper.robot.node_parameters import SAME
-from chainshaper.simulation.system import ROLES, Entity, Publisher, System
+from chainshaper.simulation.system import ROLES, Entity, SimulatedPublisher, System
 from chainshaper.values.errors import InputError
 from chainshaper.workload.description import CallbackDescription, ExecutionTime, TopicDescription
 from chainshaper.workload.execution import FIRST_AFTER, blocks
-from chainshaper.workload.live import Timing
+from chainshaper.workload.timing import Timing
 
 Int64s = npt.NDArray[np.int64]
 
@@ -52,7 +52,7 @@ class Streams:
     def add(self, times: ExecutionTime, node: str | None, index: int) -> int:
         """The place of a new stream of CPU times or delays (ns)."""
         self.constants.append(times.constant_ns)
-        self._drawn.append(blocks(times.model_dump(), self._seed, node or "", index))
+        self._drawn.append(blocks(times, self._seed, node or "", index))
         return len(self.constants) - 1
 
     def draw(self, stream: int) -> Int64s:
@@ -78,7 +78,7 @@ class Machine:
         self,
         system: System,
         handles: Handles,
-        plan: ApplicationPlan | None,
+        plan: Plan | None,
         timing: Timing,
         *,
         switches: bool,
@@ -204,7 +204,7 @@ class Machine:
     def _rank(
         self,
         threads: Sequence[_core.ThreadDescription],
-        plan: ApplicationPlan,
+        plan: Plan,
         governed: dict[int, Server],
         ranked: list[Server],
         receiving: dict[int, ReceiverPlace],
@@ -379,7 +379,7 @@ class Machine:
             )
         return publishers
 
-    def _delivery(self, reader: Entity, publisher: Publisher) -> int | None:
+    def _delivery(self, reader: Entity, publisher: SimulatedPublisher) -> int | None:
         """The stream of a reader's own times of delivery from a publisher; None: it has none."""
         process = self._system.processes[reader.process]
         described: Mapping[str, ExecutionTime] = self._system.application.simulation.deliveries.get(
@@ -397,9 +397,7 @@ class Machine:
         return self._deliveries[stream]
 
 
-def _governed_core(
-    plan: ApplicationPlan, ranked: Sequence[Server], timing: Timing
-) -> _core.CoreDescription:
+def _governed_core(plan: Plan, ranked: Sequence[Server], timing: Timing) -> _core.CoreDescription:
     """A core with servers. The run starts anywhere in a cycle."""
     table = _slot_table(plan, ranked)
     anchor = timing.start_ns if plan.moves_timers else timing.anchor_ns
@@ -415,7 +413,7 @@ def _governed_core(
     )
 
 
-def _slot_table(plan: ApplicationPlan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
+def _slot_table(plan: Plan, ranked: Sequence[Server]) -> list[tuple[int, int]]:
     """Rows (offset in the cycle, mask of the servers that are open from then on)."""
     # A free shaping node times its messages itself: its thread needs no slot to run in.
     slots = [

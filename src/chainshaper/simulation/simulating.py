@@ -18,8 +18,8 @@ import polars as pl
 from chainshaper import _core
 from chainshaper.analysis import recorded_flow
 from chainshaper.analysis.flow import DataFlow
-from chainshaper.planning.application_plan import ApplicationPlan, open_until_done, whole
-from chainshaper.planning.plan import Plan, publisher_servers
+from chainshaper.planning.chain_plan import publisher_servers
+from chainshaper.planning.plan import Plan, open_until_done
 from chainshaper.planning.plan_file import plan_values
 from chainshaper.simulation.machine import INSTANTS, Handles, Int64s, Machine
 from chainshaper.simulation.system import System, build_system
@@ -45,6 +45,7 @@ from chainshaper.workload.description import (
     node_name,
 )
 from chainshaper.workload.event_log import EventLog
+from chainshaper.workload.timing import Timing, timing_of
 
 START_NS = 1_000_000_000
 LONGEST_NS = 1 << 62
@@ -54,7 +55,7 @@ MOST = 100_000  # samples: enough for any distribution
 def simulate(
     application: Application,
     output: str | Path,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     *,
     cycles: int = 320,
     seed: int | None = None,
@@ -74,9 +75,8 @@ def simulate(
     end, or the recording cannot be written.
     """
     output = refuse_existing(output)
-    joint = None if plan is None else whole(plan)
-    application, timing = _checked(application, joint, cycles, seed)
-    system, objects, machine = _built(application, joint, timing, switches=switches)
+    application, timing = _checked(application, plan, cycles, seed)
+    system, objects, machine = _built(application, plan, timing, switches=switches)
     info = RecordingInfo(
         source="simulated",
         host="simulation",  # thread ids say nothing about any real machine
@@ -89,15 +89,15 @@ def simulate(
         notes=("simulated",),
         chain=application.chain,
         application=application_as_written(application),
-        plan=None if joint is None else plan_values(joint),
-        in_force=None if joint is None else InForceInfo(since_ns=timing.record_from_ns),
+        plan=None if plan is None else plan_values(plan),
+        in_force=None if plan is None else InForceInfo(since_ns=timing.record_from_ns),
     )
     return write_recording(output, _event_tables(system, objects, machine, progress), info)
 
 
 def simulate_latencies(
     application: Application,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     *,
     cycles: int = 320,
     seed: int | None = None,
@@ -111,17 +111,16 @@ def simulate_latencies(
 
     Raises: as :func:`simulate`.
     """
-    joint = None if plan is None else whole(plan)
-    application, timing = _checked(application, joint, cycles, seed)
-    _, _, machine = _built(application, joint, timing, latencies=cycles)
+    application, timing = _checked(application, plan, cycles, seed)
+    _, _, machine = _built(application, plan, timing, latencies=cycles)
     for _ in _runs(machine, progress):
         pass
     return machine.simulation.latencies()
 
 
 def _checked(
-    application: Application, plan: ApplicationPlan | None, cycles: int, seed: int | None
-) -> tuple[Application, live.Timing]:
+    application: Application, plan: Plan | None, cycles: int, seed: int | None
+) -> tuple[Application, Timing]:
     """The application with the seed and the plan's shaping nodes, and the run's instants."""
     if cycles < 1:
         raise InputError(f"{cycles} cycles cannot be simulated: ask for at least 1")
@@ -140,7 +139,7 @@ def _checked(
             application = splice_application(application, plan)
         else:  # a baseline
             application = at_offsets(application, plan)
-    timing = live.timing_of(application, cycles, START_NS)
+    timing = timing_of(application, cycles, START_NS)
     slowest = max((cb.timer_ns or 0) + cb.phase_ns for _, cb in application.callbacks())
     if timing.stop_ns + slowest > LONGEST_NS:
         raise InputError(
@@ -153,8 +152,8 @@ def _checked(
 
 def _built(
     application: Application,
-    plan: ApplicationPlan | None,
-    timing: live.Timing,
+    plan: Plan | None,
+    timing: Timing,
     *,
     switches: bool = False,
     latencies: int = 0,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 from chainshaper.analysis.chains import find_chain
-from chainshaper.planning.application_plan import ApplicationPlan
-from chainshaper.planning.plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.chain_plan import ReceiverPlace, Server, Thread
+from chainshaper.planning.plan import Plan
 from chainshaper.values.application import ApplicationGraph, Callback, Chain, Node
 from chainshaper.values.errors import InputError
 from chainshaper.values.recording import ThreadInfo
@@ -40,7 +40,7 @@ class Entity:
     listens: bool = False  # for modes on behalf of the gate
 
 
-class Publisher(NamedTuple):
+class SimulatedPublisher(NamedTuple):
     """One callback's publisher of a topic."""
 
     process: int
@@ -48,7 +48,7 @@ class Publisher(NamedTuple):
     asynchronous: bool
 
 
-class Process(NamedTuple):
+class SimulatedProcess(NamedTuple):
     """A node's process; ``key`` is the node's name in the description."""
 
     node: str
@@ -65,13 +65,13 @@ class System:
     """
 
     application: Application
-    processes: tuple[Process, ...]
+    processes: tuple[SimulatedProcess, ...]
     threads: tuple[ThreadInfo, ...]
     servers: Mapping[int, Server]
     receivers: Mapping[int, ReceiverPlace]
     cores: tuple[int, ...]
     entities: tuple[Entity, ...]
-    publishers: tuple[Publisher, ...]
+    publishers: tuple[SimulatedPublisher, ...]
     chain: Chain
     modes: tuple[str, ...]
 
@@ -81,7 +81,7 @@ class System:
 
 
 def build_system(
-    application: Application, plan: ApplicationPlan | None = None, *, follow_chain: bool
+    application: Application, plan: Plan | None = None, *, follow_chain: bool
 ) -> System:
     """Everything that runs in an application; ``follow_chain`` if its chain has to be known.
 
@@ -89,11 +89,11 @@ def build_system(
     has a thread that the application does not have.
     """
     processes = tuple(
-        Process(node_name(key), key, FIRST_PID + 10 * number)
+        SimulatedProcess(node_name(key), key, FIRST_PID + 10 * number)
         for number, key in enumerate(application.nodes)
     )
     entities: list[Entity] = []
-    publishers: list[Publisher] = []
+    publishers: list[SimulatedPublisher] = []
     order = STATIC_ORDER if application.simulation.executor == "static" else KINDS
     for number, process in enumerate(processes):
         own = list(_entities(application, number, process.key, publishers))
@@ -129,14 +129,14 @@ def build_system(
 
 
 def _entities(
-    application: Application, process: int, key: str, publishers: list[Publisher]
+    application: Application, process: int, key: str, publishers: list[SimulatedPublisher]
 ) -> Iterator[Entity]:
     """A node's entities in the order of registration; their publishers are added to the list."""
     for index, described in enumerate(application.nodes[key].callbacks):
         own = tuple(range(len(publishers), len(publishers) + len(described.publishes)))
         for topic in described.publishes:
             asynchronous = application.topic(topic).publication == "asynchronous"
-            publishers.append(Publisher(process, topic, asynchronous))
+            publishers.append(SimulatedPublisher(process, topic, asynchronous))
         if described.timer_ns is not None:
             yield Entity(process, index, 0, "timer", None, described, own)
         of_modes = len(described.subscriptions) - len(described.inputs)
@@ -148,7 +148,9 @@ def _entities(
 
 
 def _threads(
-    application: Application, processes: Sequence[Process], publishers: Sequence[Publisher]
+    application: Application,
+    processes: Sequence[SimulatedProcess],
+    publishers: Sequence[SimulatedPublisher],
 ) -> Iterator[ThreadInfo]:
     for number, process in enumerate(processes):
         own = application.scheduling_of(process.key)
@@ -175,7 +177,7 @@ def _threads(
             )
 
 
-def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
+def _servers(plan: Plan, threads: Sequence[ThreadInfo]) -> dict[int, Server]:
     """The server of each thread that is in one."""
     numbers: dict[Thread, list[int]] = {}
     for number, one in enumerate(threads):
@@ -195,7 +197,7 @@ def _servers(plan: ApplicationPlan, threads: Sequence[ThreadInfo]) -> dict[int, 
 
 
 def _receivers(
-    plan: ApplicationPlan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
+    plan: Plan, threads: Sequence[ThreadInfo], servers: Mapping[int, Server]
 ) -> dict[int, ReceiverPlace]:
     """The place of each thread that receives an output, and is in no server."""
     place_of = plan.receivers_at
@@ -208,7 +210,9 @@ def _receivers(
 
 
 def _graph(
-    processes: Sequence[Process], entities: Sequence[Entity], publishers: Sequence[Publisher]
+    processes: Sequence[SimulatedProcess],
+    entities: Sequence[Entity],
+    publishers: Sequence[SimulatedPublisher],
 ) -> ApplicationGraph:
     """Where the chain is found: callbacks alone publish, so topics need not name their nodes."""
     callbacks = [

@@ -6,9 +6,14 @@ republishes on the original one is added. Where the plan gates the publisher's o
 output gets the lifespan by which DDS discards what overran.
 """
 
-from chainshaper.planning.application_plan import ApplicationPlan, whole
+from chainshaper.planning.chain_plan import (
+    ChainPlan,
+    ShapingNode,
+    publisher_servers,
+    publishing_servers,
+)
 from chainshaper.planning.overruns import Writer, check_publication, output_lifespan
-from chainshaper.planning.plan import Plan, ShapingNode, publisher_servers, publishing_servers
+from chainshaper.planning.plan import Plan
 from chainshaper.robot.node_parameters import SAME
 from chainshaper.splicing.gate_settings import gate_of
 from chainshaper.values.durations import duration_text
@@ -24,18 +29,17 @@ from chainshaper.workload.description import (
 )
 
 
-def splice_application(application: Application, plan: Plan | ApplicationPlan) -> Application:
+def splice_application(application: Application, plan: Plan) -> Application:
     """The application as the plan wants it to run, with chains at its offsets, as a new one.
 
     Raises InputError: the plan shapes nothing, or does not fit the application.
     """
-    joint = whole(plan)
-    application = _placed(at_offsets(application, joint), joint)
-    for chain in joint.chains:
+    application = _placed(at_offsets(application, plan), plan)
+    for chain in plan.chains:
         application = _with_chain(application, chain)
     own = {*map(node_name, application.nodes)}
-    planned = {thread.node for server in joint.servers for thread in server.threads}
-    if strange := planned - own - {node.thread.node for node in joint.shaping_nodes}:
+    planned = {thread.node for server in plan.servers for thread in server.threads}
+    if strange := planned - own - {node.thread.node for node in plan.shaping_nodes}:
         raise InputError(
             f"the plan names {', '.join(sorted(strange))}, which {application.name!r} does not have"
             f" (its nodes: {', '.join(sorted(own))}): correct the plan, or plan from a recording of"
@@ -44,12 +48,12 @@ def splice_application(application: Application, plan: Plan | ApplicationPlan) -
     return application
 
 
-def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
+def at_offsets(application: Application, plan: Plan) -> Application:
     """The application with timers that expire at the offsets of the chains that they start.
 
     InputError: the application lacks a chain of the plan, or it has another period there.
     """
-    for chain in joint.chains:
+    for chain in plan.chains:
         (name, timer), period_ns = (
             origin_timer(application, chain.chain.spec),
             chain.chain.period_ns,
@@ -61,7 +65,7 @@ def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
                 f" {duration_text(timer.timer_ns or 0)}: plan again from a recording of this"
                 " application"
             )
-        if joint.moves_timers:
+        if plan.moves_timers:
             node = application.nodes[name]
             moved = timer.model_copy(update={"phase_ns": chain.offset_ns})
             callbacks = tuple(moved if one is timer else one for one in node.callbacks)
@@ -70,7 +74,7 @@ def at_offsets(application: Application, joint: ApplicationPlan) -> Application:
     return application
 
 
-def _with_chain(application: Application, plan: Plan) -> Application:
+def _with_chain(application: Application, plan: ChainPlan) -> Application:
     shaping = plan.shaping_node
     if shaping is None and any(publisher_servers(plan)):
         check_publication(plan, writers_of(application))
@@ -99,7 +103,7 @@ def _with_chain(application: Application, plan: Plan) -> Application:
     return application
 
 
-def nothing_to_splice(plan: Plan) -> InputError:
+def nothing_to_splice(plan: ChainPlan) -> InputError:
     """The error for a plan without a shaping node."""
     return InputError(
         f"the plan has no `shaping_node`, so there is nothing to splice: put {plan.policy} in force"
@@ -107,12 +111,12 @@ def nothing_to_splice(plan: Plan) -> InputError:
     )
 
 
-def _placed(application: Application, joint: ApplicationPlan) -> Application:
+def _placed(application: Application, plan: Plan) -> Application:
     """The application with nodes where the servers have them: core, and rank where they differ;
     and who receives an output in the place for that, behind the shaping nodes.
     """
-    publishing = {one.name for chain in joint.chains for one in publishing_servers(chain)}
-    running = [server for server in joint.servers if server.name not in publishing]
+    publishing = {one.name for chain in plan.chains for one in publishing_servers(chain)}
+    running = [server for server in plan.servers if server.name not in publishing]
     server_of = {thread.node: server for server in running for thread in server.threads}
     best = min((server.priority for server in running), default=1)
     nodes = dict(application.nodes)
@@ -123,14 +127,14 @@ def _placed(application: Application, joint: ApplicationPlan) -> Application:
             if (own.core, own.priority, node.bound) != (server.core, rank, True):
                 placed = {"core": server.core, "priority": rank, "bound": True}
                 nodes[name] = node.model_copy(update=placed)
-        elif (place := joint.receivers_at.get(node_name(name))) is not None:
-            gates = (one.fifo_priority for one in joint.shaping_nodes)
+        elif (place := plan.receivers_at.get(node_name(name))) is not None:
+            gates = (one.fifo_priority for one in plan.shaping_nodes)
             receiving = {"core": place.core, "priority": max(1, min(gates) - 1)}
             nodes[name] = node.model_copy(update=receiving)
     return application.model_copy(update={"nodes": nodes})
 
 
-def _spliced(application: Application, plan: Plan, shaping: ShapingNode) -> Application:
+def _spliced(application: Application, plan: ChainPlan, shaping: ShapingNode) -> Application:
     """The application with one shaping node behind the publisher of its output."""
     if shaping.name in {name.strip("/") for name in application.nodes}:
         raise InputError(
@@ -181,7 +185,7 @@ def writers_of(application: Application) -> list[Writer]:
     ]
 
 
-def _described(plan: Plan, shaping: ShapingNode, depth: int, phase_ns: int) -> NodeDescription:
+def _described(plan: ChainPlan, shaping: ShapingNode, depth: int, phase_ns: int) -> NodeDescription:
     gate = gate_of(plan, shaping, depth)
     described = {name: getattr(gate, name) for name in (*SAME, "slots", "depth")}
     described |= {"phase_ns": phase_ns, "spin_ns": shaping.spin_ns, "pause_ns": shaping.pause_ns}

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from chainshaper.linux.threads import gate_thread_name
+from chainshaper.planning.chain_plan import ChainPlan, ShapingNode, server_of
 from chainshaper.planning.overruns import cycles_until_output
-from chainshaper.planning.plan import Plan, ShapingNode, server_of
 from chainshaper.robot.gate import DEPTH, Gate, Modes
 from chainshaper.robot.node_parameters import gate_parameters
 from chainshaper.sources.preload import native_library
@@ -20,7 +20,7 @@ GATES = "CHAINSHAPER_GATES"
 """The variable that names the file with all gates of an application (`in_front_of_rmw.hpp`)."""
 
 
-def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
+def gate_of(plan: ChainPlan, node: ShapingNode, depth: int = DEPTH) -> Gate:
     """The gate of a plan's shaping node, with room for so many messages."""
     server = server_of(plan, node.thread)  # a plan without one for a shaping node is refused
     modes = plan.modes if node == plan.shaping_node else None
@@ -40,7 +40,7 @@ def gate_of(plan: Plan, node: ShapingNode, depth: int = DEPTH) -> Gate:
     )
 
 
-def shaping_parameters(plan: Plan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
+def shaping_parameters(plan: ChainPlan, node: ShapingNode, log: Path | None) -> dict[str, Any]:
     """The ROS parameters of a shaping node, by the names of :class:`NodeParameters`."""
     mode_topic = "" if plan.modes is None else plan.modes.topic
     parameters = gate_parameters(gate_of(plan, node), mode_topic) | {
@@ -62,7 +62,7 @@ def page_name(node: ShapingNode, place: Path) -> str:
     return f"{node.name}.{hashlib.sha256(str(place.absolute()).encode()).hexdigest()[:8]}"
 
 
-def gate_settings(plan: Plan, node: ShapingNode, publisher: str, log: Path) -> str:
+def gate_settings(plan: ChainPlan, node: ShapingNode, publisher: str, log: Path) -> str:
     """The block of an output in the file that :data:`GATES` names, a line for each value."""
     values = {
         "output": node.output,

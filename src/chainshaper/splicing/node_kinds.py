@@ -7,7 +7,7 @@ C++ follows from the output. All kinds shape alike, with the same parameters and
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
-from chainshaper.planning.plan import Plan
+from chainshaper.planning.chain_plan import ChainPlan
 from chainshaper.splicing.message_types import headers_installed
 from chainshaper.splicing.node_packages import missing_build_tool
 from chainshaper.values.plan_choices import NodeChoice, NodeLanguage
@@ -55,7 +55,7 @@ def kind_of(
     return "generic", f"in C++ for all types, since no headers of {message_type} are installed here"
 
 
-def passes_within_container(plan: Plan, publisher: str, recording: "Recording | None") -> bool:
+def passes_within_container(plan: ChainPlan, publisher: str, recording: "Recording | None") -> bool:
     """Return whether subscribers get the plan's output within the publisher's container.
 
     The evidence of the plan says whether they get it without DDS. The recording, if there is one,
@@ -75,7 +75,7 @@ def passes_within_container(plan: Plan, publisher: str, recording: "Recording | 
     return not pids.isdisjoint(loading["pid"])
 
 
-def copies_made(plan: Plan, kind: NodeKind, *, within_container: bool) -> Iterator[str]:
+def copies_made(plan: ChainPlan, kind: NodeKind, *, within_container: bool) -> Iterator[str]:
     """Yield a line where a node of this kind needs copies of messages that are not made now."""
     if not plan.evidence.intra_process or kind == "component":
         return

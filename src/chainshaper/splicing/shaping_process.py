@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from chainshaper.planning.plan import Plan, ShapingNode
+from chainshaper.planning.chain_plan import ChainPlan, ShapingNode
 from chainshaper.robot.gate import DEPTH
 from chainshaper.robot.throttling import Rule
 from chainshaper.splicing.gate_settings import page_name, shaping_parameters
@@ -69,7 +69,7 @@ class ShapingProcess:
 
 
 def write_shaping_process(
-    plan: Plan,
+    plan: ChainPlan,
     node: ShapingNode,
     kind: NodeKind,
     folder: Path,

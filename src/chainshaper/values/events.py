@@ -14,8 +14,8 @@ within one process and only until they are freed. Tables lack columns that their
 know; a table that is missing altogether is the same as an empty one.
 """
 
-from collections.abc import Iterable, Mapping
-from typing import TypeAlias
+from collections.abc import Collection, Iterable, Mapping
+from typing import Protocol, TypeAlias, runtime_checkable
 
 import polars as pl
 
@@ -99,6 +99,14 @@ def table(tables: EventTables, name: str, columns: Iterable[str] = ()) -> pl.Dat
     frame, known = tables[name] if name in tables else empty(name), column_types(name)
     nulls = [pl.lit(None, known[one]).alias(one) for one in columns if one not in frame.columns]
     return frame.with_columns(nulls) if nulls else frame
+
+
+@runtime_checkable
+class ReadAgain(Protocol):
+    """Tables that can be read again, so that nobody needs to keep them in memory."""
+
+    def let_go(self, names: Collection[str]) -> None:
+        """Forget these tables until they are asked for the next time."""
 
 
 def column_types(name: str) -> dict[str, pl.DataType]:

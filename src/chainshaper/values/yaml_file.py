@@ -29,7 +29,6 @@ from chainshaper.values.durations import duration_text, format_duration, parse_d
 from chainshaper.values.errors import InputError
 
 Model = TypeVar("Model", bound=BaseModel)
-Other = TypeVar("Other", bound=BaseModel)
 _Path: TypeAlias = tuple[str | int, ...]
 
 _KINDS = {
@@ -106,11 +105,14 @@ def wrong_value(reason: str, *where: str | int) -> PydanticCustomError:
 
 
 KINDS = {
-    "a plan": {"servers", "predicted"},
-    "a plan of several chains": {"format", "chains"},
+    "a plan": {"format", "chains"},
+    "a plan of an earlier version, converted by `chainshaper plan --convert {path} -o NEW.yaml`": {
+        "servers",
+        "predicted",
+    },
     "the description of an application": {"nodes", "scheduling"},
 }
-"""What other files are, by keys that only they have."""
+"""Kinds of files, for messages, and the keys that only files of this kind have."""
 
 
 def read_model(
@@ -118,12 +120,11 @@ def read_model(
     model: type[Model],
     *,
     made_by: str,
-    otherwise: tuple[str, type[Other]] | None = None,
-) -> Model | Other:
+) -> Model:
     """A YAML file as a Pydantic model; ``made_by`` completes the sentence "such a file is …".
 
-    ``otherwise`` is the model of a file that has a certain key. Raises InputError: no such file,
-    not YAML, or wrong values, each with its line, key, reason and remedy.
+    Raises InputError: no such file, not YAML, or wrong values, each with its line, key, reason and
+    remedy.
     """
     path = Path(path)
     root, plain = compose(read_text(path, made_by), path), PlainData(path)
@@ -131,17 +132,15 @@ def read_model(
     if not isinstance(values, dict):
         found = "the file is empty" if root is None else "expected a YAML mapping (key: value)"
         raise InputError(f"{path}:1: {found}; such a file is {made_by}")
-    meant: type[Model] | type[Other] = model
-    if otherwise is not None and otherwise[0] in values:
-        meant = otherwise[1]
     try:
-        return meant.model_validate(values, context=AS_YAML)
+        return model.model_validate(values, context=AS_YAML)
     except ValidationError as error:
-        own = {name.removesuffix("_ns") for name in meant.model_fields}
+        known = {name.removesuffix("_ns") for name in model.model_fields}
         for kind, keys in KINDS.items():
-            if keys <= values.keys() and not keys <= own and meant is model:
-                raise InputError(f"{path}: is {kind}; wanted is a file {made_by}") from error
-        raise plain.problems(error, meant) from error
+            if keys <= values.keys() and not keys <= known:
+                reason = f"is {kind.format(path=path)}; wanted is a file {made_by}"
+                raise InputError(f"{path}: {reason}") from error
+        raise plain.problems(error, model) from error
 
 
 def read_text(path: Path, made_by: str) -> str:

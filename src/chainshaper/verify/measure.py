@@ -24,9 +24,9 @@ from chainshaper.analysis import (
 )
 from chainshaper.analysis.flow import DataFlow, left_when_taken
 from chainshaper.analysis.latency import summary
-from chainshaper.planning import ApplicationPlan, Plan
-from chainshaper.planning.application_plan import plan_of_chain, whole
-from chainshaper.planning.plan import publisher_servers
+from chainshaper.planning import ChainPlan, Plan
+from chainshaper.planning.chain_plan import publisher_servers
+from chainshaper.planning.plan import plan_of_chain
 from chainshaper.planning.plan_file import plan_in
 from chainshaper.sources import open_source
 from chainshaper.values import events
@@ -83,7 +83,7 @@ class Measurement:
     outcomes: dict[str, Outcome]
     into_open_slots: int | None
     dropped: dict[str, int] | None
-    plan: Plan | None
+    plan: ChainPlan | None
     prediction: JudgedPrediction | None
     left_out: LeftOut
 
@@ -142,7 +142,7 @@ def taken_chain(recording: Recording, chain: str | None, spec: str) -> tuple[str
 def measure_latency(
     recording: Recording | str | Path,
     chain: str | None = None,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     flow: DataFlow | None = None,
 ) -> Measurement:
     """Analyse the end-to-end latency of one chain in a recording.
@@ -158,10 +158,10 @@ def opened(recording: Recording | str | Path) -> Recording:
     return recording if isinstance(recording, Recording) else open_source(recording)
 
 
-def _plan_of(recording: Recording, plan: Plan | ApplicationPlan | None) -> ApplicationPlan | None:
+def _plan_of(recording: Recording, plan: Plan | None) -> Plan | None:
     """The plan in force: the given one, or that of the recording."""
     if plan is not None:
-        return whole(plan)
+        return plan
     known = recording.info.plan
     return None if known is None else plan_in(known, f"{recording.path}, its plan in force")
 
@@ -169,7 +169,7 @@ def _plan_of(recording: Recording, plan: Plan | ApplicationPlan | None) -> Appli
 def _measured(
     recording: Recording,
     chains: Sequence[str | None],
-    plan: Plan | ApplicationPlan | None,
+    plan: Plan | None,
     flow: DataFlow | None = None,
 ) -> list[Measurement]:
     """The measurements of several chains in one recording, whose events are resolved once."""
@@ -211,7 +211,7 @@ def _measured(
     return measurements
 
 
-def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recording) -> None:
+def _refuse_other_period(plan: ChainPlan, analysis: LatencyAnalysis, recording: Recording) -> None:
     """Refuse to judge by a plan whose cycle is not the chain's period, or several of them (a source
     may be faster than the cycle)."""
     period = analysis.period_ns
@@ -223,7 +223,7 @@ def _refuse_other_period(plan: Plan, analysis: LatencyAnalysis, recording: Recor
         )
 
 
-def _in_front(chain: str, plan: ApplicationPlan | None) -> str:
+def _in_front(chain: str, plan: Plan | None) -> str:
     """A chain whose first topic is shaped, from in front of that shaping node.
 
     So is a chain of one callback, and the first topic under LET per callback.
@@ -258,7 +258,7 @@ def longest_stall(recording: Recording) -> int | None:
 def compare_recordings(
     recordings: Sequence[Recording | str | Path],
     chain: str | None = None,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
 ) -> Comparison:
     """Measure the same chain, the first of several, in several recordings.
 
@@ -272,7 +272,7 @@ def compare_recordings(
 def compare_chains(
     recordings: Sequence[Recording | str | Path],
     chain: str | None = None,
-    plan: Plan | ApplicationPlan | None = None,
+    plan: Plan | None = None,
     *,
     least: int = 2,
     progress: Callable[[float, str], None] = lambda *_: None,

@@ -24,9 +24,9 @@ from chainshaper.analysis import LatencyAnalysis
 from chainshaper.analysis.messages import with_overrun
 from chainshaper.analysis.objects import named_nodes
 from chainshaper.analysis.traversals import OWES_NO_OUTPUT
-from chainshaper.planning import Plan
+from chainshaper.planning import ChainPlan
+from chainshaper.planning.chain_plan import publisher_servers, shaping_nodes
 from chainshaper.planning.overruns import cycles_until_output, slots_of_latency
-from chainshaper.planning.plan import publisher_servers, shaping_nodes
 from chainshaper.robot.decision import DROPPED
 from chainshaper.values import events
 from chainshaper.values.plan_choices import STANDBY
@@ -47,7 +47,7 @@ _MOVES_SHOWN = 8
 
 
 def gate_releases(
-    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis
+    recording: Recording, plan: ChainPlan | None, analysis: LatencyAnalysis
 ) -> pl.DataFrame | None:
     """The table `gate_release` with ``overrun``, which older recordings lack; None: there is none.
 
@@ -75,7 +75,10 @@ def _of_nodes(recording: Recording, table: pl.DataFrame, own: Collection[str]) -
 
 
 def overruns_in(
-    recording: Recording, plan: Plan | None, analysis: LatencyAnalysis, decided: pl.DataFrame | None
+    recording: Recording,
+    plan: ChainPlan | None,
+    analysis: LatencyAnalysis,
+    decided: pl.DataFrame | None,
 ) -> dict[str, int] | None:
     """How many outputs overran, per policy that was applied to them; None: nothing was gated.
 
@@ -109,7 +112,7 @@ class Outcome:
     next_hit: int
 
 
-def outcomes_in(analysis: LatencyAnalysis, plan: Plan | None) -> dict[str, Outcome]:
+def outcomes_in(analysis: LatencyAnalysis, plan: ChainPlan | None) -> dict[str, Outcome]:
     """What became of the outputs that overran, per policy that was applied to them; those that a
     standby dealt with did not overrun.
     """

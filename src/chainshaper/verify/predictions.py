@@ -25,7 +25,8 @@ import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis, LatencyStatistics, latency_statistics
 from chainshaper.analysis.disturbance import Due
-from chainshaper.planning import Plan, publish_slots
+from chainshaper.planning import ChainPlan, publish_slots
+from chainshaper.planning.chain_plan import SHORTEST_SLOT_NS, Slot, publisher_servers, server_of
 from chainshaper.planning.margins import OVERRUN_PROBABILITY
 from chainshaper.planning.overruns import (
     GATE_NS,
@@ -34,7 +35,6 @@ from chainshaper.planning.overruns import (
     expected,
     slots_of_latency,
 )
-from chainshaper.planning.plan import SHORTEST_SLOT_NS, Slot, publisher_servers, server_of
 from chainshaper.values.durations import milliseconds
 from chainshaper.verify.promises import (
     STANDARD_ERRORS,
@@ -185,7 +185,7 @@ class JudgedPrediction:
         return f"jitter within bands {measured} ms, at most {', '.join(bounds)} ms"
 
 
-def due_of(plan: Plan) -> tuple[Due, ...]:
+def due_of(plan: ChainPlan) -> tuple[Due, ...]:
     """When a plan has its outputs leave, as the analysis needs it: the chain's, other sinks'."""
     last = {} if plan.modes is None else {m: band - 1 for m, band in plan.modes.bands.items()}
     own = Due(
@@ -206,13 +206,13 @@ def due_of(plan: Plan) -> tuple[Due, ...]:
     return own, *sinks
 
 
-def _from_cycle(plan: Plan) -> bool:
+def _from_cycle(plan: ChainPlan) -> bool:
     """Whether slots count from the start of the cycle, whenever in it the chain began."""
     by_cycle = plan.shaping_node is not None and plan.anchor == "cycle"
     return by_cycle or any(publisher_servers(plan))
 
 
-def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
+def judge_prediction(plan: ChainPlan, analysis: LatencyAnalysis) -> JudgedPrediction:
     """Hold the prediction of the plan in force against the analysis of a recording.
 
     The analysis knows from :func:`due_of` when outputs were due.
@@ -252,7 +252,9 @@ def judge_prediction(plan: Plan, analysis: LatencyAnalysis) -> JudgedPrediction:
     )
 
 
-def _receivers(plan: Plan, analysis: LatencyAnalysis, from_cycle: bool) -> JudgedReceivers | None:
+def _receivers(
+    plan: ChainPlan, analysis: LatencyAnalysis, from_cycle: bool
+) -> JudgedReceivers | None:
     """What is promised for those that receive the output, beside the measurement."""
     promised = plan.predicted.receivers
     if promised is None:
@@ -275,7 +277,7 @@ def _receivers(plan: Plan, analysis: LatencyAnalysis, from_cycle: bool) -> Judge
 
 
 def _figures(
-    plan: Plan, slots: Sequence[Slot], measured: LatencyStatistics
+    plan: ChainPlan, slots: Sequence[Slot], measured: LatencyStatistics
 ) -> tuple[JudgedFigure, JudgedFigure, JudgedFigure]:
     """Average, maximum and jitter: with outputs at slot starts and ends, with room, measured."""
     predicted = plan.predicted
@@ -324,7 +326,7 @@ def _figures(
     )
 
 
-def jitter_within_band(plan: Plan, slot: Slot, *, last: bool) -> int:
+def jitter_within_band(plan: ChainPlan, slot: Slot, *, last: bool) -> int:
     """How far apart the outputs of one of several bands may be: as wide as its slot, into which
     they come at any time. Into the last one all that are in time come before it opens.
     """

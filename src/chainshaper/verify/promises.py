@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 import polars as pl
 
 from chainshaper.analysis import LatencyAnalysis
-from chainshaper.planning import Plan
-from chainshaper.planning.plan import Evidence
+from chainshaper.planning import ChainPlan
+from chainshaper.planning.chain_plan import Evidence
 
 STANDARD_ERRORS = 3  # beyond so many, a figure is not what was predicted
 NOT_PUBLISHED, NOT_BEGUN, NEVER_CAME = "not published", "not begun", "never came"
@@ -39,7 +39,7 @@ class OutputsDue:
 
     @classmethod
     def of(
-        cls, count: int, late: int | None, incomplete: int, plan: Plan | None = None
+        cls, count: int, late: int | None, incomplete: int, plan: ChainPlan | None = None
     ) -> "OutputsDue":
         """Of so many outputs that came, and so many that did not, for no known reason."""
         absent, due, usual = {NEVER_CAME: incomplete} if incomplete else {}, count + incomplete, 0
@@ -88,7 +88,7 @@ def most_by_chance(count: int, share: float) -> int:
     return math.floor(mean + STANDARD_ERRORS * math.sqrt(mean))
 
 
-def promised_by(plan: Plan) -> float:
+def promised_by(plan: ChainPlan) -> float:
     """The share of outputs that a plan says may be missed, at most."""
     return plan.margin.overrun_probability or 0.0
 
@@ -99,7 +99,7 @@ def _usual(evidence: Evidence, before: int, due: int, absent: int) -> int:
     return min(absent, most_by_chance(due, before / planned_from)) if before else 0
 
 
-def outputs_due(analysis: LatencyAnalysis, plan: Plan | None = None) -> OutputsDue:
+def outputs_due(analysis: LatencyAnalysis, plan: ChainPlan | None = None) -> OutputsDue:
     """What became of the outputs of a chain that were due, under a plan if one was in force."""
     return _counted(analysis.traversals, analysis.not_begun, plan)
 
@@ -109,7 +109,7 @@ def undisturbed_outputs_due(analysis: LatencyAnalysis) -> OutputsDue:
     return _counted(analysis.traversals.filter(~pl.col("disturbed")), analysis.not_begun, None)
 
 
-def _counted(traversals: pl.DataFrame, not_begun: int, plan: Plan | None) -> OutputsDue:
+def _counted(traversals: pl.DataFrame, not_begun: int, plan: ChainPlan | None) -> OutputsDue:
     due = traversals.filter("was_due")
     gone = due.filter(~pl.col("complete"))
     absent = Counter[str](gone["reason"].cast(pl.String)) if gone.height else Counter[str]()

@@ -5,64 +5,67 @@ import zlib
 from collections import deque
 from collections.abc import Iterator
 from itertools import count
-from typing import Any
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from chainshaper.workload.description import ExecutionTime
+
+Int64s: TypeAlias = npt.NDArray[np.int64]
 BLOCK = 1024
 FIRST_AFTER = 1 << 16
-"""What callbacks do behind their publications is numbered from here, callbacks from 0."""
-_DATA, _STEP_NS = bytes(16_384), 30_000
-"""Bytes for whose checksum the lock is released, and longer than that takes."""
+"""Sequences of what callbacks do behind their publications count from here; callbacks, from 0."""
+_DATA = bytes(16_384)  # so many that `crc32` releases the interpreter's lock
+_STEP_NS = 30_000  # longer than their checksum takes
 
 
-def draw(
-    execution: dict[str, Any], number: int, random: np.random.Generator
-) -> npt.NDArray[np.int64]:
-    """``number`` execution times (ns) from a described ``ExecutionTime``, as a dictionary."""
-    if (constant := execution.get("constant_ns")) is not None:
-        return np.full(number, constant, dtype=np.int64)
-    if (uniform := execution.get("uniform_ns")) is not None:
-        return random.integers(uniform[0], uniform[1], number, dtype=np.int64, endpoint=True)
-    if (samples := execution.get("samples_ns")) is not None:
-        block = execution.get("block", 1)
-        starts = (random.random(-(-number // block)) * len(samples)).astype(np.int64)
-        places = (starts[:, None] + np.arange(block)).ravel()[:number] % len(samples)
-        measured: npt.NDArray[np.int64] = np.asarray(samples, dtype=np.int64)[places]
+def draw(times: ExecutionTime, number: int, random: np.random.Generator) -> Int64s:
+    """Draw ``number`` execution times (ns) of a described distribution."""
+    if times.constant_ns is not None:
+        return np.full(number, times.constant_ns, dtype=np.int64)
+    if times.uniform_ns is not None:
+        low, high = times.uniform_ns
+        return random.integers(low, high, number, dtype=np.int64, endpoint=True)
+    if times.samples_ns is not None:
+        samples = np.asarray(times.samples_ns, dtype=np.int64)
+        stretches = -(-number // times.block)
+        starts = (random.random(stretches) * len(samples)).astype(np.int64)
+        places = (starts[:, None] + np.arange(times.block)).ravel()[:number] % len(samples)
+        measured: Int64s = samples[places]
         return measured
-    mean, deviation = execution["normal_ns"]
-    low, high = execution["within_ns"]
+    if times.normal_ns is None or times.within_ns is None:
+        raise ValueError("a sequence is gone through, not drawn from")
+    mean, deviation = times.normal_ns
+    low, high = times.within_ns
     drawn = random.normal(mean, deviation, number)
     while (outside := (drawn < low) | (drawn > high)).any():
         drawn[outside] = random.normal(mean, deviation, int(outside.sum()))
     return drawn.astype(np.int64)
 
 
-def blocks(
-    execution: dict[str, Any], seed: int, node: str, index: int
-) -> Iterator[npt.NDArray[np.int64]]:
-    """The endless sequence of execution times of one callback, in blocks of `BLOCK` values (ns).
+def blocks(times: ExecutionTime, seed: int, node: str, index: int) -> Iterator[Int64s]:
+    """Yield the endless sequence of execution times of a callback, in blocks of `BLOCK` (ns).
 
     Seed, node and the callback's index in its node determine the sequence, in a run and in its
     simulation. Stretches of samples depend on the seed only: callbacks that were measured together
     draw together.
     """
-    if (sequence := execution.get("sequence_ns")) is not None:
-        measured: npt.NDArray[np.int64] = np.asarray(sequence, dtype=np.int64)
+    if times.sequence_ns is not None:
+        measured: Int64s = np.asarray(times.sequence_ns, dtype=np.int64)
         for first in count(0, BLOCK):
             yield measured[(first + np.arange(BLOCK)) % len(measured)]
-    together = execution.get("block", 1) > 1
+    together = times.block > 1
     random = np.random.default_rng([seed] if together else [seed, zlib.crc32(node.encode()), index])
     while True:  # values that are drawn again must not depend on how many are asked for at once
-        yield draw(execution, BLOCK, random)
+        yield draw(times, BLOCK, random)
 
 
 class ExecutionTimes:
-    """The same sequence one by one, drawn beforehand: a callback has to spend them, not to draw."""
+    """A callback's sequence, value by value; drawn beforehand, so that an instance only spends."""
 
-    def __init__(self, execution: dict[str, Any], seed: int, node: str, index: int) -> None:
-        self._blocks = blocks(execution, seed, node, index)
+    def __init__(self, times: ExecutionTime, seed: int, node: str, index: int) -> None:
+        self._blocks = blocks(times, seed, node, index)
         self._values: deque[int] = deque()
 
     def refill(self, count: int) -> None:

@@ -91,7 +91,7 @@ Entity: TypeAlias = Timer | SubscriptionEntity
 IDLE_NS = 500_000_000  # between looks of an executor with nothing to do whether it is to end
 
 
-class Executor:
+class NodeExecutor:
     """Runs the callbacks of one process on the calling thread, and on ``threads`` − 1 others.
 
     Once ``over``, it ends when it next looks.

@@ -22,14 +22,18 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import IO, Any, TextIO
+from typing import IO, TYPE_CHECKING, Any, TextIO, TypeVar
 
 from chainshaper.linux.own_processes import end_in_words, module_command
 from chainshaper.values.errors import OperationError
 
+if TYPE_CHECKING:  # a stall meter is Python alone
+    from pydantic import BaseModel
+
 ENOUGH = signal.SIGUSR1  # has a child end its run early, and send what it recorded
 ANSWER_S = 60.0  # a process that is silent for longer, discovery included, hangs
 DYING_S = 2.0  # a process that has closed its pipe ends by then, or talks nonsense
+Model = TypeVar("Model", bound="BaseModel")
 WORKER_NAME = "executor"  # of a node's threads that execute beside its main one
 
 
@@ -48,9 +52,19 @@ class Child:
 
     def tell(self, **fields: Any) -> None:
         """Send a line; a process that is gone is noticed by :meth:`hear` or the watch."""
+        self._send(json.dumps(fields))
+
+    def tell_model(self, model: "BaseModel") -> None:
+        """Send a model, as :meth:`tell` does; what its defaults are stays out.
+
+        A validator sees the same fields set at both ends.
+        """
+        self._send(model.model_dump_json(exclude_unset=True))
+
+    def _send(self, line: str) -> None:
         assert self.process.stdin is not None  # noqa: S101 - start_child opens it
         with contextlib.suppress(BrokenPipeError):
-            self.process.stdin.write(json.dumps(fields).encode() + b"\n")
+            self.process.stdin.write(line.encode() + b"\n")
             self.process.stdin.flush()
 
     def hear(self, within_s: float = ANSWER_S) -> dict[str, Any]:
@@ -159,12 +173,21 @@ def end_all(children: Iterable[Child], patience_s: float = 2.0) -> None:
 
 
 def receive() -> dict[str, Any]:
-    """The launcher's next line; ends this process when the launcher is gone."""
+    """Read the launcher's next line; end this process when the launcher is gone."""
+    received: dict[str, Any] = json.loads(_receive_line())
+    return received
+
+
+def receive_model(model: type[Model]) -> Model:
+    """Read a model that the launcher sent by :meth:`Child.tell_model`."""
+    return model.model_validate_json(_receive_line())
+
+
+def _receive_line() -> str:
     line = sys.stdin.readline()
     if not line:
         sys.exit(0)
-    received: dict[str, Any] = json.loads(line)
-    return received
+    return line
 
 
 def own_output() -> TextIO:

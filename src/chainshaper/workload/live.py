@@ -50,7 +50,9 @@ from chainshaper.workload.description import (
 )
 from chainshaper.workload.event_log import ABSENT, ALSO_TAKEN, EVENTS, LAYOUT, WIDTH, WORDS
 from chainshaper.workload.launcher import Child
+from chainshaper.workload.node_setup import Counterparts, NodeSetup
 from chainshaper.workload.stall_meter import StallWatch, far_from, meter_tables, stalls_watched
+from chainshaper.workload.timing import Timing, timing_of
 
 Numbers: TypeAlias = npt.NDArray[np.int64]
 
@@ -72,7 +74,6 @@ class StartedNodes:
 Enforcement: TypeAlias = Callable[[StartedNodes], AbstractContextManager[object]]
 """Puts reservation servers in force for as long as its context lasts."""
 
-WARM_UP_CYCLES = 5
 LEAD_NS = 300_000_000
 ENFORCING_NS = 2_000_000_000  # at most until servers are in force, before the first cycle
 DISCOVERY_NS = 20_000_000_000
@@ -184,45 +185,6 @@ def _permitted(wanted: bool | None) -> bool:
     return permitted
 
 
-@dataclass(frozen=True)
-class Timing:
-    """The instants of a run (ns), live or simulated: from the timers' common start to the end."""
-
-    start_ns: int
-    anchor_ns: int
-    record_from_ns: int
-    last_timer_ns: int
-    stop_ns: int
-    period_ns: int
-
-    @property
-    def cycles(self) -> int:
-        """How many whole cycles are recorded at ``stop_ns``."""
-        return (self.stop_ns - self.record_from_ns) // self.period_ns
-
-
-def timing_of(application: Application, cycles: int, start: int) -> Timing:
-    """The instants of a run that begins at ``start``; what has begun in its last cycle completes.
-
-    It is recorded from just before the first recorded expiry: instances are not cut in two.
-    """
-    _, timer = origin_timer(application)
-    period = timer.timer_ns or 0
-    anchor = start + timer.phase_ns
-    first = anchor + WARM_UP_CYCLES * period
-    end, apart = first + cycles * period, min(1_000_000, period // 10)
-    gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
-    delayed = max((gate.due_cycles for gate in gates), default=0)
-    return Timing(
-        start_ns=start,
-        anchor_ns=anchor,
-        record_from_ns=first - apart,
-        last_timer_ns=end - apart,
-        stop_ns=end + max(2 * period, 200_000_000) + delayed * period,
-        period_ns=period,
-    )
-
-
 def _between_releases(application: Application) -> int:
     """Where behind the anchor stall meters wake up, and every millisecond then."""
     gates = (cb.gate for _, cb in application.callbacks() if cb.gate is not None)
@@ -252,33 +214,40 @@ def _start_nodes(application: Application, nodes: dict[str, Child], realtime: bo
 
     domain = free_domain()
     environment = {"CYCLONEDDS_URI": closed_domain_configuration(), **SINGLE_THREADED}
-    described = [callback for _, callback in application.callbacks()]
-    writers = Counter(topic for callback in described for topic in callback.publishes)
-    readers = Counter(topic for callback in described for topic in callback.subscriptions)
-    for name, node in application.nodes.items():
+    for name in application.nodes:
         namespace, _, base = node_name(name).rpartition("/")
-        arguments = ("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}")
-        module = "chainshaper.workload.node_process"
-        own = (module, environment, arguments, LIBRARIES)
-        nodes[name] = launcher.start_child(f"node {name}", *own)
-        executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
-        nodes[name].tell(
-            node=node_name(name),
-            domain=domain,
-            seed=application.seed,
-            parent=os.getpid(),
-            discovery_ns=DISCOVERY_NS,
-            origin_phase=origin_timer(application)[1].phase_ns,
-            delivery_core=dds.core if realtime and dds.core != executor.core else None,
-            callbacks=[
-                {**callback.model_dump(), "group": node.exclusive_group(callback)}
-                for callback in node.callbacks
-            ],
-            threads=node.threads,
-            topics={topic: application.topic(topic).model_dump() for topic in writers},
-            announced=sorted(application.announced()),
-            expected={topic: (writers[topic], readers[topic]) for topic in writers},
+        nodes[name] = launcher.start_child(
+            f"node {name}",
+            "chainshaper.workload.node_process",
+            environment,
+            arguments=("--ros-args", "-r", f"__node:={base}", "-r", f"__ns:={namespace or '/'}"),
+            libraries=LIBRARIES,
         )
+        nodes[name].tell_model(_setup_of(application, name, domain, realtime))
+
+
+def _setup_of(application: Application, name: str, domain: int, realtime: bool) -> NodeSetup:
+    """What the process of the node gets before it runs."""
+    described = [callback for _, callback in application.callbacks()]
+    publishers = Counter(topic for callback in described for topic in callback.publishes)
+    subscriptions = Counter(topic for callback in described for topic in callback.subscriptions)
+    executor, dds = application.scheduling_of(name), application.dds_scheduling_of(name)
+    return NodeSetup(
+        name=node_name(name),
+        node=application.nodes[name],
+        topics={topic: application.topic(topic) for topic in publishers},
+        announced=frozenset(application.announced()),
+        counterparts={
+            topic: Counterparts(publishers=publishers[topic], subscriptions=subscriptions[topic])
+            for topic in publishers
+        },
+        domain=domain,
+        discovery_ns=DISCOVERY_NS,
+        seed=application.seed,
+        parent=os.getpid(),
+        origin_phase_ns=origin_timer(application)[1].phase_ns,
+        delivery_core=dds.core if realtime and dds.core != executor.core else None,
+    )
 
 
 def _await_ready(children: Iterable[Child]) -> bool:

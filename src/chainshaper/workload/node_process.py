@@ -1,7 +1,7 @@
 """One node of the live workload, in a process of its own: ``python -m …node_process``.
 
-It talks with :mod:`chainshaper.workload.live` as :mod:`chainshaper.workload.launcher` says. It
-imports little on purpose: every page of it is locked into memory.
+It talks with :mod:`chainshaper.workload.live` as :mod:`chainshaper.workload.launcher` says. Every
+page of it is locked into memory: it imports nothing that it does not need.
 """
 
 import os
@@ -13,317 +13,228 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from chainshaper.linux import scheduling
-from chainshaper.robot.clear_core import ClearCore
-from chainshaper.robot.gate import Gate, Modes
 from chainshaper.robot.handover import Turn
-from chainshaper.robot.node_parameters import SAME
 from chainshaper.robot.serialized import text_of
-from chainshaper.robot.shaper import READER_DEPTH, STALL_NS, Shaper
-from chainshaper.robot.waiting import Outcome
+from chainshaper.robot.shaper import READER_DEPTH, Shaper
 from chainshaper.workload import dds, executor, launcher
-from chainshaper.workload.event_log import ABSENT, LAYOUT, EventLog, number_of
+from chainshaper.workload.description import CallbackDescription, ExecutionTime, GateDescription
+from chainshaper.workload.event_log import EventLog, number_of
 from chainshaper.workload.execution import FIRST_AFTER, ExecutionTimes, spend
+from chainshaper.workload.gate_callback import GateCallback, GateHandles, shaper_of
+from chainshaper.workload.node_setup import NodeSetup
+from chainshaper.workload.traced import TracedPublisher, traced_callback
 
 NEVER_S = 1e6
+KINDS = ("subscription", "service", "client")  # in the order in which executors look at them
 Body: TypeAlias = Callable[[dds.Message], None]
+Completes: TypeAlias = Callable[[dds.Message], tuple[dds.Message, ...]]
+"""Of a synchroniser: takes a message, returns the set that it completes, or nothing."""
 
 
 @dataclass(frozen=True)
-class TracedPublisher:
-    """A publisher with its trace point, which is recorded apart from sending."""
+class Endpoint:
+    """A publisher or subscription that waits for its counterparts."""
 
-    write: Callable[[bytes, int], None]
-    template: bytes
-    handle: int
-    rmw_handle: int
-    point: Callable[..., None]
-
-    def send(self, payload: bytes) -> tuple[int, int]:
-        """Publish; the time of publication (ns) and the source timestamp.
-
-        As the rmw layers do: one time stamp, given to the trace point and to DDS. With
-        asynchronous publication that is when the message was handed over, not when it was sent.
-        """
-        source_timestamp, now = time.time_ns(), time.monotonic_ns()
-        self.write(payload, source_timestamp)
-        return now, source_timestamp
-
-    def record(self, payload: bytes, now: int, source_timestamp: int) -> None:
-        """Record what :meth:`send` did."""
-        self.point(now, self.handle, self.rmw_handle, id(payload), source_timestamp)
+    name: str
+    entity: dds.Publisher | dds.Subscription
+    expected: int  # counterparts
+    counterparts: str  # what they are called
 
 
 class NodeProcess:
     """A node built from its description, ready to run."""
 
-    def __init__(self, spec: dict[str, Any]) -> None:
-        self.spec = spec
+    def __init__(self, setup: NodeSetup) -> None:
+        self.setup = setup
         self.log = EventLog()
-        self.participant = dds.Participant(spec["domain"])
+        self.participant = dds.Participant(setup.domain)
         sys.setswitchinterval(NEVER_S)  # the kernel alone decides which thread of an executor runs
-        self.executor = executor.Executor(self.participant, self.log, spec["threads"])
-        # What waits for its counterparts: its name, itself, how many of what it is to find.
-        self.ends: list[tuple[str, dds.Publisher | dds.Subscription, int, str]] = []
+        self.executor = executor.NodeExecutor(self.participant, self.log, setup.node.threads)
+        self.endpoints: list[Endpoint] = []
         self.to_send: queue.SimpleQueue[executor.AsynchronousWriter] | None = None
-        self.shapers: list[tuple[Shaper, list[tuple[int, int]]]] = []  # with their moves
+        self.shapers: list[tuple[Shaper, GateDescription]] = []
         self.execution_times: list[ExecutionTimes] = []
-        self._point = {name: self.log.point(name) for name in LAYOUT}
-        self.log.node(spec["node"], "live workload")
-        kinds = ("subscription", "service", "client")  # as executors look at them
-        numbered = list(enumerate(spec["callbacks"]))
-        for index, callback in sorted(numbered, key=lambda each: kinds.index(each[1]["kind"])):
+        self._several = setup.node.threads > 1
+        self.log.node(setup.name, "live workload")
+        numbered = enumerate(setup.node.callbacks)
+        for index, callback in sorted(numbered, key=lambda pair: KINDS.index(pair[1].kind)):
             self._add_callback(index, callback)
 
     # Building -----------------------------------------------------------------------------
 
-    def _add_callback(self, index: int, callback: dict[str, Any]) -> None:
-        symbol, topic = f"{self.spec['node']}::callback{index}", callback["subscription"]
-        if callback["gate"] is not None:
-            self._add_gate(symbol, topic, callback["gate"], callback["publishes"][0])
+    def _add_callback(self, index: int, callback: CallbackDescription) -> None:
+        symbol = f"{self.setup.name}::callback{index}"
+        if callback.gate is not None and callback.subscription is not None:
+            self._add_gate(symbol, callback.subscription, callback.gate, callback.publishes[0])
             return
-        publishers = [self._publisher(topic) for topic in callback["publishes"]]
+        group = self.setup.node.exclusive_group(callback)
+        publishers = [self._publisher(topic) for topic in callback.publishes]
         work = self._work(index, callback, publishers)
-        rest = self._rest(index, callback)
-        if callback["synchronises"]:
-            topics = callback["synchronises"]
-            depths = [self.spec["topics"][topic]["depth"] for topic in topics]
-            trigger = callback["triggered_by"]
-            place = None if trigger is None else topics.index(trigger)
-            synchroniser = executor.Synchroniser[dds.Message](depths, place)
-            for number, topic in enumerate(topics):
-                # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
-                handle = self.log.callback(f"message_filters::{symbol}.{number}")
-                complete = partial(synchroniser.add, number)
-                body = self._working_body(handle, work, publishers, rest, complete)
-                self._subscribe(handle, topic, body, callback["group"])
+        rest = self._rest(index, callback.afterwards)
+        if callback.synchronises:
+            self._add_synchroniser(symbol, callback, partial(_body, work, publishers, rest))
             return
         handle = self.log.callback(symbol)
-        body = self._working_body(handle, work, publishers, rest)
-        if topic is not None:
-            self._subscribe(handle, topic, body, callback["group"])
-            return
-        period, due = callback["timer_ns"], callback["phase_ns"]  # behind the common start
-        own = (self.log.timer(handle, period), period, body, due, callback["group"])
-        self.executor.timers.append(executor.Timer(*own))
+        body = traced_callback(self.log, handle, _body(work, publishers, rest))
+        if callback.subscription is not None:
+            self._subscribe(handle, callback.subscription, body, group)
+        elif callback.timer_ns is not None:
+            period_ns = callback.timer_ns
+            self.executor.timers.append(
+                executor.Timer(
+                    handle=self.log.timer(handle, period_ns),
+                    period_ns=period_ns,
+                    callback=body,
+                    due_ns=callback.phase_ns,  # behind the common start
+                    group=group,
+                )
+            )
+
+    def _add_synchroniser(
+        self,
+        symbol: str,
+        callback: CallbackDescription,
+        body_of: Callable[[Completes], Callable[..., None]],
+    ) -> None:
+        """Add a callback for each input, of which the one that completes a set does the work."""
+        topics, trigger = callback.synchronises, callback.triggered_by
+        synchroniser = executor.Synchroniser[dds.Message](
+            depths=[self.setup.topics[topic].depth for topic in topics],
+            trigger=None if trigger is None else topics.index(trigger),
+        )
+        for number, topic in enumerate(topics):
+            # As in ROS 2, by which the analysis knows the inputs of one synchroniser.
+            handle = self.log.callback(f"message_filters::{symbol}.{number}")
+            body = traced_callback(self.log, handle, body_of(partial(synchroniser.add, number)))
+            self._subscribe(handle, topic, body, self.setup.node.exclusive_group(callback))
 
     def _work(
-        self, index: int, callback: dict[str, Any], publishers: Sequence[TracedPublisher]
+        self, index: int, callback: CallbackDescription, publishers: Sequence[TracedPublisher]
     ) -> executor.Work:
         """What the callback does: call the function that it names, or spend drawn times."""
-        if callback["computes"] is not None:
-            function = executor.load_function(callback["computes"])
-            return executor.computing(callback["computes"], function, len(publishers))
-        times = ExecutionTimes(callback["execution"], self.spec["seed"], self.spec["node"], index)
-        self.execution_times.append(times)
-        announced = [dds.text_message(mode) for mode in callback["announces"]]
-        templates, several = [one.template for one in publishers], self.spec["threads"] > 1
-        return executor.spending(times, templates, announced, beside_others=several)
+        if callback.computes is not None:
+            function = executor.load_function(callback.computes)
+            return executor.computing(callback.computes, function, len(publishers))
+        return executor.spending(
+            self._times(callback.execution, index),
+            templates=[publisher.template for publisher in publishers],
+            announced=[dds.text_message(mode) for mode in callback.announces],
+            beside_others=self._several,
+        )
 
-    def _rest(self, index: int, callback: dict[str, Any]) -> Callable[[], None]:
+    def _rest(self, index: int, afterwards: ExecutionTime | None) -> Callable[[], None]:
         """What the callback does when it has published: spend drawn times, if it has any."""
-        if callback["afterwards"] is None:
+        if afterwards is None:
             return lambda: None
-        own = (self.spec["seed"], self.spec["node"], FIRST_AFTER + index)
-        times = ExecutionTimes(callback["afterwards"], *own)
-        self.execution_times.append(times)
-        several = self.spec["threads"] > 1
+        times = self._times(afterwards, FIRST_AFTER + index)
+        several = self._several
         return lambda: spend(times.next(), time.thread_time_ns(), beside_others=several)
 
-    def _subscribe(self, handle: int, topic: str, body: Body, group: str | None = None) -> None:
-        subscription, depth = self._subscription(topic), self.spec["topics"][topic]["depth"]
-        own = self.log.subscription(handle, topic, depth)
-        entity = executor.SubscriptionEntity(*own, subscription, body, group)
-        self.executor.add_subscription(entity)
+    def _times(self, described: ExecutionTime, index: int) -> ExecutionTimes:
+        times = ExecutionTimes(described, self.setup.seed, self.setup.name, index)
+        self.execution_times.append(times)
+        return times
 
-    def _subscription(self, topic: str, depth: int = 0) -> dds.Subscription:
-        qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
-        own = (topic, qos["reliability"], max(depth, qos["depth"]))
-        subscription = dds.Subscription(self.participant, *own, carries_text=text)
-        writers = self.spec["expected"][topic][0]
-        self.ends.append((f"subscription to {topic}", subscription, writers, "writers"))
+    def _subscribe(self, handle: int, topic: str, body: Body, group: str | None = None) -> None:
+        """Have the executor run a callback, by its handle, for each message of a topic."""
+        subscription = self._subscription(topic)
+        depth = self.setup.topics[topic].depth
+        subscription_handle, rmw_handle = self.log.subscription(handle, topic, depth)
+        self.executor.add_subscription(
+            executor.SubscriptionEntity(subscription_handle, rmw_handle, subscription, body, group)
+        )
+
+    def _subscription(self, topic: str, least_depth: int = 0) -> dds.Subscription:
+        described = self.setup.topics[topic]
+        subscription = dds.Subscription(
+            self.participant,
+            topic,
+            described.reliability,
+            max(least_depth, described.depth),
+            carries_text=topic in self.setup.announced,
+        )
+        expected = self.setup.counterparts[topic].publishers
+        self.endpoints.append(
+            Endpoint(f"subscription to {topic}", subscription, expected, "writers")
+        )
         return subscription
 
     def _publisher(self, topic: str) -> TracedPublisher:
-        qos, text = self.spec["topics"][topic], topic in self.spec["announced"]
-        own = (topic, qos["reliability"], qos["depth"], qos["lifespan_ns"])
-        publisher = dds.Publisher(self.participant, *own, carries_text=text)
-        readers = self.spec["expected"][topic][1]
-        self.ends.append((f"publisher of {topic}", publisher, readers, "readers"))
-        asynchronous, write = qos["publication"] == "asynchronous", publisher.write
-        handle, rmw_handle = self.log.publisher(topic, qos["depth"], asynchronous)
+        described = self.setup.topics[topic]
+        publisher = dds.Publisher(
+            self.participant,
+            topic,
+            described.reliability,
+            described.depth,
+            described.lifespan_ns,
+            carries_text=topic in self.setup.announced,
+        )
+        expected = self.setup.counterparts[topic].subscriptions
+        self.endpoints.append(Endpoint(f"publisher of {topic}", publisher, expected, "readers"))
+        asynchronous, write = described.publication == "asynchronous", publisher.write
+        handle, rmw_handle = self.log.publisher(topic, described.depth, asynchronous)
         if asynchronous:  # the process's publisher thread does the writing
             self.to_send = self.to_send or executor.start_publisher_thread()
-            note, history = partial(self._note_send, rmw_handle), (qos["depth"], qos["lifespan_ns"])
-            write = executor.AsynchronousWriter(write, *history, note, self.to_send).publish
-        point = self._point["publish"]
-        return TracedPublisher(write, bytes(qos["payload"]), handle, rmw_handle, point)
+            write = executor.AsynchronousWriter(
+                write,
+                described.depth,
+                described.lifespan_ns,
+                note=self._note_sends(rmw_handle),
+                to_send=self.to_send,
+            ).publish
+        template, point = bytes(described.payload), self.log.point("publish")
+        return TracedPublisher(write, template, handle, rmw_handle, point)
 
-    def _note_send(self, handle: int, at_ns: int, stamp: int, outcome: str, lasted: int) -> None:
-        """Record what became of a message, in whichever thread."""
-        number = number_of("outcome", outcome)
-        self._point["asynchronous_send"](at_ns, handle, stamp, number, lasted)
+    def _note_sends(self, rmw_handle: int) -> executor.Note:
+        """A function that records what became of a publisher's messages, in whichever thread."""
+        point = self.log.point("asynchronous_send")
 
-    def _working_body(
-        self,
-        handle: int,
-        work: executor.Work,
-        publishers: Sequence[TracedPublisher],
-        rest: Callable[[], None],
-        complete: Callable[[dds.Message], tuple[dds.Message, ...]] | None = None,
-    ) -> Callable[..., None]:
-        """An ordinary callback: work, publish, and do the rest.
+        def note(at_ns: int, source_timestamp: int, outcome: str, lasted_ns: int) -> None:
+            number = number_of("outcome", outcome)
+            point(at_ns, rmw_handle, source_timestamp, number, lasted_ns)
 
-        With ``complete`` nothing is done until a message completes a set, for which it is then.
-        """
-
-        def body(message: dds.Message | None = None) -> None:
-            wall, used = time.time_ns(), time.thread_time_ns()
-            messages: tuple[dds.Message, ...] = () if message is None else (message,)
-            if complete is not None and message is not None:
-                messages = complete(message)
-            if messages or complete is None:
-                for payload, publisher in zip(work(messages, wall, used), publishers, strict=False):
-                    publisher.record(payload, *publisher.send(payload))
-                rest()
-
-        return self._recorded(handle, body)
-
-    def _recorded(self, handle: int, body: Callable[..., None]) -> Callable[..., None]:
-        """A callback, whose instances are recorded."""
-        start, end = self._point["callback_start"], self._point["callback_end"]
-
-        def callback(*arguments: Any) -> None:
-            start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
-            body(*arguments)
-            end(time.monotonic_ns(), handle, time.thread_time_ns())
-
-        return callback
+        return note
 
     # Gates --------------------------------------------------------------------------------
 
-    def _add_gate(self, symbol: str, topic: str, gate: dict[str, Any], output: str) -> None:
-        """The latency-shaping callback (paper, section 3.2.2): delay, then republish unchanged.
-
-        Between waking and writing nothing is computed, and after writing the thread pauses, so
-        that threads it outranks can deliver, unless another message has to leave meanwhile; only
-        then are its events recorded. Delay that no other thread caused is a stall of the machine.
-
-        What comes while one waits for its release waits behind it. The executor has it worked off
-        before it takes the next: a message is recorded as taken when it is its turn.
-        """
-        publisher, turn = self._publisher(output), self._turn(output)
-        shaper, subscription = self._shaper(gate, turn), self._subscription(topic, READER_DEPTH)
-        if gate["modes"] is not None:  # before the messages that it concerns
-            self._listen(gate["modes"]["topic"], shaper)
-        handle = self.log.callback(symbol)
-        depth = self.spec["topics"][topic]["depth"]
-        own_handle, rmw_handle = self.log.subscription(handle, topic, depth)
-        stalled, pause_ns = self._point["machine_stall"], gate["pause_ns"]
-        note = partial(self._note_release, handle, gate, turn)
-        note_alone = self._recorded(handle, note)
-        waiting, overflowed = shaper.queue.waiting, shaper.overflowed
-
-        def look() -> None:
-            while subscription.ready():
-                if (message := subscription.take()) is not None:
-                    now = time.monotonic_ns()
-                    shaper.arrive(message.payload, now, message.source_timestamp, message)
-
-        @partial(self._recorded, handle)
-        def hold() -> None:
-            if (outcome := shaper.hold()) is not None:
-                if outcome.release.at_ns is not None:
-                    payload = outcome.message.payload
-                    published, source_timestamp = publisher.send(payload)
-                    lost = shaper.time_lost(outcome.release, published)
-                    shaper.rest(published, pause_ns)
-                    publisher.record(payload, published, source_timestamp)
-                    if lost >= STALL_NS:
-                        stalled(outcome.release.at_ns, lost)
-                note(outcome)
-
-        def let_one_pass() -> None:
-            hold()
-            for gone in overflowed:
-                self.executor.record_take(rmw_handle, gone.message.about)
-                note_alone(gone)
-            overflowed.clear()
-
-        def body(message: dds.Message) -> None:
-            alone = not waiting
-            shaper.arrive(message.payload, time.monotonic_ns(), about=message)
-            if alone:
-                let_one_pass()
-
-        def work_off() -> bool:
-            served = False
-            while waiting and not (served and shaper.nothing_due()):
-                self.executor.record_take(rmw_handle, waiting[0].about)
-                let_one_pass()
-                served = True
-            return bool(waiting)
-
-        shaper.look = look
-        self.executor.backlogs.append(work_off)
-        entity = executor.SubscriptionEntity(own_handle, rmw_handle, subscription, body)
-        self.executor.add_subscription(entity)
-
-    def _shaper(self, gate: dict[str, Any], turn: Turn | None) -> Shaper:
-        modes, core = gate["modes"], self.spec["delivery_core"]
-        if gate["phase_ns"] is None:
-            gate["phase_ns"] = self.spec["origin_phase"]
-        own = Gate(
-            slots=tuple((begin, finish) for begin, finish in gate["slots"]),
-            modes=modes and Modes(modes["bands"], modes["default"], modes["late"]),
-            **{name: gate[name] for name in (*SAME, "depth")},
+    def _add_gate(self, symbol: str, topic: str, gate: GateDescription, output: str) -> None:
+        """Add the latency-shaping callback between two topics."""
+        publisher, turn = self._publisher(output), _turn(output)
+        shaper = shaper_of(gate, self.setup.origin_phase_ns, self.setup.delivery_core, turn)
+        self.shapers.append((shaper, gate))
+        subscription = self._subscription(topic, READER_DEPTH)
+        if gate.modes is not None:  # before the messages that it concerns
+            self._follow_modes(gate.modes.topic, shaper)
+        handle, depth = self.log.callback(symbol), self.setup.topics[topic].depth
+        subscription_handle, rmw_handle = self.log.subscription(handle, topic, depth)
+        callback = GateCallback(
+            gate,
+            shaper=shaper,
+            subscription=subscription,
+            publisher=publisher,
+            turn=turn,
+            log=self.log,
+            handles=GateHandles(handle, rmw_handle),
+            record_take=self.executor.record_take,
         )
-        shaper, first = Shaper(own, gate["spin_ns"]), own.slots[0][0]
-        if core is not None:
-            clear_until, pause_ns = ClearCore(core).clear_until, gate["pause_ns"]
-            shaper.on_waking = lambda release_ns: clear_until(release_ns + pause_ns)
-        if turn is not None:
-            shaper.moved = turn.moved
-        self.shapers.append((shaper, [(since, begin - first) for since, begin in gate["moves"]]))
-        return shaper
+        self.executor.backlogs.append(callback.work_off)
+        self.executor.add_subscription(
+            executor.SubscriptionEntity(
+                subscription_handle, rmw_handle, subscription, callback.body
+            )
+        )
 
-    def _listen(self, topic: str, shaper: Shaper) -> None:
-        """Listen to the modes that are announced."""
-        handle = self.log.new_handle()
+    def _follow_modes(self, topic: str, shaper: Shaper) -> None:
+        """Have a gate switch to the modes that are announced on a topic."""
 
-        @partial(self._recorded, handle)
         def switch(message: dds.Message) -> None:
             shaper.switch(text_of(message.payload), time.monotonic_ns())
 
-        self._subscribe(handle, topic, switch)
-
-    def _turn(self, output: str) -> Turn | None:
-        """The page by which others know an output, as that of a shaping node, but without standby.
-
-        None where there cannot be one, or another run has the same output.
-        """
-        with suppress(OSError):
-            turn = Turn(f"live{output.replace('/', '.')}", output)
-            if turn.take(None):
-                return turn
-        return None
-
-    def _note_release(
-        self, handle: int, gate: dict[str, Any], turn: Turn | None, outcome: Outcome
-    ) -> None:
-        """Record what became of a message at a gate."""
-        message, release = outcome.message, outcome.release
-        mode = release.mode and [*gate["modes"]["bands"]].index(release.mode)
-        if turn is not None:
-            turn.count(outcome)
-        came = (message.about.source_timestamp, message.arrival_ns)
-        leaves = (release.origin_ns, release.at_ns, release.slot, release.cycles_waited)
-        why = (number_of("anchor", release.anchor), number_of("overrun", release.overrun), mode)
-        row = (*came, *leaves, *why, number_of("dropped", release.dropped), release.moved_ns)
-        absent = (ABSENT if number is None else number for number in row)
-        self._point["gate_release"](outcome.awake_ns, handle, *absent)
+        handle = self.log.new_handle()
+        self._subscribe(handle, topic, traced_callback(self.log, handle, switch))
 
     # Running ------------------------------------------------------------------------------
 
@@ -331,9 +242,9 @@ class NodeProcess:
         """Wait until DDS discovery is complete; what is still missing at the deadline."""
         while True:
             missing = [
-                f"{name} found {end.matched()} of {expected} {others}"
-                for name, end, expected, others in self.ends
-                if end.matched() < expected
+                f"{end.name} found {end.entity.matched()} of {end.expected} {end.counterparts}"
+                for end in self.endpoints
+                if end.entity.matched() < end.expected
             ]
             if not missing or time.monotonic_ns() > deadline_ns:
                 return missing
@@ -346,22 +257,59 @@ class NodeProcess:
         periods = [timer.period_ns for timer in self.executor.timers] or [100_000_000]
         for times in self.execution_times:
             times.refill(min(1 + (stop_ns - start_ns) // min(periods), 100_000))
-        for shaper, moves in self.shapers:
+        for shaper, gate in self.shapers:
             shaper.queue.phase_ns = start_ns + shaper.gate.phase_ns
-            shaper.queue.moves.extend((start_ns + since, by) for since, by in moves)
+            shaper.queue.moves.extend(gate.moved(start_ns))
         scheduling.stop_garbage_collection()
         self.executor.spin_until(stop_ns, last_timer_ns)
+
+
+def _body(
+    work: executor.Work,
+    publishers: Sequence[TracedPublisher],
+    rest: Callable[[], None],
+    complete: Completes | None = None,
+) -> Callable[..., None]:
+    """An ordinary callback: work, publish, and do the rest.
+
+    With ``complete`` it does so only for a message that completes a set, and for that set.
+    """
+
+    def body(message: dds.Message | None = None) -> None:
+        wall_ns, cpu_ns = time.time_ns(), time.thread_time_ns()
+        messages: tuple[dds.Message, ...] = () if message is None else (message,)
+        if complete is not None and message is not None:
+            messages = complete(message)
+        if messages or complete is None:
+            payloads = work(messages, wall_ns, cpu_ns)
+            for payload, publisher in zip(payloads, publishers, strict=False):
+                publisher.record(payload, *publisher.send(payload))
+            rest()
+
+    return body
+
+
+def _turn(output: str) -> Turn | None:
+    """The page by which others know an output, as that of a shaping node, but without standby.
+
+    None where there cannot be one, or another run has the same output.
+    """
+    with suppress(OSError):
+        turn = Turn(f"live{output.replace('/', '.')}", output)
+        if turn.take(None):
+            return turn
+    return None
 
 
 def main() -> None:
     """Run one node as the launcher says."""
     output = launcher.own_output()  # what callbacks compute may print
-    spec = launcher.receive()
-    scheduling.signalled_with_parent(spec["parent"], signal.SIGKILL)
-    scheduling.set_thread_name(spec["node"].strip("/").replace("/", "."))
-    node = NodeProcess(spec)
+    setup = launcher.receive_model(NodeSetup)
+    scheduling.signalled_with_parent(setup.parent, signal.SIGKILL)
+    scheduling.set_thread_name(setup.name.strip("/").replace("/", "."))
+    node = NodeProcess(setup)
     signal.signal(launcher.ENOUGH, lambda *_: setattr(node.executor, "over", True))
-    missing = node.wait_for_counterparts(time.monotonic_ns() + spec["discovery_ns"])
+    missing = node.wait_for_counterparts(time.monotonic_ns() + setup.discovery_ns)
     launcher.send(output, missing=missing, memory_locked=scheduling.lock_memory())
     times = launcher.receive()
     node.run(times["start_ns"], times["last_timer_ns"], times["stop_ns"])

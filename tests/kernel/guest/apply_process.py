@@ -17,7 +17,8 @@ sys.path.insert(0, "/src")
 from chainshaper.enforcement.undoing import RunState
 from chainshaper.flow.apply import apply_plan
 from chainshaper.flow.phase import DriftWatch
-from chainshaper.planning import plan as of
+from chainshaper.planning import Plan
+from chainshaper.planning import chain_plan as of
 
 cycle, end, follows = map(int, sys.argv[1:4])
 nodes = ["sensor"]
@@ -35,7 +36,7 @@ servers = [
     )
     for place, node in enumerate(nodes)
 ]
-plan = of.Plan(
+plan = of.ChainPlan(
     chain=of.ChainOfPlan(spec="sensor", period_ns=cycle),
     evidence=of.Evidence(samples=1, min_latency_ns=1, mean_latency_ns=1, max_latency_ns=end),
     margin=of.Margin(epsilon_ns=0),
@@ -57,6 +58,6 @@ def watch(state: RunState) -> None:
 
 
 phase_ns = 0 if slot_ends else None
-state = apply_plan(plan, back_end="scx", phase_ns=phase_ns, stop=stop, watch=watch).state
+state = apply_plan(Plan.of(plan), back_end="scx", phase_ns=phase_ns, stop=stop, watch=watch).state
 moved = f"{len(anchors) - 1} moves, {state.drift_ns or 0} ns in all"
 os.write(1, f"{moved}, {state.servers[0].counters}\n".encode())

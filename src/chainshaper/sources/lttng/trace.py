@@ -13,7 +13,7 @@ they really happened.
 """
 
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from threading import Lock
@@ -154,6 +154,12 @@ class TraceTables(Mapping[str, pl.DataFrame]):
             if name not in self._read:
                 self._decode(next(group for group in _GROUPS if name in group))
         return self._read[name]
+
+    def let_go(self, names: Collection[str]) -> None:
+        """Forget tables, which are decoded again when they are asked for."""
+        with self._decoding:
+            for name in names:
+                self._read.pop(name, None)
 
     def __contains__(self, name: object) -> bool:
         return name in events.FIELDS and self._counted(str(name)) > 0

@@ -1,0 +1,45 @@
+"""Publishers and callbacks of the live workload whose events are recorded."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from chainshaper.workload.event_log import EventLog
+
+
+@dataclass(frozen=True)
+class TracedPublisher:
+    """A publisher with its trace point, which is recorded apart from sending."""
+
+    write: Callable[[bytes, int], None]  # gets a message and its source timestamp
+    template: bytes  # the data of its messages
+    handle: int
+    rmw_handle: int
+    point: Callable[..., None]
+
+    def send(self, payload: bytes) -> tuple[int, int]:
+        """Publish; return the time of publication (ns) and the source timestamp.
+
+        As the rmw layers do: one time stamp, given to the trace point and to DDS. With
+        asynchronous publication that is when the message was handed over, not when it was sent.
+        """
+        source_timestamp, now_ns = time.time_ns(), time.monotonic_ns()
+        self.write(payload, source_timestamp)
+        return now_ns, source_timestamp
+
+    def record(self, payload: bytes, now_ns: int, source_timestamp: int) -> None:
+        """Record what :meth:`send` did."""
+        self.point(now_ns, self.handle, self.rmw_handle, id(payload), source_timestamp)
+
+
+def traced_callback(log: EventLog, handle: int, body: Callable[..., None]) -> Callable[..., None]:
+    """A callback whose instances are recorded, from start to end."""
+    start, end = log.point("callback_start"), log.point("callback_end")
+
+    def callback(*arguments: Any) -> None:
+        start(time.monotonic_ns(), handle, time.thread_time_ns(), 0)
+        body(*arguments)
+        end(time.monotonic_ns(), handle, time.thread_time_ns())
+
+    return callback
